@@ -1,4 +1,4 @@
-"""From trees to functions: a specification is checked and written in the intermediate form (`ir/form.py`).
+"""Type-check specifications and lower them to the intermediate form (`form/nodes.py`).
 
-Names in the form are made here (`v12`, `f3`); no identifier of a specification is ever one.
+Names in the form are generated (`v12`, `f3`), and never identifiers of a specification.
 """

@@ -9,10 +9,10 @@ from rosmop.types.value_types import Type
 
 @dataclass(eq=False)
 class Variable:
-    """A variable: its name in the text and in the code.
+    """A variable: its names in the text and in the code.
 
-    `flag` is the code's name for "was assigned", for parameters that are bound to fields. `alias` is what a
-    reference stands for. `shared` variables live in the namespace of the module.
+    `flag` is the code's name for "was assigned", for parameters that are bound to fields. `alias` is the value that a
+    reference refers to. `shared` variables belong to the set of specifications, others to one function.
     """
 
     name: str
@@ -22,29 +22,29 @@ class Variable:
     shared: bool = False
     constant: bool = False
     known: bool | int | float | None = None
-    """What a `const` number is, if it is written down."""
+    """The value of a `const` number that is a literal; None for other variables."""
     flag: str | None = None
     alias: "Value | None" = None
     copied: bool = False
-    """A `char *` or `T name[]` that holds a copy of another's elements, where C++'s would point to them."""
+    """Whether a `char *` or `T name[]` holds a copy of another array, where C++ would point to it."""
     used: bool = False
     assigned: bool = False
     sliced: bool = False
-    """Each slice of a parametric specification has its own."""
+    """Whether each slice of a parametric specification has its own value."""
 
 
 @dataclass(frozen=True)
 class Value:
-    """An expression: its form, and what is known of it.
+    """A compiled expression: its form, and the facts known about it.
 
-    `place` is where the value lives if it can be assigned. `owned` means that nothing else refers to it, so it
-    needs no copy. `constant` is known without running. `first` is what the form begins with, before its place is known.
-    Of an iterator, `vector` is what it is a place in.
+    `place` is the place of a value that can be assigned. `owned`: nothing else refers to the value (no copy needed).
+    `constant` is its value if that is known at compile time. `first` are the expressions at the start of the form,
+    before the place is known. For an iterator, `vector` is the vector that it points into.
     """
 
     form: Expression
     position: Position
-    place: "Place | None" = None
+    place: "Lvalue | None" = None
     owned: bool = True
     constant: bool | int | float | bytes | None = None
     first: tuple[Expression, ...] = ()
@@ -52,29 +52,29 @@ class Value:
 
     @property
     def pure(self) -> bool:
-        """Whether to compute it changes nothing."""
+        """Whether evaluating the expression has no effect."""
         return not acts(self.form)
 
     @property
     def type(self) -> Type:
-        """What it is one of."""
+        """Return the type of the expression."""
         return self.form.type
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a value lives."""
+class Lvalue:
+    """A place that can be assigned."""
 
 
 @dataclass(frozen=True)
-class VariablePlace(Place):
+class VariableLvalue(Lvalue):
     """A variable."""
 
     variable: Variable
 
 
 @dataclass(frozen=True)
-class ElementPlace(Place):
+class ElementLvalue(Lvalue):
     """An element of a vector."""
 
     base: Value
@@ -83,7 +83,7 @@ class ElementPlace(Place):
 
 
 @dataclass(frozen=True)
-class CharacterPlace(Place):
+class CharacterLvalue(Lvalue):
     """A character of a string."""
 
     base: Value
@@ -92,7 +92,7 @@ class CharacterPlace(Place):
 
 
 @dataclass(frozen=True)
-class SlotPlace(Place):
+class FieldLvalue(Lvalue):
     """A field of a message."""
 
     base: Value
@@ -100,7 +100,7 @@ class SlotPlace(Place):
 
 
 @dataclass(frozen=True)
-class PartPlace(Place):
+class TimePartLvalue(Lvalue):
     """`sec` or `nsec` of a time or duration."""
 
     base: Value
@@ -109,23 +109,23 @@ class PartPlace(Place):
 
 
 def path(value: Value) -> tuple[object, ...]:
-    """Where a value lives: the name of the variable, then elements and fields, down to it."""
+    """Return the path of a value: the name of its variable, then indices and fields."""
     place = value.place
-    if isinstance(place, VariablePlace):
+    if isinstance(place, VariableLvalue):
         alias = place.variable.alias
         return (place.variable.name,) if alias is None else path(alias)
-    if isinstance(place, ElementPlace | CharacterPlace):
+    if isinstance(place, ElementLvalue | CharacterLvalue):
         return (*path(place.base), place.index)
-    if isinstance(place, SlotPlace):
+    if isinstance(place, FieldLvalue):
         return (*path(place.base), place.slot)
-    return (*path(place.base), place.part) if isinstance(place, PartPlace) else ()
+    return (*path(place.base), place.part) if isinstance(place, TimePartLvalue) else ()
 
 
 def root(value: Value) -> Variable | None:
-    """The variable that a place is part of."""
+    """Return the variable that a place is part of."""
     place = value.place
     while place is not None:
-        if isinstance(place, VariablePlace):
+        if isinstance(place, VariableLvalue):
             variable = place.variable
             return root(variable.alias) if variable.alias is not None else variable
         place = place.base.place  # type: ignore[attr-defined]  # every other place has a base

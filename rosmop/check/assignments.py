@@ -1,26 +1,26 @@
 """Assignments: to variables, elements, fields, characters and parts of times.
 
-A parameter that is bound to a field remembers that it was assigned, because only then the field is written.
+A parameter that is bound to a field remembers that it was assigned, because the field is written only then.
 """
 
 from rosmop.check.assignables import (
-    CharacterPlace,
-    ElementPlace,
-    PartPlace,
-    Place,
-    SlotPlace,
+    CharacterLvalue,
+    ElementLvalue,
+    FieldLvalue,
+    Lvalue,
+    TimePartLvalue,
     Value,
-    VariablePlace,
+    VariableLvalue,
     root,
 )
-from rosmop.check.scope import Scope
+from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 
 
-def require_place(target: Value, what: str) -> Place:
-    """The place of a value that is to be assigned; refuses constants and values that live nowhere."""
+def require_place(target: Value, what: str) -> Lvalue:
+    """Return the place of an assigned value; rejects constants and values without a place."""
     if target.place is None:
         raise SpecificationError.at(target.position, f"{what} needs a variable, a field or an element")
     variable = root(target)
@@ -30,7 +30,7 @@ def require_place(target: Value, what: str) -> Place:
 
 
 def require_original(target: Value) -> None:
-    """Refuse to write into a `char *` or `T name[]` that is a copy: C++ would change what it was copied from."""
+    """Reject writing into a `char *` or `T name[]` that is a copy: C++ would change the original."""
     variable = root(target)
     if variable is not None and variable.copied:
         raise SpecificationError.at(
@@ -41,19 +41,23 @@ def require_original(target: Value) -> None:
 
 
 def note_copy(target: Value, value: Value) -> None:
-    """Remember that a `char *` was given another's characters."""
+    """Remember that a `char *` was assigned the characters of another."""
     variable = root(target)
-    if variable is not None and value.place is not None and isinstance(value.type, value_types.Characters):
-        variable.copied = variable.copied or isinstance(variable.type, value_types.Characters)
+    if (
+        variable is not None
+        and value.place is not None
+        and isinstance(value.type, value_types.CharactersType)
+    ):
+        variable.copied = variable.copied or isinstance(variable.type, value_types.CharactersType)
 
 
-def store(scope: Scope, target: Value, value: nodes.Expression) -> nodes.Expression:
-    """An expression that assigns and has the value assigned."""
+def store(scope: FunctionScope, target: Value, value: nodes.Expression) -> nodes.Expression:
+    """Return an expression that assigns; its result is the assigned value."""
     stored = _store(scope, require_place(target, "an assignment"), value)
     return marked(mark(scope, target), stored)
 
 
-def write_store(scope: Scope, target: Value, value: nodes.Expression) -> None:
+def write_store(scope: FunctionScope, target: Value, value: nodes.Expression) -> None:
     """Write the statements that assign."""
     place = require_place(target, "an assignment")
     flag = mark(scope, target)
@@ -63,52 +67,52 @@ def write_store(scope: Scope, target: Value, value: nodes.Expression) -> None:
 
 
 def marked(flag: str | None, change: nodes.Expression) -> nodes.Expression:
-    """An expression that changes a place, which sets the flag for that, if there is one."""
+    """Return `change`, preceded by an assignment that sets `flag` if there is one."""
     if flag is None:
         return change
     assigned = nodes.Assign(value_types.BOOL, flag, nodes.Literal(value_types.BOOL, True))
     return nodes.Sequence(change.type, (assigned, change), 1)
 
 
-def mark(scope: Scope, target: Value) -> str | None:
-    """The flag to set when (a part of) this place changes, None if nobody asks."""
+def mark(scope: FunctionScope, target: Value) -> str | None:
+    """Note that (a part of) this place changes; return the flag to set then, or None."""
     variable = root(target)
     scope.changes = True
     if variable is None:
         return None
     if variable.shared:
         scope.changes_shared.add(variable.code)
-    if not isinstance(target.place, VariablePlace) or target.place.variable.alias is not None:
+    if not isinstance(target.place, VariableLvalue) or target.place.variable.alias is not None:
         require_original(target)
     variable.assigned = variable.used = True
     return variable.flag
 
 
-def _store(scope: Scope, place: Place, value: nodes.Expression) -> nodes.Expression:
-    if isinstance(place, VariablePlace):
+def _store(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> nodes.Expression:
+    if isinstance(place, VariableLvalue):
         if place.variable.alias is not None:
             return _store(scope, require_place(place.variable.alias, "an assignment"), value)
         _note(scope, place)
         return nodes.Assign(place.variable.type, place.variable.code, value)
-    if isinstance(place, ElementPlace):
+    if isinstance(place, ElementLvalue):
         return nodes.Call(value.type, "a_put", (place.base.form, place.index, value), place.site)
-    if isinstance(place, SlotPlace):
+    if isinstance(place, FieldLvalue):
         slot = nodes.Literal(value_types.INT, place.slot)
         return nodes.Call(value.type, "a_slot", (place.base.form, slot, value))
     return _store_part(scope, place, value)
 
 
-def _store_part(scope: Scope, place: Place, value: nodes.Expression) -> nodes.Expression:
-    """Strings and times do not change in place: the whole is stored anew."""
-    assert isinstance(place, CharacterPlace | PartPlace)  # the last kinds of places
+def _store_part(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> nodes.Expression:
+    """Store a changed string or time as a whole, because neither changes in place."""
+    assert isinstance(place, CharacterLvalue | TimePartLvalue)  # the last kinds of places
     inner, base = require_place(place.base, "an assignment"), place.base.form
-    if isinstance(place, PartPlace):
+    if isinstance(place, TimePartLvalue):
         part = nodes.Literal(value_types.VOID, place.part.encode())
         return _store(scope, inner, nodes.Call(base.type, "a_part", (base, part, value), place.site))
     changed = nodes.Call(base.type, "a_character", (base, place.index, value), place.site)
     return _store(scope, inner, changed)
 
 
-def _note(scope: Scope, place: VariablePlace) -> None:
+def _note(scope: FunctionScope, place: VariableLvalue) -> None:
     if place.variable.shared:
         scope.written.add(place.variable.code)

@@ -9,9 +9,9 @@ from rosmop.check.assignables import Value, path, root
 from rosmop.check.assignments import require_place, store
 from rosmop.check.conversion import condition, convert, number
 from rosmop.check.initializers import elements
-from rosmop.check.invocation import Invocation
-from rosmop.check.print_statements import Stream, formatted
-from rosmop.check.scope import HelperFunction, Loan, Scope
+from rosmop.check.invocation import MemberCall
+from rosmop.check.print_statements import OutputStream, formatted
+from rosmop.check.scope import ConstantReference, FunctionScope, HelperFunction
 from rosmop.check.standard_functions import LIBRARY, Arguments, find_function
 from rosmop.form import nodes
 from rosmop.form.positions import Position
@@ -25,21 +25,21 @@ from rosmop.types.resolve import named_type, record
 _MACRO = re.compile(r"ROS_(DEBUG|INFO|WARN|ERROR|FATAL)(_STREAM)?(_COND|_ONCE|_THROTTLE|_NAMED)?\Z")
 
 
-def call(scope: Scope, node: tree.Call) -> Value:
-    """A call of anything."""
+def call(scope: FunctionScope, node: tree.CallExpression) -> Value:
+    """Compile a call of any function, macro, member or type."""
     callee = node.callee
-    if isinstance(callee, tree.Member):
+    if isinstance(callee, tree.MemberAccess):
         base = scope.value_of(callee.base)
         arguments = [scope.value_of(argument) for argument in node.arguments]
         first, base, arguments = order.of_member(scope, base, arguments)
         at = (node.position, scope.site(node))
-        return order.after(first, members.call(Invocation(scope, base, callee.name, arguments, at)))
+        return order.after(first, members.call(MemberCall(scope, base, callee.name, arguments, at)))
     if not isinstance(callee, tree.Name):
         raise SpecificationError.at(node.position, "only functions can be called")
     return _named(scope, node, callee.parts)
 
 
-def _named(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> Value:
+def _named(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ...]) -> Value:
     function = scope.names.functions.get(parts[0]) if len(parts) == 1 else None
     if function is not None:
         return _helper(scope, node, function)
@@ -61,8 +61,8 @@ def _named(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> Value:
     return construct(scope, node.position, kind, node.arguments)
 
 
-def _known(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> Value | None:
-    """A function that every specification has, None if this is none."""
+def _known(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ...]) -> Value | None:
+    """Compile a call of a predefined function; None for another name."""
     if parts[-2:] == ("Time", "now"):
         if node.arguments:
             raise SpecificationError.at(node.position, "`now` takes no argument")
@@ -78,13 +78,13 @@ def _known(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> Value | Non
     return None
 
 
-def _unknown(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> SpecificationError:
+def _unknown(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ...]) -> SpecificationError:
     name = "::".join(parts)
     if name in scope.names.misdeclared:
         return SpecificationError(())
-    told = instead(parts)
-    if told is not None:
-        return SpecificationError.at(node.position, f"there is no function {shown(name)}; {told}")
+    advice = instead(parts)
+    if advice is not None:
+        return SpecificationError.at(node.position, f"unknown function {shown(name)}; {advice}")
     owners = [other.name for other in scope.shared.specifications if parts[0] in other.functions]
     if owners and len(parts) == 1:
         return SpecificationError.at(
@@ -94,14 +94,14 @@ def _unknown(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> Specifica
     known = [*scope.names.functions, *LIBRARY, "printf", "ROS_INFO", "ROS_WARN", "ROS_ERROR"]
     hint = nearest(parts[-1], known)
     return SpecificationError.at(
-        node.position, f"there is no function {shown(name)}{hint if 'mean' in hint else ''}"
+        node.position, f"unknown function {shown(name)}{hint if 'mean' in hint else ''}"
     )
 
 
 # Helper functions
 
 
-def _helper(scope: Scope, node: tree.Call, function: HelperFunction) -> Value:
+def _helper(scope: FunctionScope, node: tree.CallExpression, function: HelperFunction) -> Value:
     if len(node.arguments) != len(function.parameters):
         raise SpecificationError.at(
             node.position,
@@ -137,8 +137,8 @@ def _helper(scope: Scope, node: tree.Call, function: HelperFunction) -> Value:
     return order.after(first, Value(nodes.Sequence(function.result, items, -1), node.position))
 
 
-def _check_references(scope: Scope, function: HelperFunction, values: Sequence[Value]) -> None:
-    """Refuse what a reference would see and a copy does not; of constants, note what the function may not change."""
+def _check_references(scope: FunctionScope, function: HelperFunction, values: Sequence[Value]) -> None:
+    """Reject references that a copy cannot replace; note shared variables passed as constant references."""
     handed: list[tuple[Value, bool]] = []
     for parameter, value in zip(function.parameters, values, strict=True):
         changes = parameter in function.references
@@ -152,7 +152,7 @@ def _check_references(scope: Scope, function: HelperFunction, values: Sequence[V
         handed.append((value, changes))
         variable = root(value)
         if not changes and variable is not None and variable.shared:
-            scope.names.lent.append(Loan(value.position, function.name, parameter, variable))
+            scope.names.lent.append(ConstantReference(value.position, function.name, parameter, variable))
 
 
 def _check_referenced(value: Value, kind: value_types.Type, function: HelperFunction) -> None:
@@ -171,7 +171,7 @@ def _check_referenced(value: Value, kind: value_types.Type, function: HelperFunc
 
 
 def _check_apart(one: Value, other: Value, function: HelperFunction) -> None:
-    """Refuse references that share something: one change would undo the other, or not be seen."""
+    """Reject references to overlapping values: one change would undo the other, or not be seen."""
     if all(step == beside for step, beside in zip(path(one), path(other), strict=False)):
         raise SpecificationError.at(
             other.position,
@@ -183,7 +183,7 @@ def _check_apart(one: Value, other: Value, function: HelperFunction) -> None:
 # Output
 
 
-def _macro(scope: Scope, node: tree.Call, macro: re.Match[str]) -> Value:
+def _macro(scope: FunctionScope, node: tree.CallExpression, macro: re.Match[str]) -> Value:
     level, stream, variant = macro.groups()
     arguments = list(node.arguments)
     guard: nodes.Expression | None = None
@@ -209,7 +209,9 @@ def _macro(scope: Scope, node: tree.Call, macro: re.Match[str]) -> Value:
     return Value(nodes.Conditional(value_types.VOID, guard, value.form, nothing), node.position)
 
 
-def _log(scope: Scope, node: tree.Call, level: str, arguments: Sequence[tree.Expression]) -> Value:
+def _log(
+    scope: FunctionScope, node: tree.CallExpression, level: str, arguments: Sequence[tree.Expression]
+) -> Value:
     if not arguments:
         raise SpecificationError.at(node.position, "there is nothing to print; write a text")
     template, *rest = (scope.value_of(argument) for argument in arguments)
@@ -217,8 +219,8 @@ def _log(scope: Scope, node: tree.Call, level: str, arguments: Sequence[tree.Exp
     return Value(line, node.position)
 
 
-def _line(scope: Scope, node: tree.Call) -> Value:
-    """`puts(text)`: no format."""
+def _line(scope: FunctionScope, node: tree.CallExpression) -> Value:
+    """Compile `puts(text)`, which has no format."""
     if len(node.arguments) != 1:
         raise SpecificationError.at(node.position, f"`puts` takes 1 argument(s), not {len(node.arguments)}")
     text = convert(scope, scope.value_of(node.arguments[0]), value_types.STRING)
@@ -226,10 +228,10 @@ def _line(scope: Scope, node: tree.Call) -> Value:
 
 
 def stream_of(node: tree.Expression) -> str | None:
-    """The level of a statement `std::cout << …` or `std::cerr << …`, None for another."""
-    if not isinstance(node, tree.Binary):
+    """Return the level of a statement `std::cout << …` or `std::cerr << …`; None for other expressions."""
+    if not isinstance(node, tree.BinaryExpression):
         return None
-    while isinstance(node, tree.Binary) and node.operator == "<<":
+    while isinstance(node, tree.BinaryExpression) and node.operator == "<<":
         node = node.left
     if not isinstance(node, tree.Name) or node.parts[:-1] not in ((), ("std",)):
         return None
@@ -237,30 +239,25 @@ def stream_of(node: tree.Expression) -> str | None:
 
 
 def streamed(
-    scope: Scope,
-    node: tree.Node,
-    level: str,
-    chain: tree.Expression,
-    *,
-    headed: bool = False,
+    scope: FunctionScope, node: tree.SyntaxNode, level: str, chain: tree.Expression, *, headed: bool = False
 ) -> Value:
-    """Print `a << b << c`; `headed` if the first is the stream itself."""
+    """Compile the output of `a << b << c`; `headed`: the first operand is the stream itself."""
     parts: list[tree.Expression] = []
-    while isinstance(chain, tree.Binary) and chain.operator == "<<":
+    while isinstance(chain, tree.BinaryExpression) and chain.operator == "<<":
         parts.append(chain.right)
         chain = chain.left
     parts += [] if headed else [chain]
-    stream = Stream(scope, scope.site(node))
+    stream = OutputStream(scope, scope.site(node))
     pieces = [_piece(scope, stream, part) for part in reversed(parts)]
     site = scope.site(node)
     text = nodes.Join(tuple(piece for piece in pieces if piece is not None), site)
     return Value(nodes.Log(level, text, site), node.position)
 
 
-def _piece(scope: Scope, stream: Stream, part: tree.Expression) -> nodes.Expression | None:
+def _piece(scope: FunctionScope, stream: OutputStream, part: tree.Expression) -> nodes.Expression | None:
     if isinstance(part, tree.Name) and part.parts[-1] == "endl":
         return nodes.Literal(value_types.STRING, b"\n")
-    if isinstance(part, tree.Call) and isinstance(part.callee, tree.Name):
+    if isinstance(part, tree.CallExpression) and isinstance(part.callee, tree.Name):
         name, arguments = part.callee.parts[-1], part.arguments
         if name == "setprecision" and len(arguments) == 1:
             stream.manipulated(part.callee, scope.value_of(arguments[0]))
@@ -272,43 +269,42 @@ def _piece(scope: Scope, stream: Stream, part: tree.Expression) -> nodes.Express
 
 
 def construct(
-    scope: Scope,
-    position: Position,
-    kind: value_types.Type,
-    arguments: Sequence[tree.Expression],
+    scope: FunctionScope, position: Position, kind: value_types.Type, arguments: Sequence[tree.Expression]
 ) -> Value:
-    """`type(arguments)`."""
+    """Compile `type(arguments)`."""
     if not arguments:
         return Value(nodes.Zero(kind), position)
-    values = [scope.value_of(argument) for argument in arguments if not isinstance(argument, tree.Elements)]
+    values = [
+        scope.value_of(argument) for argument in arguments if not isinstance(argument, tree.InitializerList)
+    ]
     site = scope.lines.site
-    if isinstance(kind, value_types.Vector):
+    if isinstance(kind, value_types.VectorType):
         return Value(_vector(scope, kind, arguments, values), position)
     if (
-        isinstance(kind, value_types.Time | value_types.Duration)
+        isinstance(kind, value_types.TimeType | value_types.DurationType)
         and values
         and value_types.is_number(values[0].type)
     ):
         return Value(_moment(kind, values, site), position)
-    if isinstance(kind, value_types.String) and len(values) == 2:
+    if isinstance(kind, value_types.StringType) and len(values) == 2:
         count = convert(scope, values[0], value_types.ULONG)
         character = convert(scope, values[1], value_types.CHAR)
         return Value(nodes.Call(kind, "e_repeat", (count, character), site), position)
-    if len(arguments) != 1 or len(values) != 1 or isinstance(kind, value_types.Void):
+    if len(arguments) != 1 or len(values) != 1 or isinstance(kind, value_types.VoidType):
         raise SpecificationError.at(position, f"{kind} cannot be made from this")
     return Value(convert(scope, values[0], kind), position)
 
 
 def _vector(
-    scope: Scope,
-    kind: value_types.Vector,
+    scope: FunctionScope,
+    kind: value_types.VectorType,
     arguments: Sequence[tree.Expression],
     values: Sequence[Value],
 ) -> nodes.Expression:
     site = scope.lines.site
-    if len(arguments) == 1 and isinstance(arguments[0], tree.Elements):
+    if len(arguments) == 1 and isinstance(arguments[0], tree.InitializerList):
         return elements(scope, arguments[0], kind)
-    if len(values) == 1 and isinstance(values[0].type, value_types.Vector):
+    if len(values) == 1 and isinstance(values[0].type, value_types.VectorType):
         return convert(scope, values[0], kind, site)
     if not values or len(values) > 2 or not value_types.is_number(values[0].type):
         raise SpecificationError.at(
@@ -326,7 +322,7 @@ def _vector(
 def _moment(kind: value_types.Type, values: Sequence[Value], site: int) -> nodes.Expression:
     if len(values) == 1:
         seconds = nodes.Call(value_types.LONG, "m_nanoseconds", (values[0].form,), site)
-        limit = "m_time" if isinstance(kind, value_types.Time) else "m_duration"
+        limit = "m_time" if isinstance(kind, value_types.TimeType) else "m_duration"
         return nodes.Call(kind, limit, (seconds,), site)
     if len(values) != 2:
         raise SpecificationError.at(values[2].position, f"{kind} takes seconds, or seconds and nanoseconds")
@@ -335,10 +331,10 @@ def _moment(kind: value_types.Type, values: Sequence[Value], site: int) -> nodes
 
 
 def limits_of(kind: value_types.Type) -> Mapping[str, int | float]:
-    """What `std::numeric_limits` says of a type."""
-    if isinstance(kind, value_types.Integer):
+    """Return the value of `std::numeric_limits<type>::name()`."""
+    if isinstance(kind, value_types.IntegerType):
         return {"min": kind.least, "max": kind.most, "lowest": kind.least}
-    if isinstance(kind, value_types.Floating):
+    if isinstance(kind, value_types.FloatingType):
         large = 1.7976931348623157e308 if kind.bits == 64 else 3.4028234663852886e38
         return {
             "max": large,

@@ -1,6 +1,7 @@
-"""`v.begin()`, `v.end()` and what takes them: `erase`, `insert`, `std::sort`, `std::reverse`, `std::accumulate`.
+"""Compile `v.begin()`, `v.end()` and the functions that take them: `erase`, `insert`, `std::sort`, `std::reverse`,
+`std::accumulate`.
 
-A cursor is an index into a vector that is known when the code is compiled; it is no value that a variable holds.
+A cursor is an index into a vector. The vector is known at compile time, and a variable cannot hold a cursor.
 """
 
 from collections.abc import Sequence
@@ -8,18 +9,18 @@ from collections.abc import Sequence
 from rosmop.check.assignables import Value
 from rosmop.check.assignments import mark, marked, require_place
 from rosmop.check.conversion import convert, number
-from rosmop.check.scope import Scope
+from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.form.positions import Position
 from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 
 ALGORITHMS = frozenset({"sort", "reverse", "accumulate"})
-"""Functions of `<algorithm>` and `<numeric>` that take a vector from `begin` to `end`."""
+"""Functions of `<algorithm>` and `<numeric>` that take the range of a vector."""
 
 
 def moved(operator: str, left: Value, right: Value, position: Position) -> Value | None:
-    """`begin + n`, `end - n`, `end - begin`; None if this is none of them."""
+    """Compile `begin + n`, `end - n` or `end - begin`; None for other operands."""
     if left.vector is None or operator not in ("+", "-"):
         return None
     if value_types.is_number(right.type):
@@ -36,21 +37,21 @@ def moved(operator: str, left: Value, right: Value, position: Position) -> Value
 
 
 def begin_or_end(base: Value, name: str, position: Position) -> Value:
-    """`v.begin()` or `v.end()`."""
+    """Compile `v.begin()` or `v.end()`."""
     begin = nodes.Literal(value_types.INDEX, 0)
     place = begin if name == "begin" else nodes.Call(value_types.INDEX, "l_len", (base.form,))
     return Value(place, position, vector=base)
 
 
-def erase(scope: Scope, base: Value, cursors: Sequence[Value], at: tuple[Position, int]) -> Value:
-    """`v.erase(place)`, `v.erase(first, last)`."""
+def erase(scope: FunctionScope, base: Value, cursors: Sequence[Value], at: tuple[Position, int]) -> Value:
+    """Compile `v.erase(place)` or `v.erase(first, last)`."""
     first, last = _index(base, cursors[0]), nodes.Literal(value_types.VOID, None)
     arguments = (base.form, first, _index(base, cursors[1]) if len(cursors) > 1 else last)
     return _changed(scope, base, nodes.Call(value_types.VOID, "k_erase", arguments, at[1]), at[0])
 
 
-def insert(scope: Scope, base: Value, arguments: Sequence[Value], at: tuple[Position, int]) -> Value:
-    """`v.insert(place, value)`."""
+def insert(scope: FunctionScope, base: Value, arguments: Sequence[Value], at: tuple[Position, int]) -> Value:
+    """Compile `v.insert(place, value)`."""
     kind = _vector(base, at[0])
     value = convert(scope, arguments[1], kind.element, at[1])
     width = nodes.Literal(value_types.ULONG, scope.values.width(kind.element))
@@ -58,8 +59,8 @@ def insert(scope: Scope, base: Value, arguments: Sequence[Value], at: tuple[Posi
     return _changed(scope, base, nodes.Call(value_types.VOID, "k_insert", handed, at[1]), at[0])
 
 
-def algorithm(scope: Scope, name: str, values: Sequence[Value], at: tuple[Position, int]) -> Value:
-    """`std::sort(first, last)` and its like."""
+def algorithm(scope: FunctionScope, name: str, values: Sequence[Value], at: tuple[Position, int]) -> Value:
+    """Compile one of `ALGORITHMS`, such as `std::sort(first, last)`."""
     position, site = at
     if len(values) < 2 or values[0].vector is None:
         raise SpecificationError.at(position, f"`{name}` goes from `v.begin()` to `v.end()`")
@@ -85,7 +86,7 @@ def _sum(
             at[0], "`accumulate` goes from `v.begin()` to `v.end()`, with a number to start from"
         )
     kind = values[2].type
-    assert values[0].vector is not None  # the caller has looked
+    assert values[0].vector is not None  # the caller has checked
     element = _vector(values[0].vector, at[0]).element
     if not value_types.is_number(element):
         raise SpecificationError.at(at[0], f"{element} has no sum")
@@ -93,8 +94,8 @@ def _sum(
     return Value(nodes.Accumulate(kind, *span, values[2].form, wide, at[1]), at[0])
 
 
-def _vector(base: Value, position: Position) -> value_types.Vector:
-    if not isinstance(base.type, value_types.Vector):
+def _vector(base: Value, position: Position) -> value_types.VectorType:
+    if not isinstance(base.type, value_types.VectorType):
         raise SpecificationError.at(position, f"{base.type} has no elements")
     return base.type
 
@@ -105,6 +106,6 @@ def _index(base: Value, cursor: Value) -> nodes.Expression:
     return cursor.form
 
 
-def _changed(scope: Scope, base: Value, change: nodes.Expression, position: Position) -> Value:
+def _changed(scope: FunctionScope, base: Value, change: nodes.Expression, position: Position) -> Value:
     require_place(base, "this")
     return Value(marked(mark(scope, base), change), position)

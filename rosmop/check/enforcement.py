@@ -1,4 +1,4 @@
-"""Whether a property can be enforced: what handlers may drop, and what is published when it is due (`enforced by`)."""
+"""Decide whether a property can be enforced: by handlers that drop, or by publishing (`enforced by`)."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -7,13 +7,13 @@ from rosmop.check.function_bodies import topics_of
 from rosmop.check.scope import SpecificationNames
 from rosmop.logics.interface import CompiledProperty
 from rosmop.logics.pattern import ENFORCED, TimedPattern
-from rosmop.logics.property_lint import TIME, Graph, graph_of, shortest_trace_to
+from rosmop.logics.property_lint import TIME, VerdictGraph, graph_of, shortest_trace_to
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
 from rosmop.types.messages import nearest, shown
 
 _TAKES = {
-    "pattern": "it takes `enforced by f` behind `within`, with a function f that publishes what is due",
+    "pattern": "it takes `enforced by f` after `within`, with a function f that publishes what is due",
     "mtl": "it takes a `pattern: … causes … within … enforced by f`, with a function f that publishes what is due",
 }
 
@@ -21,7 +21,7 @@ _TAKES = {
 def blocking_refused(
     compiled: CompiledProperty, specification: tree.Specification, category: str
 ) -> str | None:
-    """Why a handler cannot drop the message that brought it about."""
+    """Return why a handler cannot drop the message that caused its verdict; None if it can."""
     refused = compiled.blocking_refused(category)
     if refused is not None:
         return refused
@@ -37,9 +37,9 @@ def enforcement(
     published: Sequence[str],
     dropping: Collection[str],
 ) -> str:
-    """Whether the property can be kept from being violated, by what, or what it would take.
+    """Describe whether and how violations of a property can be prevented, or what is missing for that.
 
-    `published` are the topics of its remedy, `dropping` the categories whose handlers may drop the message.
+    `published` are the topics of its remedy, `dropping` the categories whose handlers drop the message.
     """
     if compiled.remedy is not None:
         topics = ", ".join(published)
@@ -52,7 +52,7 @@ def enforcement(
     if refused is None:
         brings = _bringing(compiled, graph, category) if graph is not None else compiled.events
         named = ", ".join(event for event in compiled.events if event in brings)
-        said = f"can be enforced: @{category} may drop the message that brings it about ({named})"
+        said = f"can be enforced: @{category} may drop the message that causes it ({named})"
         if category not in dropping:
             said += f"; to enforce it write `@{category} {{ DROP; }}`"
         return f"{said}; {_COUNTS[compiled.suppresses]}"
@@ -70,10 +70,10 @@ _COUNTS = {
 }
 
 
-def _bringing(compiled: CompiledProperty, graph: Graph, category: str) -> set[str]:
-    """The events that lead to the category from where it is not yet.
+def _bringing(compiled: CompiledProperty, graph: VerdictGraph, category: str) -> set[str]:
+    """Return the events that lead to the category from a state without it.
 
-    Where a dropped message has not happened, only from where the messages lead that were not dropped.
+    If a dropped message has not happened, only states that undropped messages reach are considered.
     """
     reached, brings = {graph.initial}, set[str]()
     waiting = [graph.initial]
@@ -90,7 +90,7 @@ def _bringing(compiled: CompiledProperty, graph: Graph, category: str) -> set[st
 
 
 def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> list[str]:
-    """What the remedy of a property publishes; raises `SpecificationError` if it is none."""
+    """Return the topics that a property's remedy publishes; raises `SpecificationError` for an unsuitable function."""
     name = compiled.remedy
     if name is None:
         return []
@@ -99,11 +99,9 @@ def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> l
     if function is None:
         if name in names.misdeclared:
             raise SpecificationError(())
-        raise SpecificationError.at(
-            place, f"there is no function {shown(name)}{nearest(name, names.functions)}"
-        )
+        raise SpecificationError.at(place, f"unknown function {shown(name)}{nearest(name, names.functions)}")
     if function.parameters:
-        raise SpecificationError.at(place, f"{shown(name)} takes parameters; nobody gives them at a deadline")
+        raise SpecificationError.at(place, f"{shown(name)} takes parameters; at a deadline there are none")
     topics = topics_of(names, name)
     if not topics:
         raise SpecificationError.at(place, f"{shown(name)} publishes nothing; write `PUBLISH(…)` in it")
@@ -111,12 +109,12 @@ def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> l
 
 
 def with_remedy(compiled: CompiledProperty, node: tree.Property) -> list[tree.Handler]:
-    """The handlers of a property; that of `enforced` calls the remedy first."""
+    """Return the handlers of a property; the handler of `enforced` calls the remedy first."""
     handlers = list(node.handlers)
     if compiled.remedy is None:
         return handlers
     at = node.position
-    call = tree.Evaluate(at, tree.Call(at, tree.Name(at, (compiled.remedy,)), ()))
+    call = tree.ExpressionStatement(at, tree.CallExpression(at, tree.Name(at, (compiled.remedy,)), ()))
     mine = [place for place, handler in enumerate(handlers) if (handler.category,) == ENFORCED]
     for place in mine:
         body = handlers[place].body

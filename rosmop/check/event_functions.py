@@ -1,7 +1,7 @@
-"""Events as functions: match a message against the pattern, run the action, write back what was assigned.
+"""Compile events: match a message against the pattern, run the action, write back the assigned fields.
 
 `e(m)` takes the message (None for a timer) and returns whether the event happened. Only fields that the action,
-the `when` or a constant of the pattern look at are decoded; only fields that were assigned are written.
+the `when` or a constant of the pattern uses are decoded; only assigned fields are written.
 """
 
 import math
@@ -10,13 +10,13 @@ from dataclasses import replace
 from rosmop.check.assignables import Variable
 from rosmop.check.conversion import condition, refusal
 from rosmop.check.locate import type_of_path
-from rosmop.check.message_fields import Bound, check_overlaps, read_fields, writes
-from rosmop.check.scope import Scope, Shared, SpecificationNames
+from rosmop.check.message_fields import PatternField, check_overlaps, read_fields, writes
+from rosmop.check.scope import CompilationContext, FunctionScope, SpecificationNames
 from rosmop.check.slicing import acts, binds, creates
 from rosmop.check.statements import check_topic, write
 from rosmop.form import nodes
 from rosmop.form.compiled import EventCode
-from rosmop.form.positions import Finding
+from rosmop.form.positions import Diagnostic
 from rosmop.form.sites import Site
 from rosmop.runtime.numbers import f32
 from rosmop.text import tree
@@ -29,7 +29,10 @@ from roswire.errors import DefinitionError
 
 
 def compile_event(
-    shared: Shared, names: SpecificationNames, specification: tree.Specification, event: tree.Event
+    shared: CompilationContext,
+    names: SpecificationNames,
+    specification: tree.Specification,
+    event: tree.EventDefinition,
 ) -> EventCode:
     """Write the function of an event."""
     function = shared.symbols.fresh("e")
@@ -38,7 +41,7 @@ def compile_event(
     trigger = event.trigger
     check_topic(trigger.topic, trigger.position)
     kind = _message_type(shared, trigger)
-    scope = Scope(shared, names, "action")
+    scope = FunctionScope(shared, names, "action")
     scope.message_type = kind
     scope.lines.site = scope.site(event)
     bound = _bind(scope, event, trigger, kind)
@@ -63,14 +66,18 @@ def compile_event(
 
 
 def _key(
-    shared: Shared, names: SpecificationNames, event: tree.Event, trigger: tree.MessageTrigger, kind: str
+    shared: CompilationContext,
+    names: SpecificationNames,
+    event: tree.EventDefinition,
+    trigger: tree.MessageTrigger,
+    kind: str,
 ) -> str:
-    """Write the function for what an event binds: False where the message is none of its; else a list of True and
-    the values, or True alone.
+    """Write the function for the values that an event binds: False if the message does not match; else a list of True
+    and the values, or True alone.
     """
-    scope = Scope(shared, names, "action")
+    scope = FunctionScope(shared, names, "action")
     scope.message_type = kind
-    # No slice has its turn: there are no values to tell.
+    # No slice is running, so a fault has no values to show.
     site = scope.lines.site = scope.symbols.site(Site(event.position))
     bound = _bind(scope, event, trigger, kind)
     found = {field.variable.name: field.variable for field in bound if field.variable is not None}
@@ -86,13 +93,15 @@ def _key(
     return function
 
 
-def _timer(shared: Shared, names: SpecificationNames, event: tree.Event, function: str) -> EventCode:
-    assert isinstance(event.trigger, tree.TimerTrigger)  # the caller has looked
+def _timer(
+    shared: CompilationContext, names: SpecificationNames, event: tree.EventDefinition, function: str
+) -> EventCode:
+    assert isinstance(event.trigger, tree.TimerTrigger)  # the caller has checked
     if event.parameters:
         raise SpecificationError.at(
             event.parameters[0].position, "a timer has no message, so it takes no parameters"
         )
-    scope = Scope(shared, names, "timer")
+    scope = FunctionScope(shared, names, "timer")
     scope.drop_refused = "a timer has no message to drop"
     scope.lines.site = scope.site(event)
     write(scope, event.action)
@@ -104,7 +113,7 @@ def _timer(shared: Shared, names: SpecificationNames, event: tree.Event, functio
     )
 
 
-def _message_type(shared: Shared, trigger: tree.MessageTrigger) -> str:
+def _message_type(shared: CompilationContext, trigger: tree.MessageTrigger) -> str:
     kind = trigger.type
     if trigger.part is not None:
         try:
@@ -113,7 +122,7 @@ def _message_type(shared: Shared, trigger: tree.MessageTrigger) -> str:
             known = shared.messages.definitions.service_types
             raise SpecificationError.at(
                 trigger.type_position,
-                f"there is no service type {shown(kind)}{nearest(kind, known)}; others need a .srv file (--msg DIR)",
+                f"unknown service type {shown(kind)}{nearest(kind, known)}; others need a .srv file (--msg DIR)",
             ) from None
         kind = (service.request if trigger.part == "request" else service.response).name
     try:
@@ -126,7 +135,9 @@ def _message_type(shared: Shared, trigger: tree.MessageTrigger) -> str:
 # The pattern
 
 
-def _bind(scope: Scope, event: tree.Event, trigger: tree.MessageTrigger, kind: str) -> list[Bound]:
+def _bind(
+    scope: FunctionScope, event: tree.EventDefinition, trigger: tree.MessageTrigger, kind: str
+) -> list[PatternField]:
     parameters = {}
     for parameter in event.parameters:
         if parameter.name in parameters:
@@ -159,31 +170,33 @@ def _bind(scope: Scope, event: tree.Event, trigger: tree.MessageTrigger, kind: s
 
 
 def _binds_nothing(
-    scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Parameter], kind: str
+    scope: FunctionScope, binding: tree.Binding, parameters: dict[str, tree.ParameterDeclaration], kind: str
 ) -> bool:
-    """Whether a variable of a pattern is no parameter of the event; ROSMOP accepts that, and so does this, warning.
+    """Whether a variable of a pattern is not a parameter of the event, which is a warning, as ROSMOP accepts it.
 
-    Raises SpecificationError where its field is none.
+    Raises SpecificationError if the message has no such field.
     """
     name = binding.variable or ""
     if name in parameters or name in scope.names.parameters:
         return False
     type_of_path(scope.messages, kind, binding.path)
     text = f"{shown(name)} is not a parameter of the event, so it binds nothing; leave it out"
-    scope.shared.findings.append(Finding(binding.value_position, "warning", text))
+    scope.shared.findings.append(Diagnostic(binding.value_position, "warning", text))
     return True
 
 
-def _bind_one(scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Parameter], kind: str) -> Bound:
+def _bind_one(
+    scope: FunctionScope, binding: tree.Binding, parameters: dict[str, tree.ParameterDeclaration], kind: str
+) -> PatternField:
     field = type_of_path(scope.messages, kind, binding.path)
     if binding.constant is not None:
-        return Bound(binding, field, constant=_constant(scope, binding, field))
-    assert binding.variable is not None  # a binding has one of the two
+        return PatternField(binding, field, constant=_constant(scope, binding, field))
+    assert binding.variable is not None  # a binding has a constant or a variable
     parameter = parameters.get(binding.variable)
     if parameter is None:
         raise SpecificationError.at(
             binding.value_position,
-            f"there is no parameter {shown(binding.variable)}{nearest(binding.variable, parameters)}",
+            f"unknown parameter {shown(binding.variable)}{nearest(binding.variable, parameters)}",
         )
     target = field if parameter.type.name == ("auto",) else resolve(parameter.type, scope.messages)
     if not value_types.convertible(field, target):
@@ -192,8 +205,8 @@ def _bind_one(scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Pa
             parameter.position,
             f"`{name}` is {field} and cannot be bound to {target}: {refusal(field, target)}",
         )
-    if isinstance(target, value_types.Vector) and isinstance(field, value_types.Vector):
-        target = value_types.Vector(target.element, field.length)
+    if isinstance(target, value_types.VectorType) and isinstance(field, value_types.VectorType):
+        target = value_types.VectorType(target.element, field.length)
     sliced = scope.names.parameters.get(parameter.name)
     if sliced is not None and sliced.type != target:
         text = (
@@ -204,11 +217,11 @@ def _bind_one(scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Pa
     variable.constant = parameter.type.constant
     variable.flag = scope.symbols.fresh("f")
     scope.declare(variable)
-    return Bound(binding, field, variable)
+    return PatternField(binding, field, variable)
 
 
-def _constant(scope: Scope, binding: tree.Binding, field: Type) -> bool | int | float | bytes:
-    assert binding.constant is not None  # the caller has looked
+def _constant(scope: FunctionScope, binding: tree.Binding, field: Type) -> bool | int | float | bytes:
+    assert binding.constant is not None  # the caller has checked
     constant = scope.value_of(binding.constant).constant
     held = None if constant is None else _held(constant, field)
     if held is None:
@@ -218,19 +231,19 @@ def _constant(scope: Scope, binding: tree.Binding, field: Type) -> bool | int | 
 
 
 def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | float | bytes | None:
-    """The constant as the field holds it; None if it cannot."""
-    if isinstance(field, value_types.String):
+    """Return the constant as the field holds it; None if the field cannot hold it."""
+    if isinstance(field, value_types.StringType):
         return constant if isinstance(constant, bytes) else None
     if isinstance(constant, bytes) or not value_types.is_number(field):
         return None
-    if isinstance(field, value_types.Floating):
+    if isinstance(field, value_types.FloatingType):
         held = f32(float(constant)) if field.bits == 32 else float(constant)
         return None if math.isinf(held) and not math.isinf(float(constant)) else held
     if isinstance(constant, float) and (constant - constant != 0 or constant != int(constant)):
         return None
-    if isinstance(field, value_types.Bool):
+    if isinstance(field, value_types.BoolType):
         return bool(constant) if constant in (0, 1) else None
-    assert isinstance(field, value_types.Integer)  # numbers are one of the three
+    assert isinstance(field, value_types.IntegerType)  # numbers are one of the three
     return int(constant) if field.least <= constant <= field.most else None
 
 
@@ -238,9 +251,9 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
 
 
 def _body(
-    scope: Scope, event: tree.Event, trigger: tree.MessageTrigger
+    scope: FunctionScope, event: tree.EventDefinition, trigger: tree.MessageTrigger
 ) -> tuple[list[nodes.Statement], list[nodes.Statement]]:
-    """The `when` and the action. They come first, because they say which fields are needed."""
+    """Compile the `when` and the action. They come first, because they decide which fields are needed."""
     when = trigger.when
     with scope.nested() as conditions:
         if when is not None:
@@ -258,13 +271,13 @@ def _body(
 
 
 def _assemble(
-    scope: Scope,
-    event: tree.Event,
-    bound: list[Bound],
+    scope: FunctionScope,
+    event: tree.EventDefinition,
+    bound: list[PatternField],
     conditions: list[nodes.Statement],
     action: list[nodes.Statement],
 ) -> int:
-    """Write all statements of the function; returns how many stand before the action."""
+    """Write all statements of the function; return the number of statements before the action."""
     site = scope.lines.site = scope.site(event)
     read_fields(scope, bound)
     written = [field for field in bound if field.variable is not None and field.variable.assigned]

@@ -1,11 +1,11 @@
-"""Helper functions, `init`, first values and handlers."""
+"""Compile helper functions, `init`, first values and handlers."""
 
 from collections.abc import Iterable, Mapping, Set
 
 from rosmop.check.assignables import Value, Variable
 from rosmop.check.conversion import convert
 from rosmop.check.loops import charge
-from rosmop.check.scope import HelperFunction, Scope, Shared, SpecificationNames
+from rosmop.check.scope import CompilationContext, FunctionScope, HelperFunction, SpecificationNames
 from rosmop.check.slicing import check_own
 from rosmop.check.statements import initial, known, write
 from rosmop.form import nodes
@@ -18,7 +18,9 @@ from rosmop.types.resolve import resolve
 _TAKEN = frozenset({"MESSAGE", "PUBLISH", "DROP", "init"})
 
 
-def declare_variables(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
+def declare_variables(
+    shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
+) -> None:
     """Give the shared variables of a specification their names and types."""
     for declaration in specification.declarations:
         for declarator in declaration.declarators:
@@ -33,11 +35,14 @@ def declare_variables(shared: Shared, names: SpecificationNames, specification: 
 
 
 def _shared_variable(
-    shared: Shared, names: SpecificationNames, declaration: tree.Declaration, declarator: tree.Declarator
+    shared: CompilationContext,
+    names: SpecificationNames,
+    declaration: tree.Declaration,
+    declarator: tree.Declarator,
 ) -> Variable:
     if declarator.name in names.variables or declarator.name in _TAKEN:
         raise SpecificationError.at(declarator.position, f"{shown(declarator.name)} is declared twice")
-    scope = Scope(shared, names, "init")
+    scope = FunctionScope(shared, names, "init")
     scope.lines.site = scope.site(declaration)
     automatic = declaration.type.name == ("auto",)
     if automatic and _constant(scope, declarator) is None:
@@ -46,8 +51,8 @@ def _shared_variable(
             "a shared variable needs a type; `auto` is for local ones, and for constants that are written down",
         )
     value = declarator.value if automatic or (declarator.is_array and declarator.size is None) else None
-    if declarator.is_array and value is None and isinstance(declarator.value, tree.Elements):
-        value = tree.Elements(declarator.value.position, ())
+    if declarator.is_array and value is None and isinstance(declarator.value, tree.InitializerList):
+        value = tree.InitializerList(declarator.value.position, ())
     kind, _ = initial(scope, declaration.type, tree.Declarator(
         declarator.position, declarator.name, size=declarator.size, is_array=declarator.is_array, value=value,
     ))  # fmt: skip
@@ -64,9 +69,9 @@ def _shared_variable(
 
 
 def _known(
-    scope: Scope, declaration: tree.Declaration, declarator: tree.Declarator, kind: value_types.Type
+    scope: FunctionScope, declaration: tree.Declaration, declarator: tree.Declarator, kind: value_types.Type
 ) -> bool | int | float | None:
-    """The value of a constant, if it can be told now; what is wrong with it is found when it is compiled."""
+    """Return the value of a constant, or None if it is not known now. Compiling the constant reports its errors."""
     try:
         return known(scope, declaration.type, declarator, kind)
     except SpecificationError:
@@ -74,11 +79,11 @@ def _known(
 
 
 def compile_start(
-    shared: Shared, names: SpecificationNames, specification: tree.Specification
+    shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> tuple[str, ...]:
-    """Write the functions by which a specification begins: constants and zeros, first values, `init`.
+    """Write the functions that start a specification: constants and zeros, first values, `init`.
 
-    Each is called for all specifications before the next one, because one may read another's variables.
+    Each stage runs for all specifications before the next stage, because one may read another's variables.
     """
     scopes = [
         _constants(shared, names, specification),
@@ -95,14 +100,16 @@ def compile_start(
     return functions
 
 
-def _start_scope(shared: Shared, names: SpecificationNames) -> Scope:
-    scope = Scope(shared, names, "init")
+def _start_scope(shared: CompilationContext, names: SpecificationNames) -> FunctionScope:
+    scope = FunctionScope(shared, names, "init")
     scope.drop_refused = "there is no message yet"
     return scope
 
 
-def _constants(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> Scope:
-    """What C++ calls static initialisation: the constants that are written down, zero for the rest."""
+def _constants(
+    shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
+) -> FunctionScope:
+    """Write the static initialisation of C++: constants that are literals, and zero for other variables."""
     scope = _start_scope(shared, names)
     for parameter in names.parameters.values():
         scope.written.add(parameter.code)
@@ -120,9 +127,9 @@ def _constants(shared: Shared, names: SpecificationNames, specification: tree.Sp
     return scope
 
 
-def _constant(scope: Scope, declarator: tree.Declarator) -> Value | None:
-    """A constant first value; what is wrong with one is found when it is compiled as a first value."""
-    if declarator.is_array or declarator.value is None or isinstance(declarator.value, tree.Elements):
+def _constant(scope: FunctionScope, declarator: tree.Declarator) -> Value | None:
+    """Return a first value that is a constant, or None. Compiling it as a first value reports its errors."""
+    if declarator.is_array or declarator.value is None or isinstance(declarator.value, tree.InitializerList):
         return None
     try:
         value = scope.value_of(declarator.value)
@@ -131,7 +138,9 @@ def _constant(scope: Scope, declarator: tree.Declarator) -> Value | None:
     return value if value.constant is not None else None
 
 
-def _first_values(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> Scope:
+def _first_values(
+    shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
+) -> FunctionScope:
     scope = _start_scope(shared, names)
     scope.below = set(names.variables)
     for declaration in specification.declarations:
@@ -148,7 +157,7 @@ def _first_values(shared: Shared, names: SpecificationNames, specification: tree
 
 
 def _first_value(
-    scope: Scope, declaration: tree.Declaration, declarator: tree.Declarator, variable: Variable
+    scope: FunctionScope, declaration: tree.Declaration, declarator: tree.Declarator, variable: Variable
 ) -> None:
     with scope.at(declarator):
         _, value = initial(scope, declaration.type, declarator)
@@ -156,7 +165,9 @@ def _first_value(
         scope.evaluate(nodes.Assign(variable.type, variable.code, value))
 
 
-def declare_functions(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
+def declare_functions(
+    shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
+) -> None:
     """Give the helper functions of a specification their names and types."""
     for node in specification.functions:
         try:
@@ -175,19 +186,21 @@ def declare_functions(shared: Shared, names: SpecificationNames, specification: 
 
 
 def _calls(names: SpecificationNames) -> dict[str, set[str]]:
-    """The functions of the specification that each of them calls."""
+    """Return, for each function of the specification, the ones that it calls."""
     known = names.functions
     return {name: {*_called(function.node.body)} & known.keys() for name, function in known.items()}
 
 
 def topics_of(names: SpecificationNames, function: str) -> list[str]:
-    """What a function publishes, and those that it calls."""
+    """Return the topics that a function publishes, and the functions that it calls."""
     reached = _reached({function}, _calls(names))
-    found = (node for name in reached for node in _nodes(names.functions[name].node.body))
-    return sorted({node.topic for node in found if isinstance(node, tree.Publish)})
+    found = (node for name in reached for node in tree.walk(names.functions[name].node.body))
+    return sorted({node.topic for node in found if isinstance(node, tree.PublishStatement)})
 
 
-def _signature(shared: Shared, names: SpecificationNames, node: tree.Function) -> HelperFunction:
+def _signature(
+    shared: CompilationContext, names: SpecificationNames, node: tree.FunctionDefinition
+) -> HelperFunction:
     if node.name in names.functions or node.name in _TAKEN:
         raise SpecificationError.at(node.position, f"the function {shown(node.name)} is declared twice")
     result = value_types.VOID if node.type is None else resolve(node.type, shared.messages)
@@ -213,7 +226,7 @@ def _signature(shared: Shared, names: SpecificationNames, node: tree.Function) -
 
 
 def _reached(first: Set[str], called: Mapping[str, Set[str]]) -> set[str]:
-    """The functions that are called from these, however far away, and these."""
+    """Return these functions and all that they call, also indirectly."""
     seen = set(first)
     waiting = list(first)
     while waiting:
@@ -223,36 +236,25 @@ def _reached(first: Set[str], called: Mapping[str, Set[str]]) -> set[str]:
     return seen
 
 
-def _called(node: tree.Node) -> Iterable[str]:
-    for inner in _nodes(node):
-        if isinstance(inner, tree.Call) and isinstance(inner.callee, tree.Name):
+def _called(node: tree.SyntaxNode) -> Iterable[str]:
+    for inner in tree.walk(node):
+        if isinstance(inner, tree.CallExpression) and isinstance(inner.callee, tree.Name):
             yield inner.callee.parts[-1]
 
 
-def _free_names(function: tree.Function) -> set[str]:
-    """The names in a function that it does not declare itself."""
-    inside = list(_nodes(function.body))
-    own = {inner.name for inner in inside if isinstance(inner, tree.Declarator | tree.RangeFor)}
+def _free_names(function: tree.FunctionDefinition) -> set[str]:
+    """Return the names in a function that it does not declare itself."""
+    inside = list(tree.walk(function.body))
+    own = {inner.name for inner in inside if isinstance(inner, tree.Declarator | tree.RangeForStatement)}
     own |= {parameter.name for parameter in function.parameters}
     return {
         inner.parts[0] for inner in inside if isinstance(inner, tree.Name) and len(inner.parts) == 1
     } - own
 
 
-def _nodes(node: tree.Node) -> Iterable[tree.Node]:
-    waiting: list[object] = [node]
-    while waiting:
-        current = waiting.pop()
-        if isinstance(current, tuple):
-            waiting += current
-        elif isinstance(current, tree.Node):
-            yield current
-            waiting += [getattr(current, name) for name in current.__dataclass_fields__]
-
-
-def compile_function(shared: Shared, names: SpecificationNames, function: HelperFunction) -> None:
+def compile_function(shared: CompilationContext, names: SpecificationNames, function: HelperFunction) -> None:
     """Write a helper function."""
-    scope = Scope(shared, names, "function")
+    scope = FunctionScope(shared, names, "function")
     scope.drop_refused = "a function has no message; return a `bool` and drop in the action"
     scope.result, scope.references, scope.recursive = function.result, function.references, function.recursive
     for variable in function.parameters:
@@ -263,7 +265,7 @@ def compile_function(shared: Shared, names: SpecificationNames, function: Helper
             scope.add(nodes.LimitDepth(scope.lines.site, function.name))
         write(scope, function.node.body)
         nothing = nodes.Literal(value_types.VOID, None)
-        value = nothing if isinstance(function.result, value_types.Void) else nodes.Zero(function.result)
+        value = nothing if isinstance(function.result, value_types.VoidType) else nodes.Zero(function.result)
         handed = tuple(variable.code for variable in function.references)
         scope.add(nodes.Return(scope.lines.site, value, handed))
     function.changes, function.calls = frozenset(scope.changes_shared), frozenset(scope.calls)
@@ -272,10 +274,10 @@ def compile_function(shared: Shared, names: SpecificationNames, function: Helper
 
 
 def compile_handler(
-    shared: Shared, names: SpecificationNames, handler: tree.Handler, drop_refused: str | None
+    shared: CompilationContext, names: SpecificationNames, handler: tree.Handler, drop_refused: str | None
 ) -> str:
     """Write the function of a handler; returns its name."""
-    scope = Scope(shared, names, "handler")
+    scope = FunctionScope(shared, names, "handler")
     scope.drop_refused = drop_refused
     write(scope, handler.body)
     function = shared.symbols.fresh("j")

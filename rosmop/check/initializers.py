@@ -1,7 +1,7 @@
-"""What a variable is initialised or assigned with: an expression that converts, or `{a, b, c}` for a vector."""
+"""Compile initial and assigned values: an expression that converts, or `{a, b, c}` for a vector."""
 
 from rosmop.check.conversion import convert
-from rosmop.check.scope import Scope
+from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
@@ -9,16 +9,16 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 
-def converted(scope: Scope, node: tree.Expression, target: Type) -> nodes.Expression:
-    """An expression as a value of the target type; `{…}` makes a vector."""
-    if isinstance(node, tree.Elements):
+def converted(scope: FunctionScope, node: tree.Expression, target: Type) -> nodes.Expression:
+    """Compile an expression as a value of the target type; `{…}` makes a vector."""
+    if isinstance(node, tree.InitializerList):
         return elements(scope, node, target)
     return convert(scope, scope.value_of(node), target, scope.site(node))
 
 
-def elements(scope: Scope, node: tree.Elements, target: Type) -> nodes.Expression:
-    """`{a, b, c}` as a vector."""
-    if not isinstance(target, value_types.Vector):
+def elements(scope: FunctionScope, node: tree.InitializerList, target: Type) -> nodes.Expression:
+    """Compile `{a, b, c}` as a vector."""
+    if not isinstance(target, value_types.VectorType):
         if len(node.items) == 1:
             return converted(scope, node.items[0], target)
         if not node.items:

@@ -1,22 +1,27 @@
-"""A call of a member function while it is compiled: its base, its arguments, and the results it can have."""
+"""Compile a call of a member function: its base, its arguments, and its possible results."""
 
 from collections.abc import Callable, Sequence
 
 from rosmop.check.assignables import Value
 from rosmop.check.assignments import mark, marked, require_place, store
 from rosmop.check.conversion import convert, number
-from rosmop.check.scope import Scope
+from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.form.positions import Position
 from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 
 
-class Invocation:
-    """A call of a member function."""
+class MemberCall:
+    """A call of a member function while it is compiled."""
 
     def __init__(
-        self, scope: Scope, base: Value, name: str, arguments: Sequence[Value], at: tuple[Position, int]
+        self,
+        scope: FunctionScope,
+        base: Value,
+        name: str,
+        arguments: Sequence[Value],
+        at: tuple[Position, int],
     ) -> None:
         self.scope = scope
         self.base = base
@@ -25,7 +30,7 @@ class Invocation:
         self.position, self.site = at
 
     def count(self, least: int, most: int | None = None) -> int:
-        """How many arguments there are; refuses another number."""
+        """Check the number of arguments; return it."""
         number_of = len(self.arguments)
         if not least <= number_of <= (least if most is None else most):
             wanted = str(least) if most in (None, least) else f"{least} to {most}"
@@ -35,7 +40,7 @@ class Invocation:
         return number_of
 
     def index(self, position: int, default: int | None = None) -> nodes.Expression:
-        """An argument as an index."""
+        """Return an argument as an index."""
         if default is not None and position >= len(self.arguments):
             return nodes.Literal(value_types.ULONG, default)
         value = self.arguments[position]
@@ -44,30 +49,30 @@ class Invocation:
         return number(value.form, value_types.ULONG)
 
     def text(self, position: int) -> nodes.Expression:
-        """An argument as a string; a character is one of length 1."""
+        """Return an argument as a string; a character is one of length 1."""
         value = self.arguments[position]
         if value.type == value_types.CHAR:
             return nodes.Call(value_types.STRING, "t_byte", (value.form,))
         return convert(self.scope, value, value_types.STRING)
 
     def called(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> nodes.Call:
-        """A function of the form, of the base and these arguments."""
+        """Return a call of a function of the form with the base and these arguments."""
         return nodes.Call(kind, function, (self.base.form, *arguments), self.site)
 
     def value(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> Value:
-        """The result, by a function of the form."""
+        """Return the same call as a value."""
         return Value(self.called(kind, function, *arguments), self.position)
 
     def changes(self, value: nodes.Expression) -> Value:
-        """The result of a function that gives the base a new value."""
+        """Assign the base a new value; return a value without a result."""
         require_place(self.base, f"`{self.name}`")
         stored = store(self.scope, self.base, value)
         return Value(nodes.Discard(stored), self.position)
 
     def changes_in_place(self, function: str, *arguments: nodes.Expression) -> Value:
-        """The result of a function of the form that changes the vector itself."""
+        """Return a call of a function of the form that changes the vector in place."""
         require_place(self.base, f"`{self.name}`")
-        if isinstance(self.base.type, value_types.Vector) and self.base.type.length is not None:
+        if isinstance(self.base.type, value_types.VectorType) and self.base.type.length is not None:
             raise SpecificationError.at(
                 self.position, f"`{self.name}`: an array of fixed length stays so long"
             )
@@ -75,17 +80,17 @@ class Invocation:
         return Value(change, self.position)
 
 
-Method = Callable[[Invocation], Value]
-"""A member function: from a call to its value."""
+Method = Callable[[MemberCall], Value]
+"""A member function, which compiles a call to a value."""
 
 
-def length(call: Invocation) -> Value:
-    """`size()`, `length()`."""
+def length(call: MemberCall) -> Value:
+    """Compile `size()` or `length()`."""
     call.count(0)
     return call.value(value_types.ULONG, "l_len")
 
 
-def empty(call: Invocation) -> Value:
-    """`empty()`."""
+def empty(call: MemberCall) -> Value:
+    """Compile `empty()`."""
     call.count(0)
     return call.value(value_types.BOOL, "l_empty")

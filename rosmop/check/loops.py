@@ -1,11 +1,11 @@
-"""Loops and `switch`. Every iteration is charged, so that no loop outlives its budget."""
+"""Compile loops and `switch`. Every iteration is charged, so the budget ends every loop."""
 
 from collections.abc import Callable, Sequence
 
 from rosmop.check.assignables import Value, Variable
 from rosmop.check.conversion import condition, convert, number
 from rosmop.check.order import settled
-from rosmop.check.scope import Loop, Scope
+from rosmop.check.scope import FunctionScope, LoopScope
 from rosmop.check.vector_members import element_value
 from rosmop.form import nodes
 from rosmop.form.positions import Position
@@ -16,35 +16,35 @@ from rosmop.types import value_types
 from rosmop.types.resolve import resolve
 from rosmop.types.value_types import Type
 
-Write = Callable[[Scope, tree.Statement], None]
-"""Writes a statement; handed in, because statements contain loops and loops contain statements."""
+Write = Callable[[FunctionScope, tree.Statement], None]
+"""A function that writes a statement. It is a parameter, because statements and loops contain each other."""
 
 MAX_NESTED = 15
-"""Loops inside each other; Python takes no more than 20."""
+"""The maximum depth of nested loops; Python allows 20."""
 
 
-def charge(scope: Scope, node: tree.Node) -> None:
+def charge(scope: FunctionScope, node: tree.SyntaxNode) -> None:
     """Charge for one iteration (or one call)."""
     scope.add(nodes.Charge(scope.lines.site, weight(node)))
 
 
-def weight(node: tree.Node) -> int:
-    """How many instructions an iteration (or a call) is charged: one, and one for each statement in the body."""
+def weight(node: tree.SyntaxNode) -> int:
+    """Return the charge of an iteration or call: one instruction, plus one for each statement in the body."""
     total = 1
     waiting: list[object] = [getattr(node, name) for name in node.__dataclass_fields__]
     while waiting:
         current = waiting.pop()
         if isinstance(current, tuple):
             waiting += current
-        elif isinstance(current, tree.Statement | tree.Case):
+        elif isinstance(current, tree.Statement | tree.SwitchCase):
             total += not isinstance(current, tree.Block)
             waiting += [getattr(current, name) for name in current.__dataclass_fields__]
     return total
 
 
-def write_while(scope: Scope, node: tree.While, write: Write) -> None:
-    """`while` and `do … while`."""
-    _enter(scope, node, Loop((lambda: _leave_unless(scope, node.condition)) if node.at_end else None))
+def write_while(scope: FunctionScope, node: tree.WhileStatement, write: Write) -> None:
+    """Write `while` or `do … while`."""
+    _enter(scope, node, LoopScope((lambda: _leave_unless(scope, node.condition)) if node.at_end else None))
     with scope.nested() as statements:
         charge(scope, node)
         if not node.at_end:
@@ -56,13 +56,13 @@ def write_while(scope: Scope, node: tree.While, write: Write) -> None:
     scope.loops.pop()
 
 
-def write_for(scope: Scope, node: tree.For, write: Write) -> None:
-    """`for (start; condition; step)`."""
+def write_for(scope: FunctionScope, node: tree.ForStatement, write: Write) -> None:
+    """Write `for (start; condition; step)`."""
     with scope.block():
         if node.start is not None:
             write(scope, node.start)
-        step = tree.Evaluate(node.step.position, node.step) if node.step is not None else None
-        _enter(scope, node, Loop((lambda: write(scope, step)) if step is not None else None))
+        step = tree.ExpressionStatement(node.step.position, node.step) if node.step is not None else None
+        _enter(scope, node, LoopScope((lambda: write(scope, step)) if step is not None else None))
         with scope.nested() as statements:
             charge(scope, node)
             if node.condition is not None:
@@ -74,19 +74,19 @@ def write_for(scope: Scope, node: tree.For, write: Write) -> None:
         scope.loops.pop()
 
 
-def write_range_for(scope: Scope, node: tree.RangeFor, write: Write) -> None:
-    """`for (type name : values)`."""
+def write_range_for(scope: FunctionScope, node: tree.RangeForStatement, write: Write) -> None:
+    """Write `for (type name : values)`."""
     values = scope.value_of(node.values)
     by_value = not node.type.reference or node.type.constant
     if not by_value:
         first, values = settled(scope, values)
         for each in first:
             scope.evaluate(each)
-    if not isinstance(values.type, value_types.Vector | value_types.String):
+    if not isinstance(values.type, value_types.VectorType | value_types.StringType):
         raise SpecificationError.at(values.position, f"{values.type} has no elements to go through")
-    element = values.type.element if isinstance(values.type, value_types.Vector) else value_types.CHAR
+    element = values.type.element if isinstance(values.type, value_types.VectorType) else value_types.CHAR
     kind = element if node.type.name == ("auto",) else resolve(node.type, scope.messages)
-    _enter(scope, node, Loop(None))
+    _enter(scope, node, LoopScope(None))
     item = scope.temporary() if by_value else None
     index = "" if item is not None else _first_index(scope, node, values, kind)
     with scope.block(), scope.nested() as statements:
@@ -104,19 +104,21 @@ def write_range_for(scope: Scope, node: tree.RangeFor, write: Write) -> None:
     scope.loops.pop()
 
 
-def _by_value(scope: Scope, node: tree.RangeFor, element: Type, kind: Type, item: str) -> None:
+def _by_value(
+    scope: FunctionScope, node: tree.RangeForStatement, element: Type, kind: Type, item: str
+) -> None:
     charge(scope, node)
     read: nodes.Expression = nodes.Read(element, item)
-    if element == value_types.CHAR:  # of a string; those of a vector are in their range
+    if element == value_types.CHAR:  # of a string; elements of a vector are already signed
         read = nodes.Convert(value_types.CHAR, nodes.Read(value_types.UINT8, item))
     value = Value(read, node.position, owned=node.type.reference)
     variable = scope.local(node.name, kind, node.position, constant=node.type.constant)
     scope.evaluate(nodes.Assign(kind, variable.code, convert(scope, value, kind)))
 
 
-def _first_index(scope: Scope, node: tree.RangeFor, values: Value, kind: Type) -> str:
-    """The name of an index that stands before the first element."""
-    if not isinstance(values.type, value_types.Vector) or values.place is None:
+def _first_index(scope: FunctionScope, node: tree.RangeForStatement, values: Value, kind: Type) -> str:
+    """Return the name of a new index that is before the first element."""
+    if not isinstance(values.type, value_types.VectorType) or values.place is None:
         raise SpecificationError.at(
             node.values.position, "a reference goes through a vector variable; leave out the `&`"
         )
@@ -127,7 +129,9 @@ def _first_index(scope: Scope, node: tree.RangeFor, values: Value, kind: Type) -
     return index
 
 
-def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type, index: str) -> None:
+def _by_reference(
+    scope: FunctionScope, node: tree.RangeForStatement, values: Value, kind: Type, index: str
+) -> None:
     charge(scope, node)
     site, at = scope.lines.site, nodes.Read(value_types.LONG, index)
     one = nodes.Literal(value_types.LONG, 1)
@@ -140,11 +144,11 @@ def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type, 
     scope.declare(Variable(node.name, kind, index, node.position, alias=alias))
 
 
-def write_switch(scope: Scope, node: tree.Switch, write: Write) -> None:
-    """`switch`: the index of the first case, then every block from there on until a `break`."""
+def write_switch(scope: FunctionScope, node: tree.SwitchStatement, write: Write) -> None:
+    """Write a `switch`: the index of the first case, then every block from there on until a `break`."""
     value = scope.value_of(node.value)
     kind = value_types.promoted(value.type)
-    if not isinstance(kind, value_types.Integer):
+    if not isinstance(kind, value_types.IntegerType):
         raise SpecificationError.at(value.position, f"`switch` needs an integer; this is {value.type}")
     start, flag = scope.temporary(), scope.temporary("k")
     table, default = _cases(scope, node, kind)
@@ -152,7 +156,7 @@ def write_switch(scope: Scope, node: tree.Switch, write: Write) -> None:
     nothing = nodes.Literal(value_types.BOOL, False)
     scope.evaluate(nodes.Assign(value_types.BOOL, flag, nothing))
     scope.add(nodes.Select(site, start, number(value.form, kind), table, default))
-    _enter(scope, node, Loop(None, flag=flag))
+    _enter(scope, node, LoopScope(None, flag=flag))
     with scope.block() as names, scope.nested() as statements:
         for index, case in enumerate(node.cases):
             if case.statements:
@@ -163,7 +167,7 @@ def write_switch(scope: Scope, node: tree.Switch, write: Write) -> None:
                 )
                 scope.add(nodes.If(site, reached, tuple(inner), ()))
         scope.add(nodes.Break(site))
-    for variable in names.values():  # a case may jump over the declaration
+    for variable in names.values():  # a case may jump past the declaration
         scope.evaluate(nodes.Assign(variable.type, variable.code, nodes.Zero(variable.type)))
     scope.add(nodes.Loop(site, tuple(statements)))
     loop = scope.loops.pop()
@@ -174,7 +178,7 @@ def write_switch(scope: Scope, node: tree.Switch, write: Write) -> None:
 
 
 def _cases(
-    scope: Scope, node: tree.Switch, kind: value_types.Integer
+    scope: FunctionScope, node: tree.SwitchStatement, kind: value_types.IntegerType
 ) -> tuple[tuple[tuple[int, int], ...], int]:
     table: dict[int, int] = {}
     default = len(node.cases)
@@ -200,10 +204,10 @@ def _cases(
     return tuple(table.items()), default
 
 
-def write_continue(scope: Scope, position: Position) -> None:
-    """`continue`: the step of the innermost loop, then its next iteration."""
+def write_continue(scope: FunctionScope, position: Position) -> None:
+    """Write a `continue`: the step of the innermost loop, then its next iteration."""
     if all(loop.flag is not None for loop in scope.loops):
-        raise SpecificationError.at(position, "`continue` stands in a loop")
+        raise SpecificationError.at(position, "`continue` is only allowed in a loop")
     loop = scope.loops[-1]
     if loop.flag is not None:
         loop.continued = True
@@ -216,7 +220,7 @@ def write_continue(scope: Scope, position: Position) -> None:
     scope.add(nodes.Continue(scope.lines.site))
 
 
-def _enter(scope: Scope, node: tree.Node, loop: Loop) -> None:
+def _enter(scope: FunctionScope, node: tree.SyntaxNode, loop: LoopScope) -> None:
     if len(scope.loops) >= MAX_NESTED:
         raise SpecificationError.at(
             node.position, f"more than {MAX_NESTED} loops inside each other; use helper functions"
@@ -224,7 +228,7 @@ def _enter(scope: Scope, node: tree.Node, loop: Loop) -> None:
     scope.enter(loop)
 
 
-def _leave_unless(scope: Scope, node: tree.Expression) -> None:
+def _leave_unless(scope: FunctionScope, node: tree.Expression) -> None:
     with scope.at(node):
         site = scope.lines.site
         with scope.looking():
@@ -232,18 +236,20 @@ def _leave_unless(scope: Scope, node: tree.Expression) -> None:
         scope.add(nodes.If(site, left, (nodes.Break(site),), ()))
 
 
-def body(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> tuple[nodes.Statement, ...]:
-    """Statements in a block of names of their own."""
+def body(
+    scope: FunctionScope, statements: Sequence[tree.Statement], write: Write
+) -> tuple[nodes.Statement, ...]:
+    """Return statements, written in a block with names of its own."""
     with scope.nested() as found:
         _block(scope, statements, write)
     return tuple(found)
 
 
-def _block(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> None:
+def _block(scope: FunctionScope, statements: Sequence[tree.Statement], write: Write) -> None:
     with scope.block():
         _statements(scope, statements, write)
 
 
-def _statements(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> None:
+def _statements(scope: FunctionScope, statements: Sequence[tree.Statement], write: Write) -> None:
     for statement in statements:
         write(scope, statement)

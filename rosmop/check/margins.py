@@ -1,8 +1,8 @@
-"""How close comparisons of numbers came: of each the sides when they were nearest, while it was true and while not.
+"""Note how close comparisons of numbers came: their sides when nearest, while true and while false.
 
-In the place of a comparison stands an expression that notes its sides and has the same value: they are compared as the
-type that C++ compares them as, and nothing is charged. Left alone are conditions of loops (how close a counter came to
-its end says nothing), what `when` looks at, first values and `init`.
+An expression that notes both sides replaces the comparison. It has the same value, compares the sides in the same type
+as C++, and charges nothing. Comparisons in loop conditions (a counter's distance from its end says nothing), `when`,
+first values and `init` are not noted.
 """
 
 from dataclasses import replace
@@ -11,21 +11,23 @@ import msgspec
 
 from rosmop.check.assignables import Value
 from rosmop.check.conversion import number
-from rosmop.check.scope import Scope
+from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.form.compiled import Comparison
 from rosmop.text import tree
 from rosmop.types import value_types
 
 MOST_NOTED = 32
-"""Comparisons of a specification; those that are compiled after them are not noted."""
+"""The maximum number of noted comparisons of a specification; later ones are not noted."""
 
 _COMPARED = frozenset({"<", "<=", ">", ">="})
 _TRUE, _FALSE = (nodes.Literal(value_types.BOOL, truth) for truth in (True, False))
 
 
-def noted(scope: Scope, node: tree.Binary, left: Value, right: Value, value: Value) -> Value:
-    """The value of `left operator right`, noted if that is a comparison of numbers which are not both known."""
+def noted(
+    scope: FunctionScope, node: tree.BinaryExpression, left: Value, right: Value, value: Value
+) -> Value:
+    """Return `value`, noted if it is a comparison of numbers that are not both constant."""
     compare = value.form
     if (
         not scope.notes
@@ -60,7 +62,7 @@ def noted(scope: Scope, node: tree.Binary, left: Value, right: Value, value: Val
 
 
 def _note(now: list[nodes.Expression], variables: tuple[str, str]) -> nodes.Expression:
-    """Keep the sides if they are nearer to each other than those that are kept."""
+    """Return an expression that keeps the sides if they are nearer to each other than the kept ones."""
     before = [nodes.Read(value_types.DOUBLE, name) for name in variables]
     nearer = nodes.Compare("<", _distance(*now), _distance(*before), -1)
     kept = (nodes.Assign(value_types.DOUBLE, name, side) for name, side in zip(variables, now, strict=True))

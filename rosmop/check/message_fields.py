@@ -1,4 +1,4 @@
-"""Fields: what a bound parameter reads from the bytes of a message, and what an assigned one writes.
+"""Compile reading bound fields from the bytes of a message, and writing assigned ones.
 
 Numbers at known distances from each other are read together. A changed number is written in place; only a
 changed string, array or message of another size makes a new buffer.
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from rosmop.check.assignables import Value, Variable
 from rosmop.check.conversion import convert
-from rosmop.check.locate import Locator, Walk
-from rosmop.check.scope import Scope
+from rosmop.check.locate import FieldLocator, MessageCursor
+from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.form.nodes import Spot
 from rosmop.runtime.values import struct_code, struct_size
@@ -20,7 +20,7 @@ from rosmop.types.value_types import Type
 
 
 @dataclass(eq=False)
-class Bound:
+class PatternField:
     """A field of the pattern: the variable it is bound to, or the constant it must equal."""
 
     binding: tree.Binding
@@ -29,11 +29,11 @@ class Bound:
     constant: bool | int | float | bytes | None = None
     spot: Spot | None = None
     read: str = ""  # the code's name for the field's value
-    end: str = ""  # of a field of variable size: the code's name for where it ends
+    end: str = ""  # of a field of variable size: the code's name for its end
 
 
-def writes(scope: Scope, written: list[Bound]) -> tuple[nodes.Write, ...]:
-    """The fields that the action assigns."""
+def writes(scope: FunctionScope, written: list[PatternField]) -> tuple[nodes.Write, ...]:
+    """Return the fields that the action assigns."""
     found = []
     for field in written:
         variable = field.variable
@@ -49,34 +49,38 @@ def writes(scope: Scope, written: list[Bound]) -> tuple[nodes.Write, ...]:
     return tuple(found)
 
 
-def _slots(scope: Scope, field: Bound) -> list[int | str]:
-    """The path as indexes into lists; the parts of a time by name."""
-    kind: Type = value_types.Record(scope.message_type or "")
+def _slots(scope: FunctionScope, field: PatternField) -> list[int | str]:
+    """Return the path of a field as list indices; the parts of a time by name."""
+    kind: Type = value_types.RecordType(scope.message_type or "")
     path: list[int | str] = []
     for step in field.binding.path:
-        if isinstance(kind, value_types.Record):
+        if isinstance(kind, value_types.RecordType):
             slot = scope.messages.slot(kind.name, step.name)
             path.append(slot.index)
             kind = slot.type
         else:
             path.append(step.name)
-        if step.index is not None and isinstance(kind, value_types.Vector):
+        if step.index is not None and isinstance(kind, value_types.VectorType):
             path.append(step.index)
             kind = kind.element
     return path
 
 
-def read_fields(scope: Scope, bound: list[Bound]) -> None:
-    """Write what finds and reads the fields that are used, and compares those that have constants."""
+def read_fields(scope: FunctionScope, bound: list[PatternField]) -> None:
+    """Write the statements that find and read the used fields, and compare fields with constants."""
     layout = scope.messages.definitions.layout(scope.message_type or "")
-    walk = Walk(Locator(scope.symbols, scope.lines.found, scope.lines.site), layout, Spot(None, 0))
-    fixed: list[Bound] = []
-    variable_size: list[Bound] = []
+    walk = MessageCursor(
+        FieldLocator(scope.symbols, scope.lines.found, scope.lines.site), layout, Spot(None, 0)
+    )
+    fixed: list[PatternField] = []
+    variable_size: list[PatternField] = []
     for field in bound:
         field.spot = walk.find(field.binding.path)
         if field.variable is None or field.variable.used:
             (variable_size if struct_code(field.type) is None else fixed).append(field)
-    if any(isinstance(field.type, value_types.Vector | value_types.Record) for field in variable_size):
+    if any(
+        isinstance(field.type, value_types.VectorType | value_types.RecordType) for field in variable_size
+    ):
         scope.add(nodes.Allocate(scope.lines.site, None))
     _read_fixed(scope, fixed)
     for field in variable_size:
@@ -87,9 +91,9 @@ def read_fields(scope: Scope, bound: list[Bound]) -> None:
         _take(scope, field)
 
 
-def _read_fixed(scope: Scope, fixed: list[Bound]) -> None:
-    """Read numbers; those at known distances from each other together."""
-    groups: dict[str | None, list[Bound]] = {}
+def _read_fixed(scope: FunctionScope, fixed: list[PatternField]) -> None:
+    """Write reads of numbers; one read for numbers at known distances from each other."""
+    groups: dict[str | None, list[PatternField]] = {}
     for field in fixed:
         assert field.spot is not None  # a number is somewhere
         groups.setdefault(field.spot.base, []).append(field)
@@ -102,16 +106,16 @@ def _read_fixed(scope: Scope, fixed: list[Bound]) -> None:
             _read_together(scope, together)
 
 
-def _offset(field: Bound) -> int:
+def _offset(field: PatternField) -> int:
     return field.spot.offset if field.spot is not None else 0
 
 
-def _near(one: Bound, other: Bound) -> bool:
+def _near(one: PatternField, other: PatternField) -> bool:
     gap = _offset(other) - _offset(one) - struct_size(struct_code(one.type) or "")
     return 0 <= gap <= 256
 
 
-def _read_together(scope: Scope, together: list[Bound]) -> None:
+def _read_together(scope: FunctionScope, together: list[PatternField]) -> None:
     first = together[0].spot
     assert first is not None  # a number is somewhere
     for field in together:
@@ -120,13 +124,13 @@ def _read_together(scope: Scope, together: list[Bound]) -> None:
     scope.add(nodes.ReadNumbers(scope.lines.site, first, fields))
 
 
-def _take(scope: Scope, field: Bound) -> None:
-    """Compare a field with its constant, or give it to its variable."""
+def _take(scope: FunctionScope, field: PatternField) -> None:
+    """Write the comparison of a field with its constant, or the assignment to its variable."""
     site, read = scope.lines.site, nodes.Read(field.type, field.read)
     if field.constant is not None:
         constant = nodes.Literal(field.type, field.constant)
         test: nodes.Expression = nodes.Compare("==", read, constant, site)
-        if isinstance(field.type, value_types.String):
+        if isinstance(field.type, value_types.StringType):
             test = nodes.CompareTexts("==", read, constant, True, site)
         scope.add(nodes.Require(site, test))
     elif field.variable is not None and field.variable.used:
@@ -134,8 +138,8 @@ def _take(scope: Scope, field: Bound) -> None:
         scope.evaluate(nodes.Assign(field.variable.type, field.variable.code, value))
 
 
-def check_overlaps(bound: list[Bound], written: list[Bound]) -> None:
-    """Refuse an assignment to a field that is bound twice: one change would undo the other."""
+def check_overlaps(bound: list[PatternField], written: list[PatternField]) -> None:
+    """Reject an assignment to a field that is bound twice: one change would undo the other."""
     for field in written:
         for other in bound:
             if other is not field and _overlap(field.binding, other.binding):
@@ -146,7 +150,7 @@ def check_overlaps(bound: list[Bound], written: list[Bound]) -> None:
 
 
 def _overlap(one: tree.Binding, other: tree.Binding) -> bool:
-    """Whether one is the other or a part of it; an array without an index is all its elements."""
+    """Whether one binding is the other or a part of it; an array without an index is all its elements."""
     return all(
         step.name == beside.name and (step.index == beside.index or None in (step.index, beside.index))
         for step, beside in zip(one.path, other.path, strict=False)

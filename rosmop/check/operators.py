@@ -1,13 +1,9 @@
-"""Operators, with the types C++ gives their results."""
+"""Compile operators, with the types that C++ gives their results."""
 
 from rosmop.check import cursors, order
 from rosmop.check.assignables import Value
-from rosmop.check.conversion import (
-    condition,
-    convert,
-    number,
-)
-from rosmop.check.scope import Scope
+from rosmop.check.conversion import condition, convert, number
+from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.form.positions import Position
 from rosmop.text.errors import SpecificationError
@@ -16,14 +12,16 @@ from rosmop.types.value_types import Type
 
 COMPARISONS = frozenset({"==", "!=", "<", ">", "<=", ">="})
 _BITS = frozenset({"&", "|", "^"})
-_TEXTS = (value_types.String, value_types.Characters)
-_MOMENTS = (value_types.Time, value_types.Duration)
+_TEXTS = (value_types.StringType, value_types.CharactersType)
+_MOMENTS = (value_types.TimeType, value_types.DurationType)
 
 
 class Operands:
-    """Two operands, where the operation stands, and the site of its faults."""
+    """Two operands, the position of the operation, and the site of its faults."""
 
-    def __init__(self, scope: Scope, position: Position, left: Value, right: Value, site: int) -> None:
+    def __init__(
+        self, scope: FunctionScope, position: Position, left: Value, right: Value, site: int
+    ) -> None:
         self.scope = scope
         self.position = position
         self.left = left
@@ -31,11 +29,11 @@ class Operands:
         self.site = site
 
     def value(self, result: nodes.Expression) -> Value:
-        """The result."""
+        """Return an expression as a value at this position."""
         return Value(result, self.position)
 
     def refused(self, operator: str, hint: str = "") -> SpecificationError:
-        """The refusal of this operation."""
+        """Return the error that rejects this operation."""
         left, right = self.left.type, self.right.type
         return SpecificationError.at(
             self.position, f"`{operator}` has no meaning for {left} and {right}{hint}"
@@ -43,7 +41,7 @@ class Operands:
 
 
 def binary(operator: str, operands: Operands) -> Value:
-    """`left operator right`."""
+    """Compile `left operator right`."""
     left, right = operands.left.type, operands.right.type
     if operator in ("&&", "||"):
         word = "and" if operator == "&&" else "or"
@@ -60,7 +58,7 @@ def binary(operator: str, operands: Operands) -> Value:
     if (
         operator in ("==", "!=")
         and left == right
-        and not isinstance(left, value_types.Void | value_types.Index)
+        and not isinstance(left, value_types.VoidType | value_types.IteratorType)
     ):
         first, (one, other) = order.arguments(operands.scope, (operands.left, operands.right))
         return order.after(
@@ -70,9 +68,9 @@ def binary(operator: str, operands: Operands) -> Value:
 
 
 def _hint(left: Type, right: Type) -> str:
-    if isinstance(left, value_types.Vector) != isinstance(right, value_types.Vector):
+    if isinstance(left, value_types.VectorType) != isinstance(right, value_types.VectorType):
         return "; write an index, `[0]`"
-    if isinstance(left, value_types.Record) or isinstance(right, value_types.Record):
+    if isinstance(left, value_types.RecordType) or isinstance(right, value_types.RecordType):
         return "; write a field, `.data`"
     return ""
 
@@ -87,7 +85,7 @@ def _arithmetic(operator: str, operands: Operands) -> Value:
     if operator in ("<<", ">>"):
         return _shift(operator, operands)
     kind = value_types.common(operands.left.type, operands.right.type)
-    if isinstance(kind, value_types.Floating) and (operator == "%" or operator in _BITS):
+    if isinstance(kind, value_types.FloatingType) and (operator == "%" or operator in _BITS):
         raise operands.refused(operator, "; write `fmod(…)`" if operator == "%" else "")
     left, right = (number(value.form, kind) for value in (operands.left, operands.right))
     return operands.value(nodes.Arithmetic(kind, operator, left, right, operands.site))
@@ -95,7 +93,7 @@ def _arithmetic(operator: str, operands: Operands) -> Value:
 
 def _shift(operator: str, operands: Operands) -> Value:
     kind, amount = value_types.promoted(operands.left.type), value_types.promoted(operands.right.type)
-    if not isinstance(kind, value_types.Integer) or not isinstance(amount, value_types.Integer):
+    if not isinstance(kind, value_types.IntegerType) or not isinstance(amount, value_types.IntegerType):
         raise operands.refused(operator)
     left = number(operands.left.form, kind)
     return operands.value(nodes.Arithmetic(kind, operator, left, operands.right.form, operands.site))
@@ -119,14 +117,14 @@ def _texts(operator: str, operands: Operands) -> Value:
 
 
 def extended(operands: Operands) -> Value:
-    """`left += right`, where `left` is a string: what it holds goes with it."""
+    """Compile `left += right` for a string, which replaces the bytes of `left`."""
     return _put_together("o_extend", operands)
 
 
 def _put_together(function: str, operands: Operands) -> Value:
     for value, other in ((operands.left, operands.right), (operands.right, operands.left)):
-        if isinstance(value.type, value_types.Characters) and isinstance(
-            other.type, value_types.Integer | value_types.Floating
+        if isinstance(value.type, value_types.CharactersType) and isinstance(
+            other.type, value_types.IntegerType | value_types.FloatingType
         ):
             hint = "; there is no arithmetic of pointers: write `std::string(…).substr(1)`"
             raise operands.refused("+", hint)
@@ -138,14 +136,16 @@ def _text_hint(left: Value, right: Value) -> str:
     other = left if isinstance(right.type, _TEXTS) else right
     if other.type == value_types.CHAR:
         return "; a character is written 'a', a string \"a\""
-    return "; write an index, `[0]`" if isinstance(other.type, value_types.Vector) else ""
+    return "; write an index, `[0]`" if isinstance(other.type, value_types.VectorType) else ""
 
 
 def _joined(operands: Operands, value: Value) -> nodes.Expression:
-    if isinstance(value.type, value_types.Integer) and value.type == value_types.CHAR:
+    if isinstance(value.type, value_types.IntegerType) and value.type == value_types.CHAR:
         return nodes.Call(value_types.STRING, "t_byte", (value.form,))
     if value_types.is_number(value.type):
-        raise SpecificationError.at(value.position, f"{value.type} is no string; write `std::to_string(…)`")
+        raise SpecificationError.at(
+            value.position, f"{value.type} is not a string; write `std::to_string(…)`"
+        )
     return convert(operands.scope, value, value_types.STRING)
 
 
@@ -171,14 +171,14 @@ def _sum(operator: str, left: Type, right: Type) -> Type | None:
 
 
 def unary(operator: str, operand: Value, position: Position, site: int) -> Value:
-    """`!x`, `-x`, `+x`, `~x`."""
+    """Compile `!x`, `-x`, `+x` or `~x`."""
     if operator == "!":
         return Value(nodes.Not(condition(operand)), position)
     if operator == "-" and operand.type == value_types.DURATION:
         nothing = nodes.Literal(value_types.DURATION, 0)
         return Value(nodes.Moment(value_types.DURATION, "-", nothing, operand.form, site), position)
     kind = value_types.promoted(operand.type)
-    if not value_types.is_number(kind) or (operator == "~" and not isinstance(kind, value_types.Integer)):
+    if not value_types.is_number(kind) or (operator == "~" and not isinstance(kind, value_types.IntegerType)):
         raise SpecificationError.at(position, f"`{operator}` has no meaning for {operand.type}")
     value = number(operand.form, kind)
     changed = value if operator == "+" else nodes.Unary(kind, operator, value)

@@ -1,4 +1,4 @@
-"""Output: `ROS_INFO("…%f…", x)`, `printf`, `std::cout << x`.
+"""Compile output: `ROS_INFO("…%f…", x)`, `printf`, `std::cout << x`.
 
 A format is read when the specification is compiled, and its conversions are checked against the arguments.
 """
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from rosmop.check.assignables import Value
 from rosmop.check.conversion import convert, number
-from rosmop.check.scope import Scope
+from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.form.positions import Position
 from rosmop.text import tree
@@ -17,13 +17,13 @@ from rosmop.types import value_types
 
 _CONVERSION = re.compile(rb"%([-+ #0]*)(\*|[0-9]*)(?:\.(\*|[0-9]*))?(hh|h|ll|l|z|j|t|L|q)?(.?)", re.DOTALL)
 _MAX_WIDTH = 1000
-_LONG = 1024  # bytes that a text may have without being charged before it is made
+_LONG = 1024  # maximum bytes of text that is not charged in advance
 _SIGNED, _UNSIGNED, _FLOATING = b"di", b"uoxX", b"fFeEgGaA"
-_TEXTS = (value_types.String, value_types.Characters)
+_TEXTS = (value_types.StringType, value_types.CharactersType)
 
 
-def formatted(scope: Scope, template: Value, arguments: Sequence[Value]) -> nodes.Expression:
-    """A formatted text; refuses conversions that do not fit."""
+def formatted(scope: FunctionScope, template: Value, arguments: Sequence[Value]) -> nodes.Expression:
+    """Return a formatted text; rejects conversions that do not fit their arguments."""
     if not isinstance(template.constant, bytes):
         if arguments or not isinstance(template.type, _TEXTS):
             raise SpecificationError.at(
@@ -66,7 +66,7 @@ def formatted(scope: Scope, template: Value, arguments: Sequence[Value]) -> node
 
 
 def _with_widths(found: re.Match[bytes], waiting: list[Value]) -> re.Match[bytes]:
-    """Return the conversion with the numbers that stand for `*` in the arguments, as C reads them; takes those."""
+    """Replace `*` in a conversion with its arguments, as in C, and take those arguments."""
     flags, width, precision, size, letter = (part or b"" for part in found.groups())
     if width == b"*" and (number := _literal_width(waiting)) is not None:
         flags, width = (flags, b"%d" % number) if number >= 0 else (flags + b"-", b"%d" % -number)
@@ -78,19 +78,19 @@ def _with_widths(found: re.Match[bytes], waiting: list[Value]) -> re.Match[bytes
 
 
 def _literal_width(waiting: list[Value]) -> int | None:
-    """Take the next argument if it is a number that is known; None if it is not."""
+    """Take the next argument if it is a constant integer; otherwise return None."""
     if not waiting or type(waiting[0].constant) is not int:
         return None
-    return waiting.pop(0).constant  # type: ignore[return-value] # as was just seen
+    return waiting.pop(0).constant  # type: ignore[return-value] # checked above
 
 
 def _longest(found: re.Match[bytes]) -> int:
-    """How long the text of a conversion can be, but for strings."""
+    """Return the maximum length of the text of a conversion, without strings."""
     return max(int(found[2] or 0), int(found[3] or 0) + (400 if found[5] in _FLOATING else 20))
 
 
 def _conversion(
-    scope: Scope, found: re.Match[bytes], value: Value, where: Position
+    scope: FunctionScope, found: re.Match[bytes], value: Value, where: Position
 ) -> tuple[bytes, nodes.Expression]:
     flags, width, precision, size, letter = found.groups()
     shown = found[0].decode("utf-8", "replace")
@@ -98,17 +98,17 @@ def _conversion(
         raise SpecificationError.at(where, f"the width in `{shown}` must be a number up to {_MAX_WIDTH}")
     head = b"%" + flags + width + (b"" if precision is None else b"." + precision)
     if not letter:
-        raise SpecificationError.at(where, f"`{shown}` is no conversion; for a percent sign write `%%`")
+        raise SpecificationError.at(where, f"`{shown}` is not a conversion; for a percent sign write `%%`")
     if letter == b"s":
         if not isinstance(value.type, _TEXTS):
             raise SpecificationError.at(value.position, f"`{shown}` needs a string; this is {value.type}")
         return head + b"s", convert(scope, value, value_types.STRING)
     if letter == b"c":
-        if not isinstance(value.type, value_types.Integer | value_types.Bool):
+        if not isinstance(value.type, value_types.IntegerType | value_types.BoolType):
             raise SpecificationError.at(value.position, f"`{shown}` needs a char; this is {value.type}")
         return head + b"s", nodes.Call(value_types.STRING, "p_character", (value.form,))
     if letter not in _SIGNED + _UNSIGNED + _FLOATING:
-        raise SpecificationError.at(where, f"`{shown}` is no conversion; write %d, %u, %f, %g, %s or %c")
+        raise SpecificationError.at(where, f"`{shown}` is not a conversion; write %d, %u, %f, %g, %s or %c")
     if not value_types.is_number(value.type):
         hint = "; write %s" if isinstance(value.type, _TEXTS) else "; write `.toSec()`"
         raise SpecificationError.at(value.position, f"`{shown}` needs a number; this is {value.type}{hint}")
@@ -129,15 +129,15 @@ def _conversion(
 
 
 def _integer(letter: bytes, size: bytes | None, value: Value) -> nodes.Expression:
-    """What an integer conversion prints: as wide as its letters say, signed or unsigned as they say.
+    """Return the number that an integer conversion prints, with the width and sign of its letters.
 
-    Without a size it is as wide as the value; a floating-point value is truncated.
+    Without a size the number has the width of the value. A floating-point value is truncated.
     """
     kind = value_types.promoted(value.type)
-    bits = kind.bits if isinstance(kind, value_types.Integer) else 64
+    bits = kind.bits if isinstance(kind, value_types.IntegerType) else 64
     bits = {b"hh": 8, b"h": 16, None: bits}.get(size, 64)
-    target = value_types.Integer(bits, letter in _SIGNED, "")
-    if isinstance(kind, value_types.Integer):
+    target = value_types.IntegerType(bits, letter in _SIGNED, "")
+    if isinstance(kind, value_types.IntegerType):
         return number(value.form, target)
     return number(number(value.form, value_types.LONG), target)
 
@@ -145,7 +145,7 @@ def _integer(letter: bytes, size: bytes | None, value: Value) -> nodes.Expressio
 def _integer_head(
     flags: bytes, width: bytes, precision: bytes | None, letter: bytes, value: nodes.Expression
 ) -> tuple[bytes, nodes.Expression]:
-    """What Python writes for an integer conversion, and the argument; where the two differ, C's answer."""
+    """Return the Python format and the argument of an integer conversion; where C differs, C's text."""
     if letter in _UNSIGNED:
         flags = flags.replace(b"+", b"").replace(b" ", b"")
     if precision is not None:
@@ -160,17 +160,17 @@ def _integer_head(
     return b"%" + flags.replace(b"#", b"") + width + point + python, value
 
 
-class Stream:
-    """The state of `<<` in one statement: what `std::fixed` and `std::setprecision` said before."""
+class OutputStream:
+    """The state of `<<` in one statement: `std::fixed` and `std::setprecision`."""
 
-    def __init__(self, scope: Scope, site: int) -> None:
+    def __init__(self, scope: FunctionScope, site: int) -> None:
         self._scope = scope
         self._site = site
         self._fixed = False
         self._precision: nodes.Expression | None = None
 
     def manipulated(self, node: tree.Expression, value: Value | None) -> bool:
-        """Take a manipulator; False if this is none. `value` is the argument of `setprecision`."""
+        """Apply a manipulator; return whether it is one. `value` is the argument of `setprecision`."""
         parts = node.parts if isinstance(node, tree.Name) else ()
         name = parts[-1] if parts and parts[:-1] in ((), ("std",)) else ""
         if name in ("fixed", "defaultfloat", "scientific"):
@@ -186,24 +186,25 @@ class Stream:
         return name == "flush"
 
     def piece(self, value: Value) -> nodes.Expression:
-        """One value as text."""
+        """Return one value as text."""
         kind = value.type
         if isinstance(kind, _TEXTS):
             return convert(self._scope, value, value_types.STRING)
-        if isinstance(kind, value_types.Floating):
+        if isinstance(kind, value_types.FloatingType):
             return self._floating(value)
         if not isinstance(
-            kind, value_types.Bool | value_types.Integer | value_types.Time | value_types.Duration
+            kind,
+            value_types.BoolType | value_types.IntegerType | value_types.TimeType | value_types.DurationType,
         ):
             hint = (
                 "; write an index or a field"
-                if isinstance(kind, value_types.Vector | value_types.Record)
+                if isinstance(kind, value_types.VectorType | value_types.RecordType)
                 else ""
             )
             raise SpecificationError.at(value.position, f"{kind} cannot be printed{hint}")
-        if isinstance(kind, value_types.Time | value_types.Duration):
+        if isinstance(kind, value_types.TimeType | value_types.DurationType):
             return nodes.Call(value_types.STRING, "p_moment", (value.form,))
-        is_character = isinstance(kind, value_types.Integer) and kind.bits == 8
+        is_character = isinstance(kind, value_types.IntegerType) and kind.bits == 8
         return nodes.Call(value_types.STRING, "p_character" if is_character else "p_integer", (value.form,))
 
     def _floating(self, value: Value) -> nodes.Expression:

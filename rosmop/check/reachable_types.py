@@ -1,6 +1,8 @@
-"""Which message types a specification uses, however deep: whether its state outlives a change of definitions.
+"""Find the message types that a specification uses, also nested ones.
 
-What is found may be more than what is used (a string that is the name of a type), never less.
+The state of a specification survives a change of definitions only if these types are unchanged.
+
+The result may include an unused type (a string that is the name of a type), but never lacks a used one.
 """
 
 from collections.abc import Iterator
@@ -13,7 +15,7 @@ from roswire.definitions import Definitions
 
 
 def reached(node: tree.Specification, definitions: Definitions) -> frozenset[str]:
-    """The message types that a specification names, and those they are made of."""
+    """Return the message types that a specification names, and their nested types."""
     messages, services = set(definitions.message_types), set(definitions.service_types)
     waiting: list[str] = []
     for name in set(_names(node)):
@@ -32,7 +34,7 @@ def reached(node: tree.Specification, definitions: Definitions) -> frozenset[str
 
 
 def identity(node: tree.Specification) -> bytes:
-    """The same for specifications that are the same but for where they stand."""
+    """Return a digest that ignores positions."""
     return sha256(repr(_plain(node)).encode()).digest()
 
 
@@ -46,7 +48,7 @@ def _plain(node: Any) -> object:
 
 
 def _names(root: object) -> Iterator[str]:
-    """Every string of a tree that may name a type: `pkg/T`, `pkg::T`, or the two parts apart."""
+    """Yield every string of a tree that may name a type: `pkg/T`, `pkg::T`, or the two parts apart."""
     waiting = [root]
     while waiting:
         node = waiting.pop()

@@ -1,4 +1,4 @@
-"""What a function under compilation knows: variables by name, the statements written so far, where it stands."""
+"""The context of a function under compilation: variables by name, and the statements written so far."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,25 +9,25 @@ from typing import Literal
 from rosmop.check.assignables import Value, Variable
 from rosmop.form import nodes
 from rosmop.form.compiled import Comparison, Publication
-from rosmop.form.positions import Finding, Position
+from rosmop.form.positions import Diagnostic, Position
 from rosmop.form.sites import Site, SiteVariable, Symbols
-from rosmop.runtime.values import Values
+from rosmop.runtime.values import ValueCodec
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
 from rosmop.text.foreign import instead
 from rosmop.types import value_types
-from rosmop.types.messages import Messages, nearest, shown
+from rosmop.types.messages import MessageTypes, nearest, shown
 from rosmop.types.value_types import Type
 
 Role = Literal["action", "timer", "handler", "init", "function"]
-ValueOf = Callable[["Scope", tree.Expression], Value]
+ValueOf = Callable[["FunctionScope", tree.Expression], Value]
 
 
 @dataclass(eq=False)
 class HelperFunction:
-    """A helper function; `references` are the parameters that are handed back.
+    """A helper function; `references` are the parameters whose new values it returns.
 
-    `names` are the names of other variables that it, or what it calls, looks at or assigns.
+    `names` are the names of other variables that it, or a function it calls, reads or assigns.
     """
 
     name: str
@@ -35,7 +35,7 @@ class HelperFunction:
     result: Type
     parameters: tuple[Variable, ...]
     references: tuple[Variable, ...]
-    node: tree.Function
+    node: tree.FunctionDefinition
     recursive: bool = False
     names: frozenset[str] = frozenset()
     changes: frozenset[str] = frozenset()
@@ -44,8 +44,8 @@ class HelperFunction:
 
 
 @dataclass(frozen=True)
-class Loan:
-    """A shared variable, or a part of one, that is handed to a function as a constant reference."""
+class ConstantReference:
+    """A shared variable, or a part of it, that is passed to a function as a constant reference."""
 
     position: Position
     function: str
@@ -55,24 +55,24 @@ class Loan:
 
 @dataclass(eq=False)
 class SpecificationNames:
-    """What one specification declares, and the code's name for its context."""
+    """The names that one specification declares, and the code's name for its context."""
 
     name: str
     context: str
     variables: dict[str, Variable] = field(default_factory=dict)
     functions: dict[str, HelperFunction] = field(default_factory=dict)
     parameters: dict[str, Variable] = field(default_factory=dict)
-    """The parameters of the specification, in order; they are variables, too."""
+    """The parameters of the specification, in order; they are also variables."""
     misdeclared: set[str] = field(default_factory=set)
-    """Names of variables and functions whose declarations are refused: to use them is no further mistake."""
+    """Names of variables and functions with rejected declarations; using them is not reported again."""
     uses: set[str] = field(default_factory=set)
     """The other specifications whose variables are used."""
-    comparisons: dict[tree.Binary, Comparison] = field(default_factory=dict)
+    comparisons: dict[tree.BinaryExpression, Comparison] = field(default_factory=dict)
     """The comparisons that are noted."""
-    lent: list[Loan] = field(default_factory=list)
+    lent: list[ConstantReference] = field(default_factory=list)
 
     def changed_by(self, name: str) -> frozenset[str]:
-        """The shared variables that a function, or one that it calls, assigns, as the code names them."""
+        """Return the shared variables that a function, or one that it calls, assigns, as the code names them."""
         waiting, seen, found = [name], {name}, frozenset[str]()
         while waiting:
             function = self.functions[waiting.pop()]
@@ -83,47 +83,47 @@ class SpecificationNames:
 
 
 @dataclass(eq=False)
-class Loop:
-    """A loop or switch around the current statement, and what a `continue` needs before it.
+class LoopScope:
+    """A loop or switch around the current statement, and the step that a `continue` runs first.
 
-    `blocks` are the names that the step sees: those around the loop, not those around the `continue`.
+    `blocks` are the names visible to the step: those around the loop, not those around the `continue`.
     """
 
     step: Callable[[], None] | None
     blocks: list[dict[str, Variable]] = field(default_factory=list)
-    flag: str | None = None  # of a switch: tells the loop around it to continue
+    flag: str | None = None  # of a switch: set if the loop around it continues
     continued: bool = False  # of a switch: whether a `continue` in it sets the flag
 
 
 @dataclass
-class Statements:
-    """Statements while they are written, and the site of the next."""
+class StatementList:
+    """A list of statements under construction, and the site of the next one."""
 
     found: list[nodes.Statement] = field(default_factory=list)
     site: int = -1
 
 
-class Shared:
-    """What all functions of all specifications share while they are compiled."""
+class CompilationContext:
+    """The state that all functions of all specifications share during compilation."""
 
-    def __init__(self, messages: Messages, value_of: ValueOf, *, margins: bool = False) -> None:
+    def __init__(self, messages: MessageTypes, value_of: ValueOf, *, margins: bool = False) -> None:
         self.symbols = Symbols()
         self.margins = margins
         self.messages = messages
         self.value_of = value_of
-        self.values = Values(messages)
+        self.values = ValueCodec(messages)
         self.functions: dict[str, nodes.Function] = {}
         self.specifications: list[SpecificationNames] = []
         self.types: dict[str, Type] = {}
-        """Those of variables, by their names in the form."""
+        """The types of the variables, by their names in the form."""
         self.owners: dict[str, list[SpecificationNames]] = {}
-        """The specifications that have a variable of a name."""
+        """The specifications that declare a variable of a name."""
         self.unsliced: set[str] = set()
-        """The variables of which slices have none of their own, by their names in the form."""
-        self.findings: list[Finding] = []
+        """The variables that slices share, by their names in the form."""
+        self.findings: list[Diagnostic] = []
         self.publications: list[Publication] = []
         self.partial = False
-        """Files of the set could not be read: a name that is not known here may be declared there."""
+        """Whether some files of the set could not be parsed, so that they may declare unknown names."""
 
     def define(self, function: nodes.Function) -> None:
         """Add a function."""
@@ -140,7 +140,7 @@ class Shared:
     def foreign(
         self, own: SpecificationNames, name: str, position: Position
     ) -> tuple[Variable | None, str | None]:
-        """A variable of another specification, and which that is."""
+        """Return a variable of another specification, and that specification's name."""
         owners = [other for other in self.owners.get(name, ()) if other is not own]
         if len(owners) > 1:
             both = " and ".join(other.name for other in owners[:2])
@@ -157,10 +157,10 @@ class Shared:
         return variable, owners[0].name
 
 
-class Scope:
+class FunctionScope:
     """A function under compilation."""
 
-    def __init__(self, shared: Shared, names: SpecificationNames, role: Role) -> None:
+    def __init__(self, shared: CompilationContext, names: SpecificationNames, role: Role) -> None:
         self.shared = shared
         self.names = names
         self.role: Role = role
@@ -168,30 +168,30 @@ class Scope:
         self.values = shared.values
         self.messages = shared.messages
         self.value_of = partial(shared.value_of, self)
-        """Computes an expression."""
+        """Compiles an expression to a value."""
         self.context = names.context
-        self.lines = Statements()
+        self.lines = StatementList()
         self.result: Type = value_types.VOID
         self.references: tuple[Variable, ...] = ()
-        self.message_type: str | None = None  # of the message that `MESSAGE` is
+        self.message_type: str | None = None  # the type of `MESSAGE`
         self.pending: str | None = None  # `MESSAGE` was read: the code's name for what this action assigns
-        self.drop_refused: str | None = None  # why `DROP;` may not stand here
-        self.below: set[str] = set()  # shared variables whose declarations are still to come
-        self.loops: list[Loop] = []
+        self.drop_refused: str | None = None  # why `DROP;` is not allowed here
+        self.below: set[str] = set()  # shared variables that are declared later
+        self.loops: list[LoopScope] = []
         self.written: set[str] = set()
         self.changes = False  # something was assigned
-        self.changes_shared: set[str] = set()  # the shared variables that were, as the code names them
+        self.changes_shared: set[str] = set()  # the assigned shared variables, as the code names them
         self.calls: set[str] = set()  # the helper functions that are called
         self.recursive = False
         self.notes = shared.margins and role != "init"  # comparisons are noted
-        self.misdeclared: set[str] = set()  # local names whose declarations are refused
+        self.misdeclared: set[str] = set()  # local names with rejected declarations
         self._blocks: list[dict[str, Variable]] = [{}]
 
     # Names
 
     @contextmanager
     def block(self) -> Iterator[dict[str, Variable]]:
-        """A block with names of its own."""
+        """Open a block with names of its own; yield them."""
         names: dict[str, Variable] = {}
         self._blocks.append(names)
         try:
@@ -199,14 +199,14 @@ class Scope:
         finally:
             self._blocks.pop()
 
-    def enter(self, loop: Loop) -> None:
-        """A loop or switch begins here."""
+    def enter(self, loop: LoopScope) -> None:
+        """Enter a loop or switch."""
         loop.blocks = self._blocks.copy()
         self.loops.append(loop)
 
     @contextmanager
-    def around(self, loop: Loop) -> Iterator[None]:
-        """Names are those that the loop sees."""
+    def around(self, loop: LoopScope) -> Iterator[None]:
+        """Restore the names that the loop sees."""
         inner, self._blocks = self._blocks, loop.blocks
         try:
             yield
@@ -214,7 +214,7 @@ class Scope:
             self._blocks = inner
 
     def declare(self, variable: Variable) -> None:
-        """A name of the innermost block."""
+        """Declare a name in the innermost block."""
         block = self._blocks[-1]
         if variable.name in block:
             raise SpecificationError.at(
@@ -225,13 +225,13 @@ class Scope:
             self.shared.types[variable.code] = variable.type
 
     def local(self, name: str, kind: Type, position: Position, *, constant: bool = False) -> Variable:
-        """A new local variable."""
+        """Return a new local variable."""
         variable = Variable(name, kind, self.symbols.fresh("v"), position, constant=constant)
         self.declare(variable)
         return variable
 
     def find(self, name: str, position: Position) -> Variable | None:
-        """The variable of this name, which the code uses: local, of this specification, of another one."""
+        """Return the variable of this name (local, of this specification, or of another one), and note its use."""
         variable, owner = self._known(name, position)
         if owner is not None:
             self.names.uses.add(owner)
@@ -247,19 +247,19 @@ class Scope:
         return (own, None) if own is not None else self.shared.foreign(self.names, name, position)
 
     def changes_anything(self) -> bool:
-        """Whether what was written so far assigns something, itself or in a function that it calls."""
+        """Whether the statements written so far, or functions they call, assign a variable."""
         return self.changes or any(self.names.changed_by(called) for called in self.calls)
 
     def unknown(self, name: str, position: Position, what: str = "variable") -> SpecificationError:
-        """The refusal of a name that nothing has."""
+        """Return the error for an unknown name."""
         wrong = (self.misdeclared, *(other.misdeclared for other in self.shared.specifications))
         if self.shared.partial or any(name in names for names in wrong):
             return SpecificationError(())
         known = [local for block in self._blocks for local in block]
         known += [*self.names.variables, *self.names.functions]
-        told = instead(name.split("::"))
-        hint = f"; {told}" if told else nearest(name, known)
-        return SpecificationError.at(position, f"there is no {what} {shown(name)}{hint}")
+        advice = instead(name.split("::"))
+        hint = f"; {advice}" if advice else nearest(name, known)
+        return SpecificationError.at(position, f"unknown {what} {shown(name)}{hint}")
 
     def published(self, topic: str, kind: str, position: Position) -> None:
         """Note that the topic is published."""
@@ -268,16 +268,16 @@ class Scope:
     # Statements
 
     def temporary(self, prefix: str = "t") -> str:
-        """A name for an intermediate value."""
+        """Return a new name for an intermediate value."""
         return self.symbols.fresh(prefix)
 
-    def site(self, node: tree.Node) -> int:
-        """The site of a node: where it stands, and the variables in it."""
+    def site(self, node: tree.SyntaxNode) -> int:
+        """Return the site of a node: its position, and the variables in it."""
         return self.symbols.site(Site(node.position, tuple(self._variables(node))))
 
     @contextmanager
-    def at(self, node: tree.Node) -> Iterator[None]:
-        """Statements written inside belong to this node."""
+    def at(self, node: tree.SyntaxNode) -> Iterator[None]:
+        """Attribute the statements written inside to this node."""
         before = self.lines.site
         self.lines.site = self.site(node)
         try:
@@ -287,7 +287,7 @@ class Scope:
 
     @contextmanager
     def looking(self) -> Iterator[None]:
-        """Comparisons inside are not noted."""
+        """Do not note comparisons written inside."""
         before, self.notes = self.notes, False
         try:
             yield
@@ -304,7 +304,7 @@ class Scope:
 
     @contextmanager
     def nested(self) -> Iterator[list[nodes.Statement]]:
-        """Statements written inside are these, and not of the function itself."""
+        """Collect the statements written inside in a separate list."""
         outer, self.lines.found = self.lines.found, []
         try:
             yield self.lines.found
@@ -314,11 +314,11 @@ class Scope:
     def function(
         self, name: str, parameters: tuple[str, ...], *, happens: int | None = None
     ) -> nodes.Function:
-        """What was written, as a function."""
+        """Return the function as written so far."""
         shared = tuple(sorted(self.written))
         return nodes.Function(name, self.context, parameters, tuple(self.lines.found), shared, happens)
 
-    def _variables(self, node: tree.Node) -> Iterator[SiteVariable]:
+    def _variables(self, node: tree.SyntaxNode) -> Iterator[SiteVariable]:
         seen: set[str] = set()
         for name in names_in(node):
             if name in seen or len(seen) >= 16:
@@ -329,12 +329,14 @@ class Scope:
             except SpecificationError:
                 continue
             if variable is not None and variable.alias is None:
-                steady = value_types.is_scalar(variable.type) or isinstance(variable.type, value_types.String)
+                steady = value_types.is_scalar(variable.type) or isinstance(
+                    variable.type, value_types.StringType
+                )
                 yield SiteVariable(name, variable.code, variable.type, steady)
 
 
 def names_in(node: object) -> Iterator[str]:
-    """The simple names in an expression, or in the expressions of a statement that holds no other statement."""
+    """Yield the simple names in an expression, or in the expressions of a statement but not of those inside it."""
     waiting = [node]
     while waiting:
         current = waiting.pop()
@@ -343,5 +345,7 @@ def names_in(node: object) -> Iterator[str]:
                 yield current.parts[0]
         elif isinstance(current, tuple):
             waiting += current
-        elif isinstance(current, tree.Node) and (current is node or not isinstance(current, tree.Statement)):
+        elif isinstance(current, tree.SyntaxNode) and (
+            current is node or not isinstance(current, tree.Statement)
+        ):
             waiting += [getattr(current, name) for name in reversed(current.__dataclass_fields__)]

@@ -1,16 +1,16 @@
-"""Parametric specifications: their parameters as variables, and what each event binds of them.
+"""Compile parametric specifications: their parameters as variables, and the parameters that each event binds.
 
-An event binds a parameter of the specification by one of its own with that name and type. Beside its function it has
-one that gives the values that it binds, for which nothing else of the message is read.
+An event binds a parameter of the specification by having one of the same name and type. A second function of the event
+returns the values that it binds, and reads nothing else of the message.
 """
 
 from collections.abc import Iterable, Sequence
 
 from rosmop.check.assignables import Variable
-from rosmop.check.scope import Shared, SpecificationNames
+from rosmop.check.scope import CompilationContext, SpecificationNames
 from rosmop.form import nodes
 from rosmop.form.compiled import EventCode, PropertyCode, Slicing
-from rosmop.form.positions import Finding
+from rosmop.form.positions import Diagnostic
 from rosmop.logics.bounded import BoundedProperty
 from rosmop.logics.interface import CompiledProperty
 from rosmop.logics.past_monitors import PastProperty
@@ -25,16 +25,18 @@ MOST_PARAMETERS = 6
 _ACTS = (nodes.Log, nodes.Throttle, nodes.Drop, nodes.Publish, nodes.Invoke)
 
 
-def declare_parameters(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
-    """Make the parameters variables that each slice has a value of, and that nothing assigns."""
+def declare_parameters(
+    shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
+) -> None:
+    """Declare the parameters as constant variables with a value for each slice."""
     for parameter in specification.parameters:
         try:
             kind = resolve(parameter.type, shared.messages)
             if not (
                 value_types.is_number(kind)
-                or isinstance(kind, value_types.String | value_types.Time | value_types.Duration)
+                or isinstance(kind, value_types.StringType | value_types.TimeType | value_types.DurationType)
             ):
-                text = f"a parameter of a specification is a string, a number or a time, and {kind} is none"
+                text = f"a parameter of a specification is a string, a number or a time, not {kind}"
                 raise SpecificationError.at(parameter.position, text)
             if parameter.name in names.variables:
                 raise SpecificationError.at(
@@ -52,14 +54,14 @@ def declare_parameters(shared: Shared, names: SpecificationNames, specification:
         shared.declare(names, variable)
     if len(specification.parameters) > MOST_PARAMETERS:
         text = f"a specification has at most {MOST_PARAMETERS} parameters"
-        shared.findings.append(Finding(specification.parameters[-1].position, "error", text))
+        shared.findings.append(Diagnostic(specification.parameters[-1].position, "error", text))
 
 
 def check_own(names: SpecificationNames, variable: Variable) -> None:
-    """Refuse a variable of which not each slice can have its own: what slices hold is bounded by their number."""
+    """Reject a slice variable that is not a number or a time: only the number of slices bounds their memory."""
     if variable.sliced and not (
         value_types.is_number(variable.type)
-        or isinstance(variable.type, value_types.Time | value_types.Duration)
+        or isinstance(variable.type, value_types.TimeType | value_types.DurationType)
     ):
         text = (
             f"each slice of {names.name} has its own {shown(variable.name)}, so it is a number or a time; "
@@ -69,9 +71,12 @@ def check_own(names: SpecificationNames, variable: Variable) -> None:
 
 
 def slicing_of(
-    shared: Shared, names: SpecificationNames, events: Iterable[EventCode], properties: Iterable[PropertyCode]
+    shared: CompilationContext,
+    names: SpecificationNames,
+    events: Iterable[EventCode],
+    properties: Iterable[PropertyCode],
 ) -> Slicing | None:
-    """What the slices of a specification differ in; None without parameters."""
+    """Return the parameters that distinguish the slices of a specification; None without parameters."""
     if not names.parameters:
         return None
     own = (
@@ -88,7 +93,7 @@ def slicing_of(
     )
 
 
-def _enforces(shared: Shared, functions: Sequence[str]) -> bool:
+def _enforces(shared: CompilationContext, functions: Sequence[str]) -> bool:
     """Whether these functions, or those that they call, drop, change or publish a message."""
     waiting, seen = [*functions], {*functions}
     while waiting:
@@ -104,23 +109,23 @@ def _enforces(shared: Shared, functions: Sequence[str]) -> bool:
     return False
 
 
-def binds(names: SpecificationNames, event: tree.Event) -> tuple[int, ...]:
-    """Which parameters of the specification an event binds, by their numbers."""
+def binds(names: SpecificationNames, event: tree.EventDefinition) -> tuple[int, ...]:
+    """Return the numbers of the specification's parameters that an event binds."""
     own = {parameter.name for parameter in event.parameters}
     return tuple(number for number, name in enumerate(names.parameters) if name in own)
 
 
-def creates(specification: tree.Specification, event: tree.Event) -> bool:
-    """Whether a slice may begin with an event: with all where none is a `creation event`."""
+def creates(specification: tree.Specification, event: tree.EventDefinition) -> bool:
+    """Whether a slice may begin with an event: with any event if none is a `creation event`."""
 
-    def marked(event: tree.Event) -> bool:
+    def marked(event: tree.EventDefinition) -> bool:
         return any(modifier.parts == ("creation",) for modifier in event.modifiers)
 
     return marked(event) or not any(map(marked, specification.events))
 
 
-def acts(function: nodes.Function, shared: Shared) -> bool:
-    """Whether the action of an event does more than to change the slice's own variables."""
+def acts(function: nodes.Function, shared: CompilationContext) -> bool:
+    """Whether the action of an event does more than change the slice's own variables."""
     if not shared.unsliced.isdisjoint(function.shared):
         return True
     return any(
@@ -130,7 +135,7 @@ def acts(function: nodes.Function, shared: Shared) -> bool:
 
 
 def unsliceable(compiled: CompiledProperty) -> str | None:
-    """Why slices cannot have a run each of a property."""
+    """Return why slices cannot run a property; None if they can."""
     if isinstance(compiled, PastProperty) and compiled.timed:
         return (
             "a formula with several bounds of time, or with one that neither begins at 0 nor ends at `inf`, cannot be "
@@ -146,10 +151,12 @@ def unsliceable(compiled: CompiledProperty) -> str | None:
     return None
 
 
-def check_parameters(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
-    """Every parameter is bound by an event."""
+def check_parameters(
+    shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
+) -> None:
+    """Report each parameter that no event binds."""
     bound = {number for event in specification.events for number in binds(names, event)}
     for number, (name, variable) in enumerate(names.parameters.items()):
         if number not in bound:
             text = f"no event binds the parameter {shown(name)}: give an event a parameter of that name"
-            shared.findings.append(Finding(variable.position, "error", text))
+            shared.findings.append(Diagnostic(variable.position, "error", text))

@@ -1,10 +1,10 @@
-"""Texts of specifications, read and compiled."""
+"""Parse and compile the texts of specifications."""
 
 from collections.abc import Mapping
 
 from rosmop.check.specification import compile_files, findings_of
 from rosmop.form.compiled import Compiled
-from rosmop.form.positions import Finding
+from rosmop.form.positions import Diagnostic
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
 from rosmop.text.parser import parse
@@ -12,9 +12,9 @@ from roswire.definitions import Definitions
 
 
 def compiled_from(sources: Mapping[str, str], definitions: Definitions, *, margins: bool = False) -> Compiled:
-    """Compile files (name to text) in this order; raises `SpecificationError` with all that is wrong."""
-    files: list[tree.File] = []
-    findings: list[Finding] = []
+    """Compile files (name to text) in this order; raises `SpecificationError` with all errors."""
+    files: list[tree.SpecificationFile] = []
+    findings: list[Diagnostic] = []
     for name, text in sources.items():
         try:
             files.append(parse(text, name))

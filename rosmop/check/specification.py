@@ -1,18 +1,13 @@
-"""Specifications as code: a set of files becomes one module, and a description of what is in it.
+"""Compile a set of files with specifications.
 
-Specifications of one set see each other's variables. Everything wrong with any of them is found in one pass.
+Specifications of one set see each other's variables. One pass finds all errors of all of them.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TypeVar
 
-from rosmop.check.enforcement import (
-    blocking_refused,
-    enforcement,
-    topics_of_remedy,
-    with_remedy,
-)
+from rosmop.check.enforcement import blocking_refused, enforcement, topics_of_remedy, with_remedy
 from rosmop.check.event_functions import compile_event
 from rosmop.check.expressions import value_of
 from rosmop.check.function_bodies import (
@@ -23,19 +18,18 @@ from rosmop.check.function_bodies import (
     declare_variables,
 )
 from rosmop.check.reachable_types import identity, reached
-from rosmop.check.scope import Shared, SpecificationNames
+from rosmop.check.scope import CompilationContext, SpecificationNames
 from rosmop.check.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
-from rosmop.check.slips import slips
-from rosmop.check.specification_lint import kept_slices, lint_property, unused_events
+from rosmop.check.specification_lint import kept_slices, lint_property, lint_statements, unused_events
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
-from rosmop.form.positions import Finding
+from rosmop.form.positions import Diagnostic
 from rosmop.logics.catalogue import compile_property
 from rosmop.logics.interface import CompiledProperty, FormulaError
 from rosmop.runtime.action_context import MAX_BYTES
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
-from rosmop.types.messages import Messages, nearest, shown
+from rosmop.types.messages import MessageTypes, nearest, shown
 from roswire.definitions import Definitions
 
 _T = TypeVar("_T")
@@ -43,15 +37,17 @@ _T = TypeVar("_T")
 _TAKEN = "revisions"
 MODIFIERS = frozenset({"hold", "begin"})
 IGNORED_MODIFIERS = frozenset({"unsynchronized", "decentralized", "perthread", "suffix", "creation"})
-"""Modifiers of MOP that say how a monitor is generated, and mean nothing here (`creation` does before an event)."""
+"""Modifiers of MOP that control how a monitor is generated; here they have no effect."""
 
 
-def compile_files(files: Sequence[tree.File], definitions: Definitions, *, margins: bool = False) -> Compiled:
-    """Compile a set of files; raises `SpecificationError` with everything that is wrong.
+def compile_files(
+    files: Sequence[tree.SpecificationFile], definitions: Definitions, *, margins: bool = False
+) -> Compiled:
+    """Compile a set of files; raises `SpecificationError` with all errors.
 
-    With `margins` the comparisons of numbers are noted (`margins.py`).
+    `margins`: note comparisons of numbers (`margins.py`).
     """
-    shared = Shared(Messages(definitions), value_of, margins=margins)
+    shared = CompilationContext(MessageTypes(definitions), value_of, margins=margins)
     pairs = [(file, specification) for file in files for specification in file.specifications]
     compiled = _compile_all(shared, pairs)
     findings = list(dict.fromkeys(shared.findings))
@@ -68,16 +64,16 @@ def compile_files(files: Sequence[tree.File], definitions: Definitions, *, margi
     )
 
 
-def findings_of(files: Sequence[tree.File], definitions: Definitions) -> list[Finding]:
-    """What is wrong with these files while others of their set cannot be read; names may be declared in those."""
-    shared = Shared(Messages(definitions), value_of)
+def findings_of(files: Sequence[tree.SpecificationFile], definitions: Definitions) -> list[Diagnostic]:
+    """Return the errors of these files while others of the set cannot be parsed; names may be declared in those."""
+    shared = CompilationContext(MessageTypes(definitions), value_of)
     shared.partial = True
     _compile_all(shared, [(file, specification) for file in files for specification in file.specifications])
     return list(dict.fromkeys(shared.findings))
 
 
 def _compile_all(
-    shared: Shared, pairs: Sequence[tuple[tree.File, tree.Specification]]
+    shared: CompilationContext, pairs: Sequence[tuple[tree.SpecificationFile, tree.Specification]]
 ) -> list[SpecificationCode]:
     names = [_declare(shared, specification) for _, specification in pairs]
     _check_names(shared, [specification for _, specification in pairs])
@@ -90,7 +86,7 @@ def _compile_all(
     return compiled
 
 
-def _declare(shared: Shared, specification: tree.Specification) -> SpecificationNames:
+def _declare(shared: CompilationContext, specification: tree.Specification) -> SpecificationNames:
     shared.symbols.begin(specification.name)
     names = SpecificationNames(specification.name, shared.symbols.fresh("c"))
     shared.specifications.append(names)
@@ -100,7 +96,7 @@ def _declare(shared: Shared, specification: tree.Specification) -> Specification
     size = sum(shared.values.width(variable.type) for variable in names.variables.values())
     if size > MAX_BYTES:
         shared.findings.append(
-            Finding(
+            Diagnostic(
                 specification.position,
                 "error",
                 f"the variables take {size} bytes; a specification may hold {MAX_BYTES >> 20} MiB",
@@ -109,7 +105,7 @@ def _declare(shared: Shared, specification: tree.Specification) -> Specification
     return names
 
 
-def _check_names(shared: Shared, specifications: Sequence[tree.Specification]) -> None:
+def _check_names(shared: CompilationContext, specifications: Sequence[tree.Specification]) -> None:
     seen: dict[str, tree.Specification] = {}
     owners: dict[str, str] = {}
     for specification, names in zip(specifications, shared.specifications, strict=True):
@@ -118,7 +114,7 @@ def _check_names(shared: Shared, specifications: Sequence[tree.Specification]) -
             text = (
                 f"there is another specification {shown(specification.name)} at {first}; give it another name"
             )
-            shared.findings.append(Finding(specification.position, "error", text))
+            shared.findings.append(Diagnostic(specification.position, "error", text))
         seen[specification.name] = specification
         for variable in names.variables.values():
             if variable.sliced:
@@ -126,11 +122,14 @@ def _check_names(shared: Shared, specifications: Sequence[tree.Specification]) -
             other = owners.setdefault(variable.name, names.name)
             if other != names.name:
                 text = f"{shown(variable.name)} is also a variable of {other}; each has its own"
-                shared.findings.append(Finding(variable.position, "warning", text))
+                shared.findings.append(Diagnostic(variable.position, "warning", text))
 
 
 def _compile(
-    shared: Shared, names: SpecificationNames, file: tree.File, specification: tree.Specification
+    shared: CompilationContext,
+    names: SpecificationNames,
+    file: tree.SpecificationFile,
+    specification: tree.Specification,
 ) -> SpecificationCode | None:
     shared.symbols.begin(specification.name)
     _check_head(shared, specification)
@@ -149,7 +148,7 @@ def _compile(
         return None
     known = tuple(code for code in properties if code is not None)
     shared.findings += unused_events(specification, known)
-    shared.findings += slips(specification)
+    shared.findings += lint_statements(specification)
     if names.parameters:
         shared.findings += kept_slices(names.name, good, known, specification.properties)
     variables = {variable.name: variable.code for variable in names.variables.values()}
@@ -173,19 +172,19 @@ def _compile(
     )
 
 
-def _seen_changes(names: SpecificationNames) -> Iterator[Finding]:
-    """Constant references through which a function would see what it changes: here they are what they were."""
+def _seen_changes(names: SpecificationNames) -> Iterator[Diagnostic]:
+    """Yield errors for constant references to variables that the function changes: here they would not change."""
     for loan in names.lent:
         if loan.variable.code in names.changed_by(loan.function):
             text = (
                 f"`{loan.function}` gives `{loan.variable.name}` another value, which `{loan.parameter.name}` would"
                 f" not show: leave out the `&` of `{loan.parameter.name}`, or use `{loan.variable.name}` itself"
             )
-            yield Finding(loan.position, "error", text)
+            yield Diagnostic(loan.position, "error", text)
 
 
-def _noted(shared: Shared, action: Callable[[], _T]) -> _T | None:
-    """What the action returns; None if it refused, which is noted."""
+def _noted(shared: CompilationContext, action: Callable[[], _T]) -> _T | None:
+    """Return the result of `action`; None if it raised an error, which is added to the findings."""
     try:
         return action()
     except SpecificationError as error:
@@ -193,42 +192,47 @@ def _noted(shared: Shared, action: Callable[[], _T]) -> _T | None:
         return None
 
 
-def _check_head(shared: Shared, specification: tree.Specification) -> None:
+def _check_head(shared: CompilationContext, specification: tree.Specification) -> None:
     for modifier in specification.modifiers:
         word = modifier.parts[0]
         if word in IGNORED_MODIFIERS:
-            shared.findings.append(Finding(modifier.position, "warning", f"{shown(word)} means nothing here"))
+            shared.findings.append(
+                Diagnostic(modifier.position, "warning", f"{shown(word)} means nothing here")
+            )
         elif word not in MODIFIERS:
-            text = f"{shown(word)} is no modifier of a specification{nearest(word, MODIFIERS)}"
-            shared.findings.append(Finding(modifier.position, "error", text))
+            text = f"{shown(word)} is not a modifier of a specification{nearest(word, MODIFIERS)}"
+            shared.findings.append(Diagnostic(modifier.position, "error", text))
     if {modifier.parts[0] for modifier in specification.modifiers} >= MODIFIERS:
         text = "`hold` and `begin` exclude each other: leave one of them out"
-        shared.findings.append(Finding(specification.position, "error", text))
+        shared.findings.append(Diagnostic(specification.position, "error", text))
     if specification.name == _TAKEN:
         text = f"no specification can be called {shown(_TAKEN)}: over REST /v1/monitors/{_TAKEN} is their history"
-        shared.findings.append(Finding(specification.position, "error", text))
+        shared.findings.append(Diagnostic(specification.position, "error", text))
     if not specification.events:
         text = f"the specification {shown(specification.name)} has no event; write `event name() /topic …`"
-        shared.findings.append(Finding(specification.position, "error", text))
+        shared.findings.append(Diagnostic(specification.position, "error", text))
     seen = set()
     for event in specification.events:
         if event.name in seen:
             shared.findings.append(
-                Finding(event.position, "error", f"the event {shown(event.name)} occurs twice")
+                Diagnostic(event.position, "error", f"the event {shown(event.name)} occurs twice")
             )
         seen.add(event.name)
         for modifier in event.modifiers:
             if specification.parameters and modifier.parts == ("creation",):
                 continue
             text = f"the modifier {shown(modifier.parts[0])} of an event means nothing here"
-            shared.findings.append(Finding(modifier.position, "warning", text))
+            shared.findings.append(Diagnostic(modifier.position, "warning", text))
 
 
 # Properties
 
 
 def _property(
-    shared: Shared, names: SpecificationNames, specification: tree.Specification, node: tree.Property
+    shared: CompilationContext,
+    names: SpecificationNames,
+    specification: tree.Specification,
+    node: tree.Property,
 ) -> PropertyCode | None:
     events = tuple(dict.fromkeys(event.name for event in specification.events))
     try:
@@ -238,7 +242,7 @@ def _property(
         return None
     why = unsliceable(compiled) if specification.parameters else None
     if why is not None:
-        shared.findings.append(Finding(node.position, "error", why))
+        shared.findings.append(Diagnostic(node.position, "error", why))
     handlers: dict[str, str] = {}
     published = _noted(shared, partial(topics_of_remedy, names, compiled))
     if published is None:
@@ -246,7 +250,7 @@ def _property(
     for handler in with_remedy(compiled, node):
         text = _handler_refused(compiled, handlers, handler)
         if text is not None:
-            shared.findings.append(Finding(handler.position, "error", text))
+            shared.findings.append(Diagnostic(handler.position, "error", text))
             continue
         refused = blocking_refused(compiled, specification, handler.category)
         function = _noted(shared, partial(compile_handler, shared, names, handler, refused))
@@ -261,7 +265,7 @@ def _property(
     if compiled.suppresses:
         at = {handler.category: handler.position for handler in node.handlers}
         shared.findings += [
-            Finding(
+            Diagnostic(
                 at[category],
                 "warning",
                 f"when @{category} drops the message, `__RESET;` does nothing: for `{compiled.logic}` a dropped message"
@@ -285,8 +289,8 @@ def _handler_refused(
     return None
 
 
-def _check_types(shared: Shared, compiled: Sequence[SpecificationCode]) -> None:
-    """A topic has one type: in all events, and in all that is published."""
+def _check_types(shared: CompilationContext, compiled: Sequence[SpecificationCode]) -> None:
+    """Report each topic that events or publications use with different types."""
     types: dict[tuple[str, str | None], tuple[str, object]] = {}
     for specification in compiled:
         for event in specification.events:
@@ -297,9 +301,9 @@ def _check_types(shared: Shared, compiled: Sequence[SpecificationCode]) -> None:
             known, where = types.setdefault(key, (kind, event.position))
             if known != kind:
                 text = f"{event.topic} has the type {known} at {where}, and {kind} here; a topic has one type"
-                shared.findings.append(Finding(event.position, "error", text))
+                shared.findings.append(Diagnostic(event.position, "error", text))
     for published in shared.publications:
         known, where = types.setdefault((published.topic, None), (published.type, published.position))
         if known != published.type:
             text = f"{published.topic} has the type {known} at {where}, and {published.type} here"
-            shared.findings.append(Finding(published.position, "error", text))
+            shared.findings.append(Diagnostic(published.position, "error", text))

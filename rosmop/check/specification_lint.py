@@ -1,11 +1,13 @@
-"""Find probable mistakes: events no property uses, handlers that never run, properties that say nothing."""
+"""Find probable mistakes: unused events, handlers that never run, properties and statements without effect."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Protocol
 
+from rosmop.check.call_expressions import stream_of
 from rosmop.form.compiled import EventCode, PropertyCode
-from rosmop.form.positions import Finding
+from rosmop.form.positions import Diagnostic
+from rosmop.logics.catalogue import LOGICS
 from rosmop.logics.interface import Categories, ClockedProperty, CompiledProperty, FiniteProperty
 from rosmop.logics.property_lint import analyse
 from rosmop.text import tree
@@ -20,27 +22,27 @@ class _HasProperty(Protocol):
     def property(self) -> CompiledProperty: ...
 
 
-def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Finding]:
-    """Warnings about a property, each at the handler or formula it is about."""
+def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Diagnostic]:
+    """Return warnings about a property, each at its handler or formula."""
     handlers = {handler.category: handler.position for handler in node.handlers}
     findings = []
     if not handlers:
         handler = f"`@{compiled.categories[-1]} {{ … }}`"
-        text = f"nothing comes of this property: it has no handler; write {handler} behind it"
-        findings.append(Finding(node.position, "warning", text))
+        text = f"this property has no effect without a handler; write {handler} after it"
+        findings.append(Diagnostic(node.position, "warning", text))
     for fact in analyse(compiled, [category for category in handlers if category in compiled.categories]):
         position = handlers.get(fact.category) if fact.kind == "never runs" else node.position
         trace = f" (shortest trace: {' '.join(fact.trace)})" if fact.trace else ""
-        findings.append(Finding(position or node.position, "warning", fact.text + trace))
+        findings.append(Diagnostic(position or node.position, "warning", fact.text + trace))
     return findings
 
 
 def kept_slices(
     name: str, events: Sequence[EventCode], properties: Sequence[PropertyCode], nodes: Sequence[tree.Property]
-) -> list[Finding]:
-    """Warnings about what keeps the slices of a parametric specification for ever."""
+) -> list[Diagnostic]:
+    """Return warnings about timers and properties that keep slices of a specification for ever."""
     found = [
-        Finding(
+        Diagnostic(
             event.position,
             "warning",
             f"the slices of {shown(name)} never end: the timer {shown(event.name)} does more than to change their"
@@ -52,7 +54,7 @@ def kept_slices(
     for code, node in zip(properties, nodes, strict=True):
         for_good = _for_good(code.property)
         found += [
-            Finding(
+            Diagnostic(
                 handler.position,
                 "warning",
                 f"@{handler.category} is empty and for good: a binding that comes to it keeps its slice for ever, and"
@@ -65,7 +67,7 @@ def kept_slices(
 
 
 def _for_good(compiled: CompiledProperty) -> set[str]:
-    """The categories of states that are never left."""
+    """Return the categories of states that are never left."""
     verdicts: Sequence[Categories]
     if isinstance(compiled, FiniteProperty):
         automaton = compiled.automaton
@@ -81,23 +83,60 @@ def _for_good(compiled: CompiledProperty) -> set[str]:
         ]
     else:
         return set()
-    return {name for told, stay in zip(verdicts, stays, strict=True) if stay for name in told}
+    return {name for categories, stay in zip(verdicts, stays, strict=True) if stay for name in categories}
 
 
-def unused_events(specification: tree.Specification, properties: Sequence[_HasProperty]) -> list[Finding]:
-    """Warnings about events that no property names, if there are properties; `default` names all of them."""
+def unused_events(specification: tree.Specification, properties: Sequence[_HasProperty]) -> list[Diagnostic]:
+    """Return warnings about events that no property names, if there are properties; `default` names all events."""
     if not properties:
         return []
     named = {word for code in properties for word in _WORD.findall(code.property.formula)}
-    if any(code.property.logic == "ptcaret" for code in properties):
-        named |= {"begin", "end"}
-    if any(
-        code.property.logic in ("fsm", "tfsm") and _DEFAULT.search(code.property.formula)
-        for code in properties
-    ):
-        return []
+    for code in properties:
+        logic = LOGICS[code.property.logic]
+        if logic.has_states and _DEFAULT.search(code.property.formula):
+            return []
+        named.update(logic.implicit_events)
     return [
-        Finding(event.position, "warning", f"no property uses the event {shown(event.name)}")
+        Diagnostic(event.position, "warning", f"no property uses the event {shown(event.name)}")
         for event in specification.events
         if event.name not in named
     ]
+
+
+def lint_statements(specification: tree.Specification) -> Iterator[Diagnostic]:
+    """Yield warnings about statements that C++ allows but that are probably mistakes: `if (v = 0.8)`, `x == 1;`."""
+    for node in tree.walk(specification):
+        if (
+            isinstance(
+                node, tree.IfStatement | tree.WhileStatement | tree.ForStatement | tree.ConditionalExpression
+            )
+            and node.condition is not None
+        ):
+            yield from _assigned(node.condition)
+        elif isinstance(node, tree.MessageTrigger) and node.when is not None:
+            yield from _assigned(node.when)
+        elif isinstance(node, tree.ExpressionStatement) and not _acts(node.expression):
+            text = "this statement has no effect; remove it, or assign its value to a variable"
+            if isinstance(node.expression, tree.BinaryExpression) and node.expression.operator == "==":
+                text = "this statement has no effect: `==` compares; to assign write `=`"
+            yield Diagnostic(node.position, "warning", text)
+
+
+def _assigned(condition: tree.Expression) -> Iterator[Diagnostic]:
+    """Yield warnings about assignments in a condition."""
+    if isinstance(condition, tree.Assignment) and condition.operator == "=":
+        text = "`=` assigns, and the condition is the value that was assigned; to compare write `==`"
+        yield Diagnostic(condition.position, "warning", text)
+    elif isinstance(condition, tree.UnaryExpression):
+        yield from _assigned(condition.operand)
+    elif isinstance(condition, tree.BinaryExpression) and condition.operator in ("&&", "||"):
+        yield from _assigned(condition.left)
+        yield from _assigned(condition.right)
+
+
+def _acts(expression: tree.Expression) -> bool:
+    """Whether an expression may have an effect; each call may."""
+    acting = (tree.Assignment, tree.IncrementExpression, tree.CallExpression, tree.NewExpression)
+    return stream_of(expression) is not None or any(
+        isinstance(node, acting) for node in tree.walk(expression)
+    )

@@ -1,4 +1,4 @@
-"""Functions that every specification can call: `<math.h>`, `std::min`, `std::to_string`, `strcpy`, …"""
+"""Compile functions that every specification can call: `<math.h>`, `std::min`, `std::to_string`, `strcpy`, …"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -8,7 +8,7 @@ from rosmop.check.assignables import Value
 from rosmop.check.assignments import require_original, store
 from rosmop.check.conversion import convert, number, require_number
 from rosmop.check.print_statements import formatted
-from rosmop.check.scope import Scope
+from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.form.positions import Position
 from rosmop.runtime import numbers, strings
@@ -17,10 +17,15 @@ from rosmop.types import value_types
 
 
 class Arguments:
-    """The arguments of a call, where it stands, and what it is called."""
+    """The arguments of a call, its position and its name."""
 
     def __init__(
-        self, scope: Scope, parts: tuple[str, ...], values: Sequence[Value], position: Position, site: int
+        self,
+        scope: FunctionScope,
+        parts: tuple[str, ...],
+        values: Sequence[Value],
+        position: Position,
+        site: int,
     ) -> None:
         self.scope = scope
         self.name = "::".join(parts)
@@ -29,7 +34,7 @@ class Arguments:
         self.site = site
 
     def count(self, least: int, most: int | None = None) -> None:
-        """Refuse another number of arguments."""
+        """Reject any other number of arguments."""
         most = least if most is None else most
         if not least <= len(self.values) <= most:
             wanted = str(least) if most == least else f"{least} to {most}"
@@ -38,15 +43,15 @@ class Arguments:
             )
 
     def text(self, index: int) -> nodes.Expression:
-        """An argument as a string."""
+        """Return an argument as a string."""
         return convert(self.scope, self.values[index], value_types.STRING)
 
     def result(self, result: nodes.Expression) -> Value:
-        """The result of a function without effects."""
+        """Return an expression as the value of the call."""
         return Value(result, self.position)
 
     def value(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> Value:
-        """The same, by a function of the form."""
+        """Return a call of a function of the form as the value."""
         return self.result(nodes.Call(kind, function, arguments, self.site))
 
 
@@ -54,7 +59,7 @@ Function = Callable[[Arguments], Value]
 
 
 def find_function(parts: tuple[str, ...]) -> Function | None:
-    """The library function of this name, with or without `std::`."""
+    """Return the library function of this name, with or without `std::`."""
     if parts[0] == "std" and len(parts) == 2:
         parts = parts[1:]
     return LIBRARY.get(parts[0]) if len(parts) == 1 else None
@@ -65,7 +70,7 @@ def _math(name: str, count: int) -> Function:
         call.count(count)
         for value in call.values:
             require_number(value, f"`{call.name}`")
-        if all(value.type == value_types.FLOAT for value in call.values):  # C++ has an overload for them
+        if all(value.type == value_types.FLOAT for value in call.values):  # C++ has an overload for floats
             return call.value(value_types.FLOAT, f"h_{name}f", *(value.form for value in call.values))
         doubles = [number(value.form, value_types.DOUBLE) for value in call.values]
         return call.value(value_types.DOUBLE, f"h_{name}", *doubles)
@@ -74,7 +79,7 @@ def _math(name: str, count: int) -> Function:
 
 
 def _math_of_floats(name: str, count: int) -> Function:
-    """`sqrtf` and its like."""
+    """Return the compiler of a function such as `sqrtf`."""
     function = _math(name, count)
 
     def of_floats(call: Arguments) -> Value:
@@ -90,7 +95,7 @@ def _math_of_floats(name: str, count: int) -> Function:
 
 
 def _rounded(name: str) -> Function:
-    """`lround` and its like."""
+    """Return the compiler of a function such as `lround`."""
     function = _math(name, 1)
 
     def to_integer(call: Arguments) -> Value:
@@ -100,7 +105,7 @@ def _rounded(name: str) -> Function:
 
 
 def _absolute_of_long(call: Arguments) -> Value:
-    """`labs`: of an integer, whatever is given."""
+    """Compile `labs`, which takes any number and returns an integer."""
     for value in call.values:
         require_number(value, "`labs`")
     call.values = [Value(number(value.form, value_types.LONG), value.position) for value in call.values]
@@ -122,13 +127,13 @@ def _extreme(name: str) -> Function:
             kind = left.type if left.type == right.type else value_types.common(left.type, right.type)
             return call.value(kind, f"h_{name}", *(number(value.form, kind) for value in call.values))
         if left.type != right.type or not isinstance(
-            left.type, value_types.String | value_types.Time | value_types.Duration
+            left.type, value_types.StringType | value_types.TimeType | value_types.DurationType
         ):
             raise SpecificationError.at(
                 call.position, f"`{call.name}` has no meaning for {left.type} and {right.type}"
             )
         first = left.form
-        if isinstance(left.type, value_types.String):
+        if isinstance(left.type, value_types.StringType):
             first = nodes.Call(left.type, "o_charged", (first,), call.site)
         return call.value(left.type, f"h_{name}", first, right.form)
 
@@ -148,11 +153,11 @@ def _to_string(call: Arguments) -> Value:
     call.count(1)
     value = call.values[0]
     require_number(value, "`std::to_string`")
-    floating = isinstance(value.type, value_types.Floating)
+    floating = isinstance(value.type, value_types.FloatingType)
     return call.value(value_types.STRING, f"h_to_{'floating' if floating else 'integer'}", value.form)
 
 
-def _parser(kind: value_types.Integer) -> Function:
+def _parser(kind: value_types.IntegerType) -> Function:
     def function(call: Arguments) -> Value:
         call.count(1, 3)
         if len(call.values) > 1 and call.values[1].constant != 0:
@@ -166,7 +171,7 @@ def _parser(kind: value_types.Integer) -> Function:
     return function
 
 
-def _parse_floating(kind: value_types.Floating) -> Function:
+def _parse_floating(kind: value_types.FloatingType) -> Function:
     def function(call: Arguments) -> Value:
         call.count(1)
         return call.value(kind, "h_parse_floating", call.text(0), nodes.Literal(value_types.INT, kind.bits))
@@ -177,7 +182,7 @@ def _parse_floating(kind: value_types.Floating) -> Function:
 def _lenient(kind: value_types.Type, name: str) -> Function:
     def function(call: Arguments) -> Value:
         call.count(1)
-        wide = value_types.LONG if isinstance(kind, value_types.Integer) else kind
+        wide = value_types.LONG if isinstance(kind, value_types.IntegerType) else kind
         return call.result(number(nodes.Call(wide, f"h_{name}", (call.text(0),)), kind))
 
     return function
@@ -196,7 +201,7 @@ def _length(call: Arguments) -> Value:
 
 def _buffer(call: Arguments) -> Value:
     target = call.values[0]
-    if not isinstance(target.type, value_types.Characters):
+    if not isinstance(target.type, value_types.CharactersType):
         raise SpecificationError.at(
             target.position, f"`{call.name}` needs a `char` buffer; for a {target.type} write `=` or `+=`"
         )
@@ -221,7 +226,7 @@ def _fills_at_most(call: Arguments) -> Value:
 
 
 def _stored(call: Arguments, target: Value, function: str, *arguments: nodes.Expression) -> Value:
-    """The buffer after a function of the form has filled it."""
+    """Return the buffer after a function of the form has filled it."""
     filled = nodes.Call(value_types.CHARACTERS, function, (target.form, *arguments), call.site)
     return Value(store(call.scope, target, filled), call.position)
 
@@ -243,7 +248,7 @@ def _prints_at_most(call: Arguments) -> Value:
 def _printed(
     call: Arguments, target: Value, function: str, text: nodes.Expression, *arguments: nodes.Expression
 ) -> Value:
-    """The length of a text that a function of the form puts into a buffer."""
+    """Return the length of a text that a function of the form puts into a buffer."""
     made = nodes.Read(value_types.STRING, call.scope.temporary())
     filled = _stored(call, target, function, made, *arguments)
     length = nodes.Call(value_types.INT, "h_len", (made,))
@@ -287,7 +292,7 @@ LIBRARY: Mapping[str, Function] = MappingProxyType(
     }
 )
 
-_LIMITED: Mapping[str, value_types.Integer] = MappingProxyType(
+_LIMITED: Mapping[str, value_types.IntegerType] = MappingProxyType(
     {
         "SCHAR": value_types.INT8,
         "UCHAR": value_types.UINT8,

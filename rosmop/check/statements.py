@@ -1,6 +1,6 @@
-"""Statements. One function for each kind of statement of `syntax/tree.py`.
+"""Compile statements: one function for each class of statement in `text/tree.py`.
 
-A statement that is refused is noted and the next one is looked at, so that one check finds as much as it can.
+An error is noted and the next statement is compiled, so one check finds as many errors as it can.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,7 +12,7 @@ from rosmop.check.assignments import write_store
 from rosmop.check.conversion import condition, convert
 from rosmop.check.expressions import assignment
 from rosmop.check.initializers import converted, elements
-from rosmop.check.scope import Scope
+from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.form.positions import Position
 from rosmop.runtime import numbers
@@ -24,11 +24,11 @@ from rosmop.types.resolve import record, resolve
 from roswire import names
 
 LARGE = 4096
-"""A local variable of so many bytes is charged when it is declared."""
+"""The size in bytes from which a local variable is charged at its declaration."""
 
 
-def write(scope: Scope, node: tree.Statement) -> None:
-    """Write the lines of a statement."""
+def write(scope: FunctionScope, node: tree.Statement) -> None:
+    """Write a statement."""
     around = len(scope.loops)
     try:
         with scope.at(node):
@@ -41,7 +41,7 @@ def write(scope: Scope, node: tree.Statement) -> None:
 # Declarations
 
 
-def _declaration(scope: Scope, node: tree.Declaration) -> None:
+def _declaration(scope: FunctionScope, node: tree.Declaration) -> None:
     try:
         _declare(scope, node)
     except SpecificationError:
@@ -49,7 +49,7 @@ def _declaration(scope: Scope, node: tree.Declaration) -> None:
         raise
 
 
-def _declare(scope: Scope, node: tree.Declaration) -> None:
+def _declare(scope: FunctionScope, node: tree.Declaration) -> None:
     if node.type.static:
         raise SpecificationError.at(
             node.position, "there are no static variables in functions; declare it before the events"
@@ -65,42 +65,44 @@ def _declare(scope: Scope, node: tree.Declaration) -> None:
         scope.evaluate(nodes.Assign(kind, variable.code, value))
 
 
-def _is_copy(scope: Scope, declarator: tree.Declarator, kind: value_types.Type) -> bool:
-    """Whether a `char *` begins with the characters of another one."""
+def _is_copy(scope: FunctionScope, declarator: tree.Declarator, kind: value_types.Type) -> bool:
+    """Whether a `char *` is initialised with another one."""
     if kind != value_types.CHARACTERS or declarator.is_array or not isinstance(declarator.value, tree.Name):
         return False
-    return isinstance(scope.value_of(declarator.value).type, value_types.Characters)
+    return isinstance(scope.value_of(declarator.value).type, value_types.CharactersType)
 
 
 def known(
-    scope: Scope, name: tree.TypeName, declarator: tree.Declarator, kind: value_types.Type
+    scope: FunctionScope, name: tree.TypeName, declarator: tree.Declarator, kind: value_types.Type
 ) -> bool | int | float | None:
-    """The value of a `const` number whose value is written down, for sizes of arrays and cases; None for others."""
+    """Return the value of a `const` number that is a literal, for array sizes and cases; else None."""
     if not name.constant or not value_types.is_number(kind) or declarator.is_array:
         return None
     node = declarator.value
     if node is None and declarator.arguments is not None and len(declarator.arguments) == 1:
         node = declarator.arguments[0]
-    if node is None or isinstance(node, tree.Elements):
+    if node is None or isinstance(node, tree.InitializerList):
         return None
     value = scope.value_of(node).constant
-    if isinstance(kind, value_types.Floating):
+    if isinstance(kind, value_types.FloatingType):
         return None if value is None or isinstance(value, bytes) else _rounded(float(value), kind)
     if not isinstance(value, int):
         return None
     return (
-        numbers.wrap(value, kind.bits, kind.signed) if isinstance(kind, value_types.Integer) else bool(value)
+        numbers.wrap(value, kind.bits, kind.signed)
+        if isinstance(kind, value_types.IntegerType)
+        else bool(value)
     )
 
 
-def _rounded(value: float, kind: value_types.Floating) -> float:
+def _rounded(value: float, kind: value_types.FloatingType) -> float:
     return value if kind.bits == 64 else numbers.f32(value)
 
 
 def initial(
-    scope: Scope, name: tree.TypeName, declarator: tree.Declarator
+    scope: FunctionScope, name: tree.TypeName, declarator: tree.Declarator
 ) -> tuple[value_types.Type, nodes.Expression]:
-    """The type of a declared variable, and its first value."""
+    """Return the type and the first value of a declared variable."""
     if name.name == ("auto",):
         return _deduced(scope, declarator)
     kind = resolve(name, scope.messages)
@@ -116,23 +118,23 @@ def initial(
     return kind, converted(scope, declarator.value, kind)
 
 
-def _deduced(scope: Scope, declarator: tree.Declarator) -> tuple[value_types.Type, nodes.Expression]:
-    if declarator.value is None or isinstance(declarator.value, tree.Elements) or declarator.is_array:
+def _deduced(scope: FunctionScope, declarator: tree.Declarator) -> tuple[value_types.Type, nodes.Expression]:
+    if declarator.value is None or isinstance(declarator.value, tree.InitializerList) or declarator.is_array:
         raise SpecificationError.at(declarator.position, "`auto` needs a value: `auto x = …;`")
     value = scope.value_of(declarator.value)
-    if isinstance(value.type, value_types.Void | value_types.Index):
+    if isinstance(value.type, value_types.VoidType | value_types.IteratorType):
         raise SpecificationError.at(
             declarator.position, f"a variable cannot hold {value.type}; use the expression itself"
         )
-    kind = value_types.STRING if isinstance(value.type, value_types.Characters) else value.type
+    kind = value_types.STRING if isinstance(value.type, value_types.CharactersType) else value.type
     return kind, convert(scope, value, kind)
 
 
 def _array(
-    scope: Scope, kind: value_types.Type, declarator: tree.Declarator
+    scope: FunctionScope, kind: value_types.Type, declarator: tree.Declarator
 ) -> tuple[value_types.Type, nodes.Expression]:
     size = _array_size(scope, declarator)
-    if kind == value_types.CHAR and not isinstance(declarator.value, tree.Elements):
+    if kind == value_types.CHAR and not isinstance(declarator.value, tree.InitializerList):
         site, nothing = scope.lines.site, nodes.Literal(value_types.CHAR, 0)
         zeros = nodes.Call(
             value_types.CHARACTERS, "e_repeat", (nodes.Literal(value_types.ULONG, size), nothing), site
@@ -142,7 +144,7 @@ def _array(
         text = converted(scope, declarator.value, value_types.STRING)
         if size is None:
             return value_types.CHARACTERS, nodes.Call(value_types.CHARACTERS, "t_zeroed", (text,))
-        if isinstance(declarator.value, tree.Text) and len(declarator.value.value) >= size:
+        if isinstance(declarator.value, tree.StringLiteral) and len(declarator.value.value) >= size:
             length = len(declarator.value.value)
             raise SpecificationError.at(
                 declarator.value.position,
@@ -150,17 +152,17 @@ def _array(
             )
         return value_types.CHARACTERS, nodes.Call(value_types.CHARACTERS, "e_filled", (zeros, text), site)
     if size is None:
-        assert isinstance(declarator.value, tree.Elements)  # _array_size has looked
+        assert isinstance(declarator.value, tree.InitializerList)  # _array_size has checked
         size = len(declarator.value.items)
-    array = value_types.Vector(kind, size)
+    array = value_types.VectorType(kind, size)
     if declarator.value is None:
         return array, nodes.Zero(array)
-    if not isinstance(declarator.value, tree.Elements):
+    if not isinstance(declarator.value, tree.InitializerList):
         raise SpecificationError.at(declarator.value.position, "an array is initialised by `{…}`")
     return array, elements(scope, declarator.value, array)
 
 
-def _array_size(scope: Scope, declarator: tree.Declarator) -> int | None:
+def _array_size(scope: FunctionScope, declarator: tree.Declarator) -> int | None:
     if declarator.size is None:
         if declarator.value is None:
             raise SpecificationError.at(declarator.position, "an array needs a size: `name[3]`")
@@ -178,30 +180,32 @@ def _array_size(scope: Scope, declarator: tree.Declarator) -> int | None:
 # Expressions and control
 
 
-def _evaluate(scope: Scope, node: tree.Evaluate) -> None:
+def _evaluate(scope: FunctionScope, node: tree.ExpressionStatement) -> None:
     expression = node.expression
     level = call_expressions.stream_of(expression)
     if level is not None:
         scope.evaluate(call_expressions.streamed(scope, node, level, expression, headed=True).form)
-    elif isinstance(expression, tree.Assign):
+    elif isinstance(expression, tree.Assignment):
         first, target, assigned = assignment(scope, expression)
         for each in first:
             scope.evaluate(each)
         write_store(scope, target, assigned)
-    elif isinstance(expression, tree.Step):
-        prefix = tree.Step(expression.position, expression.operator, expression.target, prefix=True)
+    elif isinstance(expression, tree.IncrementExpression):
+        prefix = tree.IncrementExpression(
+            expression.position, expression.operator, expression.target, prefix=True
+        )
         scope.evaluate(scope.value_of(prefix).form)
     else:
         scope.evaluate(scope.value_of(expression).form)
 
 
-def _block(scope: Scope, node: tree.Block) -> None:
+def _block(scope: FunctionScope, node: tree.Block) -> None:
     with scope.block():
         for statement in node.statements:
             write(scope, statement)
 
 
-def _if(scope: Scope, node: tree.If) -> None:
+def _if(scope: FunctionScope, node: tree.IfStatement) -> None:
     with scope.at(node.condition):
         test, site = condition(scope.value_of(node.condition)), scope.lines.site
     yes = loops.body(scope, [node.yes], write)
@@ -209,30 +213,30 @@ def _if(scope: Scope, node: tree.If) -> None:
     scope.add(nodes.If(site, test, yes, no))
 
 
-def _break(scope: Scope, node: tree.Statement) -> None:
+def _break(scope: FunctionScope, node: tree.Statement) -> None:
     if not scope.loops:
-        raise SpecificationError.at(node.position, "`break` stands in a loop or a `switch`")
+        raise SpecificationError.at(node.position, "`break` is only allowed in a loop or a `switch`")
     scope.add(nodes.Break(scope.lines.site))
 
 
-def _continue(scope: Scope, node: tree.Statement) -> None:
+def _continue(scope: FunctionScope, node: tree.Statement) -> None:
     loops.write_continue(scope, node.position)
 
 
-def _return(scope: Scope, node: tree.Return) -> None:
+def _return(scope: FunctionScope, node: tree.ReturnStatement) -> None:
     if scope.role == "function":
         _return_value(scope, node)
         return
     if node.value is not None:
         hint = "write `return;` to drop the message" if scope.role == "action" else "write `return;`"
-        raise SpecificationError.at(node.value.position, f"there is nobody to return a value to; {hint}")
+        raise SpecificationError.at(node.value.position, f"there is no caller to return a value to; {hint}")
     if scope.role == "action":
         scope.add(nodes.Drop(scope.lines.site, anyway=True))
     scope.add(nodes.Leave(scope.lines.site, True if scope.role in ("action", "timer") else None))
 
 
-def _return_value(scope: Scope, node: tree.Return) -> None:
-    void = isinstance(scope.result, value_types.Void)
+def _return_value(scope: FunctionScope, node: tree.ReturnStatement) -> None:
+    void = isinstance(scope.result, value_types.VoidType)
     if void != (node.value is None):
         hint = (
             "this function has no value; write `return;`" if void else f"this function returns {scope.result}"
@@ -243,28 +247,28 @@ def _return_value(scope: Scope, node: tree.Return) -> None:
     scope.add(nodes.Return(scope.lines.site, value, tuple(variable.code for variable in scope.references)))
 
 
-# What only specifications have
+# Statements that C++ lacks
 
 
-def _drop(scope: Scope, node: tree.Statement) -> None:
+def _drop(scope: FunctionScope, node: tree.Statement) -> None:
     if scope.drop_refused is not None:
-        raise SpecificationError.at(node.position, f"`DROP;` cannot stand here: {scope.drop_refused}")
+        raise SpecificationError.at(node.position, f"`DROP;` is not allowed here: {scope.drop_refused}")
     scope.add(nodes.Drop(scope.lines.site, anyway=scope.role != "handler"))  # a timeout has no message
 
 
-def _reset(scope: Scope, node: tree.Statement) -> None:
+def _reset(scope: FunctionScope, node: tree.Statement) -> None:
     if scope.role != "handler":
-        raise SpecificationError.at(node.position, "`__RESET;` stands in the handlers of a property")
+        raise SpecificationError.at(node.position, "`__RESET;` is only allowed in the handlers of a property")
     scope.add(nodes.Reset(scope.lines.site))
 
 
-def _delete(scope: Scope, node: tree.Delete) -> None:
+def _delete(scope: FunctionScope, node: tree.DeleteStatement) -> None:
     value = scope.value_of(node.target)
-    if not isinstance(value.type, value_types.Characters):
+    if not isinstance(value.type, value_types.CharactersType):
         raise SpecificationError.at(node.position, f"`delete` is for `char` buffers; {value.type} needs none")
 
 
-def _publish(scope: Scope, node: tree.Publish) -> None:
+def _publish(scope: FunctionScope, node: tree.PublishStatement) -> None:
     check_topic(node.topic, node.position)
     kind = record(node.type_position, node.type, scope.messages)
     value = scope.value_of(node.value)
@@ -275,26 +279,26 @@ def _publish(scope: Scope, node: tree.Publish) -> None:
 
 
 def check_topic(topic: str, position: Position) -> None:
-    """Refuse the name of a topic or service that is not global and canonical."""
+    """Reject a topic or service name that is not global and canonical."""
     if not names.is_global_name(topic):
         hint = f"; write `/{topic}`" if names.is_global_name("/" + topic) else "; write for example `/a/b`"
-        raise SpecificationError.at(position, f"{shown(topic)} is no global name{hint}")
+        raise SpecificationError.at(position, f"{shown(topic)} is not a global name{hint}")
 
 
-_KINDS: Mapping[type[tree.Statement], Callable[[Scope, Any], None]] = {
+_KINDS: Mapping[type[tree.Statement], Callable[[FunctionScope, Any], None]] = {
     tree.Declaration: _declaration,
-    tree.Evaluate: _evaluate,
+    tree.ExpressionStatement: _evaluate,
     tree.Block: _block,
-    tree.If: _if,
-    tree.While: partial(loops.write_while, write=write),
-    tree.For: partial(loops.write_for, write=write),
-    tree.RangeFor: partial(loops.write_range_for, write=write),
-    tree.Switch: partial(loops.write_switch, write=write),
-    tree.Break: _break,
-    tree.Continue: _continue,
-    tree.Return: _return,
-    tree.Drop: _drop,
-    tree.Reset: _reset,
-    tree.Delete: _delete,
-    tree.Publish: _publish,
+    tree.IfStatement: _if,
+    tree.WhileStatement: partial(loops.write_while, write=write),
+    tree.ForStatement: partial(loops.write_for, write=write),
+    tree.RangeForStatement: partial(loops.write_range_for, write=write),
+    tree.SwitchStatement: partial(loops.write_switch, write=write),
+    tree.BreakStatement: _break,
+    tree.ContinueStatement: _continue,
+    tree.ReturnStatement: _return,
+    tree.DropStatement: _drop,
+    tree.ResetStatement: _reset,
+    tree.DeleteStatement: _delete,
+    tree.PublishStatement: _publish,
 }

@@ -1,23 +1,23 @@
-"""A compiled set of specifications as data: what the compiler writes, and what runs it reads."""
+"""A compiled set of specifications as data: the compiler writes it, and the engine runs it."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rosmop.form import nodes
 from rosmop.form.connected_groups import sharing, way_of
-from rosmop.form.positions import Finding, Position
+from rosmop.form.positions import Diagnostic, Position
 from rosmop.form.sites import Site, Symbols
 from rosmop.logics.interface import CompiledProperty
 from rosmop.types import value_types
-from rosmop.types.messages import Messages
+from rosmop.types.messages import MessageTypes
 from rosmop.types.value_types import Type
 
 
 @dataclass(frozen=True)
 class EventCode:
-    """A compiled event: the name of its function, and what makes it happen.
+    """A compiled event: the name of its function, and its trigger.
 
-    `type` is the message type (of a service: that of the request or response), `service_type` the service's.
+    `type` is the type of the message, request or response, `service_type` that of the service.
     """
 
     name: str
@@ -29,27 +29,27 @@ class EventCode:
     service_type: str | None = None
     period_ns: int | None = None
     binds: tuple[int, ...] = ()
-    """The parameters of the specification that it binds, by their numbers."""
+    """Numbers of the specification's parameters that the event binds."""
     key: str = ""
-    """Of an event on messages of a parametric specification: its function for the values of these."""
+    """For an event on messages, the function that returns the values of these parameters."""
     creates: bool = False
-    """A slice may begin with it."""
+    """Whether the event may begin a slice."""
     plain: bool = False
-    """Where its key is known it has happened, and there is nothing to do."""
+    """Whether the event has neither an action nor a `when`, so its key alone decides."""
     acts: bool = False
-    """Its action does more than to change the slice's own variables."""
+    """Whether the action does more than change the slice's own variables."""
 
     @property
     def way(self) -> str | None:
-        """What its messages come on: the topic, or the part of a service (see `way_of`); None of a timer."""
+        """Return the topic or the part of a service (see `way_of`) of the messages; None for a timer."""
         return self.topic if self.topic is None or self.part is None else way_of(self.topic, self.part)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of a specification. `when_true` and `when_false` are variables of the code (double) for its sides.
+    """A comparison of a specification. `when_true` and `when_false` are variables (double) for its sides.
 
-    The left one is infinite until it came up. `threshold`: the side that is a constant, 0 or 1; None if neither is.
+    The left one is infinite until the comparison is evaluated. `threshold`: the constant side (0, 1), or None.
     """
 
     position: Position
@@ -59,13 +59,13 @@ class Comparison:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """All of them."""
+        """Return the variables of both sides for both results."""
         return (*self.when_true, *self.when_false)
 
 
 @dataclass(frozen=True)
 class Publication:
-    """A topic that a specification publishes, and where it says so."""
+    """A topic that a specification publishes, and the position of the statement."""
 
     specification: str
     topic: str
@@ -75,9 +75,9 @@ class Publication:
 
 @dataclass(frozen=True)
 class Slicing:
-    """What slices differ in: the parameters (name in the text, name in the code, type), and their own variables.
+    """The parameters of slices (name in the text, name in the code, type), and their own variables.
 
-    `enforces`: the specification drops or changes messages, or publishes some.
+    `enforces`: the specification drops, changes or publishes messages.
     """
 
     parameters: tuple[tuple[str, str, value_types.Type], ...]
@@ -87,7 +87,7 @@ class Slicing:
 
 @dataclass(frozen=True)
 class PropertyCode:
-    """A compiled property: its monitor, and for each category that is handled the name of the function.
+    """A compiled property: its monitor, and the name of the handler's function for each handled category.
 
     `enforcement` says whether and how a violation can be prevented.
     """
@@ -100,17 +100,17 @@ class PropertyCode:
 
 @dataclass(frozen=True)
 class SpecificationCode:
-    """A compiled specification. `variables` are its shared variables: name in the text to name in the code.
+    """A compiled specification. `variables` maps its shared variables to their names in the code.
 
-    `start` are the functions by which it begins: constants and zeros, first values, `init`.
+    `start` are the functions that initialise it: constants and zeros, first values, `init`.
     """
 
     name: str
     position: Position
     identity: bytes
-    """The same for the same text, wherever it stands."""
+    """A hash of the specification that ignores positions."""
     reached: frozenset[str]
-    """The message types that it names, and those they are made of (`reach.py`)."""
+    """The message types that it names, with their nested types."""
     file: str
     hold: bool
     start: tuple[str, ...]
@@ -119,30 +119,30 @@ class SpecificationCode:
     properties: tuple[PropertyCode, ...]
     variables: Mapping[str, str]
     uses: frozenset[str]
-    """The other specifications whose variables it uses."""
+    """Other specifications whose variables this one uses."""
     comparisons: tuple[Comparison, ...] = ()
-    """The comparisons that are noted, in the order of the text."""
+    """Comparisons whose margins are noted, in the order of the text."""
     slicing: Slicing | None = None
-    """Of a parametric specification: what its slices differ in."""
+    """Parameters and own variables of slices; None without parameters."""
     begins: bool = False
-    """Declared `begin`: where its state is lost it begins again and does not hold its topics."""
+    """Declared `begin`: when its state is lost, it restarts instead of holding its topics."""
 
 
 @dataclass(eq=False)
 class Compiled:
-    """A set of specifications: their functions in the intermediate form, by name, and what is in them."""
+    """A set of specifications, with their functions in the intermediate form, by name."""
 
     specifications: tuple[SpecificationCode, ...]
-    warnings: tuple[Finding, ...]
+    warnings: tuple[Diagnostic, ...]
     functions: Mapping[str, nodes.Function]
     sites: Sequence[Site]
     types: Mapping[str, Type]
-    """Those of variables, by their names in the form."""
-    messages: Messages
+    """Types of variables, by their names in the form."""
+    messages: MessageTypes
     publications: tuple[Publication, ...]
 
     def alone(self, names: Collection[str]) -> "Compiled":
-        """As `part`, without anything of the others: the same whatever else is in the set."""
+        """Return `part` without data of the other specifications, so that it does not depend on them."""
         part = self.part(names)
         functions = {name: each for name, each in self.functions.items() if Symbols.owner(name) in names}
         found = [node for function in functions.values() for node in nodes.walk(function)]
@@ -157,17 +157,17 @@ class Compiled:
         )
 
     def groups(self, names: Collection[str]) -> list[set[str]]:
-        """Those that share variables, however indirectly, with one of these."""
+        """Return the groups of specifications that share variables, also indirectly, with one of `names`."""
         uses = {one.name: one.uses for one in self.specifications}
         return [group for group in sharing(uses) if not group.isdisjoint(names)]
 
     def without(self, names: Collection[str]) -> "Compiled":
-        """All but these, and those that share variables with them."""
+        """Return the set without `names` and without the specifications that share variables with them."""
         gone = {name for group in self.groups(names) for name in group}
         return self.part({one.name for one in self.specifications} - gone)
 
     def part(self, names: Collection[str]) -> "Compiled":
-        """These of the specifications only; all that share variables with one of them must be among them."""
+        """Return the set with only `names`, which must include all that share variables with one of them."""
         return replace(
             self,
             specifications=tuple(one for one in self.specifications if one.name in names),
@@ -181,7 +181,7 @@ class Compiled:
 
     @property
     def stamped(self) -> frozenset[str]:
-        """The topics whose messages do."""
+        """Return the topics whose messages begin with a `std_msgs/Header`."""
         events = [
             event
             for specification in self.specifications

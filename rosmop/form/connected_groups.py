@@ -1,10 +1,10 @@
-"""What belongs together, however indirectly."""
+"""Group connected items, also indirectly connected ones."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 
 def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
-    """Specifications by those that share variables, however indirectly; `uses` says whose each one uses."""
+    """Group specifications that share variables, also indirectly; `uses` lists whose variables each uses."""
     names = list(uses)
     return [
         {names[number] for number in group} for group in connected([(name, *uses[name]) for name in names])
@@ -12,7 +12,7 @@ def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
 
 
 def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
-    """The numbers of what has keys in common, however indirectly, in order."""
+    """Return groups of indices whose items have keys in common, also indirectly, in order."""
     owners: dict[object, int] = {}
     chief = list(range(len(keys)))
 
@@ -31,5 +31,5 @@ def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
 
 
 def way_of(service: str, part: str) -> str:
-    """What stands for the `request` or `response` (the `part`) of a service where topics stand: none has a blank."""
+    """Return the name that replaces a topic for the `request` or `response` of a service; no topic has a blank."""
     return f"{service} {part}"

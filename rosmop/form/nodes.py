@@ -1,26 +1,24 @@
 """The form: typed expressions, statements and functions, without names to look up or types to infer.
 
-Everything is an immutable value. Types are those of `types/value_types.py`; every expression has one, and its operands
-have the types that the operation takes (conversions are written out). Values are as in C++ on a 64-bit machine:
-integers of their width that wrap, floats of 32 or 64 bits, strings of bytes. Times and durations are nanoseconds.
-Vectors and messages are references: assigning one shares it, so copies are written out, too (`Copy`).
+All nodes are immutable. Types are those of `types/value_types.py`; every expression has one, and its operands have the
+types that the operation takes (conversions are explicit). Values are as in C++ on a 64-bit machine: integers wrap at
+their width, floats have 32 or 64 bits, strings are bytes. Times and durations are nanoseconds. Vectors and messages
+are references: assigning one shares it, so copies are also explicit (`Copy`).
 
-Names are of the set of specifications: `g…` variables that specifications share, all others belong to one call of one
-function. A *site* is the number of a place in the text, to tell faults by; -1 is that of the statement.
+Names belong to the set of specifications (`g…`, the variables that specifications share) or to one call of one
+function. A *site* is the number of a position in the text, for reports of faults; -1 means the statement's own site.
 
-A message is its bytes, from 0. A `Spot` is a position in it: a distance from the start, or from a position that a
-statement before has found and named. What is read beyond the end is a fault.
+A message is its bytes, from 0. A `Spot` is a position in it: an offset from the start, or from a position that an
+earlier statement named. Reading beyond the end is a fault.
 
-What an action does to the world is a list of effects, in order: drop this message (`Drop`, or a `Return` that drops),
-write fields (`WriteBack`), a line of output (`Log`), a message to be published (`Publish`), `Reset` of the property.
-Bounds: `Charge` and `Allocate` take from the budget of instructions and bytes, as do functions that make or look at
-something long; what exceeds them is a fault.
+The effects of an action are a list, in order: drop this message (`Drop`, or a `Return` that drops), write fields
+(`WriteBack`), print a line (`Log`), publish a message (`Publish`), restart the property (`Reset`). Each back end has a
+row for each kind of expression and statement: an implementation, or `Left`. Bounds: `Charge` and `Allocate` take from
+the budgets of instructions and bytes, as do functions with long values; exceeding a budget is a fault.
 """
 
-import re
-from collections.abc import Callable, Iterator, Mapping
-from types import UnionType
-from typing import Any, get_args
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -28,54 +26,54 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 CHARGED = 1024
-"""A message longer than this is charged when an array or all of it is decoded."""
+"""The size of a message in bytes from which decoding an array or the whole message is charged."""
 
 SHORT = 64
-"""To compare with a string of so many bytes takes no longer than any other instruction."""
+"""Comparing with a string of at most this many bytes costs no more than other instructions."""
 
 
-class Node(msgspec.Struct, frozen=True, tag=True, tag_field="node", array_like=True):
-    """A part of the form, which can be sent as it is."""
+class FormNode(msgspec.Struct, frozen=True, tag=True, tag_field="node", array_like=True):
+    """A node of the form. It can be serialised."""
 
 
 # Expressions
 
 
-class Literal(Node, frozen=True):
-    """A constant. What is no value of the language (None, and names of parts of a time) has the type void."""
+class Literal(FormNode, frozen=True):
+    """A constant. None and the names of parts of a time have the type void, as they are not values of the language."""
 
     type: Type
     value: bool | int | float | bytes | None
 
 
-class Read(Node, frozen=True):
+class Read(FormNode, frozen=True):
     """The value of a variable."""
 
     type: Type
     name: str
 
 
-class Assign(Node, frozen=True):
-    """Give a variable a value; the value."""
+class Assign(FormNode, frozen=True):
+    """Assign a value to a variable; the result is the value."""
 
     type: Type
     name: str
     value: "Expression"
 
 
-class Convert(Node, frozen=True):
-    """A number as one of another type: integers wrap, floating-point numbers are truncated toward zero within the
-    limits (NaN is 0) or rounded, and what is not zero is true.
+class Convert(FormNode, frozen=True):
+    """Convert a number to another type: integers wrap, floating-point numbers are truncated toward zero within the
+    limits (NaN is 0) or rounded, and every number other than zero is true.
     """
 
     type: Type
     value: "Expression"
 
 
-class Arithmetic(Node, frozen=True):
-    """`+ - * / % & | ^ << >>` of numbers of this type; of a shift the right operand may have another.
+class Arithmetic(FormNode, frozen=True):
+    """`+ - * / % & | ^ << >>` of numbers of this type; the right operand of a shift may have another type.
 
-    Integers wrap, shifts count modulo the width, integer division truncates and is a fault by zero.
+    Integers wrap; shifts count modulo the width; integer division truncates, and faults if the divisor is zero.
     """
 
     type: Type
@@ -85,7 +83,7 @@ class Arithmetic(Node, frozen=True):
     site: int
 
 
-class Unary(Node, frozen=True):
+class Unary(FormNode, frozen=True):
     """`-`, `~` or `abs` of a number; integers wrap."""
 
     type: Type
@@ -93,8 +91,8 @@ class Unary(Node, frozen=True):
     value: "Expression"
 
 
-class Moment(Node, frozen=True):
-    """A sum or difference of times and durations, exact; a fault beyond what this type holds."""
+class Moment(FormNode, frozen=True):
+    """An exact sum or difference of times and durations; a fault if this type cannot hold it."""
 
     type: Type
     operator: str
@@ -103,8 +101,8 @@ class Moment(Node, frozen=True):
     site: int
 
 
-class MomentOf(Node, frozen=True):
-    """A time or duration of seconds and nanoseconds (`long`), exact; a fault beyond what this type holds."""
+class MomentOf(FormNode, frozen=True):
+    """A time or duration from seconds and nanoseconds (`long`); a fault if this type cannot hold it."""
 
     type: Type
     seconds: "Expression"
@@ -112,8 +110,8 @@ class MomentOf(Node, frozen=True):
     site: int
 
 
-class Compare(Node, frozen=True):
-    """`== != < > <= >=` of two values of the same type; vectors and messages are charged by what they hold."""
+class Compare(FormNode, frozen=True):
+    """`== != < > <= >=` of two values of the same type; vectors and messages are charged by their size."""
 
     operator: str
     left: "Expression"
@@ -122,9 +120,9 @@ class Compare(Node, frozen=True):
     type: Type = value_types.BOOL
 
 
-class CompareTexts(Node, frozen=True):
-    """The same of strings. The left one is charged by its length, unless one of them is known to be `short`, or the
-    right one is a variable that holds few bytes.
+class CompareTexts(FormNode, frozen=True):
+    """Compare strings. The left one is charged by its length, unless one of them is known to be `short`, or the right
+    one is a variable with few bytes.
     """
 
     operator: str
@@ -135,8 +133,8 @@ class CompareTexts(Node, frozen=True):
     type: Type = value_types.BOOL
 
 
-class Logical(Node, frozen=True):
-    """`and`, `or`: the right operand is looked at only if the left one does not decide."""
+class Logical(FormNode, frozen=True):
+    """`and`, `or`: the right operand is evaluated only if the left one does not decide."""
 
     operator: str
     left: "Expression"
@@ -144,14 +142,14 @@ class Logical(Node, frozen=True):
     type: Type = value_types.BOOL
 
 
-class Not(Node, frozen=True):
-    """The opposite."""
+class Not(FormNode, frozen=True):
+    """Logical negation."""
 
     value: "Expression"
     type: Type = value_types.BOOL
 
 
-class Conditional(Node, frozen=True):
+class Conditional(FormNode, frozen=True):
     """`test ? yes : no`."""
 
     type: Type
@@ -160,63 +158,61 @@ class Conditional(Node, frozen=True):
     no: "Expression"
 
 
-class Sequence(Node, frozen=True):
-    """All items in order; the value is that of the chosen one."""
+class Sequence(FormNode, frozen=True):
+    """Evaluate all items in order; the result is the value of the chosen one."""
 
     type: Type
     items: "tuple[Expression, ...]"
     chosen: int
 
 
-class Discard(Node, frozen=True):
-    """An expression for its effect alone."""
+class Discard(FormNode, frozen=True):
+    """Evaluate an expression for its effect only."""
 
     value: "Expression"
     type: Type = value_types.VOID
 
 
-class Item(Node, frozen=True):
-    """A field of a message, or a part of what a function hands back, by its number."""
+class Item(FormNode, frozen=True):
+    """A field of a message, or a part of a function's result, by number."""
 
     type: Type
     base: "Expression"
     number: int
 
 
-class Vector(Node, frozen=True):
-    """A vector of these elements, and so many zeros behind them."""
+class Vector(FormNode, frozen=True):
+    """A vector of these elements, followed by `zeros` zero values."""
 
-    type: value_types.Vector
+    type: value_types.VectorType
     items: "tuple[Expression, ...]"
     zeros: int = 0
 
 
-class Zero(Node, frozen=True):
-    """A zero value, newly made."""
+class Zero(FormNode, frozen=True):
+    """A new zero value."""
 
     type: Type
 
 
-class Copy(Node, frozen=True):
-    """A copy of a vector or message with all that is in it."""
+class Copy(FormNode, frozen=True):
+    """A deep copy of a vector or message."""
 
     type: Type
     value: "Expression"
     site: int
 
 
-class Recast(Node, frozen=True):
-    """A vector of bytes (or of vectors of them) as one of bytes of another kind."""
+class Recast(FormNode, frozen=True):
+    """A vector of bytes (or of vectors of them), converted to another type of bytes."""
 
-    type: value_types.Vector
+    type: value_types.VectorType
     value: "Expression"
     site: int
 
 
-class OfType(Node, frozen=True):
-    """What a function is handed to deal with values of a type: how to make a `zero`,
-    `copy` one, `measure` its bytes.
-    """
+class OfType(FormNode, frozen=True):
+    """A function for a type, passed as an argument: make a `zero`, `copy` a value, or `measure` its bytes."""
 
     what: str
     of: Type
@@ -224,8 +220,8 @@ class OfType(Node, frozen=True):
     type: Type = value_types.VOID
 
 
-class Call(Node, frozen=True):
-    """A call of a function of `functions.py`."""
+class Call(FormNode, frozen=True):
+    """A call of a function of `runtime/builtin_functions.py`."""
 
     type: Type
     function: str
@@ -233,8 +229,8 @@ class Call(Node, frozen=True):
     site: int = -1
 
 
-class Accumulate(Node, frozen=True):
-    """The sum of a vector's elements from `first` to before `last`, and of `start`: calculated in `wide`, each step
+class Accumulate(FormNode, frozen=True):
+    """The sum of `start` and a vector's elements from `first` to before `last`, calculated in `wide`; each step is
     converted to the type.
     """
 
@@ -247,10 +243,11 @@ class Accumulate(Node, frozen=True):
     site: int
 
 
-class Invoke(Node, frozen=True):
-    """A call of a helper function; with references what comes back is the value and the references' new values.
+class Invoke(FormNode, frozen=True):
+    """A call of a helper function; with references, the result is its value and their new values.
 
-    `depth`: of a recursive one, whether it is called from a recursive one (a level deeper) or begins.
+    `depth` is None for a function that is not recursive; else whether the caller is recursive, so the call is one
+    level deeper.
     """
 
     type: Type
@@ -259,9 +256,9 @@ class Invoke(Node, frozen=True):
     depth: bool | None
 
 
-class Format(Node, frozen=True):
-    """Text by a template with conversions, as Python's `%` of bytes has them. `size` is how long it can be without its
-    strings if that is to be charged, else None.
+class Format(FormNode, frozen=True):
+    """Text formatted by a template, as with Python's `%` of bytes. `size` is the maximum length without its strings
+    if that is charged, else None.
     """
 
     template: bytes
@@ -271,15 +268,15 @@ class Format(Node, frozen=True):
     type: Type = value_types.STRING
 
 
-class Join(Node, frozen=True):
-    """Strings one after the other."""
+class Join(FormNode, frozen=True):
+    """Concatenated strings."""
 
     pieces: "tuple[Expression, ...]"
     site: int
     type: Type = value_types.STRING
 
 
-class Log(Node, frozen=True):
+class Log(FormNode, frozen=True):
     """A line of output."""
 
     level: str
@@ -288,24 +285,24 @@ class Log(Node, frozen=True):
     type: Type = value_types.VOID
 
 
-class Throttle(Node, frozen=True):
-    """Whether output at this site is due: the last was at least so many seconds ago."""
+class Throttle(FormNode, frozen=True):
+    """A test whether output at this site is due: the last one was at least `seconds` ago."""
 
     seconds: "Expression"
     site: int
     type: Type = value_types.BOOL
 
 
-class Now(Node, frozen=True):
-    """The time at which the message was received."""
+class Now(FormNode, frozen=True):
+    """The time when the message was received."""
 
     type: Type = value_types.TIME
 
 
-class Whole(Node, frozen=True):
-    """`MESSAGE`: all of it, with the fields that this action has assigned so far, which `Pending` has named."""
+class Whole(FormNode, frozen=True):
+    """`MESSAGE`: the whole message with the fields assigned so far, which `Pending` lists."""
 
-    type: value_types.Record
+    type: value_types.RecordType
     pending: str
     site: int
 
@@ -320,14 +317,14 @@ Expression = (
 # Statements
 
 
-class Evaluate(Node, frozen=True):
-    """An expression for its effect."""
+class Evaluate(FormNode, frozen=True):
+    """Evaluate an expression for its effect."""
 
     site: int
     value: Expression
 
 
-class If(Node, frozen=True):
+class If(FormNode, frozen=True):
     """`if (test) yes else no`."""
 
     site: int
@@ -336,15 +333,15 @@ class If(Node, frozen=True):
     no: "tuple[Statement, ...]"
 
 
-class Loop(Node, frozen=True):
+class Loop(FormNode, frozen=True):
     """A loop that only `Break` ends."""
 
     site: int
     body: "tuple[Statement, ...]"
 
 
-class ForEach(Node, frozen=True):
-    """Once for each element of a vector (also one that the body appends) or character of a string (as a byte)."""
+class ForEach(FormNode, frozen=True):
+    """A loop over the elements of a vector (including those that the body appends) or the bytes of a string."""
 
     site: int
     name: str
@@ -352,20 +349,20 @@ class ForEach(Node, frozen=True):
     body: "tuple[Statement, ...]"
 
 
-class Break(Node, frozen=True):
+class Break(FormNode, frozen=True):
     """Leave the innermost loop."""
 
     site: int
 
 
-class Continue(Node, frozen=True):
-    """The innermost loop's next turn."""
+class Continue(FormNode, frozen=True):
+    """Go on with the next iteration of the innermost loop."""
 
     site: int
 
 
-class Select(Node, frozen=True):
-    """Give a variable the number that the table has for a value, or the default."""
+class Select(FormNode, frozen=True):
+    """Assign the number that a table has for a value, or the default."""
 
     site: int
     name: str
@@ -374,61 +371,61 @@ class Select(Node, frozen=True):
     default: int
 
 
-class Return(Node, frozen=True):
-    """The end of a helper function, with its value and those of its references."""
+class Return(FormNode, frozen=True):
+    """Return from a helper function, with its value and those of its references."""
 
     site: int
     value: Expression
     references: tuple[str, ...] = ()
 
 
-class Leave(Node, frozen=True):
-    """The end of anything else. Of an event: whether it happened."""
+class Leave(FormNode, frozen=True):
+    """Return from any other function; for an event, whether it happened."""
 
     site: int
     happened: bool | None
 
 
-class Charge(Node, frozen=True):
-    """Take so many instructions from the budget."""
+class Charge(FormNode, frozen=True):
+    """Take a number of instructions from the budget."""
 
     site: int
     instructions: int
 
 
-class Allocate(Node, frozen=True):
-    """Charge for so many bytes that will be made; None: as many as the message has, if they are many."""
+class Allocate(FormNode, frozen=True):
+    """Charge for the bytes of a new value (None: of the message, if it is long)."""
 
     site: int
     size: int | None
 
 
-class LimitDepth(Node, frozen=True):
-    """A fault if this recursive function has been called too often within itself."""
+class LimitDepth(FormNode, frozen=True):
+    """Fault if the recursion is too deep."""
 
     site: int
     name: str
 
 
-class Drop(Node, frozen=True):
-    """The message is not relayed. `anyway`: there is one; else only if there is (a deadline brings none)."""
+class Drop(FormNode, frozen=True):
+    """Drop the message. `anyway`: there always is one; otherwise only if there is (a deadline has none)."""
 
     site: int
     anyway: bool
 
 
-class Reset(Node, frozen=True):
-    """The property begins anew when its handlers have run."""
+class Reset(FormNode, frozen=True):
+    """Restart the property when its handlers have run."""
 
     site: int
 
 
-class Publish(Node, frozen=True):
-    """Publish a message; `name` is a variable for its bytes."""
+class Publish(FormNode, frozen=True):
+    """Publish a message; its bytes are in the variable `name`."""
 
     site: int
     topic: str
-    kind: value_types.Record
+    kind: value_types.RecordType
     value: Expression
     name: str
 
@@ -436,27 +433,27 @@ class Publish(Node, frozen=True):
 # Fields of the message
 
 
-class Spot(Node, frozen=True):
-    """A position: so many bytes behind a named one, or behind the start."""
+class Spot(FormNode, frozen=True):
+    """A position: an offset from a named position, or from the start."""
 
     base: str | None
     offset: int
 
     def plus(self, more: int) -> "Spot":
-        """The position so many bytes further."""
+        """Return the position `more` bytes further."""
         return Spot(self.base, self.offset + more)
 
 
-class AfterText(Node, frozen=True):
-    """Name the position behind the string at `at`."""
+class AfterText(FormNode, frozen=True):
+    """Name the position after the string at `at`."""
 
     site: int
     name: str
     at: Spot
 
 
-class Count(Node, frozen=True):
-    """Name the number of elements of the array at `at`; a fault if so many, of `least` bytes each, are not there."""
+class Count(FormNode, frozen=True):
+    """Name the number of elements of the array at `at`; fault if that many, of `least` bytes each, do not fit."""
 
     site: int
     name: str
@@ -464,8 +461,8 @@ class Count(Node, frozen=True):
     least: int
 
 
-class AfterElements(Node, frozen=True):
-    """Name the position behind so many elements (a number, or a named one) of `size` bytes each."""
+class AfterElements(FormNode, frozen=True):
+    """Name the position after `count` elements (a number, or a named one) of `size` bytes each."""
 
     site: int
     name: str
@@ -474,10 +471,10 @@ class AfterElements(Node, frozen=True):
     size: int
 
 
-class Skip(Node, frozen=True):
-    """Name the position behind so many elements of variable size, each of which `skipper` measures (None: strings).
+class Skip(FormNode, frozen=True):
+    """Name the position after `count` elements of variable size; `skipper` measures each (None: strings).
 
-    They are charged; `inner` (within an element that is skipped) even if they are few.
+    They are charged if they are many, or if they are `inner` (within a skipped element).
     """
 
     site: int
@@ -488,24 +485,24 @@ class Skip(Node, frozen=True):
     inner: bool
 
 
-class NotPast(Node, frozen=True):
-    """The event does not happen, and that is told, unless there are more elements than `index`."""
+class NotPast(FormNode, frozen=True):
+    """Let the event not happen, and report it, unless there are more elements than `index`."""
 
     site: int
     count: str
     index: int
 
 
-class ReadNumbers(Node, frozen=True):
-    """Give variables the numbers or times at so many bytes behind `at`, in the order in which they stand there."""
+class ReadNumbers(FormNode, frozen=True):
+    """Assign numbers and times to variables; fields have offsets from `at`, in ascending order."""
 
     site: int
     at: Spot
     fields: tuple[tuple[str, Type, int], ...]
 
 
-class ReadValue(Node, frozen=True):
-    """Give a variable the string, vector or message at `at`, and name the position behind it."""
+class ReadValue(FormNode, frozen=True):
+    """Assign the string, vector or message at `at` to a variable, and name the position after it."""
 
     site: int
     name: str
@@ -514,17 +511,18 @@ class ReadValue(Node, frozen=True):
     type: Type
 
 
-class Require(Node, frozen=True):
-    """The event does not happen unless this is true."""
+class Require(FormNode, frozen=True):
+    """Let the event happen only if this is true."""
 
     site: int
     test: Expression
 
 
-class Write(Node, frozen=True):
-    """A field that gets a value (of the field's type) if `flag` is set; `end` names where one of variable size ends.
+class Write(FormNode, frozen=True):
+    """Assign a value (of the field's type) to a field if `flag` is set; `end` names the end of a field of variable
+    size.
 
-    `path` leads to it from the whole message: numbers of fields and elements, `sec` or `nsec` at the end.
+    `path` is its path in the message: numbers of fields and elements, and `sec` or `nsec` at the end.
     """
 
     flag: str
@@ -534,17 +532,17 @@ class Write(Node, frozen=True):
     path: tuple[int | str, ...]
 
 
-class Pending(Node, frozen=True):
-    """Name the fields that this action may assign, for `Whole`."""
+class Pending(FormNode, frozen=True):
+    """List the fields that this action may assign, for `Whole`."""
 
     site: int
     name: str
     writes: tuple[Write, ...]
 
 
-class WriteBack(Node, frozen=True):
-    """Put the fields that were assigned into the message, all of them or, with a fault, none; `name` is a variable for
-    what is spliced. Of a dropped message none is written, and the event has happened.
+class WriteBack(FormNode, frozen=True):
+    """Write all assigned fields to the message or, if that faults, none. `name` is a variable for spliced bytes. A
+    dropped message is not changed, and the event has happened.
     """
 
     site: int
@@ -562,19 +560,19 @@ Statement = (
 # Functions
 
 
-class Skipper(Node, frozen=True):
-    """Where an element that begins at the position `p` ends."""
+class Skipper(FormNode, frozen=True):
+    """A function that finds the end of an element that begins at the position `p`."""
 
     name: str
     body: tuple[Statement, ...]
     end: Spot
 
 
-class Function(Node, frozen=True):
-    """A function: of an event (`message` is looked at; it happens from the statement `happens` on), a handler, a timer,
-    a helper function, or a stage of the beginning.
+class Function(FormNode, frozen=True):
+    """A function: an event, which has happened at the statement `happens`, a handler, a timer, a helper function, or a
+    stage of the start.
 
-    `context` is whose budget it takes from. `shared` are the variables of the set that it assigns.
+    `context` names the specification whose budget is charged. `shared` are the shared variables that it assigns.
     """
 
     name: str
@@ -588,9 +586,9 @@ class Function(Node, frozen=True):
 # Programs
 
 
-class Clock(Node, frozen=True):
-    """Of a property with a clock: the table where more than `within` ns have passed since it began, and for each state
-    how long after that its deadline is (-1: it has none).
+class PropertyClock(FormNode, frozen=True):
+    """The clock of a property: the table for events more than `within` ns after its start, and the deadline of each
+    state after the start (-1: none).
     """
 
     late: tuple[int, ...]
@@ -598,35 +596,36 @@ class Clock(Node, frozen=True):
     waits: tuple[int, ...]
 
 
-class Handled(Node, frozen=True):
-    """The states of a property in which the handler of a category runs when they are entered, also from themselves."""
+class HandledCategory(FormNode, frozen=True):
+    """The handler of a category, and the states that run it when they are entered, also from themselves."""
 
     category: str
     function: str
     states: frozenset[int]
 
 
-class Advance(Node, frozen=True):
-    """What an event does to a property: the next state for each of its states, -1 where the property has no table of
-    states. `property` is its number among those with tables; None without one. `event` is the event's number in its
-    specification. `handlers` run in their order, and may have it begin anew in its state `initial`. With a `clock`
-    there is twice the next state, and one more where it begins anew; -1 where a handler runs. One that `suppresses`
-    takes the step back when the message is dropped.
+class Advance(FormNode, frozen=True):
+    """The step of a property at an event: the next state for each state (-1: no table).
+
+    `property` is its number among those with tables; None without one. `event` is the event's number in its
+    specification. `handlers` run in their order, and may restart it in its state `initial`. With a `clock`, an entry is
+    twice the next state, plus one where the clock restarts; -1 where a handler runs. A property that `suppresses`
+    undoes the step when the message is dropped.
     """
 
     property: int | None
     table: tuple[int, ...]
     event: int = 0
-    clock: Clock | None = None
-    handlers: tuple[Handled, ...] = ()
+    clock: PropertyClock | None = None
+    handlers: tuple[HandledCategory, ...] = ()
     initial: int = 0
     suppresses: bool = False
 
 
-class Event(Node, frozen=True):
-    """An event on a topic: its function, and the steps of its specification's properties when it has happened.
+class Event(FormNode, frozen=True):
+    """An event on a topic: its function, and the steps of its specification's properties after it has happened.
 
-    `specification` counts from 0 among those of the topic.
+    `specification` is its index among the specifications of the topic.
     """
 
     function: str
@@ -634,12 +633,11 @@ class Event(Node, frozen=True):
     advances: tuple[Advance, ...]
 
 
-class Component(Node, frozen=True):
-    """Specifications that share topics or variables, and nothing with others: the variables of each of them, how many
-    properties with tables they have, and their topics (of services the request or response, by a name that no topic
-    has) with the events on each, in order.
+class Component(FormNode, frozen=True):
+    """Specifications that share topics or variables only with each other: their variables, the number of properties
+    with tables, and their topics (also requests and responses of services) with the events on each, in order.
 
-    `noted` are variables more, in which is noted what nothing depends on and the same message notes again.
+    `noted` are variables that only explain; repeating a message leaves them equal.
     """
 
     variables: tuple[str, ...]
@@ -649,7 +647,7 @@ class Component(Node, frozen=True):
 
 
 def walk(root: object) -> Iterator[object]:
-    """Everything that a part of the form is made of, and it."""
+    """Yield a part of the form and everything in it."""
     waiting = [root]
     while waiting:
         node = waiting.pop()
@@ -661,17 +659,17 @@ def walk(root: object) -> Iterator[object]:
 
 
 def moved(root: Any, sites: Mapping[int, int]) -> Any:
-    """A part of the form with other numbers for its sites."""
+    """Return a part of the form with its sites renumbered."""
     if isinstance(root, tuple):
         return tuple(moved(part, sites) for part in root)
-    if not isinstance(root, Node):
+    if not isinstance(root, FormNode):
         return root
     parts = ((name, getattr(root, name)) for name in root.__struct_fields__)
     return type(root)(*(sites[part] if name == "site" else moved(part, sites) for name, part in parts))
 
 
 def acts(root: Expression) -> bool:
-    """Whether to evaluate it changes anything, or is seen from outside."""
+    """Whether evaluating the expression has an effect."""
     return any(
         isinstance(node, Assign | Invoke | Log | Throttle)
         or (
@@ -681,7 +679,7 @@ def acts(root: Expression) -> bool:
     )
 
 
-def methods_of(walker: type, nodes: UnionType) -> Mapping[type[Any], Callable[..., Any]]:
-    """Which method of a class is for which kind of expression or statement (`nodes`): `_after_text` for `AfterText`."""
-    named = {kind: "_" + re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower() for kind in get_args(nodes)}
-    return {kind: getattr(walker, name) for kind, name in named.items() if hasattr(walker, name)}
+class Left(NamedTuple):
+    """A back end's row for a kind of node that it leaves to the interpreter, with the reason."""
+
+    reason: str

@@ -1,4 +1,4 @@
-"""Where something stands in a file of specifications, and what is to be said about it.
+"""Positions in files of specifications, and findings about them.
 
 Lines and columns count from 1; a column is a character (a tab is one). The names of the fields are those of
 ``rosrv monitor check --json``.
@@ -19,7 +19,7 @@ class Position:
     column: int
 
     def within(self, text: str, offset: int) -> "Position":
-        """Where character ``offset`` of ``text`` stands, if ``text`` begins here."""
+        """Return the position of character ``offset`` of a ``text`` that begins here."""
         lines = text.count("\n", 0, offset)
         if not lines:
             return Position(self.file, self.line, self.column + offset)
@@ -30,14 +30,14 @@ class Position:
 
 
 def line_of(text: str, number: int) -> str:
-    """A line of a specification, counted from 1, without its comment."""
+    """Return a line of a specification, counted from 1, without its comment."""
     lines = text.splitlines()[number - 1 : number]
     return lines[0].partition("//")[0].strip() if lines else ""
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One thing to tell the author of a specification: where, how grave, what, and what to write instead."""
+class Diagnostic:
+    """An error or warning for the author of a specification; the text says what to write instead."""
 
     position: Position
     severity: Severity

@@ -1,4 +1,4 @@
-"""Places in the text of specifications, by which faults and decisions are told, and how values are shown there."""
+"""Sites: positions in specifications that explain faults and decisions, with the values of variables."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from rosmop.types.value_types import Type
 
 @dataclass(frozen=True, slots=True)
 class SiteVariable:
-    """A variable by its name in the text and in the form. `steady`: a value of it never changes in place."""
+    """A variable: its names in the text and in the form. `steady`: its value never changes in place."""
 
     name: str
     code: str
@@ -22,21 +22,21 @@ class SiteVariable:
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A place in the text that statements belong to, and the variables whose values explain a fault there."""
+    """The position of statements, and the variables whose values explain a fault there."""
 
     position: Position
     variables: tuple[SiteVariable, ...] = ()
 
     @property
     def compared(self) -> list[SiteVariable]:
-        """The variables of a condition that are told when it was met: they are still what they were then."""
+        """Return the variables of a condition that can explain it later: their values do not change in place."""
         return [variable for variable in self.variables if variable.steady]
 
 
 class Symbols:
-    """The names that are made for the variables and functions of a set while it is compiled, and its sites.
+    """Makes the names of variables and functions, and the sites, of a set while it is compiled.
 
-    The names of a specification are the same whatever else is in the set.
+    The names of a specification do not depend on the rest of the set.
     """
 
     def __init__(self) -> None:
@@ -45,37 +45,37 @@ class Symbols:
         self._owner = ""
 
     def begin(self, specification: str) -> None:
-        """The names that follow are of this specification."""
+        """Begin the names of this specification."""
         self._owner = specification
 
     def fresh(self, prefix: str) -> str:
-        """A name that nothing else has."""
+        """Return a unique name."""
         self._names[self._owner] += 1
         return f"{prefix}{self._names[self._owner]} {self._owner}"
 
     @staticmethod
     def owner(name: str) -> str:
-        """The specification that a name was made for."""
+        """Return the specification that a name was made for."""
         return name.partition(" ")[2]
 
     def site(self, site: Site) -> int:
-        """The number of a site."""
+        """Add a site and return its number."""
         self.sites.append(site)
         return len(self.sites) - 1
 
 
 def showing(kind: Type) -> Callable[[Any], object]:
-    """How a value of a type is shown where a fault is told: something JSON has."""
-    if isinstance(kind, value_types.String | value_types.Characters):
+    """Return a function that converts a value of a type to JSON for a report of a fault."""
+    if isinstance(kind, value_types.StringType | value_types.CharactersType):
         return lambda value: _short(value[:200].split(b"\0")[0].decode("utf-8", "replace"))
-    if isinstance(kind, value_types.Time | value_types.Duration):
+    if isinstance(kind, value_types.TimeType | value_types.DurationType):
         return lambda value: value / 1e9
-    if isinstance(kind, value_types.Vector):
+    if isinstance(kind, value_types.VectorType):
         inner = showing(kind.element)
         return lambda values: [inner(value) for value in values[:8]] + ["…"] * (len(values) > 8)
-    if isinstance(kind, value_types.Floating):
+    if isinstance(kind, value_types.FloatingType):
         return lambda value: value if value - value == 0 else str(value)
-    if isinstance(kind, value_types.Record):
+    if isinstance(kind, value_types.RecordType):
         return lambda value: _short(str(value)[:200])
     return lambda value: value
 

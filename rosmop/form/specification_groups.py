@@ -1,4 +1,4 @@
-"""What belongs together in a set: specifications that share topics, services or variables, as the form has them."""
+"""Group the specifications of a set that share topics, services or variables."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,10 +10,10 @@ from rosmop.logics.interface import ClockedProperty, FiniteProperty
 
 
 @dataclass(frozen=True)
-class Group:
-    """A component, with the numbers of its specifications and of its properties with tables (specification, property),
-    and for each topic, and part of a service, the events on it (specification, event). Those with events of parametric
-    specifications have none: the engine takes their messages.
+class SpecificationGroup:
+    """A component, with the indices of its specifications, of its properties with tables (specification, property), and
+    of the events on each topic or part of a service (specification, event). Topics of parametric specifications have
+    no events here: the engine takes their messages.
     """
 
     component: nodes.Component
@@ -22,8 +22,8 @@ class Group:
     events: tuple[tuple[tuple[int, int], ...], ...]
 
 
-def groups(specifications: Sequence[SpecificationCode]) -> Iterator[Group]:
-    """The components of a set."""
+def groups(specifications: Sequence[SpecificationCode]) -> Iterator[SpecificationGroup]:
+    """Yield the groups of a set."""
     found = connected([
         [
             specification.name,
@@ -36,7 +36,7 @@ def groups(specifications: Sequence[SpecificationCode]) -> Iterator[Group]:
         yield _group(specifications, numbers)
 
 
-def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) -> Group:
+def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) -> SpecificationGroup:
     variables: list[str] = []
     noted: list[str] = []
     properties: list[tuple[int, int]] = []
@@ -72,7 +72,7 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
             )
         )
     component = nodes.Component(tuple(variables), len(properties), tuple(rows), tuple(noted))
-    return Group(
+    return SpecificationGroup(
         component,
         numbers,
         tuple(properties),
@@ -87,14 +87,14 @@ def event_of(
     index: int,
     place: int,
 ) -> nodes.Event:
-    """Return the form of one event of a specification, with how its properties advance."""
+    """Return the form of one event of a specification, with the steps of its properties."""
     advances = []
     for property_index, code in enumerate(specifications[number].properties):
         compiled, handlers = code.property, set(code.order)
         if isinstance(compiled, FiniteProperty):
             automaton = compiled.automaton
             handled = tuple(
-                nodes.Handled(
+                nodes.HandledCategory(
                     category,
                     code.handlers[category],
                     frozenset(state for state, told in enumerate(automaton.verdicts) if category in told),
@@ -121,7 +121,7 @@ def event_of(
                 )
                 for moves in (compiled.moves, compiled.late)
             )
-            clock = nodes.Clock(
+            clock = nodes.PropertyClock(
                 late, compiled.within, tuple(-1 if wait is None else wait.after for wait in compiled.waits)
             )
             known = properties.index((number, property_index))

@@ -1,1 +1,1 @@
-"""The text of ``.rv`` files: grammar, parser, and the tree that comes out. Nothing here knows a message type."""
+"""The text of ``.rv`` files: grammar, parser and syntax tree, without knowledge of message types."""

@@ -1,66 +1,81 @@
-"""Makes the tree of `tree.py` from lark's parse tree.
+"""Build the tree of `tree.py` from lark's parse tree.
 
-One method for each rule of the grammar. Walked without recursion, so that no nesting can exhaust the stack.
+Each rule of the grammar has a method. The walk is not recursive, so nesting cannot exhaust the stack.
 """
 
-# ruff: noqa: D102  a method is the rule of the grammar that has its name
+# ruff: noqa: D102  each method handles the rule of the grammar that has its name
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 from typing import Any, TypeVar
 
 from lark import Token, Transformer_NonRecursive, v_args
 from lark.tree import Meta
 
-from rosmop.form.positions import Finding, Position
-from rosmop.text import literals, tree
+from rosmop.form.positions import Diagnostic, Position
+from rosmop.text import tree
 from rosmop.text.complaints import FORBIDDEN
 from rosmop.text.errors import SpecificationError
 
-_T = TypeVar("_T", bound=tree.Node)
+_T = TypeVar("_T", bound=tree.SyntaxNode)
+
+_ESCAPE = re.compile(r"\\(x[0-9A-Fa-f]{1,2}|[0-7]{1,3}|.)", re.DOTALL)
+_SIMPLE = {"n": 10, "t": 9, "r": 13, "a": 7, "b": 8, "f": 12, "v": 11, "\\": 92, "'": 39, '"': 34, "?": 63}
+_UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "": 10**9, "m": 60 * 10**9, "min": 60 * 10**9,
+             "h": 3600 * 10**9}  # fmt: skip
+_DURATION = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]*)\Z")
+MIN_PERIOD_NS = 10**6
+MAX_PERIOD_NS = 10**18
+"""About 31 years."""
+
+
+class _LiteralError(Exception):
+    """An invalid literal; the text says what to write instead."""
 
 
 class _Unsaid:
-    """Something that needs nothing: a stray `;`, a `using` line."""
+    """Text without a node: a stray `;`, a `using` line."""
 
 
-def _binary(operator: str) -> Callable[..., tree.Binary]:
-    def build(self: "Builder", meta: Meta, left: Any, right: Any) -> tree.Binary:
-        return tree.Binary(self.at(meta), operator, left, right)
+def _binary(operator: str) -> Callable[..., tree.BinaryExpression]:
+    def build(self: "TreeBuilder", meta: Meta, left: Any, right: Any) -> tree.BinaryExpression:
+        return tree.BinaryExpression(self.at(meta), operator, left, right)
 
     return build
 
 
 def _made(kind: Callable[..., _T], first: int = 0, **more: bool) -> Callable[..., _T]:
-    """Of a rule whose children, from the `first` on, are the fields of its node."""
+    """Return the method for a rule whose children from `first` on are the fields of its node."""
 
-    def build(self: "Builder", meta: Meta, *children: Any) -> _T:
+    def build(self: "TreeBuilder", meta: Meta, *children: Any) -> _T:
         given = (str(child) if isinstance(child, Token) else child for child in children[first:])
         return kind(self.at(meta), *given, **more)
 
     return build
 
 
-def _all(_builder: "Builder", _: Meta, *children: Any) -> tuple[Any, ...]:
+def _all(_builder: "TreeBuilder", _: Meta, *children: Any) -> tuple[Any, ...]:
     return children
 
 
-def _unsaid(_builder: "Builder", _: Meta, *_children: Any) -> _Unsaid:
+def _unsaid(_builder: "TreeBuilder", _: Meta, *_children: Any) -> _Unsaid:
     return _Unsaid()
 
 
 @v_args(inline=True, meta=True)
-class Builder(Transformer_NonRecursive[Token, Any]):
-    """Builds the tree of one file; `findings` are the literals that mean nothing."""
+class TreeBuilder(Transformer_NonRecursive[Token, Any]):
+    """Builds the tree of one file; `findings` lists the invalid literals."""
 
     def __init__(self, file: str, text: str) -> None:
         super().__init__()
         self._file = file
         self._text = text
-        self.findings: list[Finding] = []
+        self.findings: list[Diagnostic] = []
 
     def at(self, meta: Meta | Token) -> Position:
-        """Where a rule or token begins."""
+        """Return the start of a rule or token."""
         if isinstance(meta, Token):
             return Position(self._file, meta.line or 1, meta.column or 1)
         if meta.empty:
@@ -68,14 +83,14 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         return Position(self._file, meta.line, meta.column)
 
     def refuse(self, place: Meta | Token, text: str) -> None:
-        """Remember an error."""
-        self.findings.append(Finding(self.at(place), "error", text))
+        """Add an error to `findings`."""
+        self.findings.append(Diagnostic(self.at(place), "error", text))
 
     # Files and specifications
 
-    def file(self, _: Meta, *children: Any) -> tree.File:
+    def file(self, _: Meta, *children: Any) -> tree.SpecificationFile:
         found = tuple(child for child in children if isinstance(child, tree.Specification))
-        return tree.File(self._file, self._text, found)
+        return tree.SpecificationFile(self._file, self._text, found)
 
     using = _unsaid
 
@@ -98,57 +113,57 @@ class Builder(Transformer_NonRecursive[Token, Any]):
             str(name),
             parameters,
             items(tree.Declaration),
-            items(tree.Function),
-            items(tree.Init),
-            items(tree.Event),
+            items(tree.FunctionDefinition),
+            items(tree.InitBlock),
+            items(tree.EventDefinition),
             items(tree.Property),
         )
 
     def function(
         self, meta: Meta, kind: Any, name: Any, parameters: Any, body: Any
-    ) -> tree.Function | tree.Init:
+    ) -> tree.FunctionDefinition | tree.InitBlock:
         if name == "init" and kind.name == ("void",):
             return self.init(meta, parameters, body)
-        return tree.Function(self.at(meta), kind, str(name), parameters or (), body)
+        return tree.FunctionDefinition(self.at(meta), kind, str(name), parameters or (), body)
 
     prototype = _unsaid
 
-    def procedure(self, meta: Meta, name: Any, parameters: Any, body: Any) -> tree.Function:
-        return tree.Function(self.at(meta), None, str(name), parameters or (), body)
+    def procedure(self, meta: Meta, name: Any, parameters: Any, body: Any) -> tree.FunctionDefinition:
+        return tree.FunctionDefinition(self.at(meta), None, str(name), parameters or (), body)
 
-    def init(self, meta: Meta, parameters: Any, body: Any) -> tree.Init:
+    def init(self, meta: Meta, parameters: Any, body: Any) -> tree.InitBlock:
         if parameters:
             self.refuse(meta, "`init` takes no parameters: it runs before the first message")
-        return tree.Init(self.at(meta), body)
+        return tree.InitBlock(self.at(meta), body)
 
     parameters = _all
 
-    def unnamed_parameters(self, meta: Meta, *words: Any) -> tuple[tree.Parameter, ...]:
+    def unnamed_parameters(self, meta: Meta, *words: Any) -> tuple[tree.ParameterDeclaration, ...]:
         if words != ("void",):
             self.refuse(meta, f"give the parameter a name: `{' '.join(words)} x`")
         return ()
 
-    parameter = _made(tree.Parameter)
+    parameter = _made(tree.ParameterDeclaration)
 
-    def reference_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.Parameter:
-        return tree.Parameter(self.at(meta), _referenced(kind), str(name))
+    def reference_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.ParameterDeclaration:
+        return tree.ParameterDeclaration(self.at(meta), _referenced(kind), str(name))
 
-    def array_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.Parameter:
+    def array_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.ParameterDeclaration:
         array = tree.TypeName(kind.position, ("[]",), element=kind)
-        return tree.Parameter(self.at(meta), array, str(name))
+        return tree.ParameterDeclaration(self.at(meta), array, str(name))
 
     array_parameter_behind = array_parameter
 
-    def array_reference_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.Parameter:
+    def array_reference_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.ParameterDeclaration:
         vector = tree.TypeName(kind.position, ("std", "vector"), element=kind)
         return self.reference_parameter(meta, vector, name)
 
     # Events and properties
 
-    def event(self, meta: Meta, *children: Any) -> tree.Event:
+    def event(self, meta: Meta, *children: Any) -> tree.EventDefinition:
         *modifiers, name, parameters, trigger, action = children
         words = tuple(tree.Name(self.at(word), (str(word),)) for word in modifiers)
-        return tree.Event(self.at(meta), words, str(name), parameters or (), trigger, action)
+        return tree.EventDefinition(self.at(meta), words, str(name), parameters or (), trigger, action)
 
     def trigger(
         self, meta: Meta, topic: Any, kind: Any, *rest: Any, part: str | None = None
@@ -163,8 +178,8 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
     def timer(self, meta: Meta, _every: Any, duration: Any) -> tree.TimerTrigger:
         try:
-            return tree.TimerTrigger(self.at(meta), literals.duration_ns(duration.strip()))
-        except literals.BadLiteralError as error:
+            return tree.TimerTrigger(self.at(meta), _duration_ns(duration.strip()))
+        except _LiteralError as error:
             self.refuse(duration, str(error))
             return tree.TimerTrigger(self.at(meta), 10**9)
 
@@ -194,7 +209,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         if index is None:
             return tree.PathStep(self.at(meta), str(name), None)
         if not index.isdigit() or len(index) > 10:
-            self.refuse(index, f"`{index[:20]}` is no index; write a whole number")
+            self.refuse(index, f"`{index[:20]}` is not an index; write a whole number")
             return tree.PathStep(self.at(meta), str(name), 0)
         return tree.PathStep(self.at(meta), str(name), int(index))
 
@@ -246,43 +261,45 @@ class Builder(Transformer_NonRecursive[Token, Any]):
     def block(self, meta: Meta, *children: Any) -> tree.Block:
         return tree.Block(self.at(meta), children)
 
-    evaluate = _made(tree.Evaluate)
-    if_ = _made(tree.If, 1)
-    while_ = _made(tree.While, 1)
+    evaluate = _made(tree.ExpressionStatement)
+    if_ = _made(tree.IfStatement, 1)
+    while_ = _made(tree.WhileStatement, 1)
 
-    def do_(self, meta: Meta, _: Any, body: Any, condition: Any) -> tree.While:
-        return tree.While(self.at(meta), condition, body, at_end=True)
+    def do_(self, meta: Meta, _: Any, body: Any, condition: Any) -> tree.WhileStatement:
+        return tree.WhileStatement(self.at(meta), condition, body, at_end=True)
 
-    def for_(self, meta: Meta, _: Any, start: Any, condition: Any, step: Any, body: Any) -> tree.For:
+    def for_(self, meta: Meta, _: Any, start: Any, condition: Any, step: Any, body: Any) -> tree.ForStatement:
         empty = isinstance(start, tree.Block)
-        return tree.For(self.at(meta), None if empty else start, condition, step, body)
+        return tree.ForStatement(self.at(meta), None if empty else start, condition, step, body)
 
-    range_for = _made(tree.RangeFor, 1)
+    range_for = _made(tree.RangeForStatement, 1)
 
-    def range_for_reference(self, meta: Meta, word: Any, kind: Any, *more: Any) -> tree.RangeFor:
+    def range_for_reference(self, meta: Meta, word: Any, kind: Any, *more: Any) -> tree.RangeForStatement:
         return self.range_for(meta, word, _referenced(kind), *more)
 
-    def switch(self, meta: Meta, _: Any, value: Any, *cases: Any) -> tree.Switch:
-        return tree.Switch(self.at(meta), value, cases)
+    def switch(self, meta: Meta, _: Any, value: Any, *cases: Any) -> tree.SwitchStatement:
+        return tree.SwitchStatement(self.at(meta), value, cases)
 
-    def case(self, meta: Meta, _: Any, value: Any, *statements: Any) -> tree.Case:
-        return tree.Case(self.at(meta), value, statements)
+    def case(self, meta: Meta, _: Any, value: Any, *statements: Any) -> tree.SwitchCase:
+        return tree.SwitchCase(self.at(meta), value, statements)
 
-    def default(self, meta: Meta, _: Any, *statements: Any) -> tree.Case:
-        return tree.Case(self.at(meta), None, statements)
+    def default(self, meta: Meta, _: Any, *statements: Any) -> tree.SwitchCase:
+        return tree.SwitchCase(self.at(meta), None, statements)
 
-    break_ = _made(tree.Break, 1)
-    continue_ = _made(tree.Continue, 1)
-    drop = _made(tree.Drop, 1)
-    reset = _made(tree.Reset, 1)
-    return_ = _made(tree.Return, 1)
+    break_ = _made(tree.BreakStatement, 1)
+    continue_ = _made(tree.ContinueStatement, 1)
+    drop = _made(tree.DropStatement, 1)
+    reset = _made(tree.ResetStatement, 1)
+    return_ = _made(tree.ReturnStatement, 1)
 
-    def delete(self, meta: Meta, *children: Any) -> tree.Delete:
-        return tree.Delete(self.at(meta), children[-1])
+    def delete(self, meta: Meta, *children: Any) -> tree.DeleteStatement:
+        return tree.DeleteStatement(self.at(meta), children[-1])
 
-    def publish(self, meta: Meta, _: Any, topic: Any, kind: Any, value: Any) -> tree.Publish:
+    def publish(self, meta: Meta, _: Any, topic: Any, kind: Any, value: Any) -> tree.PublishStatement:
         names = [_unquoted(child) if child.type == "STRING" else str(child) for child in (topic, kind)]
-        return tree.Publish(self.at(meta), names[0], names[1].replace("::", "/"), self.at(kind), value)
+        return tree.PublishStatement(
+            self.at(meta), names[0], names[1].replace("::", "/"), self.at(kind), value
+        )
 
     def declaration(self, meta: Meta, kind: Any, *declarators: Any) -> tree.Declaration:
         return tree.Declaration(self.at(meta), kind, declarators)
@@ -307,24 +324,24 @@ class Builder(Transformer_NonRecursive[Token, Any]):
     def elements(self, _: Meta, *items: Any) -> tuple[tree.Expression, ...]:
         return tuple(item for item in items if item is not None)
 
-    def elements_in_braces(self, meta: Meta, *children: Any) -> tree.Elements:
-        return tree.Elements(self.at(meta), children[-1] or ())
+    def elements_in_braces(self, meta: Meta, *children: Any) -> tree.InitializerList:
+        return tree.InitializerList(self.at(meta), children[-1] or ())
 
     # Expressions
 
-    def sequence(self, meta: Meta, *children: Any) -> tree.Sequence:
-        return tree.Sequence(self.at(meta), children)
+    def sequence(self, meta: Meta, *children: Any) -> tree.CommaExpression:
+        return tree.CommaExpression(self.at(meta), children)
 
-    def assign(self, meta: Meta, target: Any, operator: Any, value: Any) -> tree.Assign:
-        return tree.Assign(self.at(meta), str(operator), target, value)
+    def assign(self, meta: Meta, target: Any, operator: Any, value: Any) -> tree.Assignment:
+        return tree.Assignment(self.at(meta), str(operator), target, value)
 
-    def set(self, meta: Meta, target: Any, value: Any) -> tree.Assign:
-        return tree.Assign(self.at(meta), "=", target, value)
+    def set(self, meta: Meta, target: Any, value: Any) -> tree.Assignment:
+        return tree.Assignment(self.at(meta), "=", target, value)
 
-    conditional = _made(tree.Conditional)
+    conditional = _made(tree.ConditionalExpression)
 
-    def binary(self, meta: Meta, left: Any, operator: Any, right: Any) -> tree.Binary:
-        return tree.Binary(self.at(meta), str(operator), left, right)
+    def binary(self, meta: Meta, left: Any, operator: Any, right: Any) -> tree.BinaryExpression:
+        return tree.BinaryExpression(self.at(meta), str(operator), left, right)
 
     bit_or_ = _binary("|")
     bit_xor_ = _binary("^")
@@ -339,56 +356,58 @@ class Builder(Transformer_NonRecursive[Token, Any]):
     divide = _binary("/")
     remainder = _binary("%")
 
-    prefix = _made(tree.Unary)
-    step_before = _made(tree.Step, prefix=True)
+    prefix = _made(tree.UnaryExpression)
+    step_before = _made(tree.IncrementExpression, prefix=True)
 
-    def step_after(self, meta: Meta, target: Any, operator: Any) -> tree.Step:
-        return tree.Step(self.at(meta), str(operator), target, prefix=False)
+    def step_after(self, meta: Meta, target: Any, operator: Any) -> tree.IncrementExpression:
+        return tree.IncrementExpression(self.at(meta), str(operator), target, prefix=False)
 
     def parenthesis(self, _: Meta, _open: Any, inner: tree.Expression) -> tree.Expression:
         return inner
 
-    def cast(self, meta: Meta, _open: Any, *children: Any) -> tree.Cast:
+    def cast(self, meta: Meta, _open: Any, *children: Any) -> tree.CastExpression:
         *words, value = children
         if words[0].type == "FIXED":
             words = [part.strip() for part in words[0].split("::")]
-        return tree.Cast(self.at(meta), tree.TypeName(self.at(meta), tuple(map(str, words))), value)
+        return tree.CastExpression(self.at(meta), tree.TypeName(self.at(meta), tuple(map(str, words))), value)
 
-    def static_cast(self, meta: Meta, *children: Any) -> tree.Cast:
-        return tree.Cast(self.at(meta), *(child for child in children if not isinstance(child, Token)))
+    def static_cast(self, meta: Meta, *children: Any) -> tree.CastExpression:
+        return tree.CastExpression(
+            self.at(meta), *(child for child in children if not isinstance(child, Token))
+        )
 
-    def convert(self, meta: Meta, *children: Any) -> tree.Construct:
+    def convert(self, meta: Meta, *children: Any) -> tree.ConstructorCall:
         words = tuple(str(child) for child in children if _is_builtin(child))
-        return tree.Construct(self.at(meta), tree.TypeName(self.at(meta), words), children[-1] or ())
+        return tree.ConstructorCall(self.at(meta), tree.TypeName(self.at(meta), words), children[-1] or ())
 
-    def construct_vector(self, meta: Meta, kind: Any, arguments: Any) -> tree.Construct:
-        return tree.Construct(self.at(meta), kind, arguments or ())
+    def construct_vector(self, meta: Meta, kind: Any, arguments: Any) -> tree.ConstructorCall:
+        return tree.ConstructorCall(self.at(meta), kind, arguments or ())
 
-    def construct_elements(self, meta: Meta, kind: Any, items: Any) -> tree.Construct:
-        return tree.Construct(self.at(meta), kind, (self.elements_in_braces(meta, items),))
+    def construct_elements(self, meta: Meta, kind: Any, items: Any) -> tree.ConstructorCall:
+        return tree.ConstructorCall(self.at(meta), kind, (self.elements_in_braces(meta, items),))
 
-    def new(self, meta: Meta, *children: Any) -> tree.NewCharacters:
+    def new(self, meta: Meta, *children: Any) -> tree.NewExpression:
         words = [str(child) for child in children if _is_builtin(child)]
         if words != ["char"]:
             self.refuse(
                 meta, f"`new {' '.join(words)}[…]` is not part of the language; write a `std::vector`"
             )
-        return tree.NewCharacters(self.at(meta), children[-1])
+        return tree.NewExpression(self.at(meta), children[-1])
 
-    limit = _made(tree.Limit, 1)
-    index = _made(tree.Index)
-    member = _made(tree.Member)
+    limit = _made(tree.NumericLimit, 1)
+    index = _made(tree.IndexExpression)
+    member = _made(tree.MemberAccess)
 
-    def call(self, meta: Meta, callee: Any, arguments: Any) -> tree.Call:
-        return tree.Call(self.at(meta), callee, arguments or ())
+    def call(self, meta: Meta, callee: Any, arguments: Any) -> tree.CallExpression:
+        return tree.CallExpression(self.at(meta), callee, arguments or ())
 
     arguments = _all
 
-    def number(self, meta: Meta | Token, *children: Any) -> tree.Number:
-        return tree.Number(self.at(meta), str(children[-1]))
+    def number(self, meta: Meta | Token, *children: Any) -> tree.NumberLiteral:
+        return tree.NumberLiteral(self.at(meta), str(children[-1]))
 
-    def negative(self, meta: Meta, *children: Any) -> tree.Unary:
-        return tree.Unary(self.at(meta), "-", self.number(children[-1], children[-1]))
+    def negative(self, meta: Meta, *children: Any) -> tree.UnaryExpression:
+        return tree.UnaryExpression(self.at(meta), "-", self.number(children[-1], children[-1]))
 
     def name(self, meta: Meta, *children: Any) -> tree.Name:
         parts = children[0] if isinstance(children[0], tuple) else tuple(map(str, children))
@@ -396,21 +415,21 @@ class Builder(Transformer_NonRecursive[Token, Any]):
             self.refuse(meta, f"`{parts[0]}` is not part of the language; {FORBIDDEN[parts[0]]}")
         return tree.Name(self.at(meta), parts)
 
-    def string(self, meta: Meta, *parts: Token) -> tree.Text:
+    def string(self, meta: Meta, *parts: Token) -> tree.StringLiteral:
         value = b""
         for part in parts:
             try:
-                value += literals.string_bytes(part[1:-1])
-            except literals.BadLiteralError as error:
+                value += _string_bytes(part[1:-1])
+            except _LiteralError as error:
                 self.refuse(part, str(error))
-        return tree.Text(self.at(meta), value)
+        return tree.StringLiteral(self.at(meta), value)
 
-    def character(self, meta: Meta, quoted: Token) -> tree.Character:
+    def character(self, meta: Meta, quoted: Token) -> tree.CharacterLiteral:
         try:
-            return tree.Character(self.at(meta), literals.character_value(quoted[1:-1]))
-        except literals.BadLiteralError as error:
+            return tree.CharacterLiteral(self.at(meta), _character_value(quoted[1:-1]))
+        except _LiteralError as error:
             self.refuse(meta, str(error))
-            return tree.Character(self.at(meta), 0)
+            return tree.CharacterLiteral(self.at(meta), 0)
 
 
 def _referenced(kind: tree.TypeName) -> tree.TypeName:
@@ -423,12 +442,56 @@ def _is_builtin(child: Any) -> bool:
 
 def _unquoted(token: Token) -> str:
     try:
-        return literals.string_bytes(token[1:-1]).decode("utf-8", "replace")
-    except literals.BadLiteralError:
+        return _string_bytes(token[1:-1]).decode("utf-8", "replace")
+    except _LiteralError:
         return str(token)
 
 
-def check(builder: Builder) -> None:
-    """Raise what the builder found."""
+def check(builder: TreeBuilder) -> None:
+    """Raise the findings of the builder, if there are any."""
     if builder.findings:
         raise SpecificationError(builder.findings)
+
+
+def _string_bytes(inner: str) -> bytes:
+    """Return the bytes of a string literal, given the text between its quotes."""
+    result = bytearray()
+    last = 0
+    for found in _ESCAPE.finditer(inner):
+        result += inner[last : found.start()].encode("utf-8", "surrogatepass")
+        result.append(_escaped(found[1]))
+        last = found.end()
+    return bytes(result + inner[last:].encode("utf-8", "surrogatepass"))
+
+
+def _character_value(inner: str) -> int:
+    """Return the value of a character literal as a signed char."""
+    value = _string_bytes(inner)
+    if len(value) != 1:
+        raise _LiteralError("a character outside ASCII is more than one char; write a string")
+    return value[0] - 256 if value[0] > 127 else value[0]
+
+
+def _duration_ns(text: str) -> int:
+    """Return the nanoseconds of a duration such as `100ms`, `0.5 s` or `2`."""
+    found = _DURATION.match(text)
+    if found is None or len(found[1]) > 30:
+        raise _LiteralError("this is not a duration; write for example `100ms`, `0.5s` or `2m`")
+    if found[2] not in _UNITS_NS:
+        units = ", ".join(unit for unit in _UNITS_NS if unit)
+        raise _LiteralError(f"`{found[2][:20]}` is not a unit of time; write one of {units}")
+    number = found[1] if found[1][0] != "." else "0" + found[1]
+    result = Fraction(number.rstrip(".") if number.endswith(".") else number) * _UNITS_NS[found[2]]
+    if result.denominator != 1 or not MIN_PERIOD_NS <= result <= MAX_PERIOD_NS:
+        raise _LiteralError("a period is from 1 ms to 31 years, and a whole number of nanoseconds")
+    return int(result)
+
+
+def _escaped(code: str) -> int:
+    if code[0] == "x" and len(code) > 1:
+        return int(code[1:], 16)
+    if code[0] in "01234567":
+        return int(code, 8) & 0xFF
+    if code not in _SIMPLE:
+        raise _LiteralError(f"`\\{code}` is not an escape; write `\\\\` for a backslash")
+    return _SIMPLE[code]

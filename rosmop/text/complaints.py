@@ -1,4 +1,4 @@
-"""Says in words why a text is not of the grammar: what was found, what was expected, what to write instead."""
+"""Explain a syntax error: the text found, the text expected, and what to write instead."""
 
 import re
 import unicodedata
@@ -52,41 +52,11 @@ FORBIDDEN = {
 }
 """Words of C++ that are not part of the language, and what to write instead."""
 
-RESERVED = frozenset(
-    [
-        "if",
-        "else",
-        "while",
-        "do",
-        "for",
-        "switch",
-        "case",
-        "default",
-        "break",
-        "continue",
-        "return",
-        "const",
-        "static",
-        "auto",
-        "void",
-        "bool",
-        "char",
-        "short",
-        "int",
-        "long",
-        "float",
-        "double",
-        "signed",
-        "unsigned",
-        "new",
-        "delete",
-        "static_cast",
-        "DROP",
-        "PUBLISH",
-        "__RESET",
-        "using",
-    ]
-)
+RESERVED = frozenset({
+    "if", "else", "while", "do", "for", "switch", "case", "default", "break", "continue", "return", "const",
+    "static", "auto", "void", "bool", "char", "short", "int", "long", "float", "double", "signed",
+    "unsigned", "new", "delete", "static_cast", "DROP", "PUBLISH", "__RESET", "using",
+})  # fmt: skip
 """Words of the language that are never names."""
 
 _FOUND = re.compile(
@@ -101,14 +71,14 @@ _FORMS = tuple(
         (r"\bevent\s+\w+\s*\Z", _EVENT_FORM),
         (
             r"\bevent\s+\w+\s*\([^()]*\)[^;']*['\u2018\u2019\u00b4`]\{[^';]*\Z",
-            "a pattern is `'{field:x, list[0]:y, field:5}'`; a condition stands behind it: `when (x > 3)`",
+            "a pattern is `'{field:x, list[0]:y, field:5}'`; a condition follows it: `when (x > 3)`",
         ),
         (r"@\s*\w+\s*\Z", "a handler is `@category { … }`"),
         (r"\binit\s*\Z", "write `init() { … }`"),
-        (r"\b(?:if|while|switch|for|when)\s*\Z", "a condition stands in parentheses"),
+        (r"\b(?:if|while|switch|for|when)\s*\Z", "a condition is written in parentheses"),
     )
 )
-"""What stands before the text that is refused, and the form of what this was to be."""
+"""A pattern for the text before a syntax error, and the correct form of the construct."""
 _PIECE = re.compile(
     r"""(?P<gap>\s+|//[^\n]*|/\*(?:[^*]|\*(?!/))*\*/)|"(?:\\.|[^"\\\n])*"|'\\?[^\n]'|[{}]|[^\s{}"'/]+|."""
 )
@@ -166,17 +136,17 @@ _SITUATIONS: tuple[tuple[Set[str], str, str], ...] = (
 
 
 def shown(text: str) -> str:
-    """A piece of the file as it may stand in a message: short, and without control characters."""
+    """Return a piece of the file for a message, shortened and without control characters."""
     clean = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
     return f"`{clean if len(clean) <= 40 else clean[:37] + '…'}`"
 
 
 def describe(text: str, offset: int, accepted: Set[str]) -> tuple[int, str]:
-    """Where to say it, and the message for text that cannot follow at `offset`, where a token of `accepted` could."""
+    """Return the offset and the message for text at `offset` where only tokens of `accepted` may follow."""
     if offset >= len(text):
         return _at_end(text, accepted)
     if text.startswith("/*", offset):
-        return offset, "this comment does not end; write `*/` behind it"
+        return offset, "this comment does not end; write `*/` after it"
     match = _FOUND.match(text, offset)
     piece = match[0] if match else text[offset]
     before = _code(text, offset)
@@ -186,30 +156,30 @@ def describe(text: str, offset: int, accepted: Set[str]) -> tuple[int, str]:
         )
         form = "`logic: formula @category { … }`" if before.endswith(":") else "a handler `@category { … }`"
         return offset, f"found {shown(piece)}{what} {form}"
-    told = foreign(text, offset, len(_open_braces(text, offset)))
-    if told is not None:
-        return told[0], _refused(text, *told)
+    advice = foreign(text, offset, len(_open_braces(text, offset)))
+    if advice is not None:
+        return advice[0], _refused(text, *advice)
     if "SEMICOLON" in accepted and "\n" in text[len(before) : offset] and before[-1:] not in "{};":
         line = text.count("\n", 0, offset) + 1
-        return len(before), f"expected `;` behind this, found {shown(piece)} in line {line}"
+        return len(before), f"expected `;` after this, found {shown(piece)} in line {line}"
     hint = _hint(text[:offset], piece, accepted)
     return offset, f"found {shown(piece)}, expected {_expected(accepted)}" + (f"; {hint}" if hint else "")
 
 
 def misplaced(text: str, offset: int, word: str) -> tuple[int, str]:
-    """Where to say it, and the message for a word at `offset` that is no name and of no meaning there."""
+    """Return the offset and the message for a word at `offset` that cannot be a name."""
     if word in FORBIDDEN:
         return offset, f"`{word}` is not part of the language; {FORBIDDEN[word]}"
     opened = _open_braces(text, offset)
-    told = foreign(text, offset, len(opened))
-    if told is not None:
-        return told[0], _refused(text, *told)
+    advice = foreign(text, offset, len(opened))
+    if advice is not None:
+        return advice[0], _refused(text, *advice)
     if not opened:
         return (
             offset,
-            f"`{word}` cannot stand outside of a specification, `name() {{ … }}`; move this into one",
+            f"`{word}` is not allowed outside of a specification, `name() {{ … }}`; move this into one",
         )
-    return offset, f"`{word}` is a word of the language: it cannot stand here, and is no name"
+    return offset, f"`{word}` is a word of the language: it is not allowed here, and not as a name"
 
 
 def _refused(text: str, begin: int, end: int, advice: str) -> str:
@@ -232,7 +202,7 @@ def _hint(before: str, piece: str, accepted: Set[str]) -> str:
 
 
 def _open_braces(text: str, offset: int) -> list[int]:
-    """Where the braces stand that are open at `offset`."""
+    """Return the offsets of the braces that are open at `offset`."""
     opened: list[int] = []
     for piece in _PIECE.finditer(text, 0, offset):
         if piece[0] == "{":
@@ -243,7 +213,7 @@ def _open_braces(text: str, offset: int) -> list[int]:
 
 
 def _code(text: str, offset: int) -> str:
-    """The text before `offset`, to the end of the last thing that is no comment."""
+    """Return the text before `offset` without the comments and blanks at its end."""
     ends = (piece.end() for piece in _PIECE.finditer(text, 0, offset) if not piece["gap"])
     return text[: max(ends, default=0)]
 

@@ -1,4 +1,4 @@
-"""What people write who come from C++, roscpp, ROSMOP's relatives or Python, and what to write here instead."""
+"""Constructs of C++, roscpp, other MOPs and Python that the language lacks, and what to write instead."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ _VECTOR = "use a `std::vector`"
 _NO_THREADS = "messages come one at a time; leave it out"
 _NO_FILES = "there are no files; `ROS_INFO(…)` writes to the audit log"
 _NO_WAITING = "an action must not wait; use an event `every …`"
-_NO_NODE = "a monitor is no node; leave it out"
+_NO_NODE = "a monitor is not a node; leave it out"
 _TIMER = "write `event name() every 100ms { … }`"
 _ROS_INFO = "write `ROS_INFO(…)`"
 
@@ -70,9 +70,9 @@ _NAMES = _TEMPLATES | {
     "__SKIP": "write `DROP;`",
     "RESET": "write `__RESET;`",
     "__MONITOR __LOC __DEFAULT_MESSAGE __ACTIVITY __STATICSIG __LINE__ __FILE__ __func__": (
-        "a record has the place and the monitor by itself; leave it out"
+        "a record already has the position and the monitor; leave it out"
     ),
-    "vector": "write the type of its elements, too: `std::vector<int>`",
+    "vector": "also write the type of its elements: `std::vector<int>`",
     "emplace_back add": "write `.push_back(…)`",
     "push_front": "write `.insert(v.begin(), x)`",
     "length len": "write `.size()`",
@@ -90,10 +90,10 @@ _NAMES = _TEMPLATES | {
     "Duration": "write `ros::Duration`",
     "__int128": "write `long`, which has 64 bits",
 }  # fmt: skip
-_INSTEAD = {name: told for names, told in _NAMES.items() for name in names.split()}
+_INSTEAD = {name: advice for names, advice in _NAMES.items() for name in names.split()}
 _FAMILIES = {
     "ros": "of roscpp there are `ros::Time`, `ros::Duration` and the macros `ROS_…`",
-    "boost": "of boost there is nothing; the C++ library's part is in docs/rv-language.md",
+    "boost": "of boost there is nothing; the C++ library's part is in docs/reference/rv-language.md",
     "Eigen": "use the message types, or a variable for each number",
     "tf": "transforms are not looked up; write an event for `/tf`, of type `tf2_msgs/TFMessage`",
     "tf2": "transforms are not looked up; write an event for `/tf`, of type `tf2_msgs/TFMessage`",
@@ -101,16 +101,16 @@ _FAMILIES = {
 
 
 def instead(parts: Sequence[str]) -> str | None:
-    """What to write for a name that means nothing here; None for a name that is nobody's."""
+    """Return what to write for a known foreign name, or None."""
     pointer = re.fullmatch(r"(\w+::\w+?)(?:::)?(?:Const)?Ptr", "::".join(parts))
     if pointer is not None:
         return f"there are no pointers; write `{pointer[1]}`"
     if parts[-1] in ("iterator", "const_iterator", "reverse_iterator", "const_reverse_iterator"):
         return "walk through a vector with `for (auto& x : v) { … }`, or with an index"
-    told = _INSTEAD.get("::".join(parts)) or _INSTEAD.get("::".join(parts[-2:])) or _INSTEAD.get(parts[-1])
+    advice = _INSTEAD.get("::".join(parts)) or _INSTEAD.get("::".join(parts[-2:])) or _INSTEAD.get(parts[-1])
     if len(parts) == 1:
-        return told
-    return (told if parts[0] in ("std", "boost", "ros") else None) or _FAMILIES.get(parts[0])
+        return advice
+    return (advice if parts[0] in ("std", "boost", "ros") else None) or _FAMILIES.get(parts[0])
 
 
 _Advice = str | Callable[[re.Match[str]], str]
@@ -118,7 +118,7 @@ _Advice = str | Callable[[re.Match[str]], str]
 
 @dataclass(frozen=True)
 class _Shape:
-    """What is not of the grammar: outside of specifications (depth 0), inside (1), in actions and patterns (2)."""
+    """A construct outside the grammar; `depths`: outside specifications (0), in them (1), in braces there (2)."""
 
     pattern: re.Pattern[str]
     advice: _Advice
@@ -134,8 +134,8 @@ def _hexadecimal(found: re.Match[str]) -> str:
     return f"write `{value:#x}`"
 
 
-def _replaced(pattern: str, by: str, told: str = "write `{}`") -> Callable[[re.Match[str]], str]:
-    return lambda found: told.format(re.sub(pattern, by, found[0].strip()))
+def _replaced(pattern: str, by: str, template: str = "write `{}`") -> Callable[[re.Match[str]], str]:
+    return lambda found: template.format(re.sub(pattern, by, found[0].strip()))
 
 
 def _as_float(found: re.Match[str]) -> str:
@@ -172,7 +172,7 @@ _SHAPES = (
         r"\b(?:u8|[uUL])?R\"",
         "write it in plain quotes, with `\\\\` for a backslash and `\\n` for a new line",
     ),
-    _shape(r"\b(?:u8|[uUL])(?=[\"'])", "texts are bytes; leave it out"),
+    _shape(r"\b(?:u8|[uUL])(?=[\"'])", "strings are bytes; leave it out"),
     _shape(
         r"'[^'\n{][^'\n]+'",
         _replaced("'", '"', "a character is one; write a string in double quotes, `{}`"),
@@ -213,7 +213,7 @@ _SHAPES = (
     ),
     _shape(
         rf"\b{_NOT_A_TYPE}{_TYPE}\s+\w+\s*\([^;{{}}]*\)\s*(?:const\s*)?(?=\{{)",
-        "functions stand beside the events, not in them",
+        "functions are declared beside the events, not in them",
         2,
     ),
     _shape(rf"\b{_NOT_A_TYPE}{_TYPE}\s+\w+\s*\(\s*\)(?=\s*;)", "leave the `()` out", 2),
@@ -230,10 +230,10 @@ _SHAPES = (
         1,
     ),
     _shape(r"\.\.\.", "a function has the parameters that it names", 1),
-    _shape(r"\bauto\s+\w+\s*\([^(){};]*\)\s*->\s*[\w:]+", "write the type in front: `int f() { … }`", 1),
+    _shape(r"\bauto\s+\w+\s*\([^(){};]*\)\s*->\s*[\w:]+", "write the type first: `int f() { … }`", 1),
     _shape(r"(?<=\))\s*const\b", "functions belong to no object; leave `const` out", 1),
-    _shape(r"\.\.\.", "write each value by itself", 2),
-    _shape(r"\bcase\b[^;:{}]*\.\.", "write each value by itself", 2),
+    _shape(r"\.\.\.", "write each value separately", 2),
+    _shape(r"\bcase\b[^;:{}]*\.\.", "write each value separately", 2),
     _shape(r"\b(?:DROP|__RESET)\s*\(\s*\)?", _replaced(r"\W.*", ";"), 2),
     _shape(r"\belif\b[^;{}]*", "write `else if (…)`", 2),
     _shape(
@@ -252,7 +252,7 @@ _SHAPES = (
     _shape(r"\*\*", "write `pow(x, y)`", 2),
     _shape(
         r"(?<=[;{}\n])(?<!['\u2018\u2019\u00b4`]\{)\s*\w+\s*:(?!:)",
-        "there are no labels; use a loop, `break` or `continue` (or is a `}` missing in front of a property?)",
+        "there are no labels; use a loop, `break` or `continue` (or is a `}` missing before a property?)",
         2,
     ),
     _shape(
@@ -263,10 +263,7 @@ _SHAPES = (
     ),
     _shape(r"\busing\b[^;{}]*;?", "write the type or name itself; leave this line out"),
     _shape(
-        r"\b([a-z]\w*)\.(?:msg\.)?([A-Z]\w*)\s+(?=\w)",
-        lambda found: f"write `{found[1]}::{found[2]}`",
-        1,
-        2,
+        r"\b([a-z]\w*)\.(?:msg\.)?([A-Z]\w*)\s+(?=\w)", lambda found: f"write `{found[1]}::{found[2]}`", 1, 2
     ),
     _shape(
         r"\b[A-Za-z_]\w*(?:[-.]\w+)+(?=\s*[({])|\b\w+-\w+(?=\s)",
@@ -289,7 +286,7 @@ _WINDOW = 200
 
 
 def foreign(text: str, offset: int, depth: int) -> tuple[int, int, str] | None:
-    """Where the foreign text begins and ends that cannot be read at `offset`, and what is said of it."""
+    """Return the start and end of a foreign construct at `offset`, and the advice; None if none is known."""
     before = text[max(0, offset - _WINDOW) : offset]
     begin = offset - len(before) + max(before.rfind(mark) for mark in ";{}\n") + 1
     end = min(len(text), offset + _WINDOW)
@@ -298,6 +295,6 @@ def foreign(text: str, offset: int, depth: int) -> tuple[int, int, str] | None:
             continue
         for found in shape.pattern.finditer(text, begin, end):
             if found.start() <= offset <= found.end() and found[0].strip():
-                told = shape.advice if isinstance(shape.advice, str) else shape.advice(found)
-                return found.end() - len(found[0].lstrip()), found.end(), told
+                advice = shape.advice if isinstance(shape.advice, str) else shape.advice(found)
+                return found.end() - len(found[0].lstrip()), found.end(), advice
     return None

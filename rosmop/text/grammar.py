@@ -1,20 +1,20 @@
 """The grammar of ``.rv`` files, for lark's LALR(1) parser with its contextual lexer.
 
-The lexer knows which tokens may follow, so `/landshark/scan` is a topic where a topic may stand and two
-divisions elsewhere, and `event` or `service` are still names of variables inside an action. Where C++ needs to
-know what a name is to tell a declaration from an expression, two names in a row are a declaration.
+The lexer knows which tokens may follow, so `/landshark/scan` is a topic where a topic is allowed and two
+divisions elsewhere. Inside an action, `event` and `service` are still names of variables. C++ needs to know types to
+tell a declaration from an expression; here two names in a row are a declaration.
 """
 
 from rosmop.logics.catalogue import LOGICS
 
 _GAP = r"(?:\s|\/\/[^\n]*\n|\/\*(?:[^*]|\*(?!\/))*\*\/)"
-"""What may stand between two tokens: blanks and comments. It matches in one way only, so nothing is tried twice."""
+"""Blanks and comments between two tokens. It can match in only one way, so the lexer never backtracks."""
 
 _WORD = "(?:creation|static|unsynchronized|decentralized|perthread|suffix)"
-"""What MOP writes before `event`."""
+"""MOP's modifiers of `event`."""
 
 _AT = r"@(?=(?:bc?|c)(?!\w))(?!\w+<GAP>*\{)"
-"""The `@` of an operator of `ptcaret`, which begins no handler."""
+"""The `@` of an operator of `ptcaret`, which does not begin a handler."""
 
 _GRAMMAR = r"""
 file: (specification | using | ";")*
@@ -220,7 +220,7 @@ PREAMBLE.10: /#(\\\r?\n|[^\n])*/
 """
 
 _NEXT = rf"(?<!\w)(?:(?i:{'|'.join(LOGICS)}|dl)\s*:(?!:)|(?:{_WORD}\s+)*event\s+[A-Za-z_]\w*\s*\()"
-"""Where a formula ends that no handler follows: another property, or an event."""
+"""The end of a formula without handlers: another property, or an event."""
 
 GRAMMAR = (
     _GRAMMAR.replace("<NEXT>", _NEXT).replace("<AT>", _AT).replace("<GAP>", _GAP).replace("<WORD>", _WORD)

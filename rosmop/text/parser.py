@@ -1,7 +1,6 @@
-"""Reads the text of an ``.rv`` file into a tree, or says where and why it cannot.
+"""Parse the text of an ``.rv`` file into a tree.
 
-Bounds: a file has at most `MAX_CHARACTERS`, and nests at most `MAX_DEPTH` deep; time and memory are linear in
-its length, and no later pass meets anything deeper.
+A file has at most `MAX_CHARACTERS`, and nests at most `MAX_DEPTH` deep. Time and memory are linear in its length.
 """
 
 import re
@@ -12,18 +11,28 @@ from lark.exceptions import UnexpectedInput, UnexpectedToken
 
 from rosmop.form.positions import Position
 from rosmop.text import tree
-from rosmop.text.builder import Builder, check
+from rosmop.text.builder import TreeBuilder, check
 from rosmop.text.complaints import FORBIDDEN, RESERVED, describe, misplaced
-from rosmop.text.directives import check_directives
 from rosmop.text.errors import SpecificationError
 from rosmop.text.grammar import GRAMMAR
 
 MAX_CHARACTERS = 128 * 1024
 MAX_DEPTH = 100
-"""Statements and operators inside each other."""
+"""The maximum nesting of statements and operators."""
 
 _NO_TEXT = re.compile("[\ud800-\udfff]")
-"""Half a character: what a reader that goes on after bytes that are no UTF-8 puts in their place."""
+"""Surrogates, which replace bytes that are not UTF-8."""
+
+# Lines of the C++ preprocessor are ignored if that changes nothing.
+_PREPROCESSED = re.compile(
+    r"""(?P<comment>//[^\n]*|/\*(?:[^*]|\*(?!/))*(?:\*/|\Z))
+    |\#[ \t]*(?P<word>if|ifn?def|el(?:se|if)|endif|define|undef|include|pragma|error|warning|line)\b
+        [ \t]*(?P<macro>\w+)?(?:\\\r?\n|[^\n])*
+    |(?P<name>[A-Za-z_]\w*)
+    |"(?:\\[^\n]|[^"\\\n])*"?|'(?:\\[^\n]|[^'\\\n])'|\d[\w.]*|[^\s\ufeff]""",
+    re.VERBOSE,
+)
+_CONDITIONS = ("if", "ifdef", "ifndef")
 
 
 class _ForbiddenWordError(Exception):
@@ -32,7 +41,7 @@ class _ForbiddenWordError(Exception):
         self.token = token
 
 
-def parse(text: str, file: str) -> tree.File:
+def parse(text: str, file: str) -> tree.SpecificationFile:
     """Parse a file; `file` is its name in positions. Raises `SpecificationError`."""
     start = Position(file, 1, 1)
     if len(text) > MAX_CHARACTERS:
@@ -42,13 +51,13 @@ def parse(text: str, file: str) -> tree.File:
     broken = _NO_TEXT.search(text)
     if broken is not None:
         raise SpecificationError.at(
-            start.within(text, broken.start()), "these bytes are no UTF-8; save the file as UTF-8"
+            start.within(text, broken.start()), "these bytes are not UTF-8; save the file as UTF-8"
         )
-    check_directives(text, file)
+    _check_directives(text, file)
     parsed = _parse(text, file)
     _check_depth(parsed, file)
-    builder = Builder(file, text)
-    result: tree.File = builder.transform(parsed)
+    builder = TreeBuilder(file, text)
+    result: tree.SpecificationFile = builder.transform(parsed)
     check(builder)
     if not result.specifications:
         raise SpecificationError.at(
@@ -73,7 +82,7 @@ def _parse(text: str, file: str) -> Tree[Token]:
 
 
 def start_of(file: str, text: str, offset: int) -> Position:
-    """The position of a character; for the end of the text, the place behind the last thing in it."""
+    """Return the position of a character; for the end of the text, the position after the last non-blank character."""
     if offset >= len(text):
         offset = len(text.rstrip())
     return Position(file, 1, 1).within(text, offset)
@@ -107,7 +116,7 @@ def _allow(token: Token) -> Token:
 
 @lru_cache(maxsize=1)
 def _parser() -> Lark:
-    """The parser, made at the first use: it is always the same and keeps no state between files."""
+    """Return the parser. It is built at the first use and keeps no state between files."""
     return Lark(
         GRAMMAR,
         start="file",
@@ -116,3 +125,35 @@ def _parser() -> Lark:
         maybe_placeholders=True,
         lexer_callbacks={"NAME": _allow},
     )
+
+
+def _check_directives(text: str, file: str) -> None:
+    """Raise `SpecificationError` for conditions around more than comments, and for macros whose names are used."""
+    macros: dict[str, int] = {}
+    used: set[str] = set()
+    conditions: list[tuple[str, int]] = []
+    for piece in _PREPROCESSED.finditer(text):
+        word, place = piece["word"], piece.start()
+        if word in _CONDITIONS:
+            conditions.append((word, place))
+        elif word == "endif":
+            del conditions[-1:]
+        elif word == "define":
+            macros.setdefault(piece["macro"] or "", place)
+        elif not word and not piece["comment"]:
+            if conditions:
+                word, place = conditions[0]
+                raise _directive_error(
+                    text, file, place, f"#{word}", "leave what you want there, without conditions"
+                )
+            if piece["name"]:
+                used.add(piece["name"])
+    for macro, place in macros.items():
+        if macro in used:
+            advice = f"write `const double {macro} = …;`, or a function, into the specification"
+            raise _directive_error(text, file, place, f"#define {macro}", advice)
+
+
+def _directive_error(text: str, file: str, place: int, what: str, instead: str) -> SpecificationError:
+    position = Position(file, 1, 1).within(text, place)
+    return SpecificationError.at(position, f"`{what}`: there is no preprocessor; {instead}")

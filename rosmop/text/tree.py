@@ -4,26 +4,39 @@ Strings are bytes, as in C++ (a character outside ASCII is its UTF-8 bytes). Not
 is the tuple of its parts (`std::string` is `("std", "string")`).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from rosmop.form.positions import Position
 
 
 @dataclass(frozen=True)
-class Node:
-    """Anything that stands somewhere."""
+class SyntaxNode:
+    """A node of the syntax tree."""
 
     position: Position = field(compare=False)
+
+
+def walk(root: object) -> Iterator[SyntaxNode]:
+    """Yield a node and all nodes in it."""
+    waiting = [root]
+    while waiting:
+        current = waiting.pop()
+        if isinstance(current, tuple):
+            waiting += current
+        elif isinstance(current, SyntaxNode):
+            yield current
+            waiting += [getattr(current, name) for name in current.__dataclass_fields__]
 
 
 # Types
 
 
 @dataclass(frozen=True)
-class TypeName(Node):
+class TypeName(SyntaxNode):
     """A type as written: `name` is ("unsigned", "int"), ("std", "string"), ("std", "vector"), ("[]",), ("auto",), …
 
-    `element` is that of a vector or of an array `T[]`. `pointer` stands for `char *`, `reference` for `&`.
+    `element` is the element type of a vector or of an array `T[]`. `pointer`: `char *`; `reference`: `&`.
     """
 
     name: tuple[str, ...]
@@ -35,7 +48,7 @@ class TypeName(Node):
 
 
 @dataclass(frozen=True)
-class Parameter(Node):
+class ParameterDeclaration(SyntaxNode):
     """A parameter of an event or of a helper function."""
 
     type: TypeName
@@ -46,26 +59,26 @@ class Parameter(Node):
 
 
 @dataclass(frozen=True)
-class Expression(Node):
-    """What has a value."""
+class Expression(SyntaxNode):
+    """An expression."""
 
 
 @dataclass(frozen=True)
-class Number(Expression):
+class NumberLiteral(Expression):
     """A number as written, with its suffix."""
 
     text: str
 
 
 @dataclass(frozen=True)
-class Text(Expression):
+class StringLiteral(Expression):
     """A string literal."""
 
     value: bytes
 
 
 @dataclass(frozen=True)
-class Character(Expression):
+class CharacterLiteral(Expression):
     """A character literal, as a signed char."""
 
     value: int
@@ -79,7 +92,7 @@ class Name(Expression):
 
 
 @dataclass(frozen=True)
-class Unary(Expression):
+class UnaryExpression(Expression):
     """`!` `-` `+` `~` in front of an operand."""
 
     operator: str
@@ -87,7 +100,7 @@ class Unary(Expression):
 
 
 @dataclass(frozen=True)
-class Step(Expression):
+class IncrementExpression(Expression):
     """`++` or `--`, before or after its target."""
 
     operator: str
@@ -96,8 +109,8 @@ class Step(Expression):
 
 
 @dataclass(frozen=True)
-class Binary(Expression):
-    """Two operands; `sign` is where the operator stands."""
+class BinaryExpression(Expression):
+    """Two operands of a binary operator."""
 
     operator: str
     left: Expression
@@ -105,7 +118,7 @@ class Binary(Expression):
 
 
 @dataclass(frozen=True)
-class Assign(Expression):
+class Assignment(Expression):
     """`=`, `+=`, …"""
 
     operator: str
@@ -114,7 +127,7 @@ class Assign(Expression):
 
 
 @dataclass(frozen=True)
-class Conditional(Expression):
+class ConditionalExpression(Expression):
     """`condition ? yes : no`."""
 
     condition: Expression
@@ -123,22 +136,22 @@ class Conditional(Expression):
 
 
 @dataclass(frozen=True)
-class Sequence(Expression):
+class CommaExpression(Expression):
     """`a, b`: the last one is the value."""
 
     items: tuple[Expression, ...]
 
 
 @dataclass(frozen=True)
-class Call(Expression):
-    """A call of a function, of a member (the callee is a `Member`) or of a type."""
+class CallExpression(Expression):
+    """A call of a function, of a member (the callee is a `MemberAccess`) or of a type."""
 
     callee: Expression
     arguments: tuple[Expression, ...]
 
 
 @dataclass(frozen=True)
-class Index(Expression):
+class IndexExpression(Expression):
     """`base[index]`."""
 
     base: Expression
@@ -146,7 +159,7 @@ class Index(Expression):
 
 
 @dataclass(frozen=True)
-class Member(Expression):
+class MemberAccess(Expression):
     """`base.name`."""
 
     base: Expression
@@ -154,7 +167,7 @@ class Member(Expression):
 
 
 @dataclass(frozen=True)
-class Cast(Expression):
+class CastExpression(Expression):
     """`(int) x`, `static_cast<int>(x)`."""
 
     type: TypeName
@@ -162,7 +175,7 @@ class Cast(Expression):
 
 
 @dataclass(frozen=True)
-class Construct(Expression):
+class ConstructorCall(Expression):
     """`int(x)`, `std::vector<double>(3, 0.0)`."""
 
     type: TypeName
@@ -170,14 +183,14 @@ class Construct(Expression):
 
 
 @dataclass(frozen=True)
-class NewCharacters(Expression):
+class NewExpression(Expression):
     """`new char[size]`."""
 
     size: Expression
 
 
 @dataclass(frozen=True)
-class Limit(Expression):
+class NumericLimit(Expression):
     """`std::numeric_limits<type>::name()`."""
 
     type: TypeName
@@ -185,7 +198,7 @@ class Limit(Expression):
 
 
 @dataclass(frozen=True)
-class Elements(Expression):
+class InitializerList(Expression):
     """`{1, 2, 3}`, where a vector is initialised or assigned."""
 
     items: tuple[Expression, ...]
@@ -195,13 +208,13 @@ class Elements(Expression):
 
 
 @dataclass(frozen=True)
-class Statement(Node):
-    """What is done."""
+class Statement(SyntaxNode):
+    """A statement."""
 
 
 @dataclass(frozen=True)
-class Declarator(Node):
-    """One name of a declaration. `size` is that of `T name[size]`; `arguments` those of `T name(…)`."""
+class Declarator(SyntaxNode):
+    """One name of a declaration. `size` is from `T name[size]`, `arguments` from `T name(…)`."""
 
     name: str
     value: Expression | None = None
@@ -219,8 +232,8 @@ class Declaration(Statement):
 
 
 @dataclass(frozen=True)
-class Evaluate(Statement):
-    """An expression for its effect."""
+class ExpressionStatement(Statement):
+    """An expression that is evaluated for its effect."""
 
     expression: Expression
 
@@ -233,7 +246,7 @@ class Block(Statement):
 
 
 @dataclass(frozen=True)
-class If(Statement):
+class IfStatement(Statement):
     """`if (condition) yes else no`."""
 
     condition: Expression
@@ -242,8 +255,8 @@ class If(Statement):
 
 
 @dataclass(frozen=True)
-class While(Statement):
-    """`while (condition) body`; with `at_end` the condition is looked at after the body (`do … while`)."""
+class WhileStatement(Statement):
+    """`while (condition) body`; with `at_end`: `do … while`."""
 
     condition: Expression
     body: Statement
@@ -251,7 +264,7 @@ class While(Statement):
 
 
 @dataclass(frozen=True)
-class For(Statement):
+class ForStatement(Statement):
     """`for (start; condition; step) body`."""
 
     start: Statement | None
@@ -261,7 +274,7 @@ class For(Statement):
 
 
 @dataclass(frozen=True)
-class RangeFor(Statement):
+class RangeForStatement(Statement):
     """`for (type name : values) body`."""
 
     type: TypeName
@@ -271,57 +284,57 @@ class RangeFor(Statement):
 
 
 @dataclass(frozen=True)
-class Case(Node):
-    """The statements after one `case value:` (None: `default:`), up to the next."""
+class SwitchCase(SyntaxNode):
+    """The statements after one `case value:` (None: `default:`), up to the next case."""
 
     value: Expression | None
     statements: tuple[Statement, ...]
 
 
 @dataclass(frozen=True)
-class Switch(Statement):
+class SwitchStatement(Statement):
     """`switch (value) { case …: … }`."""
 
     value: Expression
-    cases: tuple[Case, ...]
+    cases: tuple[SwitchCase, ...]
 
 
 @dataclass(frozen=True)
-class Break(Statement):
+class BreakStatement(Statement):
     """`break;`."""
 
 
 @dataclass(frozen=True)
-class Continue(Statement):
+class ContinueStatement(Statement):
     """`continue;`."""
 
 
 @dataclass(frozen=True)
-class Return(Statement):
+class ReturnStatement(Statement):
     """`return value;`; without a value, an action drops the message."""
 
     value: Expression | None
 
 
 @dataclass(frozen=True)
-class Drop(Statement):
+class DropStatement(Statement):
     """`DROP;`."""
 
 
 @dataclass(frozen=True)
-class Reset(Statement):
+class ResetStatement(Statement):
     """`__RESET;`."""
 
 
 @dataclass(frozen=True)
-class Delete(Statement):
-    """`delete[] name;`: read, and needs nothing."""
+class DeleteStatement(Statement):
+    """`delete[] name;`, which has no effect."""
 
     target: Expression
 
 
 @dataclass(frozen=True)
-class Publish(Statement):
+class PublishStatement(Statement):
     """`PUBLISH(topic, type, value);`."""
 
     topic: str
@@ -334,7 +347,7 @@ class Publish(Statement):
 
 
 @dataclass(frozen=True)
-class PathStep(Node):
+class PathStep(SyntaxNode):
     """One field of a path, with its index if it has one."""
 
     name: str
@@ -342,7 +355,7 @@ class PathStep(Node):
 
 
 @dataclass(frozen=True)
-class Binding(Node):
+class Binding(SyntaxNode):
     """A field of the pattern: its path from the message, and a variable or a constant."""
 
     path: tuple[PathStep, ...]
@@ -352,8 +365,8 @@ class Binding(Node):
 
 
 @dataclass(frozen=True)
-class MessageTrigger(Node):
-    """When an event happens: a message on a topic, or a request or response of a service (`part`)."""
+class MessageTrigger(SyntaxNode):
+    """The trigger of an event: a message on a topic, or a request or response of a service (`part`)."""
 
     topic: str
     type: str
@@ -364,42 +377,42 @@ class MessageTrigger(Node):
 
 
 @dataclass(frozen=True)
-class TimerTrigger(Node):
-    """When an event happens: every so many nanoseconds."""
+class TimerTrigger(SyntaxNode):
+    """The trigger of a timer: its period in nanoseconds."""
 
     period_ns: int
 
 
 @dataclass(frozen=True)
-class Event(Node):
+class EventDefinition(SyntaxNode):
     """An event and its action."""
 
     modifiers: tuple[Name, ...]
     name: str
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[ParameterDeclaration, ...]
     trigger: MessageTrigger | TimerTrigger
     action: Block
 
 
 @dataclass(frozen=True)
-class Function(Node):
+class FunctionDefinition(SyntaxNode):
     """A helper function."""
 
     type: TypeName | None
     name: str
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[ParameterDeclaration, ...]
     body: Block
 
 
 @dataclass(frozen=True)
-class Init(Node):
+class InitBlock(SyntaxNode):
     """`init() { … }`."""
 
     body: Block
 
 
 @dataclass(frozen=True)
-class Handler(Node):
+class Handler(SyntaxNode):
     """`@category { … }`."""
 
     category: str
@@ -407,7 +420,7 @@ class Handler(Node):
 
 
 @dataclass(frozen=True)
-class Property(Node):
+class Property(SyntaxNode):
     """A formula of a logic, and its handlers; `formula_position` is where the formula begins."""
 
     logic: str
@@ -417,22 +430,22 @@ class Property(Node):
 
 
 @dataclass(frozen=True)
-class Specification(Node):
+class Specification(SyntaxNode):
     """One `name() { … }`."""
 
     modifiers: tuple[Name, ...]
     name: str
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[ParameterDeclaration, ...]
     declarations: tuple[Declaration, ...]
-    functions: tuple[Function, ...]
-    inits: tuple[Init, ...]
-    events: tuple[Event, ...]
+    functions: tuple[FunctionDefinition, ...]
+    inits: tuple[InitBlock, ...]
+    events: tuple[EventDefinition, ...]
     properties: tuple[Property, ...]
 
 
 @dataclass(frozen=True)
-class File:
-    """The specifications of one file, in order; `text` is what they were read from."""
+class SpecificationFile:
+    """The specifications of one file, in order, and its `text`."""
 
     name: str
     text: str

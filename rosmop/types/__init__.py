@@ -1,1 +1,1 @@
-"""The types of the ``.rv`` language, how they convert, and how they meet the definitions of messages."""
+"""The types of the ``.rv`` language, their conversions, and their relation to message definitions."""

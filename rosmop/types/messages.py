@@ -1,6 +1,6 @@
 """Message types as the language sees them: fields in order, their types, and constants.
 
-The definitions are those of `roswire`. A name that does not exist is refused with the nearest that does.
+The definitions are those of `roswire`. The error for an unknown name suggests the nearest known name.
 """
 
 import difflib
@@ -15,7 +15,7 @@ from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_text import Constant, Field, MessageDefinition
 
-_COMPARED = 600  # names that a wrong one is compared with
+_COMPARED = 600  # the maximum number of names that an unknown one is compared with
 
 PRIMITIVES: Mapping[str, Type] = MappingProxyType(
     {
@@ -40,8 +40,8 @@ PRIMITIVES: Mapping[str, Type] = MappingProxyType(
 
 
 @dataclass(frozen=True)
-class Slot:
-    """A field of a message: its place in the list that holds the message, its type, its definition."""
+class FieldSlot:
+    """A field of a message: its index in the list of the message's values, its type, and its definition."""
 
     index: int
     name: str
@@ -50,18 +50,18 @@ class Slot:
 
 
 class UnknownNameError(Exception):
-    """No such type or field; the text says so and what is near."""
+    """An unknown type or field; the text suggests a similar name."""
 
 
-class Messages:
+class MessageTypes:
     """The message types of a set of definitions."""
 
     def __init__(self, definitions: Definitions) -> None:
         self.definitions = definitions
-        self._slots: dict[str, dict[str, Slot]] = {}
+        self._slots: dict[str, dict[str, FieldSlot]] = {}
 
     def definition(self, name: str) -> MessageDefinition:
-        """The definition of a message type, complete and usable; raises `UnknownNameError`."""
+        """Return the definition of a message type, complete and usable; raises `UnknownNameError`."""
         try:
             self.definitions.layout(name)
             return self.definitions.message(name)
@@ -69,22 +69,22 @@ class Messages:
             if name in self.definitions.message_types:
                 raise UnknownNameError(f"the definition of {name} cannot be used: {error}") from None
             raise UnknownNameError(
-                f"there is no message type {shown(name)}{nearest(name, self.definitions.message_types)}; "
+                f"unknown message type {shown(name)}{nearest(name, self.definitions.message_types)}; "
                 "ROS's own are known, others need a .msg file (--msg DIR, or msg/ beside the file)"
             ) from None
 
-    def slots(self, name: str) -> dict[str, Slot]:
-        """The fields of a message type by name, in order."""
+    def slots(self, name: str) -> dict[str, FieldSlot]:
+        """Return the fields of a message type by name, in the order of the definition."""
         if name not in self._slots:
             fields = self.definition(name).fields
             self._slots[name] = {
-                field.name: Slot(index, field.name, field_type(field), field)
+                field.name: FieldSlot(index, field.name, field_type(field), field)
                 for index, field in enumerate(fields)
             }
         return self._slots[name]
 
-    def slot(self, name: str, field: str) -> Slot:
-        """One field; raises `UnknownNameError` with the nearest."""
+    def slot(self, name: str, field: str) -> FieldSlot:
+        """Return one field; raises `UnknownNameError` with the nearest name."""
         slots = self.slots(name)
         if field not in slots:
             paths = self._paths_to(name, field)
@@ -94,14 +94,14 @@ class Messages:
         return slots[field]
 
     def constant(self, name: str, constant: str) -> Constant:
-        """A constant of a message type; raises `UnknownNameError`."""
+        """Return a constant of a message type; raises `UnknownNameError`."""
         constants = {known.name: known for known in self.definition(name).constants}
         if constant not in constants:
             raise UnknownNameError(f"{name} has no constant {shown(constant)}{nearest(constant, constants)}")
         return constants[constant]
 
     def _paths_to(self, name: str, field: str) -> list[str]:
-        """Paths of at most three steps that end in a field of this name."""
+        """Return the shortest paths, of two or three steps, that end in a field of this name."""
         level = [("", name)]
         for _ in range(3):
             found = []
@@ -110,7 +110,7 @@ class Messages:
                 for slot in self.slots(record).values():
                     if slot.name == field and prefix:
                         found.append(f"{prefix}{slot.name}")
-                    if isinstance(slot.type, value_types.Record):
+                    if isinstance(slot.type, value_types.RecordType):
                         below.append((f"{prefix}{slot.name}.", slot.type.name))
             if found:
                 return found
@@ -119,22 +119,22 @@ class Messages:
 
 
 def field_type(field: Field) -> Type:
-    """The type of a field's value."""
-    element = PRIMITIVES.get(field.type) or value_types.Record(field.type)
-    return value_types.Vector(element, field.length) if field.is_array else element
+    """Return the type of a field's value."""
+    element = PRIMITIVES.get(field.type) or value_types.RecordType(field.type)
+    return value_types.VectorType(element, field.length) if field.is_array else element
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """What else could have been meant, as the tail of a message; of very many names, among the first."""
-    known = list(islice(known, _COMPARED))  # a file can have thousands of names, and of mistakes
+    """Return a suggestion, as the tail of an error. Only the first of very many names are compared."""
+    known = list(islice(known, _COMPARED))  # a file can have thousands of names and of mistakes
     near = difflib.get_close_matches(name[:100], known, 1, 0.65)
     if near:
         return f"; did you mean `{near[0]}`?"
     if 0 < len(known) <= 12:
-        return "; there are: " + ", ".join(known)
+        return "; known: " + ", ".join(known)
     return ""
 
 
 def shown(name: str) -> str:
-    """A name as it may stand in a message."""
+    """Return a name for a message, shortened."""
     return f"`{name if len(name) <= 60 else name[:57] + '…'}`"

@@ -1,11 +1,11 @@
-"""Type names of the text to types."""
+"""Resolve the type names of a specification."""
 
 from rosmop.form.positions import Position
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
 from rosmop.text.foreign import instead
 from rosmop.types import value_types
-from rosmop.types.messages import Messages, UnknownNameError, nearest
+from rosmop.types.messages import MessageTypes, UnknownNameError, nearest
 from rosmop.types.value_types import Type
 
 _SIGNED = {
@@ -34,7 +34,7 @@ _NAMED: dict[tuple[str, ...], Type] = {
     ("int64_t",): value_types.LONG,
     ("uint64_t",): value_types.ULONG,
 }
-_CPP_NAMES = {  # of the types of fields, as .msg files name them
+_CPP_NAMES = {  # C++ names of the field types that .msg files name
     **{f"{sign}int{bits}": f"{sign}int{bits}_t" for sign in ("", "u") for bits in (8, 16, 32, 64)},
     "float32": "float",
     "float64": "double",
@@ -46,17 +46,17 @@ _SHORT_NAMES = {short: f"unsigned {short[1:]}" for short in ("uint", "ushort", "
 
 
 def named_type(parts: tuple[str, ...]) -> Type | None:
-    """The type of a name that is one without looking at messages: `std::string`, `size_t`, `ros::Time`."""
+    """Return the type of a name that is not a message type (`std::string`, `size_t`, `ros::Time`), or None."""
     return _NAMED.get(parts[1:] if parts[0] == "std" and len(parts) > 1 else parts)
 
 
-def resolve(name: tree.TypeName, messages: Messages) -> Type:
-    """The type that a name of the text stands for (`auto` is not one); raises `SpecificationError`."""
+def resolve(name: tree.TypeName, messages: MessageTypes) -> Type:
+    """Return the type of a type name (not `auto`); raises `SpecificationError`."""
     if name.element is not None:
         element = resolve(name.element, messages)
         if element in (value_types.VOID, value_types.CHARACTERS):
             raise SpecificationError.at(name.position, f"there are no vectors of {element}")
-        return value_types.Vector(element)
+        return value_types.VectorType(element)
     built_in = _built_in(name)
     if name.pointer:
         if built_in != value_types.CHAR:
@@ -77,39 +77,38 @@ def _built_in(name: tree.TypeName) -> Type | None:
         return value_types.FLOAT if words == ["float"] else value_types.DOUBLE
     if not set(words) <= {"char", "short", "int", "long", "signed", "unsigned"}:
         if len(words) > 1 and words[0] in ("unsigned", "signed", "long", "short"):
-            raise SpecificationError.at(name.position, f"`{' '.join(words)}` is no type")
+            raise SpecificationError.at(name.position, f"`{' '.join(words)}` is not a type")
         return None
     signs = [word for word in words if word in ("signed", "unsigned")]
     sizes = [word for word in words if word in ("char", "short", "long")]
     known: tuple[list[str], ...] = ([], ["char"], ["short"], ["long"], ["long", "long"])
     too_many = words.count("int") > 1 or len(signs) > 1 or ("char" in words and "int" in words)
     if sizes not in known or too_many:
-        raise SpecificationError.at(name.position, f"`{' '.join(words)}` is no type")
+        raise SpecificationError.at(name.position, f"`{' '.join(words)}` is not a type")
     if words == ["signed", "char"]:
         return value_types.INT8
     table = _UNSIGNED if signs == ["unsigned"] else _SIGNED
     return table[sizes[0] if sizes else "int"]
 
 
-def _message(name: tree.TypeName, messages: Messages) -> Type:
+def _message(name: tree.TypeName, messages: MessageTypes) -> Type:
     text = "::".join(name.name)
     if text in _CPP_NAMES:
         raise SpecificationError.at(
-            name.position,
-            f"there is no type `{text}`; ROS's {text} is `{_CPP_NAMES[text]}` in C++: write that",
+            name.position, f"unknown type `{text}`; ROS's {text} is `{_CPP_NAMES[text]}` in C++: write that"
         )
     if text in _SHORT_NAMES:
-        raise SpecificationError.at(name.position, f"there is no type `{text}`; write `{_SHORT_NAMES[text]}`")
+        raise SpecificationError.at(name.position, f"unknown type `{text}`; write `{_SHORT_NAMES[text]}`")
     if len(name.name) != 2 or name.name[0] == "std":
-        raise SpecificationError.at(name.position, f"there is no type `{text}`{_meant(name.name, messages)}")
+        raise SpecificationError.at(name.position, f"unknown type `{text}`{_meant(name.name, messages)}")
     return record(name.position, "/".join(name.name), messages)
 
 
-def _meant(parts: tuple[str, ...], messages: Messages) -> str:
-    """The tail of the refusal of a type that is none, nor of the form of a message type."""
-    told = instead(parts)
-    if told is not None:
-        return f"; {told}"
+def _meant(parts: tuple[str, ...], messages: MessageTypes) -> str:
+    """Return the tail of the error for an unknown type that is not written as a message type."""
+    advice = instead(parts)
+    if advice is not None:
+        return f"; {advice}"
     named = [known for known in messages.definitions.message_types if known.endswith(f"/{parts[-1]}")]
     if named and len(parts) == 1:
         return f"; did you mean `{named[0].replace('/', '::')}`?"
@@ -117,12 +116,12 @@ def _meant(parts: tuple[str, ...], messages: Messages) -> str:
     return hint if "did you mean" in hint else "; write a C++ type or a message type `package::Type`"
 
 
-def record(position: Position, name: str, messages: Messages) -> value_types.Record:
-    """The message type of this name; raises `SpecificationError`."""
+def record(position: Position, name: str, messages: MessageTypes) -> value_types.RecordType:
+    """Return the message type of this name; raises `SpecificationError`."""
     try:
         messages.definition(name)
     except UnknownNameError as error:
-        told = instead(name.split("/")) if name not in messages.definitions.message_types else None
-        text = f"there is no `{name.replace('/', '::')}`; {told}" if told else str(error)
+        advice = instead(name.split("/")) if name not in messages.definitions.message_types else None
+        text = f"there is no `{name.replace('/', '::')}`; {advice}" if advice else str(error)
         raise SpecificationError.at(position, text) from None
-    return value_types.Record(name)
+    return value_types.RecordType(name)

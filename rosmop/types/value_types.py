@@ -1,6 +1,6 @@
 """The types of values: C++'s arithmetic types, strings, times, vectors and messages.
 
-A type is a value object; its text is how C++ writes it. How values are held while actions run: `bool`, `int` and
+A type is a value object; its text is how C++ writes it. While actions run, values are: `bool`, `int` and
 `float` as Python's; strings and `char *` buffers as bytes; times and durations as integer nanoseconds; vectors
 and messages as lists (a message's fields in the order of its definition).
 """
@@ -8,33 +8,37 @@ and messages as lists (a message's fields in the order of its definition).
 import msgspec
 
 
-class _Kind(msgspec.Struct, frozen=True, tag=True, tag_field="kind", array_like=True):
-    """What all types are."""
+def _tag(name: str) -> str:
+    return name.removesuffix("Type")
 
 
-class Void(_Kind, frozen=True):
-    """No value."""
+class _Kind(msgspec.Struct, frozen=True, tag=_tag, tag_field="kind", array_like=True):
+    """A type; its class name without `Type` is its tag."""
+
+
+class VoidType(_Kind, frozen=True):
+    """The type without values, `void`."""
 
     def __str__(self) -> str:
         return "void"
 
 
-class Index(_Kind, frozen=True):
-    """A place in a vector, which no variable holds."""
+class IteratorType(_Kind, frozen=True):
+    """The type of an iterator: a position in a vector. No variable holds it."""
 
     def __str__(self) -> str:
         return "an iterator"
 
 
-class Bool(_Kind, frozen=True):
+class BoolType(_Kind, frozen=True):
     """`bool`."""
 
     def __str__(self) -> str:
         return "bool"
 
 
-class Integer(_Kind, frozen=True):
-    """An integer type; `name` is only for messages (`long` and `long long` are the same type)."""
+class IntegerType(_Kind, frozen=True):
+    """An integer type; `name` is only for error messages (`long` and `long long` are the same type)."""
 
     bits: int
     signed: bool
@@ -42,20 +46,20 @@ class Integer(_Kind, frozen=True):
 
     @property
     def least(self) -> int:
-        """The smallest value."""
+        """Return the smallest value."""
         return -(1 << (self.bits - 1)) if self.signed else 0
 
     @property
     def most(self) -> int:
-        """The largest value."""
+        """Return the largest value."""
         return (1 << (self.bits - self.signed)) - 1
 
-    def holds(self, other: "Integer") -> bool:
+    def holds(self, other: "IntegerType") -> bool:
         """Whether every value of the other type is a value of this one."""
         return self.least <= other.least and other.most <= self.most
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Integer) and (self.bits, self.signed) == (other.bits, other.signed)
+        return isinstance(other, IntegerType) and (self.bits, self.signed) == (other.bits, other.signed)
 
     def __hash__(self) -> int:
         return hash((self.bits, self.signed))
@@ -64,7 +68,7 @@ class Integer(_Kind, frozen=True):
         return self.name
 
 
-class Floating(_Kind, frozen=True):
+class FloatingType(_Kind, frozen=True):
     """`float` or `double`."""
 
     bits: int
@@ -73,36 +77,36 @@ class Floating(_Kind, frozen=True):
         return "float" if self.bits == 32 else "double"
 
 
-class String(_Kind, frozen=True):
+class StringType(_Kind, frozen=True):
     """`std::string`."""
 
     def __str__(self) -> str:
         return "std::string"
 
 
-class Characters(_Kind, frozen=True):
+class CharactersType(_Kind, frozen=True):
     """`char *` and `char name[n]`: a buffer of characters."""
 
     def __str__(self) -> str:
         return "char *"
 
 
-class Time(_Kind, frozen=True):
+class TimeType(_Kind, frozen=True):
     """`ros::Time`."""
 
     def __str__(self) -> str:
         return "ros::Time"
 
 
-class Duration(_Kind, frozen=True):
+class DurationType(_Kind, frozen=True):
     """`ros::Duration`."""
 
     def __str__(self) -> str:
         return "ros::Duration"
 
 
-class Vector(_Kind, frozen=True):
-    """`std::vector<element>`, or with a `length` an array of exactly so many."""
+class VectorType(_Kind, frozen=True):
+    """`std::vector<element>`, or an array if it has a `length`."""
 
     element: "Type"
     length: int | None = None
@@ -111,7 +115,7 @@ class Vector(_Kind, frozen=True):
         return f"std::vector<{self.element}>" if self.length is None else f"{self.element}[{self.length}]"
 
 
-class Record(_Kind, frozen=True):
+class RecordType(_Kind, frozen=True):
     """A message type, `package/Type`."""
 
     name: str
@@ -120,25 +124,37 @@ class Record(_Kind, frozen=True):
         return self.name.replace("/", "::")
 
 
-Type = Void | Index | Bool | Integer | Floating | String | Characters | Time | Duration | Vector | Record
+Type = (
+    VoidType
+    | IteratorType
+    | BoolType
+    | IntegerType
+    | FloatingType
+    | StringType
+    | CharactersType
+    | TimeType
+    | DurationType
+    | VectorType
+    | RecordType
+)
 """Any type."""
 
 VOID, BOOL, STRING, CHARACTERS, TIME, DURATION, INDEX = (
-    Void(), Bool(), String(), Characters(), Time(), Duration(), Index()
+    VoidType(), BoolType(), StringType(), CharactersType(), TimeType(), DurationType(), IteratorType()
 )  # fmt: skip
-CHAR = Integer(8, True, "char")
-INT8 = Integer(8, True, "int8_t")
-UINT8 = Integer(8, False, "uint8_t")
-INT16 = Integer(16, True, "int16_t")
-UINT16 = Integer(16, False, "uint16_t")
-INT = Integer(32, True, "int")
-UINT = Integer(32, False, "unsigned int")
-LONG = Integer(64, True, "long")
-ULONG = Integer(64, False, "unsigned long")
-FLOAT, DOUBLE = Floating(32), Floating(64)
+CHAR = IntegerType(8, True, "char")
+INT8 = IntegerType(8, True, "int8_t")
+UINT8 = IntegerType(8, False, "uint8_t")
+INT16 = IntegerType(16, True, "int16_t")
+UINT16 = IntegerType(16, False, "uint16_t")
+INT = IntegerType(32, True, "int")
+UINT = IntegerType(32, False, "unsigned int")
+LONG = IntegerType(64, True, "long")
+ULONG = IntegerType(64, False, "unsigned long")
+FLOAT, DOUBLE = FloatingType(32), FloatingType(64)
 
-Number = Bool | Integer | Floating
-NUMBERS = (Bool, Integer, Floating)
+Number = BoolType | IntegerType | FloatingType
+NUMBERS = (BoolType, IntegerType, FloatingType)
 
 
 def is_number(kind: Type) -> bool:
@@ -147,25 +163,25 @@ def is_number(kind: Type) -> bool:
 
 
 def is_scalar(kind: Type) -> bool:
-    """Whether values of this type never change in place, so that a copy is not needed."""
-    return not isinstance(kind, Vector | Record)
+    """Whether values of this type never change in place, so they need no copy."""
+    return not isinstance(kind, VectorType | RecordType)
 
 
 def promoted(kind: Type) -> Type:
-    """The type C++ calculates in for an operand of this type."""
-    if isinstance(kind, Bool) or (isinstance(kind, Integer) and kind.bits < 32):
+    """Return the type to which C++ promotes an operand of this type."""
+    if isinstance(kind, BoolType) or (isinstance(kind, IntegerType) and kind.bits < 32):
         return INT
     return kind
 
 
 def common(left: Type, right: Type) -> Type:
-    """The type C++ calculates in for two numbers."""
+    """Return the type in which C++ calculates with two numbers."""
     left, right = promoted(left), promoted(right)
-    if isinstance(left, Floating) or isinstance(right, Floating):
-        wide = [kind.bits for kind in (left, right) if isinstance(kind, Floating)]
-        return Floating(max(wide))
-    assert isinstance(left, Integer)  # noqa: S101  for mypy: numbers that are not floating are integers by now
-    assert isinstance(right, Integer)  # noqa: S101  as the left one
+    if isinstance(left, FloatingType) or isinstance(right, FloatingType):
+        wide = [kind.bits for kind in (left, right) if isinstance(kind, FloatingType)]
+        return FloatingType(max(wide))
+    assert isinstance(left, IntegerType)  # noqa: S101  for mypy: the remaining numbers are integers
+    assert isinstance(right, IntegerType)  # noqa: S101  as above
     if left.signed == right.signed:
         return left if left.bits >= right.bits else right
     signed, unsigned = (left, right) if left.signed else (right, left)
@@ -176,20 +192,20 @@ def convertible(source: Type, target: Type) -> bool:
     """Whether a value of one type can be assigned to a variable of another."""
     if is_number(source) and is_number(target):
         return True
-    if isinstance(target, String | Characters):
-        return isinstance(source, String | Characters)
-    if isinstance(source, Vector) and isinstance(target, Vector):
+    if isinstance(target, StringType | CharactersType):
+        return isinstance(source, StringType | CharactersType)
+    if isinstance(source, VectorType) and isinstance(target, VectorType):
         lengths = (source.length, target.length)
         return same_elements(source.element, target.element) and (None in lengths or lengths[0] == lengths[1])
     return source == target
 
 
 def same_elements(one: Type, other: Type) -> bool:
-    """Whether vectors of these elements are the same to ROS: bytes, characters and booleans are all bytes."""
-    bytes_alike = all(isinstance(kind, Bool) or (isinstance(kind, Integer) and kind.bits == 8)
+    """Whether ROS encodes vectors of these elements alike: bytes, characters and booleans are all bytes."""
+    bytes_alike = all(isinstance(kind, BoolType) or (isinstance(kind, IntegerType) and kind.bits == 8)
                       for kind in (one, other))  # fmt: skip
     if bytes_alike:
         return True
-    if isinstance(one, Vector) and isinstance(other, Vector):
+    if isinstance(one, VectorType) and isinstance(other, VectorType):
         return same_elements(one.element, other.element)
     return one == other
