@@ -1,5 +1,4 @@
-"""The logics of ``.rv`` properties, as pure code: a formula and the events of its specification go in, a
-monitor comes out.
+"""The logics of ``.rv`` properties: each compiles a formula and the events of its specification to a monitor.
 
-``catalogue.compile_property`` is the way in; ``interface`` says what every logic offers. One file per logic.
+``catalogue.compile_property`` is the entry point; ``interface`` defines what every logic offers. Each logic is a file.
 """

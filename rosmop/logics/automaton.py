@@ -1,7 +1,7 @@
-"""Finite automata as tables: exploring, minimising and walking them.
+"""Finite automata as tables: explore, minimise and walk them.
 
-States and events are numbers. ``verdicts[s]`` are the categories a property is in after a step *into*
-``s``; those of the initial state are told only if it is entered again.
+States and events are numbers. ``verdicts[s]`` are the categories of a property after a step *into* ``s``;
+those of the initial state count only if it is entered again.
 """
 
 from collections import deque
@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 MAX_STATES = 10_000
-"""How many states a monitor may have before it is minimised."""
+"""The maximum number of states before minimisation."""
 MAX_TRANSITIONS = 500_000
-"""How many ways out all of them may have together: minimising takes some 300 bytes for each."""
+"""The maximum number of transitions; minimising takes about 300 bytes for each."""
 
 State = TypeVar("State", bound=Hashable)
 
 
 class TooManyStatesError(Exception):
-    """An automaton outgrew its limit."""
+    """An error for an automaton that exceeds its limit."""
 
     def __init__(self, limit: int, what: str = "states") -> None:
         super().__init__(f"more than {limit} {what}")
@@ -27,7 +27,7 @@ class TooManyStatesError(Exception):
 
 @dataclass(frozen=True)
 class Automaton:
-    """A complete deterministic automaton with outputs. ``names`` label the states for people."""
+    """A complete deterministic automaton with outputs. ``names`` are labels of the states for people."""
 
     initial: int
     table: tuple[tuple[int, ...], ...]
@@ -38,7 +38,7 @@ class Automaton:
         return len(self.table)
 
     def name(self, state: int) -> str:
-        """What to call a state."""
+        """Return the name of a state."""
         return self.names[state] if self.names else f"q{state}"
 
 
@@ -49,7 +49,7 @@ def explore(
     verdict: Callable[[State], tuple[str, ...]],
     limit: int = MAX_STATES,
 ) -> Automaton:
-    """The automaton of all states reachable from ``initial``, minimised. Raises TooManyStatesError."""
+    """Return the automaton of all states reachable from ``initial``, minimised. Raises TooManyStatesError."""
     numbers: dict[State, int] = {initial: 0}
     states = [initial]
     table: list[tuple[int, ...]] = []
@@ -71,7 +71,7 @@ def explore(
 
 
 def minimise(automaton: Automaton) -> Automaton:
-    """The smallest automaton with the same verdicts on every trace; states numbered in order of discovery."""
+    """Return the smallest automaton with the same verdicts on every trace; states numbered in order of discovery."""
     block_of = _coarsest_partition(automaton)
     numbers = {block_of[automaton.initial]: 0}
     order = [automaton.initial]
@@ -89,7 +89,7 @@ def minimise(automaton: Automaton) -> Automaton:
 
 
 def _coarsest_partition(automaton: Automaton) -> list[int]:
-    """Hopcroft's algorithm: the number of the block of states that no trace tells apart, per state."""
+    """Return for each state the number of its block of equivalent states (Hopcroft's algorithm)."""
     size, letters = len(automaton), len(automaton.table[0])
     sources: list[list[list[int]]] = [[[] for _ in range(size)] for _ in range(letters)]
     for state, row in enumerate(automaton.table):
@@ -125,7 +125,7 @@ def _coarsest_partition(automaton: Automaton) -> list[int]:
 def _smaller_halves(
     blocks: list[set[int]], cut: int, queued: set[tuple[int, int]], letters: int
 ) -> list[tuple[int, int]]:
-    """What to look at again after block ``cut`` lost its members to the last block."""
+    """Return the splitters to process after block ``cut`` lost its members to the last block."""
     fresh = len(blocks) - 1
     small = fresh if len(blocks[fresh]) <= len(blocks[cut]) else cut
     return [(fresh if (cut, letter) in queued else small, letter) for letter in range(letters)]
@@ -141,7 +141,7 @@ def _split(blocks: list[set[int]], block_of: list[int], cut: int, members: list[
 
 
 def reachable(automaton: Automaton) -> list[int]:
-    """The states a trace can lead to, nearest first; the initial state only if it can be entered again."""
+    """Return the states that a trace can lead to, nearest first; the initial one only if it can be entered again."""
     seen: dict[int, None] = {}
     frontier = [automaton.initial]
     while frontier:
@@ -154,7 +154,7 @@ def reachable(automaton: Automaton) -> list[int]:
 
 
 def letter_classes(events: Sequence[str], named: Sequence[str]) -> tuple[list[int], list[int]]:
-    """Group events that a formula cannot tell apart: those it does not name are one class.
+    """Group the events that a formula cannot distinguish: those that it does not name are one class.
 
     Returns the class of each event, and for each class the index into ``named`` (-1: none of them). Classes
     are numbered in order of first event.
@@ -166,6 +166,6 @@ def letter_classes(events: Sequence[str], named: Sequence[str]) -> tuple[list[in
 
 
 def spread(automaton: Automaton, of_event: Sequence[int]) -> Automaton:
-    """An automaton over events, from one over their classes."""
+    """Return the automaton over events for an automaton over their classes."""
     table = tuple(tuple(row[letter] for letter in of_event) for row in automaton.table)
     return Automaton(automaton.initial, table, automaton.verdicts, automaton.names)

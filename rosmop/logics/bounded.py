@@ -1,24 +1,24 @@
-"""Monitors for formulas that look into the future within bounds of time: the other part of mtl.
+"""Monitors for mtl formulas about a bounded future (`past_monitors.py` has the other part of mtl).
 
-The formula is asked at every event, and the answer for an event is told once it is certain: by an event, or when a
-bound passes. What is certain is found part by part: `x or y` is once one of them is, `x until[l,h] y` once `y` has
-come in time and `x` held until then, or `x` has failed, or the time is over.
+The formula is evaluated at every event. Its answer for an event comes once it is certain: after an event, or when a
+bound passes. `x or y` is certain once one of them is; `x until[l,h] y` once `y` came in time and `x` held until then,
+once `x` failed, or once the time is over.
 
-Theory of operation. A `Program` (`past.py`) has the distinct parts of the formula. Those that look back only are
-computed at their event (`Folded`). Of the others a *cell* stands for the value of one part at one event
-while that is open; a cell tells its *users* when it is decided. Cells are made for what is asked for only: of
-`fire => eventually[0,1s] safe` nothing is kept but the events `fire` that wait.
+Theory of operation. A `PastProgram` has the distinct subformulas. Those that only look back are computed at their event
+(`FoldedProgram`). For the others, a *cell* is the value of one subformula at one event while it is open, and a decided
+cell notifies its *users*. Cells exist only where needed: for `fire => eventually[0,1s] safe`, only the waiting `fire`
+events are kept.
 
-- `until` over parts that are known at once keeps the events asked about in order, and decides them from the oldest on:
-  a step costs the same however many wait.
-- `until` and `since` over parts that are open themselves keep *rows*, one for each event that matters. What is certain
-  is what comes out alike whether all that is open were to fail or to hold (both operators only gain when a part comes
-  to hold). When a part is decided that was open, `until` looks at the rows that this may decide, `since` at all.
+- `until` over operands known at once keeps the waiting events in order, and decides them from the oldest: the cost of
+  a step does not depend on their number.
+- `until` and `since` over open operands keep *rows*, one for each relevant event. A result is certain if it is the same
+  when all open operands fail and when all hold (both operators are monotonic). When an operand is decided, `until`
+  visits the rows that it may decide, and `since` all rows.
 
-A run waits for at most `MOST_OPEN` events; a step beyond that is a fault, and its event is not seen.
+A run waits for at most `MOST_OPEN` events; a step beyond that is a fault, and its event is ignored.
 
-To take a step back (`BoundedRun.mark`) the operators' rows are copied, each cell as it was before it is first changed
-(`Cell.touch`); rows do not change once their step is over.
+To undo a step (`BoundedRun.mark`), the operators' rows are copied, and each cell before its first change
+(`FormulaCell.touch`); rows do not change after their step.
 """
 
 from abc import ABC, abstractmethod
@@ -31,21 +31,22 @@ from typing import Any, ClassVar
 
 from rosmop.logics.formula import Formula
 from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
-from rosmop.logics.past_monitors import FOREVER, VERDICTS, Instruction, Program, Window, fold
+from rosmop.logics.past_monitors import FOREVER, VERDICTS, PastInstruction, PastProgram, SinceWindow, fold
 
 MOST_OPEN = 10_000
 
 MOST_OPEN_IN_SLICE = 1_000
-"""The same of a slice of a parametric specification, of which there may be many."""
+"""The same limit for each slice of a parametric specification; there may be many slices."""
 
 _LATER = ("until", "next")
 
 
-class Cell:
-    """The value of a part at an event that is not decided yet; `tells`: the part is the whole formula, at this event
-    (`BoundedRun.place`; 0: it is not the whole).
+class FormulaCell:
+    """The open value of a subformula at one event.
 
-    The value of a `kind` (`and`, `or`, `xor`, `not`) comes from `operands`, of which `missing` are open.
+    `tells` is the number of the event (`BoundedRun.place`) if the subformula is the whole formula, else 0.
+
+    With a `kind` (`and`, `or`, `xor`, `not`) the value is computed from `operands`, of which `missing` are open.
     """
 
     __slots__ = ("journal", "kind", "missing", "operands", "tells", "users", "value")
@@ -53,36 +54,36 @@ class Cell:
 
     def __init__(self, journal: "Journal") -> None:
         self.journal = journal
-        self.users: list[Cell | _Operator] = []
+        self.users: list[FormulaCell | _Operator] = []
         self.tells = 0
         self.value: bool | None = None
         self.kind, self.missing = "", 0
         self.operands: tuple[Value, ...] = ()
 
     def touch(self) -> None:
-        """Note what it is before it is changed, unless that is noted."""
+        """Save the content in the journal before a change, unless it is already saved."""
         if self not in self.journal:
             self.journal[self] = (
                 [*self.users], self.tells, self.value, self.kind, self.operands, self.missing,
             )  # fmt: skip
 
     def restore(self, noted: tuple[Any, ...]) -> None:
-        """Be again what was noted."""
+        """Restore the saved content."""
         self.users, self.tells, self.value, self.kind, self.operands, self.missing = noted
 
     def stand_for(self, kind: str, operands: tuple["Value", ...]) -> None:
-        """Take the value from these."""
+        """Compute the value from these operands."""
         self.touch()
         self.kind, self.operands = kind, operands
         self.missing = sum(_use(operand, self) for operand in operands)
 
     @property
     def wanted(self) -> bool:
-        """Whether it is open, and somebody waits for it."""
+        """Whether the value is open and has a user."""
         return self.value is None and bool(self.tells or self.users)
 
     def hear(self, value: bool) -> bool | None:
-        """What it is worth now that one more operand has this value; None: that is still open."""
+        """Return the value after one more operand is known, or None if it is still open."""
         self.touch()
         self.missing -= 1
         if self.kind == "not":
@@ -92,30 +93,30 @@ class Cell:
         return None if self.missing else _together(self.kind, self.operands)
 
 
-Value = bool | Cell
-Journal = dict[Cell, tuple[Any, ...]]
-"""What cells were at the last mark, of those that have changed since."""
+Value = bool | FormulaCell
+Journal = dict[FormulaCell, tuple[Any, ...]]
+"""The earlier content of the cells that changed since the last mark."""
 
 
 def _known(value: Value) -> bool | None:
-    return value.value if isinstance(value, Cell) else value
+    return value.value if isinstance(value, FormulaCell) else value
 
 
-def _use(value: Value, user: "Cell | _Operator") -> bool:
-    """Whether the value is open; its user is told then."""
-    if isinstance(value, Cell) and value.value is None:
+def _use(value: Value, user: "FormulaCell | _Operator") -> bool:
+    """Register a user of an open value, which is notified later; return whether the value is open."""
+    if isinstance(value, FormulaCell) and value.value is None:
         value.touch()
         value.users.append(user)
         return True
     return False
 
 
-def _leave(value: Value, user: "Cell | _Operator") -> None:
-    """The user waits no more; what only it waited for is not waited for either."""
+def _leave(value: Value, user: "FormulaCell | _Operator") -> None:
+    """Remove a user of a value, and the value's own uses if no user remains."""
     waiting = [(value, user)]
     while waiting:
         left, leaver = waiting.pop()
-        if isinstance(left, Cell) and left.value is None:
+        if isinstance(left, FormulaCell) and left.value is None:
             left.touch()
             left.users.remove(leaver)
             if not left.wanted:
@@ -126,7 +127,7 @@ _ABSORBING = {"and": False, "or": True}
 
 
 def _together(kind: str, operands: tuple[Value, ...]) -> bool:
-    """The value of operands that are all known, none of them absorbing."""
+    """Return the value for operands that are all known and not absorbing."""
     if kind == "xor":
         return sum(map(bool, map(_known, operands))) % 2 == 1
     return bool(_known(operands[0])) is not (kind == "not")
@@ -134,7 +135,7 @@ def _together(kind: str, operands: tuple[Value, ...]) -> bool:
 
 @dataclass(eq=False, slots=True)
 class _Row:
-    """An event that an operator keeps: its time, what its operands are worth at it, and what it was asked for."""
+    """An event that an operator keeps: its time, the operands' values, and the cell if the value was requested."""
 
     keeps: ClassVar = ("place", "time", "left", "right", "cell")
 
@@ -142,48 +143,48 @@ class _Row:
     time: int
     left: Value | None
     right: Value | None
-    cell: Cell | None
+    cell: FormulaCell | None
 
 
 class _Operator(ABC):
-    """An operator in a run. `ask` comes before `take` for each event, and `pass_by` between events."""
+    """An operator in a run. For each event, `ask` comes before `take`; `pass_by` comes between events."""
 
     keeps: ClassVar[tuple[str, ...]] = ("rows",)
 
-    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
+    def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         self.run, self.number = run, number
         self.left, self.right = instruction.operands[0], instruction.operands[-1]
         self.low, self.high = instruction.low, FOREVER if instruction.high is None else instruction.high
         self.rows: deque[_Row] = deque()
 
     def ask(self, now: int) -> Value:
-        """Its value at the event that happens now."""
-        self.rows.append(_Row(self.run.place, now, None, None, Cell(self.run.journal)))
+        """Return the operator's value at the current event."""
+        self.rows.append(_Row(self.run.place, now, None, None, FormulaCell(self.run.journal)))
         return self.rows[-1].cell or False
 
     @abstractmethod
     def take(self, now: int) -> None:
-        """Look at the event."""
+        """Process the current event."""
 
-    def settle(self) -> None:  # noqa: B027  two have open operands, and something to decide then
-        """Decide what can be, now that operands are decided."""
+    def settle(self) -> None:  # noqa: B027  only two operators have open operands
+        """Decide the rows that have become certain, now that operands are decided."""
 
-    def hear(self, cell: Cell) -> None:
-        """An operand that was open has a value; `settle` is called for all such together."""
+    def hear(self, cell: FormulaCell) -> None:
+        """Note that an open operand has a value now; one call of `settle` follows for all of them."""
         del cell
 
     def pass_by(self, time: int) -> None:
-        """There will be no event any more up to this time."""
+        """Note that no further event comes up to this time."""
         del time
 
     @property
     def deadline(self) -> int | None:
-        """When a bound passes on which something depends."""
+        """Return the time of the first bound on which a value depends."""
         return None
 
 
 class _Until(_Operator):
-    """`until` over what is known at once."""
+    """The operator `until` over known values."""
 
     def take(self, now: int) -> None:
         rows = self.rows
@@ -212,15 +213,15 @@ def _wanted(row: _Row) -> bool:
 
 
 _Mark = tuple[int, int]
-"""The time and the place of an event."""
+"""The time and the number of an event."""
 _Marks = tuple[list[_Mark], ...]
 
 
 class _Rows(_Operator):
-    """An operator that keeps what its operands are worth."""
+    """An operator that keeps the values of its operands."""
 
     def keep(self, now: int) -> _Row:
-        """The row of the event that happens now."""
+        """Return the row of the current event."""
         if not self.rows or self.rows[-1].left is not None:
             self.rows.append(_Row(self.run.place, now, None, None, None))
         row = self.rows[-1]
@@ -230,7 +231,7 @@ class _Rows(_Operator):
         return row
 
     def drop(self) -> _Row:
-        """Keep the oldest row no longer."""
+        """Remove the oldest row and return it."""
         row = self.rows.popleft()
         for value in (row.left, row.right):
             if value is not None:
@@ -239,17 +240,17 @@ class _Rows(_Operator):
 
 
 class _OpenUntil(_Rows):
-    """`until` over what may be open. All time up to `passed` is over.
+    """The operator `until` over values that may be open. All time up to `passed` is over.
 
-    `pending` are the rows that are not decided. For the others of them there is where the right operand holds (`holds`)
-    or may (`hopes`), and where the left one fails (`fails`) or may (`doubts`), as times and places in order. Whatever
-    becomes known concerns those pending rows only for which it was the first or the last of its kind: they are found by
-    their times, so a step costs the same however many wait, unless it decides them.
+    `pending` are the undecided rows. To decide them, marks in order list the events where the right operand holds
+    (`holds`) or may hold (`hopes`), and where the left one fails (`fails`) or may fail (`doubts`). A new value concerns
+    only the pending rows for which it was the first or last of its kind. They are found by their times, so the cost of
+    a step depends only on the number of rows that it decides.
     """
 
     keeps = ("rows", "passed", "pending", "holds", "hopes", "fails", "doubts", "waits")
 
-    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
+    def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         super().__init__(run, number, instruction)
         self.passed = -FOREVER
         self.pending: list[tuple[int, int, _Row]] = []
@@ -257,8 +258,8 @@ class _OpenUntil(_Rows):
         self.hopes: list[_Mark] = []
         self.fails: list[_Mark] = []
         self.doubts: list[_Mark] = []
-        self.waits: dict[Cell, list[tuple[_Mark, bool]]] = {}
-        self.heard: list[Cell] = []
+        self.waits: dict[FormulaCell, list[tuple[_Mark, bool]]] = {}
+        self.heard: list[FormulaCell] = []
 
     def take(self, now: int) -> None:
         if not self.rows:
@@ -268,7 +269,7 @@ class _OpenUntil(_Rows):
         if row.cell is not None:
             self.pending.append((*mark, row))
         for value, of_right, waiting in ((row.left, False, self.doubts), (row.right, True, self.hopes)):
-            if isinstance(value, Cell):
+            if isinstance(value, FormulaCell):
                 self.waits[value] = [*self.waits.get(value, ()), (mark, of_right)]
                 waiting.append(mark)
         if row.right is True:
@@ -277,7 +278,7 @@ class _OpenUntil(_Rows):
             self._know_left(mark, False)
         self._forget()
 
-    def hear(self, cell: Cell) -> None:
+    def hear(self, cell: FormulaCell) -> None:
         self.heard.append(cell)
 
     def settle(self) -> None:
@@ -320,7 +321,7 @@ class _OpenUntil(_Rows):
             self._look(begins, [(best[0] - self.low + 1, 0), (time, place + 1)])
 
     def _look(self, begins: list[_Mark], ends: list[_Mark]) -> None:
-        """Decide what can be of the pending rows from the last of these beginnings to the first of these ends."""
+        """Decide pending rows, if certain, from the last of these beginnings to the first of these ends."""
         begin = bisect_left(self.pending, max(begins))
         end = max(begin, bisect_left(self.pending, min(ends)))
         self.pending[begin:end] = [entry for entry in self.pending[begin:end] if not self._decided(entry[2])]
@@ -338,7 +339,7 @@ class _OpenUntil(_Rows):
         return True
 
     def _value(self, row: _Row, goods: _Marks, bads: _Marks) -> bool:
-        """Whether one of these is in the row's time before the first of those, or with it."""
+        """Whether a mark of `goods` is within the row's bounds, and not after the first mark of `bads`."""
         good = _first(goods, (row.time + self.low, row.place))
         if good is None or good[0] > row.time + self.high:
             return False
@@ -346,11 +347,11 @@ class _OpenUntil(_Rows):
         return bad is None or good <= bad
 
     def _forget(self) -> None:
-        """Keep no row that nobody waits for, nor one before it."""
+        """Drop the rows before the first one that is still needed."""
         while self.rows and not _wanted(self.rows[0]):
             row = self.drop()
             for value in (row.left, row.right):
-                if isinstance(value, Cell) and value in self.waits:
+                if isinstance(value, FormulaCell) and value in self.waits:
                     self.waits[value] = [wait for wait in self.waits[value] if wait[0][1] > row.place]
                     if not self.waits[value]:
                         del self.waits[value]
@@ -373,19 +374,19 @@ class _OpenUntil(_Rows):
 
 
 def _first(kinds: _Marks, mark: _Mark) -> _Mark | None:
-    """The first of these that is not before a mark."""
+    """Return the first of these marks that is not before `mark`."""
     found = ((marks, bisect_left(marks, mark)) for marks in kinds)
     return min((marks[index] for marks, index in found if index < len(marks)), default=None)
 
 
 def _last(kinds: _Marks, mark: _Mark) -> _Mark | None:
-    """The last of these that is before a mark."""
+    """Return the last of these marks that is before `mark`."""
     found = ((marks, bisect_left(marks, mark)) for marks in kinds)
     return max((marks[index - 1] for marks, index in found if index), default=None)
 
 
 def _behind(mark: _Mark | None, low: int = 0) -> _Mark:
-    """Where the rows begin for which a mark is too early."""
+    """Return the start of the rows for which a mark is too early."""
     return (-FOREVER, 0) if mark is None else (mark[0] - low, mark[1] + 1)
 
 
@@ -395,16 +396,16 @@ def _supposed(value: Value | None, *, hopeful: bool) -> bool:
 
 
 class _OpenSince(_Rows):
-    """`since` over what may be open; `window` is where the rows begin.
+    """The operator `since` over values that may be open; `window` is its state before the rows.
 
-    `least` and `most` are behind the newest row, if all that is open were to fail, or to hold.
+    `least` and `most` are its states after the newest row, if all open values fail or if all hold.
     """
 
     keeps = ("rows", "window", "least", "most")
 
-    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
+    def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         super().__init__(run, number, instruction)
-        self.window = Window(self.low, self.high)
+        self.window = SinceWindow(self.low, self.high)
         self.least, self.most = copy(self.window), copy(self.window)
 
     def take(self, now: int) -> None:
@@ -435,7 +436,7 @@ class _OpenSince(_Rows):
 
 
 class _OpenPreviously(_Operator):
-    """`previously` of what may be open: what that was at the event before."""
+    """The operator `previously` of a value that may be open."""
 
     keeps = ("rows", "before", "time")
 
@@ -452,11 +453,11 @@ class _OpenPreviously(_Operator):
 
 
 class _Next(_Operator):
-    """`next`: the rows ask about the event before; `fresh` are those of the event that happens now."""
+    """The operator `next`: `before` are the rows of the previous event, `rows` those of the current one."""
 
     keeps = ("rows", "before")
 
-    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
+    def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         super().__init__(run, number, instruction)
         self.before: deque[_Row] = deque()
 
@@ -467,7 +468,7 @@ class _Next(_Operator):
                 continue
             inside = self.low <= now - row.time <= self.high
             value = self.run.value(self.left) if inside else False
-            if isinstance(value, Cell):  # it is open
+            if isinstance(value, FormulaCell):  # it is open
                 row.cell.stand_for("or", (value,))
             else:
                 self.run.decide(row.cell, value)
@@ -482,17 +483,17 @@ class _Next(_Operator):
 
 
 class BoundedProperty(CompiledProperty):
-    """A formula of mtl about the future, and perhaps the past."""
+    """A property for a formula of mtl about the future, and perhaps the past."""
 
     timed = True
     most = MOST_OPEN
-    """How many events of a run may wait."""
+    """The maximum number of waiting events of a run."""
 
     def __init__(self, source: Source, formula: Formula) -> None:
         super().__init__(source, VERDICTS)
-        self.program = program = Program(formula, source.events)
+        self.program = program = PastProgram(formula, source.events)
         self.later: set[int] = set()
-        """The instructions whose value may come after their event."""
+        """The instructions whose values may become known after their event."""
         for number, instruction in enumerate(program.instructions):
             if instruction.operator in _LATER or not self.later.isdisjoint(instruction.operands):
                 self.later.add(number)
@@ -500,7 +501,7 @@ class BoundedProperty(CompiledProperty):
         at_once = sorted(asked - self.later)
         self.folded = fold(program, at_once)
         self.at_once = {number: index for index, number in enumerate(at_once)}
-        """Those that these need to know at their event, as `folded` has them."""
+        """Operands of `later` that are known at their event, with their index in `folded`."""
         self.order = {
             number: sorted(program.instructions[number].operands, key=self.later.__contains__)
             for number in self.later
@@ -508,11 +509,11 @@ class BoundedProperty(CompiledProperty):
         self._failing = self._decided_late()
 
     def start(self, time_ns: int) -> Run:
-        """A fresh run."""
+        """Return a fresh run."""
         return BoundedRun(self, time_ns)
 
     def operators(self, run: "BoundedRun") -> dict[int, _Operator]:
-        """Those whose values may come later, for a run; the outermost first."""
+        """Return new operators for a run, for the values that may come later; the outermost first."""
         found: dict[int, _Operator] = {}
         for number in sorted(self.later, reverse=True):
             instruction = self.program.instructions[number]
@@ -524,9 +525,9 @@ class BoundedProperty(CompiledProperty):
         return found
 
     def _decided_late(self) -> set[str]:
-        """The verdicts that the passing of a bound may bring: then an `until` or `next` fails, nothing else.
+        """Return the verdicts that a passed bound may cause, because an `until` or `next` fails then.
 
-        So it is `violation` where one stands that the formula needs, `validation` where one that it must not have.
+        It causes `violation` if the operator is positive in the formula, and `validation` if it is negated.
         """
         signs: dict[int, set[bool]] = {self.program.result: {False}}
         for number in sorted(self.later, reverse=True):
@@ -541,7 +542,7 @@ class BoundedProperty(CompiledProperty):
         return {VERDICTS[sign] for signs_of in found for sign in signs_of}
 
     def blocking_refused(self, category: str) -> str | None:
-        """What a deadline decides is decided when no message comes."""
+        """Return why: a deadline decides without a message."""
         super().blocking_refused(category)
         if category not in self._failing:
             return None
@@ -551,8 +552,8 @@ class BoundedProperty(CompiledProperty):
         )
 
 
-_CONTAINERS = (deque, list, dict, Window)
-"""What operators have that a step changes in place."""
+_CONTAINERS = (deque, list, dict, SinceWindow)
+"""The attributes of operators that a step changes in place."""
 
 _KINDS: dict[str, type[_Operator]] = {
     "until": _OpenUntil,
@@ -563,7 +564,7 @@ _KINDS: dict[str, type[_Operator]] = {
 
 
 _FORWARD = (_Until, _OpenUntil, _Next)
-"""Operators that keep nothing but the events that wait (`rows`)."""
+"""Operators that keep nothing but waiting events (`rows`)."""
 
 
 class BoundedRun:
@@ -580,7 +581,7 @@ class BoundedRun:
         self._now = time_ns
         self._places: tuple[int, ...] = ()
         self._values: dict[int, Value] = {}
-        self._decided: list[Cell] = []
+        self._decided: list[FormulaCell] = []
         self.changed: set[_Operator] = set()
         self.journal: Journal = {}
         self._told: dict[bool, int] = {}
@@ -588,13 +589,13 @@ class BoundedRun:
 
     @property
     def deadline(self) -> int | None:
-        """When the first bound passes on which a verdict depends."""
+        """Return the time of the first bound on which a verdict depends."""
         found = (operator.deadline for operator in self.operators.values())
         return min((deadline for deadline in found if deadline is not None), default=None)
 
     @property
     def as_new(self) -> bool:
-        """Whether no event waits, and the part about the past is as at the beginning."""
+        """Whether no event waits, and the part about the past is in its initial state."""
         operators = self.operators.values()
         return (
             all(type(operator) in _FORWARD and not operator.rows for operator in operators)
@@ -620,7 +621,7 @@ class BoundedRun:
         self._places = self._compiled.folded.take(self._at_once, event, self._now)
         self._values = {}
         whole = self.value(self._compiled.program.result)
-        if isinstance(whole, Cell):
+        if isinstance(whole, FormulaCell):
             whole.touch()
             whole.tells = self.place
         else:
@@ -640,7 +641,7 @@ class BoundedRun:
         return self._tell()
 
     def mark(self) -> tuple[Any, ...]:
-        """The place, the values that look back, and the rows of the operators."""
+        """Return the place, the values that look back, and the rows of the operators."""
         self.journal.clear()
         operators = [
             {
@@ -652,7 +653,7 @@ class BoundedRun:
         return self.place, list(map(copy, self._at_once)), operators
 
     def take_back(self, mark: tuple[Any, ...]) -> None:
-        """Return to them; the time stays."""
+        """Restore the marked state, but keep the time."""
         self.place, self._at_once, operators = mark
         for operator, before in zip(self.operators.values(), operators, strict=True):
             operator.__dict__ = before
@@ -661,7 +662,7 @@ class BoundedRun:
         self.journal.clear()
 
     def value(self, number: int) -> Value:
-        """What an instruction is worth at the event that happens now: a cell only while it is open."""
+        """Return the value of an instruction at the current event, as a cell only while it is open."""
         index = self._compiled.at_once.get(number)
         if index is not None:
             return bool(self._at_once[self._places[index]])
@@ -683,19 +684,19 @@ class BoundedRun:
             if value is absorbing:
                 return value
             operands.append(value)
-        cell = Cell(self.journal)
+        cell = FormulaCell(self.journal)
         cell.stand_for(kind, tuple(operands))
         return cell if cell.missing else _together(kind, cell.operands)
 
-    def decide(self, cell: Cell | None, value: bool) -> None:
-        """The value of a cell is known (None: nobody has asked)."""
+    def decide(self, cell: FormulaCell | None, value: bool) -> None:
+        """Set the value of a cell (None: unused)."""
         if cell is not None and cell.value is None:
             cell.touch()
             cell.value = value
             self._decided.append(cell)
 
     def _tell(self) -> Categories:
-        """Let everybody know what is decided; the verdicts that come of it."""
+        """Notify all users of decided values; return the verdicts."""
         while self._decided or self.changed:
             while self._decided:
                 self._pass_on(self._decided.pop())
@@ -708,19 +709,19 @@ class BoundedRun:
         return _CATEGORIES[False in told, True in told]
 
     def about(self, category: str) -> int:
-        """At which event, counted from 1, the formula is what the last step or deadline told."""
+        """Return the number of the event, from 1, that the last verdict is about."""
         return self._about[category == VERDICTS[True]]
 
-    def _pass_on(self, cell: Cell) -> None:
+    def _pass_on(self, cell: FormulaCell) -> None:
         assert cell.value is not None  # noqa: S101  it was decided
         cell.touch()
         if cell.tells:
             self._told[cell.value] = cell.tells
         for user in cell.users:
-            if not isinstance(user, Cell):
+            if not isinstance(user, FormulaCell):
                 user.hear(cell)
                 self.changed.add(user)
-            elif user.wanted:  # another user may have decided it a moment ago
+            elif user.wanted:  # another user may have decided it just now
                 value = user.hear(cell.value)
                 if value is not None:
                     self.decide(user, value)
@@ -736,5 +737,5 @@ _CATEGORIES: dict[tuple[bool, bool], Categories] = {
     (True, True): VERDICTS,
 }
 
-PARTS: Mapping[str, type] = {"cell": Cell, "row": _Row, "window": Window}
-"""What runs of these formulas are made of, besides numbers and truth values, by the names that `kept_runs.py` uses."""
+PARTS: Mapping[str, type] = {"cell": FormulaCell, "row": _Row, "window": SinceWindow}
+"""The classes in the state of these runs, besides plain values, by their names in `state_of_runs.py`."""

@@ -1,44 +1,45 @@
-"""From linear temporal logic to generalised Büchi automata, by way of alternating ones (Gastin and Oddoux,
+"""Translate linear temporal logic to generalised Büchi automata, by way of alternating automata (Gastin and Oddoux,
 CAV 2001).
 
-A state of the Büchi automaton is a set of nodes (``ltl_nodes``) that have to hold from here on, all of
-them: an *obligation set*.
+A state of the Büchi automaton is an *obligation set*: a set of nodes (``ltl_nodes``) that must all hold from here on.
 
 Invariants:
-- A transition fulfils an until if the until is not left over, or could have been discharged by this step
-  with what is left.
+- A transition fulfils an until if the until is not an obligation after it, or if the step could also have
+  discharged it with the same obligations left.
 - An infinite run is accepting if its transitions fulfil each until infinitely often.
 - ``live`` keeps exactly the states from which some infinite word is accepted. Where only the union of
-  languages counts (in ``after`` and ``live``, not in the search for accepting runs), a set that demands
-  more than another one is dropped.
+  languages counts (in ``after`` and ``live``, not in the search for accepting runs), a set that includes
+  another one is dropped.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from typing import TypeVar
 
-from rosmop.logics.components import strong_components
 from rosmop.logics.formula import Formula
-from rosmop.logics.ltl_nodes import Nodes, Translation
+from rosmop.logics.ltl_nodes import FormulaNodes, FormulaTranslation
 
 Obligations = int
 """A set of nodes, as a bit set of their numbers."""
 
 Sets = frozenset[Obligations]
-"""A union of obligation sets: the states in which a nondeterministic automaton may be."""
+"""A union of obligation sets: the possible states of a nondeterministic automaton."""
+
+_Node = TypeVar("_Node", bound=Hashable)
 
 MAX_OBLIGATION_SETS = 20_000
 MAX_WORK = 1_500_000
-"""How many obligation sets may be built in all, dropped ones included."""
+"""The maximum number of obligation sets in total, including dropped ones."""
 
 
 class TooLargeError(Exception):
-    """The automaton of a formula outgrew its limits."""
+    """An error for a formula whose automaton exceeds its limits."""
 
 
 class Automata:
-    """Nodes, their transitions and the automata made of them, over letters ``0 … letters-1``."""
+    """The nodes, their transitions and the automata made of them, over letters ``0 … letters-1``."""
 
     def __init__(self, letters: int) -> None:
-        self._nodes = Nodes(letters)
+        self._nodes = FormulaNodes(letters)
         self._chosen: dict[int, Sets] = {}
         self._moves: dict[tuple[int, int], Sets] = {}
         self._steps: dict[tuple[Obligations, int], Sets] = {}
@@ -47,11 +48,11 @@ class Automata:
         self._work = 0
 
     def translate(self, formula: Formula, atoms: Mapping[str, int]) -> Sets:
-        """The initial states for a formula. ``atoms``: the letters of each event."""
-        return self._choices(Translation(self._nodes, atoms).node(formula, True))
+        """Return the initial states for a formula. ``atoms``: the letters of each event."""
+        return self._choices(FormulaTranslation(self._nodes, atoms).node(formula, True))
 
     def _choices(self, node: int) -> Sets:
-        """The ways to satisfy a node, as obligation sets over nodes that are neither conjunction nor
+        """Return the ways to satisfy a node, as obligation sets over nodes that are neither conjunction nor
         disjunction."""
         known = self._chosen.get(node)
         if known is None:
@@ -76,7 +77,7 @@ class Automata:
         return product
 
     def _smallest(self, sets: Iterable[Obligations]) -> Sets:
-        """Without those sets that demand more than another one."""
+        """Return the sets that do not include another one."""
         kept: list[Obligations] = []
         for candidate in sorted(set(sets), key=int.bit_count):
             self._spend(1 + len(kept) // 8)
@@ -90,7 +91,7 @@ class Automata:
             raise TooLargeError
 
     def _move(self, node: int, letter: int) -> Sets:
-        """What is left over after a letter, if ``node`` had to hold there."""
+        """Return the possible obligations after a letter at which ``node`` must hold."""
         known = self._moves.get((node, letter))
         if known is None:
             known = self._moves[node, letter] = self._find_move(node, letter)
@@ -113,7 +114,7 @@ class Automata:
         return self._product((right, frozenset((*left, *stay))))
 
     def _transitions(self, state: Obligations, letter: int) -> Sets:
-        """All targets, none dropped for demanding more: acceptance needs them."""
+        """Return all targets, including larger sets, because acceptance needs them."""
         known = self._steps.get((state, letter))
         if known is None:
             targets: set[Obligations] = {0}
@@ -125,7 +126,7 @@ class Automata:
         return known
 
     def _fulfilled(self, letter: int, target: Obligations, untils: Obligations) -> Obligations:
-        """Which untils a transition fulfils."""
+        """Return the untils that a transition fulfils."""
         self._spend(1)
         found = untils & ~target
         for until in _members(untils & target):
@@ -134,7 +135,7 @@ class Automata:
         return found
 
     def live(self, states: Sets) -> Sets:
-        """Those of the states that accept some word; nothing that demands more than another one."""
+        """Return the states that accept some word, without sets that include another one."""
         fresh = [state for state in states if state not in self._live]
         if fresh:
             self._decide_live(fresh)
@@ -176,7 +177,7 @@ class Automata:
                 self._live[state] = verdict
 
     def after(self, states: Sets, letters: int) -> Sets:
-        """Where the automaton may be after one of the letters (a bit set); only states that accept some word."""
+        """Return the states after one of the letters (a bit set); only states that accept some word."""
         return self._smallest(
             target
             for state in states
@@ -185,7 +186,7 @@ class Automata:
         )
 
     def _possible(self, state: Obligations) -> int:
-        """The letters that no node rules out by itself; a bit set."""
+        """Return as a bit set the letters that no single node excludes."""
         letters = self._nodes.everything
         for node in _members(state):
             kind, parts = self._nodes[node]
@@ -204,10 +205,53 @@ _NOTHING_LEFT: Sets = frozenset((0,))
 
 
 def _members(bits: int) -> list[int]:
-    """The numbers in a bit set."""
+    """Return the numbers in a bit set."""
     found = []
     while bits:
         lowest = bits & -bits
         found.append(lowest.bit_length() - 1)
         bits ^= lowest
     return found
+
+
+def strong_components(
+    nodes: Iterable[_Node], successors: Callable[[_Node], Iterable[_Node]]
+) -> list[list[_Node]]:
+    """Return the strongly connected components of a graph, each after those that it leads to (Tarjan)."""
+    index: dict[_Node, int] = {}
+    low: dict[_Node, int] = {}
+    open_nodes: dict[_Node, None] = {}
+    components: list[list[_Node]] = []
+    for root in nodes:
+        if root in index:
+            continue
+        path: list[tuple[_Node, Iterator[_Node]]] = []
+        current: _Node | None = root
+        while current is not None or path:
+            if current is not None:
+                index[current] = low[current] = len(index)
+                open_nodes[current] = None
+                path.append((current, iter(successors(current))))
+            node, rest = path[-1]
+            current = None
+            for target in rest:
+                if target not in index:
+                    current = target
+                    break
+                if target in open_nodes:
+                    low[node] = min(low[node], index[target])
+            if current is not None:
+                continue
+            path.pop()
+            if path:
+                parent = path[-1][0]
+                low[parent] = min(low[parent], low[node])
+            if low[node] == index[node]:
+                component = []
+                while True:
+                    member, _ = open_nodes.popitem()
+                    component.append(member)
+                    if member == node:
+                        break
+                components.append(component)
+    return components

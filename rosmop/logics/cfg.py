@@ -1,11 +1,10 @@
 """``cfg``: context-free grammars over the events, as MOP's CFG plugin reads them.
 
 ``S -> a S b | epsilon``; the first left side starts. Any grammar is accepted, ambiguous and nullable ones
-too. The category is ``match`` while the trace so far is in the language, ``fail`` once no continuation can
+too. The category is ``match`` while the trace so far is in the language, ``fail`` if no continuation can
 be.
 
-A grammar whose recogniser has few states (because its language is regular and it says so plainly) becomes a
-table.
+A grammar whose recogniser has few states, as for a plainly regular language, becomes a table.
 """
 
 from rosmop.logics.automaton import Automaton, TooManyStatesError, explore
@@ -20,7 +19,7 @@ from rosmop.logics.interface import (
     UntimedRun,
     twin,
 )
-from rosmop.logics.parsing import Frame, Recogniser
+from rosmop.logics.parsing import EarleyRecogniser, EarleySet
 
 CATEGORIES: Categories = ("match", "fail")
 MATCH: Categories = ("match",)
@@ -28,18 +27,18 @@ FAIL: Categories = ("fail",)
 UNDECIDED: Categories = ()
 
 MAX_TABLE_FRAMES = 500
-"""Up to how many frames are looked at to find a finite table."""
+"""The maximum number of frames explored in search of a finite table."""
 
 
 class GrammarProperty(CompiledProperty):
-    """A grammar that needs a stack."""
+    """A property for a grammar that needs a stack."""
 
     def __init__(self, source: Source, grammar: Grammar) -> None:
         super().__init__(source, CATEGORIES)
-        self.recogniser = Recogniser(grammar)
+        self.recogniser = EarleyRecogniser(grammar)
 
     def start(self, _time_ns: int) -> Run:
-        """A fresh run; the time plays no part."""
+        """Return a fresh run; the time does not matter."""
         return GrammarRun(self.recogniser)
 
 
@@ -50,12 +49,12 @@ class GrammarRun(UntimedRun):
     keeps = ("frame",)
     __copy__ = twin
 
-    def __init__(self, recogniser: Recogniser) -> None:
+    def __init__(self, recogniser: EarleyRecogniser) -> None:
         self._step = recogniser.step
-        self.frame: Frame | None = recogniser.initial
+        self.frame: EarleySet | None = recogniser.initial
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """Take the event; the time plays no part. Raises RunFaultError, and is unchanged then."""
+        """Take the event; the time does not matter. If it raises RunFaultError, the run is unchanged."""
         if self.frame is None:
             return FAIL
         after = self._step(self.frame, event)
@@ -69,24 +68,23 @@ class GrammarRun(UntimedRun):
 def compile_cfg(source: Source) -> CompiledProperty:
     """Compile a ``cfg`` formula. Raises FormulaError."""
     grammar = prepare(read_grammar(source))
-    automaton = _table(Recogniser(grammar), len(source.events))
+    automaton = _table(EarleyRecogniser(grammar), len(source.events))
     if automaton is not None:
         return FiniteProperty(source, CATEGORIES, with_fail(automaton))
     return GrammarProperty(source, grammar)
 
 
-def _table(recogniser: Recogniser, events: int) -> Automaton | None:
-    """The recogniser as an automaton, if the frames it can reach are few. Frames are compared by what they
-    hold."""
-    frames: dict[object, Frame] = {}
+def _table(recogniser: EarleyRecogniser, events: int) -> Automaton | None:
+    """Return the recogniser as an automaton if it can reach only few frames. Frames are compared by content."""
+    frames: dict[object, EarleySet] = {}
 
-    def held(frame: Frame) -> object:
+    def held(frame: EarleySet) -> object:
         return (frame.shape, tuple(None if cont is None else (id(cont[0]), cont[1]) for cont in frame.conts))
 
-    def same(frame: Frame) -> Frame:
+    def same(frame: EarleySet) -> EarleySet:
         return frames.setdefault(held(frame), frame)
 
-    def step(state: tuple[Frame | None, bool], event: int) -> tuple[Frame | None, bool]:
+    def step(state: tuple[EarleySet | None, bool], event: int) -> tuple[EarleySet | None, bool]:
         after = None if state[0] is None else recogniser.step(state[0], event)
         if after is None:
             return None, False
@@ -95,13 +93,9 @@ def _table(recogniser: Recogniser, events: int) -> Automaton | None:
         return same(after[0]), after[1]
 
     try:
-        initial: tuple[Frame | None, bool] = (same(recogniser.initial), False)
+        initial: tuple[EarleySet | None, bool] = (same(recogniser.initial), False)
         return explore(
-            initial,
-            events,
-            step,
-            lambda state: MATCH if state[1] else UNDECIDED,
-            MAX_TABLE_FRAMES,
+            initial, events, step, lambda state: MATCH if state[1] else UNDECIDED, MAX_TABLE_FRAMES
         )
     except TooManyStatesError:
         return None

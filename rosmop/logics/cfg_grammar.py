@@ -1,5 +1,4 @@
-"""Context-free grammars of ``cfg`` properties: reading them, and bringing them into a form that is good to
-parse with.
+"""Read the context-free grammars of ``cfg`` properties, and transform them for parsing.
 
 ``S -> a S b | epsilon, T -> c``. The first left side starts; a comma between productions may be left out.
 As in MOP, ``( … )`` groups, and ``*`` and ``+`` after a symbol or a group repeat it.
@@ -11,10 +10,10 @@ from dataclasses import dataclass
 
 from rosmop.logics.formula import MAX_NESTING
 from rosmop.logics.interface import Source
-from rosmop.logics.lexer import Token, TokenReader, describe, suggestion
+from rosmop.logics.lexer import FormulaToken, TokenReader, describe, suggestion
 
 MAX_SYMBOLS = 20_000
-"""How many symbols all right sides together may have."""
+"""The maximum number of symbols on all right sides together."""
 
 Rule = tuple[int, tuple[int, ...]]
 
@@ -52,7 +51,7 @@ class _GrammarReader:
         return Grammar(len(self._source.events), next(iter(self._heads.values())), tuple(self._rules))
 
     def _find_heads(self) -> None:
-        """The names left of an arrow are the nonterminals, wherever they are used."""
+        """Find the nonterminals: the names left of an arrow."""
         for index in range(len(self._source.text)):
             token, following = self._tokens.ahead(index), self._tokens.ahead(index + 1)
             if token.kind == "end":
@@ -135,26 +134,25 @@ class _GrammarReader:
             symbols = [many]
         return symbols
 
-    def _number(self, token: Token) -> int:
+    def _number(self, token: FormulaToken) -> int:
         if token.text in self._heads:
             return self._heads[token.text]
         if token.text not in self._source.events:
             known = [*self._heads, *self._source.events]
             self._tokens.note(
-                token,
-                f"`{token.text}` is neither an event nor a left side{suggestion(token.text, known)}",
+                token, f"`{token.text}` is neither an event nor a left side{suggestion(token.text, known)}"
             )
             return 0
         return self._source.events.index(token.text)
 
 
 def prepare(grammar: Grammar) -> Grammar:
-    """A grammar of the same language with only useful symbols, each of which derives more than the empty
+    """Return a grammar of the same language with only useful symbols, each of which derives more than the empty
     word.
 
-    ``A -> A x A`` becomes ``A -> A x B`` where ``B`` has the other rules of ``A``: both say "B, any number
-    of times, with x between", but the second one says it in one way only. The start symbol may still derive
-    the empty word, or nothing else; then no rule is left.
+    ``A -> A x A`` becomes ``A -> A x B`` where ``B`` has the other rules of ``A``: both mean "B, any number
+    of times, with x between", but only the second one is unambiguous. The start symbol may still derive
+    the empty word. If it derives nothing else, no rule remains.
     """
     rules = _flat_repetitions(grammar)
     productive = _closure(rules, grammar.terminals)
@@ -197,7 +195,7 @@ def _flat_repetitions(grammar: Grammar) -> list[Rule]:
 
 
 def _closure(rules: list[Rule], terminals: int) -> set[int]:
-    """The nonterminals that derive some word of terminals."""
+    """Return the nonterminals that derive some word of terminals."""
     found: set[int] = set()
     users: dict[int, list[int]] = {}
     missing = []
@@ -222,7 +220,7 @@ def _closure(rules: list[Rule], terminals: int) -> set[int]:
 
 
 def _substantial(rules: list[Rule], terminals: int) -> set[int]:
-    """The nonterminals that derive more than the empty word (all rules being productive)."""
+    """Return the nonterminals that derive more than the empty word (all rules being productive)."""
     users: dict[int, list[int]] = {}
     waiting = []
     for head, body in rules:
@@ -256,6 +254,6 @@ def _reachable(start: int, rules: list[Rule]) -> set[int]:
 
 
 def nullable_symbols(grammar: Grammar) -> frozenset[int]:
-    """The nonterminals that derive the empty word."""
+    """Return the nonterminals that derive the empty word."""
     rules = [rule for rule in grammar.rules if all(symbol >= grammar.terminals for symbol in rule[1])]
     return frozenset(_closure(rules, grammar.terminals))

@@ -1,25 +1,25 @@
-"""What is drawn of the monitor of a property, and that in the language of Graphviz (``--dot``)."""
+"""Draw the graph of a property's monitor, as data and in the language of Graphviz (``--dot``)."""
 
 from dataclasses import dataclass
 
 from rosmop.logics.interface import CompiledProperty, FiniteProperty
 from rosmop.logics.pattern import MODES, TimedPattern
-from rosmop.logics.property_lint import Graph, graph_of
-from rosmop.logics.tfsm import TimedMachine
+from rosmop.logics.property_lint import VerdictGraph, graph_of
+from rosmop.logics.tfsm import TimedStateMachine
 
 
 @dataclass(frozen=True)
 class Box:
-    """A state: its name and the categories told in it that are not its name; `double`: its border is."""
+    """A drawn state: its name and its other categories. `double`: it has a double border."""
 
     name: str
-    told: str
+    other_categories: str
     double: bool
 
 
 @dataclass(frozen=True)
 class Diagram:
-    """The states that can be reached, by their numbers, and all events that lead from one to another."""
+    """A graph: the reachable states by number, and all events that lead from one to another."""
 
     initial: int
     states: dict[int, Box]
@@ -27,24 +27,24 @@ class Diagram:
 
 
 def diagram_of(compiled: CompiledProperty) -> Diagram | None:
-    """What is drawn of a property; None if its monitor is not a finite one."""
+    """Return the graph of a property; None if its monitor is not finite."""
     graph = graph_of(compiled)
     if graph is None:
         return None
     states: dict[int, Box] = {}
     edges: dict[tuple[int, int], list[str]] = {}
     for state in _reachable(graph):
-        told = graph.verdicts[state]
+        categories = graph.verdicts[state]
         name = _name(compiled, state)
-        more = ", ".join(category for category in told if category != name)
-        states[state] = Box(name, more, bool(told) and name not in told)
+        more = ", ".join(category for category in categories if category != name)
+        states[state] = Box(name, more, bool(categories) and name not in categories)
         for trace, target in graph.edges[state]:
             edges.setdefault((state, target), []).append(" ".join(trace))
     return Diagram(graph.initial, states, {ends: ", ".join(events) for ends, events in edges.items()})
 
 
 def to_dot(compiled: CompiledProperty) -> str | None:
-    """The automaton as a ``digraph``; None if the monitor is not a finite one."""
+    """Return the automaton as a ``digraph``; None if the monitor is not finite."""
     diagram = diagram_of(compiled)
     if diagram is None:
         return None
@@ -56,7 +56,7 @@ def to_dot(compiled: CompiledProperty) -> str | None:
         f"  start -> {diagram.initial};",
     ]
     for number, box in diagram.states.items():
-        label = _quoted(f"{box.name}\\n{box.told}" if box.told else box.name)
+        label = _quoted(f"{box.name}\\n{box.other_categories}" if box.other_categories else box.name)
         lines.append(f"  {number} [label={label}{', peripheries=2' if box.double else ''}];")
     lines += [
         f"  {source} -> {target} [label={_quoted(events)}];"
@@ -65,7 +65,7 @@ def to_dot(compiled: CompiledProperty) -> str | None:
     return "\n".join([*lines, "}", ""])
 
 
-def _reachable(graph: Graph) -> list[int]:
+def _reachable(graph: VerdictGraph) -> list[int]:
     found = {graph.initial}
     waiting = [graph.initial]
     while waiting:
@@ -79,7 +79,7 @@ def _reachable(graph: Graph) -> list[int]:
 def _name(compiled: CompiledProperty, state: int) -> str:
     if isinstance(compiled, FiniteProperty):
         return compiled.automaton.name(state)
-    if isinstance(compiled, TimedMachine):
+    if isinstance(compiled, TimedStateMachine):
         size = len(compiled.automaton)
         return compiled.automaton.name(compiled.automaton.initial if state == 2 * size else state % size)
     return MODES[state % len(MODES)] if isinstance(compiled, TimedPattern) else str(state)

@@ -1,12 +1,12 @@
 """``ere``: extended regular expressions, as MOP's ERE plugin reads them.
 
-``|`` union, ``&`` intersection, juxtaposition, and tightest ``~`` complement and the suffixes ``*``, ``+``,
-``^n``; ``epsilon`` is the empty trace, ``empty`` no trace at all. A suffix binds tighter than ``~``. The
+From loosest to tightest: ``|`` union, ``&`` intersection, juxtaposition, ``~`` complement, the suffixes ``*``, ``+``,
+``^n``; ``epsilon`` is the empty trace, ``empty`` no trace at all. The
 category is ``match`` while the trace so far is in the language, ``fail`` once no continuation can be.
 
 The monitor is Brzozowski's: a state is an expression, an event leads to its derivative. Expressions are
-interned modulo associativity, commutativity and idempotence of union and intersection, which makes them
-finitely many.
+interned modulo associativity, commutativity and idempotence of union and intersection, so their number is
+finite.
 """
 
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ from rosmop.logics.interface import FiniteProperty, Source
 from rosmop.logics.lexer import TokenReader
 
 MAX_SYMBOLS = 5_000
-"""How many symbols an expression may have when its powers are written out."""
+"""The maximum number of symbols of an expression after its powers are expanded."""
 MAX_WORK = 8_000_000
-"""How many operands all derivatives together may have."""
+"""The maximum number of operands of all derivatives together."""
 
 
 class TooMuchWorkError(Exception):
-    """The derivatives of an expression outgrew their limit."""
+    """An error for an expression whose derivatives exceed their limit."""
 
 
 @dataclass(frozen=True)
-class Expression:
+class RegularExpression:
     """An interned expression. ``parts`` are the numbers of its operands, or the letter of a symbol."""
 
     kind: str
@@ -36,19 +36,19 @@ class Expression:
     size: int
 
 
-class Arena:
-    """Holds each expression once, by number; knows derivatives."""
+class ExpressionTable:
+    """A table of expressions, each stored once, and of their derivatives."""
 
     def __init__(self) -> None:
         self._numbers: dict[tuple[str, tuple[int, ...]], int] = {}
-        self._all: list[Expression] = []
+        self._all: list[RegularExpression] = []
         self._derived: dict[tuple[int, int], int] = {}
         self._work = 0
         self.empty = self._intern("empty", (), nullable=False)
         self.epsilon = self._intern("epsilon", (), nullable=True)
         self.anything = self._intern("not", (self.empty,), nullable=True)
 
-    def __getitem__(self, number: int) -> Expression:
+    def __getitem__(self, number: int) -> RegularExpression:
         return self._all[number]
 
     def _intern(self, kind: str, parts: tuple[int, ...], *, nullable: bool) -> int:
@@ -56,25 +56,25 @@ class Arena:
         if number is None:
             number = self._numbers[kind, parts] = len(self._all)
             size = 1 if kind == "symbol" else 1 + sum(self._all[part].size for part in parts)
-            self._all.append(Expression(kind, parts, nullable, size))
+            self._all.append(RegularExpression(kind, parts, nullable, size))
         self._work += len(parts) + 1
         if self._work > MAX_WORK:
             raise TooMuchWorkError
         return number
 
     def symbol(self, letter: int) -> int:
-        """The one-event trace."""
+        """Return the one-event trace."""
         return self._intern("symbol", (letter,), nullable=False)
 
     def complement(self, inner: int) -> int:
-        """All other traces."""
+        """Return all other traces."""
         expression = self._all[inner]
         if expression.kind == "not":
             return expression.parts[0]
         return self._intern("not", (inner,), nullable=not expression.nullable)
 
     def star(self, inner: int) -> int:
-        """Any number of traces, one after the other."""
+        """Return any number of traces, one after the other."""
         if inner in (self.empty, self.epsilon):
             return self.epsilon
         if inner == self.anything or self._all[inner].kind == "star":
@@ -82,7 +82,7 @@ class Arena:
         return self._intern("star", (inner,), nullable=True)
 
     def sequence(self, factors: list[int]) -> int:
-        """One trace after the other."""
+        """Return one trace after the other."""
         flat: list[int] = []
         for factor in factors:
             expression = self._all[factor]
@@ -99,7 +99,7 @@ class Arena:
         )
 
     def join(self, kind: str, operands: list[int]) -> int:
-        """The traces of any operand (`union`), or of all of them (`intersection`)."""
+        """Return the traces of any operand (`union`), or of all of them (`intersection`)."""
         neutral, absorbing, quantor = self.empty, self.anything, any
         if kind == "intersection":
             neutral, absorbing, quantor = self.anything, self.empty, all
@@ -116,13 +116,13 @@ class Arena:
         return self._intern(kind, tuple(sorted(flat)), nullable=nullable)
 
     def derivative(self, number: int, letter: int) -> int:
-        """What may follow once ``letter`` has been read."""
+        """Return the derivative by ``letter``."""
         known = self._derived.get((number, letter))
         if known is None:
             known = self._derived[number, letter] = self._derive(self._all[number], letter)
         return known
 
-    def _derive(self, expression: Expression, letter: int) -> int:
+    def _derive(self, expression: RegularExpression, letter: int) -> int:
         kind, parts = expression.kind, expression.parts
         if kind == "symbol":
             return self.epsilon if parts[0] == letter else self.empty
@@ -177,7 +177,7 @@ def _match_automaton(source: Source, reader: "_ExpressionReader") -> Automaton:
 
 
 def with_fail(automaton: Automaton) -> Automaton:
-    """Mark the state of a minimal automaton from which nothing matches any more, if there is one."""
+    """Add ``fail`` to the state of a minimal automaton from which nothing can match, if there is one."""
     verdicts = tuple(
         ("fail",) if not verdict and all(target == state for target in row) else verdict
         for state, (row, verdict) in enumerate(zip(automaton.table, automaton.verdicts, strict=True))
@@ -186,13 +186,13 @@ def with_fail(automaton: Automaton) -> Automaton:
 
 
 class _ExpressionReader:
-    """Parses into an arena; letters are the events that the expression names."""
+    """Parses an expression into a table; letters are the events that the expression names."""
 
     def __init__(self, source: Source) -> None:
         self._tokens = TokenReader(source, ("|", "&", "~", "*", "+", "^", "(", ")", "?", "||", "&&", "!"))
         self._source = source
         self._letters: dict[str, int] = {}
-        self.arena = Arena()
+        self.arena = ExpressionTable()
 
     @property
     def letters(self) -> list[str]:

@@ -1,8 +1,7 @@
-"""Reads temporal formulas: one reader for ltl, ptltl and mtl, which differ only in their tables of operators.
+"""Parse temporal formulas: one parser for ltl, ptltl and mtl, with a table of operators for each.
 
-A ``Syntax`` names the unary operators, which bind tightest, and the levels of binary operators from the
-tightest to the loosest. Nesting is bounded, so that no walk over a formula can exhaust the
-stack.
+A ``Syntax`` names the unary operators, which bind tightest, and the levels of binary operators from tightest
+to loosest. Nesting is bounded, so no walk over a formula can exhaust the stack.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from rosmop.logics.interface import Source
-from rosmop.logics.lexer import Token, TokenReader, describe
+from rosmop.logics.lexer import FormulaToken, TokenReader, describe
 
 MAX_NESTING = 100
 
@@ -27,7 +26,7 @@ BOOLEAN_SIGNS = ("(", ")", "!", "&&", "/\\", "||", "\\/", "++", "^", "=>", "->",
 
 @dataclass(frozen=True)
 class Formula:
-    """A node: ``operator`` with operands; an ``event`` has its ``name``, a timed operator its ``bounds``."""
+    """A node: ``operator`` with operands. An ``event`` has a ``name``, a timed operator ``bounds``."""
 
     operator: str
     operands: tuple["Formula", ...] = ()
@@ -73,14 +72,14 @@ def read_formula(source: Source, syntax: Syntax) -> Formula:
 
 
 def nodes(formula: Formula) -> Iterator[Formula]:
-    """A formula and all its subformulas."""
+    """Yield a formula and all its subformulas."""
     yield formula
     for operand in formula.operands:
         yield from nodes(operand)
 
 
 def event_names(formula: Formula) -> list[str]:
-    """The events that a formula names, each once, in order."""
+    """Return the events that a formula names, each once, in order."""
     return list(dict.fromkeys(node.name for node in nodes(formula) if node.operator == "event"))
 
 
@@ -104,7 +103,7 @@ class _FormulaReader:
         return self._expression(len(self._syntax.levels) - 1, depth)
 
     def _expression(self, limit: int, depth: int) -> Formula:
-        """Operands joined by operators no looser than level ``limit``."""
+        """Read operands joined by operators no looser than level ``limit``."""
         left = self._unary(depth)
         joined = -1
         while (strength := self._strength.get(self._tokens.token.text, limit + 1)) <= limit:
@@ -178,18 +177,18 @@ class _FormulaReader:
             )
         return (low, high)
 
-    def _check_depth(self, depth: int, token: Token) -> None:
+    def _check_depth(self, depth: int, token: FormulaToken) -> None:
         if depth > MAX_NESTING:
             raise self._source.error(
                 token.offset,
                 f"nested more than {MAX_NESTING} deep; split the formula into several properties",
             )
 
-    def _refuse_foreign(self, token: Token) -> None:
+    def _refuse_foreign(self, token: FormulaToken) -> None:
         if token.text in self._syntax.refused and token.text not in self._source.events:
             raise self._source.error(token.offset, f"{describe(token)} {self._syntax.refused[token.text]}")
 
 
 def boolean_levels(temporal: Sequence[Level]) -> tuple[Level, ...]:
-    """``temporal`` operators tightest, then and, xor, or, then the implications, which do not chain."""
+    """Return the levels: ``temporal`` operators, then and, xor, or, then implications, which do not chain."""
     return (*temporal, Level(AND, "flat"), Level(XOR, "flat"), Level(OR, "flat"), Level(IMPLIES, "once"))

@@ -2,15 +2,14 @@
 
 ``s0 [ a -> s1, default s0 ] s1 [ b -> s0 ] alias bad = s1``. The first state is the initial one; an event
 without a transition and without a default leads to ``fail``, which no event leaves. Categories are the
-states, the aliases and ``fail``. ``read_machine`` reads the language of ``tfsm`` as well, where a state may
-have a ``timeout``.
+states, the aliases and ``fail``. ``read_state_machine`` also reads ``tfsm``, where a state may have a ``timeout``.
 """
 
 from dataclasses import dataclass, field
 
 from rosmop.logics.automaton import MAX_STATES, Automaton
 from rosmop.logics.interface import FiniteProperty, Source
-from rosmop.logics.lexer import Token, TokenReader, describe, suggestion
+from rosmop.logics.lexer import FormulaToken, TokenReader, describe, suggestion
 
 FAIL = "fail"
 TIMEOUT = "timeout"
@@ -18,15 +17,15 @@ TIMEOUT = "timeout"
 
 @dataclass
 class StateText:
-    """A state as written: where each event leads, the default, and the time bound (tfsm)."""
+    """A state as written: the target of each event, the default, and the timeout (tfsm)."""
 
-    moves: dict[str, Token] = field(default_factory=dict)
-    default: Token | None = None
-    timeout: tuple[int, Token] | None = None
+    moves: dict[str, FormulaToken] = field(default_factory=dict)
+    default: FormulaToken | None = None
+    timeout: tuple[int, FormulaToken] | None = None
 
 
 @dataclass
-class Machine:
+class StateMachineText:
     """A state machine as written; ``order`` are the states in source order."""
 
     states: dict[str, StateText]
@@ -34,26 +33,26 @@ class Machine:
 
     @property
     def order(self) -> list[str]:
-        """The names of the states, ``fail`` last."""
+        """Return the names of the states, ``fail`` last."""
         return [*self.states, FAIL]
 
     def verdict(self, state: str) -> tuple[str, ...]:
-        """The categories of a state: itself, then its aliases in source order."""
+        """Return the categories of a state: itself, then its aliases in source order."""
         return (state, *(alias for alias, members in self.aliases.items() if state in members))
 
     def categories(self) -> list[str]:
-        """All names that may have handlers."""
+        """Return all names that may have handlers."""
         return [*self.states, *self.aliases, FAIL]
 
 
 def compile_fsm(source: Source) -> FiniteProperty:
     """Compile an ``fsm`` formula. Raises FormulaError."""
-    machine = read_machine(source, timed=False)
+    machine = read_state_machine(source, timed=False)
     return FiniteProperty(source, machine.categories(), machine_automaton(source, machine))
 
 
-def machine_automaton(source: Source, machine: Machine) -> Automaton:
-    """The transitions on events; state ``i`` is ``machine.order[i]``."""
+def machine_automaton(source: Source, machine: StateMachineText) -> Automaton:
+    """Return the automaton of the transitions on events; state ``i`` is ``machine.order[i]``."""
     order = machine.order
     number = {name: index for index, name in enumerate(order)}
     fail = number[FAIL]
@@ -66,11 +65,11 @@ def machine_automaton(source: Source, machine: Machine) -> Automaton:
     return Automaton(0, tuple(table), tuple(machine.verdict(name) for name in order), tuple(order))
 
 
-def read_machine(source: Source, *, timed: bool) -> Machine:
-    """Parse a state machine and check its names. Raises FormulaError with all that was found."""
+def read_state_machine(source: Source, *, timed: bool) -> StateMachineText:
+    """Parse a state machine and check its names. Raises FormulaError with all errors."""
     reader = TokenReader(source, ("->", "[", "]", "=", ","))
-    machine = Machine({}, {})
-    used: list[Token] = []
+    machine = StateMachineText({}, {})
+    used: list[FormulaToken] = []
     if reader.token.kind == "end":
         raise reader.unexpected("a state such as `s0 [ event -> s1, default s0 ]`")
     while reader.token.kind != "end":
@@ -83,7 +82,9 @@ def read_machine(source: Source, *, timed: bool) -> Machine:
     return machine
 
 
-def _read_state(reader: TokenReader, machine: Machine, used: list[Token], *, timed: bool) -> None:
+def _read_state(
+    reader: TokenReader, machine: StateMachineText, used: list[FormulaToken], *, timed: bool
+) -> None:
     name = reader.expect("name", "the name of a state")
     reserved = (FAIL, TIMEOUT) if timed else (FAIL,)
     if name.text in reserved:
@@ -93,7 +94,7 @@ def _read_state(reader: TokenReader, machine: Machine, used: list[Token], *, tim
     if name.text in machine.states:
         reader.note(name, f"state `{name.text}` is defined twice; put all its transitions into one `[ … ]`")
     if machine.aliases:
-        reader.note(name, f"state `{name.text}` stands after an alias; write the states first")
+        reader.note(name, f"state `{name.text}` is written after an alias; write the states first")
     if len(machine.states) >= MAX_STATES:
         raise reader.source.error(name.offset, f"more than {MAX_STATES} states")
     state = machine.states.setdefault(name.text, StateText())
@@ -103,7 +104,7 @@ def _read_state(reader: TokenReader, machine: Machine, used: list[Token], *, tim
         reader.accept(",")
 
 
-def _read_transition(reader: TokenReader, state: StateText, used: list[Token], *, timed: bool) -> None:
+def _read_transition(reader: TokenReader, state: StateText, used: list[FormulaToken], *, timed: bool) -> None:
     event = reader.expect("name", "a transition such as `event -> state`, `default state` or `]`")
     if event.text == TIMEOUT and reader.token.kind == "number":
         if not timed:
@@ -128,7 +129,9 @@ def _read_transition(reader: TokenReader, state: StateText, used: list[Token], *
     used.append(target)
 
 
-def _read_timeout(reader: TokenReader, state: StateText, clause: Token, used: list[Token]) -> None:
+def _read_timeout(
+    reader: TokenReader, state: StateText, clause: FormulaToken, used: list[FormulaToken]
+) -> None:
     number = reader.token
     nanoseconds = reader.duration("a time bound")
     if nanoseconds == 0:
@@ -141,7 +144,7 @@ def _read_timeout(reader: TokenReader, state: StateText, clause: Token, used: li
     used.append(target)
 
 
-def _read_alias(reader: TokenReader, machine: Machine, used: list[Token]) -> None:
+def _read_alias(reader: TokenReader, machine: StateMachineText, used: list[FormulaToken]) -> None:
     reader.take()
     name = reader.expect("name", "the name of an alias")
     if name.text in machine.states or name.text in (FAIL, TIMEOUT):
@@ -159,12 +162,12 @@ def _read_alias(reader: TokenReader, machine: Machine, used: list[Token]) -> Non
 
 
 def _more_members(reader: TokenReader) -> bool:
-    """MOP lets commas be left out; the next alias, or a state that stands too late, ends the list."""
+    """Read a list of states. Commas are optional, as in MOP; the next alias or a misplaced state ends the list."""
     return reader.token.kind == "name" and reader.token.text != "alias" and reader.ahead(1).kind != "["
 
 
-def _check_names(reader: TokenReader, machine: Machine, used: list[Token]) -> None:
+def _check_names(reader: TokenReader, machine: StateMachineText, used: list[FormulaToken]) -> None:
     known = [*machine.states, FAIL]
     for token in used:
         if token.text not in machine.states and token.text != FAIL:
-            reader.note(token, f"there is no state {describe(token)}{suggestion(token.text, known)}")
+            reader.note(token, f"unknown state {describe(token)}{suggestion(token.text, known)}")

@@ -1,22 +1,21 @@
-"""What every logic offers to the compiler of ``.rv`` files and to the relay.
+"""The interface of every logic to the compiler of ``.rv`` files and to the relay.
 
 A logic turns a formula and the events of its specification into a ``CompiledProperty``. The property names
-the *categories* that may have handlers, and starts *runs*; a run is stepped with one event after the other
-and says after each step which categories the property is in, so that the caller runs their handlers.
+the *categories* that may have handlers, and starts *runs*. A run takes one event after the other, and each step
+returns the categories of the property, whose handlers the caller runs.
 
-Theory of operation for the caller of a run:
+Contract for the caller of a run:
 
 1. ``property.start(now)`` gives a fresh run. ``now`` is when monitoring begins, or when ``__RESET;`` took
    effect.
 2. Before a step at time ``t``: while ``run.deadline`` is not None and ``run.deadline < t``, call
-   ``run.expire()``. A bound is closed: an event exactly at the deadline is in time, so an expiry happens
-   only once it is certain that no event at or before the deadline will come. It takes effect at the
-   deadline.
-3. ``run.step(event, t)`` returns the categories after the event, in the order in which they are to be told.
-   After ``expire()`` handlers of the first category named run first (``timeout`` before the state entered).
+   ``run.expire()``. A bound is closed: an event exactly at the deadline is in time. So a deadline expires only
+   when no event at or before it can come any more; the expiry takes effect at the deadline.
+3. ``run.step(event, t)`` returns the categories after the event, in the order of their handlers.
+   After ``expire()`` the handlers of the first returned category run first (``timeout`` before the state entered).
 4. Times are integer nanoseconds and never run backwards; a time before the last one counts as the last one.
-5. Of a `FormulaRun`, `mark` before the first step of a message and `take_back` of that mark when the message is dropped
-   make it as if the message had not come; its time has passed all the same. No deadline expires between the two.
+5. A `FormulaRun` can undo a dropped message: call `mark` before the first step of the message, and `take_back` with
+   that mark when it is dropped. The time is not undone. No deadline expires between the two calls.
 
 A ``FiniteProperty`` and a ``ClockedProperty`` offer their tables as well, so that a module can step them.
 """
@@ -26,61 +25,57 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, Self
 
-from rosmop.form.positions import Finding, Position
+from rosmop.form.positions import Diagnostic, Position
 from rosmop.logics.automaton import Automaton
 
 Categories = tuple[str, ...]
 
 
 class FormulaError(Exception):
-    """A formula that cannot be accepted: what is wrong with it, where, and what to write instead."""
+    """An error for a rejected formula: the reasons, their positions, and what to write instead."""
 
-    def __init__(self, findings: Sequence[Finding]) -> None:
+    def __init__(self, findings: Sequence[Diagnostic]) -> None:
         super().__init__("; ".join(str(finding) for finding in findings))
         self.findings = tuple(findings)
 
 
 class RunFaultError(Exception):
-    """A run cannot go on, because the trace asks for more memory than a run may have."""
+    """An error for a trace that needs more memory than a run may have."""
 
 
 class Run(Protocol):
-    """One run of a property over a trace; see the head of this module for the contract. A copy (`copy.copy`) goes on
-    by itself; a run that has no `__copy__` has none. `keeps` names the attributes that change (`kept_runs.py`).
+    """One run of a property over a trace; see the head of this module for the contract. A copy (`copy.copy`) is an
+    independent run; a run without `__copy__` cannot be copied. `keeps` names the attributes that change
+    (`state_of_runs.py`).
     """
 
     @property
     def as_new(self) -> bool:
-        """Whether it goes on as a run that begins now would; where that is not known, False."""
+        """Whether the run behaves from here on like a fresh run; False if that is not known."""
 
     @property
     def deadline(self) -> int | None:
-        """The last instant (ns) at which an event is in time, or None if the run waits for nothing."""
+        """Return the last instant (ns) at which an event is in time, or None if the run waits for nothing."""
 
     def step(self, event: int, time_ns: int) -> Categories:
-        """Take the event with this index, received at ``time_ns``; return the categories the property is
-        in."""
+        """Take the event with this index, received at ``time_ns``; return the property's categories."""
 
     def expire(self) -> Categories:
-        """Let the deadline pass; return the categories that follow. Only while ``deadline`` is not None."""
+        """Let the deadline pass; return the categories then. Call it only while ``deadline`` is not None."""
 
 
 class FormulaRun(Run, Protocol):
-    """The run of a property that `suppresses`: its steps can be taken back."""
+    """A run of a property that `suppresses`, whose steps can be undone."""
 
     def mark(self) -> Any:
-        """Return what `take_back` needs to undo the steps from here on; an earlier mark is void then."""
+        """Return the data with which `take_back` undoes later steps; earlier marks become invalid."""
 
     def take_back(self, mark: Any) -> None:
-        """Undo the steps since the mark, but keep the time. A mark serves once."""
-
-
-FORMULAS = frozenset({"ltl", "ptltl", "mtl", "pattern"})
-"""The logics for which a dropped message has not happened; the others count each event whose action lets it pass."""
+        """Undo the steps since the mark, but keep the time. A mark can be used once."""
 
 
 def twin(run: Any) -> Any:
-    """A copy of a run whose attributes are replaced and never changed in place: its `__copy__`."""
+    """Return a copy of a run whose attributes never change in place, for its `__copy__`."""
     made = object.__new__(type(run))
     for name in run.__slots__:
         setattr(made, name, getattr(run, name))
@@ -89,19 +84,21 @@ def twin(run: Any) -> Any:
 
 @dataclass(frozen=True)
 class Source:
-    """A formula as it stands in the file, and the events (its alphabet) in the order of the specification."""
+    """A formula as written, and the events (its alphabet) in the order of the specification."""
 
     logic: str
     text: str
     events: tuple[str, ...]
     origin: Position
+    suppresses: bool = False
+    """Whether a dropped message has not happened for the property (`Logic.suppresses`)."""
 
-    def finding(self, offset: int, text: str) -> Finding:
-        """An error at the given character of the formula."""
-        return Finding(self.origin.within(self.text, min(offset, len(self.text))), "error", text)
+    def finding(self, offset: int, text: str) -> Diagnostic:
+        """Return an error at the given character of the formula."""
+        return Diagnostic(self.origin.within(self.text, min(offset, len(self.text))), "error", text)
 
     def error(self, offset: int, text: str) -> FormulaError:
-        """The refusal of this formula for one reason."""
+        """Return the error for this formula with one reason."""
         return FormulaError([self.finding(offset, text)])
 
 
@@ -112,21 +109,21 @@ class CompiledProperty(ABC):
     """Whether verdicts depend on the time of events (a run that is not timed never has a deadline)."""
 
     expiry = "deadline"
-    """What the passing of a run's deadline is called in records (``timeout`` for machines)."""
+    """The name of a passed deadline in records (``timeout`` for machines)."""
 
     made_of: tuple[Any, ...]
-    """What it was made of: all that another process needs to make the same."""
+    """The arguments that another process needs to make the same property."""
 
     @property
     def suppresses(self) -> bool:
-        """Whether a dropped message has not happened for it: a run takes back the steps that the message made."""
-        return self.logic in FORMULAS
+        """Whether a dropped message has not happened: its steps are undone."""
+        return self.source.suppresses
 
     remedy: str | None = None
-    """The function of the specification that publishes what was due when a deadline passes (`enforced by`)."""
+    """The function of the specification that publishes the due message at a deadline (`enforced by`)."""
 
     def __new__(cls, *made_of: Any) -> Self:
-        """Keep what it is made of."""
+        """Keep the arguments of the constructor as `made_of`."""
         made = super().__new__(cls)
         made.made_of = made_of
         return made
@@ -140,14 +137,14 @@ class CompiledProperty(ABC):
 
     @abstractmethod
     def start(self, time_ns: int) -> Run:
-        """A fresh run that begins at ``time_ns``."""
+        """Return a fresh run that begins at ``time_ns``."""
 
     def categories_after(self, event: int) -> frozenset[str]:
-        """The categories a step with this event can lead to; may name too many, never too few."""
+        """Return all categories that a step with this event can lead to; may include others."""
         return frozenset(self.categories) if 0 <= event < len(self.events) else frozenset()
 
     def blocking_refused(self, category: str) -> str | None:
-        """Why a handler of this category may not drop the message, or None if it may (it is enforceable)."""
+        """Return why a handler of this category may not drop the message, or None if it may."""
         if category not in self.categories:
             raise KeyError(category)
         return None
@@ -165,17 +162,17 @@ class FiniteProperty(CompiledProperty):
         self.automaton = automaton
 
     def start(self, _time_ns: int) -> Run:
-        """A fresh run; the time plays no part."""
+        """Return a fresh run; the time does not matter."""
         return FiniteRun(self.automaton)
 
     def categories_after(self, event: int) -> frozenset[str]:
-        """The categories of the states this event leads to."""
+        """Return the categories of the states that this event leads to."""
         verdicts = self.automaton.verdicts
         return frozenset(name for row in self.automaton.table for name in verdicts[row[event]])
 
 
 class UntimedRun:
-    """What runs that wait for nothing have in common."""
+    """The base class of runs without deadlines."""
 
     __slots__ = ()
 
@@ -183,11 +180,11 @@ class UntimedRun:
 
     @property
     def as_new(self) -> bool:
-        """Not known."""
+        """Whether the run behaves like a fresh run; False, as that is not known here."""
         return False
 
     def expire(self) -> Categories:
-        """Never right: there is no deadline."""
+        """Raise an error: there is no deadline."""
         raise ValueError("this run has no deadline")
 
 
@@ -204,40 +201,40 @@ class FiniteRun(UntimedRun):
 
     @property
     def as_new(self) -> bool:
-        """Whether it is in the initial state."""
+        """Whether the run is in the initial state."""
         return self.state == self._automaton.initial
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """Take the event; the time plays no part."""
+        """Take the event; the time does not matter."""
         self.state = self._automaton.table[self.state][event]
         return self._automaton.verdicts[self.state]
 
     def mark(self) -> int:
-        """The state."""
+        """Return the state."""
         return self.state
 
     def take_back(self, mark: int) -> None:
-        """Return to it."""
+        """Restore the marked state."""
         self.state = mark
 
 
 Move = tuple[int, bool]
-"""The next state, and whether the clock begins anew."""
+"""The next state, and whether the clock restarts."""
 
 
 class Wait(NamedTuple):
-    """What a state waits for: how long (ns) after the clock began its deadline is, and what follows then."""
+    """The wait of a state: its length (ns) after the clock's start, and the move and categories at its end."""
 
     after: int
     move: Move
-    told: Categories
+    categories: Categories
 
 
 class ClockedProperty(CompiledProperty):
     """A property whose monitor is an automaton with one clock.
 
-    ``moves[state][event]`` is the move at an event, ``late`` the same where more than ``within`` (ns) has passed since
-    the clock began. ``verdicts`` are the categories after an event that leads to a state, ``waits`` what it waits for.
+    ``moves[state][event]`` is the move at an event, ``late`` the same if more than ``within`` ns have passed since
+    the clock started. ``verdicts`` are the categories after an event that leads to a state, ``waits`` its wait.
     """
 
     timed = True
@@ -249,12 +246,12 @@ class ClockedProperty(CompiledProperty):
     waits: Sequence[Wait | None]
 
     def start(self, time_ns: int) -> Run:
-        """A run whose clock begins at ``time_ns``."""
+        """Return a run whose clock begins at ``time_ns``."""
         return ClockedRun(self, time_ns)
 
 
 class ClockedRun:
-    """A run over such tables: the state, when its clock began, and the time."""
+    """A run of a `ClockedProperty`: the state, the start of its clock, and the time."""
 
     __slots__ = ("_tables", "now", "since", "state")
     keeps = ("state", "since", "now")
@@ -267,13 +264,13 @@ class ClockedRun:
 
     @property
     def deadline(self) -> int | None:
-        """When the wait of the state is over."""
+        """Return the time at which the wait of the state ends."""
         wait = self._tables.waits[self.state]
         return None if wait is None else self.since + wait.after
 
     @property
     def as_new(self) -> bool:
-        """Whether it is in the initial state, and the clock plays no part there."""
+        """Whether the run is in the initial state, and the clock does not matter there."""
         state, tables = self.state, self._tables
         return (
             state == tables.initial
@@ -300,14 +297,14 @@ class ClockedRun:
             raise ValueError("this run has no deadline")
         self.now = self.since + wait.after
         self._move(wait.move)
-        return wait.told
+        return wait.categories
 
     def mark(self) -> tuple[int, int]:
-        """The state, and when its clock began."""
+        """Return the state and the start of its clock."""
         return self.state, self.since
 
     def take_back(self, mark: tuple[int, int]) -> None:
-        """Return to these; `now` stays."""
+        """Restore the marked state and clock, but keep the time."""
         self.state, self.since = mark
 
     def _move(self, move: Move) -> None:
@@ -317,3 +314,18 @@ class ClockedRun:
 
 
 Compiler = Callable[[Source], CompiledProperty]
+
+
+@dataclass(frozen=True)
+class Logic:
+    """A logic: its compiler, and its properties that other parts of the language need."""
+
+    compile: Compiler
+    suppresses: bool = False
+    """Whether a dropped message has not happened. Other logics count each event whose action passes the message."""
+    failure: str | None = None
+    """The category that means failure; `check` warns about a property that fails at every first event."""
+    has_states: bool = False
+    """Whether formulas name states (and may write `default` for all events); coverage counts them."""
+    implicit_events: tuple[str, ...] = ()
+    """Events that a property uses without naming them."""

@@ -1,7 +1,7 @@
-"""Splits a formula into tokens, and reads durations.
+"""Split a formula into tokens, and read durations.
 
-Each logic names its own signs; names, numbers, white space and C comments are the same in all of them. A
-formula longer than ``MAX_CHARACTERS`` is refused before anything else looks at it.
+Each logic defines its signs; names, numbers, white space and C comments are the same in all logics. A formula
+longer than ``MAX_CHARACTERS`` is rejected first.
 """
 
 import re
@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from fractions import Fraction
 
-from rosmop.form.positions import Finding
+from rosmop.form.positions import Diagnostic
 from rosmop.logics.interface import FormulaError, Source
 
 MAX_CHARACTERS = 100_000
 MAX_DURATION_NS = 10**18
-"""About 31 years; longer bounds are taken for a mistake."""
+"""About 31 years; longer bounds are rejected as mistakes."""
 MAX_NUMBER_DIGITS = 30
 
 UNITS_NS = {
@@ -30,20 +30,19 @@ UNITS_NS = {
 
 
 @dataclass(frozen=True)
-class Token:
-    """A sign, ``name``, ``number`` or ``end`` (its kind; a sign is its own kind), and where it begins."""
+class FormulaToken:
+    """A token: its kind (the sign, ``name``, ``number`` or ``end``), its text, and its offset."""
 
     kind: str
     text: str
     offset: int
 
 
-def tokenize(source: Source, signs: Sequence[str]) -> list[Token]:
-    """The tokens of a formula, the last one of kind ``end``. The longest sign that fits is taken."""
+def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
+    """Return the tokens of a formula, the last one of kind ``end``. The longest matching sign is taken."""
     if len(source.text) > MAX_CHARACTERS:
         raise source.error(
-            0,
-            f"a formula of more than {MAX_CHARACTERS} characters; split it into several properties",
+            0, f"a formula of more than {MAX_CHARACTERS} characters; split it into several properties"
         )
     longest_first = [_sign_pattern(sign) for sign in sorted(signs, key=len, reverse=True)]
     lettered = "|".join(sign for sign in longest_first if sign[0].isalpha()) or "(?!)"
@@ -65,14 +64,14 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[Token]:
         kind = "sign" if match.lastgroup == "lettered" else match.lastgroup or ""
         if kind != "space":
             text = match.group()
-            tokens.append(Token(text if kind == "sign" else kind, text, offset))
+            tokens.append(FormulaToken(text if kind == "sign" else kind, text, offset))
         offset = match.end()
-    tokens.append(Token("end", "", len(source.text)))
+    tokens.append(FormulaToken("end", "", len(source.text)))
     return tokens
 
 
 def _sign_pattern(sign: str) -> str:
-    """A sign that ends in a letter (``~o``) ends where the word ends."""
+    """Return the pattern of a sign; one that ends in a letter (``~o``) must end where the word ends."""
     return re.escape(sign) + (r"(?![A-Za-z_0-9])" if sign[-1].isalnum() else "")
 
 
@@ -80,8 +79,8 @@ def _shown(character: str) -> str:
     return f"`{character}`" if character.isprintable() else f"the character U+{ord(character):04X}"
 
 
-def describe(token: Token) -> str:
-    """How to name a token in a message."""
+def describe(token: FormulaToken) -> str:
+    """Return the name of a token for messages."""
     if token.kind == "end":
         return "the end of the formula"
     shown = token.text if len(token.text) <= 40 else token.text[:37] + "…"
@@ -89,14 +88,14 @@ def describe(token: Token) -> str:
 
 
 def suggestion(name: str, known: Sequence[str]) -> str:
-    """What else could have been meant, as the tail of a message."""
+    """Return a suggestion, as the tail of an error."""
     near = get_close_matches(name[:100], known, n=1)
     if near:
         return f"; did you mean `{near[0]}`?"
     if not known:
         return ""
     shown = ", ".join(known[:8]) + (", …" if len(known) > 8 else "")
-    return f"; there are: {shown}"
+    return f"; known: {shown}"
 
 
 class TokenReader:
@@ -106,18 +105,18 @@ class TokenReader:
         self.source = source
         self._tokens = tokenize(source, signs)
         self._next = 0
-        self.findings: list[Finding] = []
+        self.findings: list[Diagnostic] = []
 
     @property
-    def token(self) -> Token:
-        """The next token."""
+    def token(self) -> FormulaToken:
+        """Return the next token."""
         return self._tokens[self._next]
 
-    def ahead(self, count: int) -> Token:
-        """The token ``count`` places behind the next one."""
+    def ahead(self, count: int) -> FormulaToken:
+        """Return the token ``count`` tokens after the next one."""
         return self._tokens[min(self._next + count, len(self._tokens) - 1)]
 
-    def take(self) -> Token:
+    def take(self) -> FormulaToken:
         """Read the next token (the end can be read again and again)."""
         token = self._tokens[self._next]
         if token.kind != "end":
@@ -131,45 +130,45 @@ class TokenReader:
             return True
         return False
 
-    def expect(self, kind: str, what: str) -> Token:
-        """Read a token of this kind or refuse the formula, saying ``what`` was expected."""
+    def expect(self, kind: str, what: str) -> FormulaToken:
+        """Read a token of this kind, or reject the formula with ``what`` was expected."""
         if self.token.kind != kind:
             raise self.unexpected(what)
         return self.take()
 
     def unexpected(self, what: str) -> FormulaError:
-        """The refusal of the next token."""
+        """Return the error for the next token."""
         return self.source.error(self.token.offset, f"expected {what}, found {describe(self.token)}")
 
-    def note(self, token: Token, text: str) -> None:
-        """Remember an error and go on, so that one reading finds as many as it can."""
+    def note(self, token: FormulaToken, text: str) -> None:
+        """Note an error without stopping, so that one reading finds as many as it can."""
         if len(self.findings) < 20:
             self.findings.append(self.source.finding(token.offset, text))
 
     def finish(self) -> None:
-        """Refuse the formula if anything was noted."""
+        """Reject the formula if an error was noted."""
         if self.findings:
             raise FormulaError(sorted(self.findings, key=lambda finding: finding.position))
 
-    def check_event(self, token: Token) -> None:
-        """Note it if the name is not one of the events."""
+    def check_event(self, token: FormulaToken) -> None:
+        """Note an error if the name is not one of the events."""
         if token.text not in self.source.events:
             hint = suggestion(token.text, self.source.events)
             self.note(token, f"`{token.text}` is not an event of this specification{hint}")
 
     def duration(self, what: str) -> int:
-        """Read a duration such as ``100ms``, ``0.5 s`` or ``2`` (seconds); nanoseconds."""
+        """Read a duration such as ``100ms``, ``0.5 s`` or ``2`` (seconds); return nanoseconds."""
         number = self.expect("number", f"{what} such as `100ms`, `0.5s` or `2m`")
         if len(number.text) > MAX_NUMBER_DIGITS:
             raise self.source.error(
-                number.offset, f"a number of more than {MAX_NUMBER_DIGITS} digits is no duration"
+                number.offset, f"a number of more than {MAX_NUMBER_DIGITS} digits is not a duration"
             )
         unit = 10**9
         if self.token.kind == "name" and (self.token.text in UNITS_NS or self._glued(number)):
             if self.token.text not in UNITS_NS:
                 raise self.source.error(
                     self.token.offset,
-                    f"`{self.token.text}` is no unit of time; write one of {', '.join(UNITS_NS)}",
+                    f"`{self.token.text}` is not a unit of time; write one of {', '.join(UNITS_NS)}",
                 )
             unit = UNITS_NS[self.take().text]
         nanoseconds = Fraction(number.text if number.text[0] != "." else "0" + number.text) * unit
@@ -179,5 +178,5 @@ class TokenReader:
             raise self.source.error(number.offset, "a duration of more than 31 years; is the unit right?")
         return int(nanoseconds)
 
-    def _glued(self, number: Token) -> bool:
+    def _glued(self, number: FormulaToken) -> bool:
         return self.token.offset == number.offset + len(number.text)

@@ -5,39 +5,24 @@ Each event is one position, where exactly its own atom holds. The category is ``
 continuation satisfies the formula, ``validation`` once all do; both are for good. (Bauer, Leucker,
 Schallhart: LTL3.)
 
-Theory of operation: the formula and its negation are brought into normal form and each becomes a
-generalised Büchi automaton (``buchi``). States without an accepted word are cut away; both automata are
-determinised side by side; an empty left side is a violation, an empty right side a validation. The result
-is minimised.
+Theory of operation: the normal forms of the formula and of its negation each become a generalised Büchi
+automaton (``buchi``). States without an accepted word are removed; both automata are determinised side by
+side; an empty left side is a violation, an empty right side a validation. The result is minimised.
 
-An operator about the past becomes a proposition of its own, which is guessed at each position, and a formula about the
-future that only the right guesses satisfy (``_Past``). There is one right guess for every trace: so neither the
-formula nor its negation gains or loses a trace. An event stands for all letters that differ in the guesses only.
+An operator about the past becomes a proposition, whose value is guessed at each position, and a formula about the
+future that only the right guesses satisfy (``_Past``). Every trace has exactly one right guess, so neither the formula
+nor its negation gains or loses a trace. An event is the set of all letters that differ only in the guesses.
 """
 
 from rosmop.logics.automaton import TooManyStatesError, explore, letter_classes, spread
 from rosmop.logics.buchi import Automata, Sets, TooLargeError
-from rosmop.logics.formula import (
-    Formula,
-    Level,
-    Syntax,
-    boolean_levels,
-    event_names,
-    nodes,
-    read_formula,
-)
+from rosmop.logics.formula import Formula, Level, Syntax, boolean_levels, event_names, nodes, read_formula
 from rosmop.logics.interface import FiniteProperty, Source
 from rosmop.logics.ptltl import SYNTAX as PTLTL
 
 _LEVELS = boolean_levels([])
 SYNTAX = Syntax(
-    unary={
-        **PTLTL.unary,
-        "o": "next",
-        "~o": "next",
-        "[]": "always",
-        "<>": "eventually",
-    },
+    unary={**PTLTL.unary, "o": "next", "~o": "next", "[]": "always", "<>": "eventually"},
     levels=(
         *_LEVELS[:-1],
         Level(
@@ -54,17 +39,17 @@ SYNTAX = Syntax(
     ),
     refused={
         "~": "has no meaning in ltl; write `!` for a negation",
-        "X": "is no operator of ltl; write `o` for next",
-        "F": "is no operator of ltl; write `<>` for eventually",
-        "G": "is no operator of ltl; write `[]` for always",
-        "W": "is no operator of ltl; write `b R (a or b)` for `a W b`",
+        "X": "is not an operator of ltl; write `o` for next",
+        "F": "is not an operator of ltl; write `<>` for eventually",
+        "G": "is not an operator of ltl; write `[]` for always",
+        "W": "is not an operator of ltl; write `b R (a or b)` for `a W b`",
     },
 )
 _PAST = {"previously", "dual previously", "historically", "once", "since", "dual since"}
 _FUTURE = {"next", "always", "eventually", "until", "release"}
 VERDICTS = ("violation", "validation")
 MOST_LETTERS = 1024
-"""Classes of events, times two for each operator about the past."""
+"""The maximum number of letters: classes of events, doubled by each operator about the past."""
 
 
 def compile_ltl(source: Source) -> FiniteProperty:
@@ -105,7 +90,7 @@ def compile_ltl(source: Source) -> FiniteProperty:
 
 
 def _settled(for_it: Sets, against_it: Sets) -> tuple[Sets, Sets]:
-    """A pair of states; once the verdict is certain, what is left of the other side does not matter."""
+    """Return a pair of states; once the verdict is certain, the state of the other side is unified."""
     if not for_it:
         return frozenset(), _SOMETHING
     if not against_it:
@@ -117,14 +102,14 @@ _SOMETHING: Sets = frozenset((0,))
 
 
 class _Past:
-    """Takes the operators about the past out of a formula; `right` is what the guesses have to satisfy."""
+    """Replaces past operators in a formula; `right` collects the constraints on the guesses."""
 
     def __init__(self) -> None:
         self.propositions: dict[Formula, str] = {}
         self.right: list[Formula] = []
 
     def replaced(self, formula: Formula) -> Formula:
-        """The formula with propositions in the place of its operators about the past."""
+        """Return the formula with propositions instead of its operators about the past."""
         operator = formula.operator
         operands = tuple(self.replaced(operand) for operand in formula.operands)
         if operator == "once":
@@ -138,7 +123,7 @@ class _Past:
         return Formula(operator, operands, formula.name)
 
     def _proposition(self, operator: str, operands: tuple[Formula, ...]) -> Formula:
-        """What stands for `previously x`, or for `x since y`: now `y`, or `x` and it held at the event before."""
+        """Return the proposition for `previously x` or `x since y`, and add its constraint to `right`."""
         formula = Formula(operator, operands)
         if formula in self.propositions:
             return Formula("event", name=self.propositions[formula])

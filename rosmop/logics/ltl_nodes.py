@@ -1,4 +1,4 @@
-"""Formulas of linear temporal logic in negation normal form, each held once and known by number.
+"""Formulas of linear temporal logic in negation normal form, each stored once and identified by a number.
 
 Atoms and their boolean combinations are one node, ``letters``: the bit set of the letters at which they
 hold, because at each position exactly one letter holds. The other nodes are ``and`` and ``or`` (flat),
@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from rosmop.logics.formula import Formula
 
 
-class Nodes:
+class FormulaNodes:
     """The nodes over letters ``0 … letters-1``."""
 
     def __init__(self, letters: int) -> None:
@@ -19,7 +19,7 @@ class Nodes:
         self._nodes: list[tuple[str, tuple[int, ...]]] = []
 
     def __getitem__(self, node: int) -> tuple[str, tuple[int, ...]]:
-        """The kind of a node and its parts: nodes, or the bit set of a ``letters`` node."""
+        """Return the kind of a node, and its nodes or the bit set of a ``letters`` node."""
         return self._nodes[node]
 
     def _intern(self, kind: str, parts: tuple[int, ...]) -> int:
@@ -29,7 +29,7 @@ class Nodes:
         return number
 
     def letters(self, mask: int) -> int:
-        """Any of the letters of a bit set."""
+        """Return the node for any of the letters of a bit set."""
         return self._intern("letters", (mask,))
 
     def _mask(self, node: int) -> int | None:
@@ -37,7 +37,7 @@ class Nodes:
         return parts[0] if kind == "letters" else None
 
     def join(self, kind: str, operands: Iterable[int]) -> int:
-        """A conjunction or disjunction, flat, with its letters merged into one operand."""
+        """Return a conjunction or disjunction, flat, with its letters merged into one operand."""
         mask = self.everything if kind == "and" else 0
         absorbing = 0 if kind == "and" else self.everything
         parts: set[int] = set()
@@ -58,32 +58,32 @@ class Nodes:
         return parts.pop() if len(parts) == 1 else self._intern(kind, tuple(sorted(parts)))
 
     def next(self, operand: int) -> int:
-        """At the next position."""
+        """Return the node that holds if this one holds at the next position."""
         return operand if self._mask(operand) in (0, self.everything) else self._intern("next", (operand,))
 
     def until(self, left: int, right: int) -> int:
-        """``right`` at some position, and ``left`` at all before it."""
+        """Return the node for ``right`` at some position and ``left`` at all positions before it."""
         if self._mask(right) in (0, self.everything) or self._mask(left) == 0 or left == right:
             return right
         return self._intern("until", (left, right))
 
     def release(self, left: int, right: int) -> int:
-        """``right`` up to and including the first position of ``left``, or always."""
+        """Return the node for ``right`` up to and including the first position of ``left``, or always."""
         if self._mask(right) in (0, self.everything) or self._mask(left) == self.everything or left == right:
             return right
         return self._intern("release", (left, right))
 
 
-class Translation:
-    """Formula to node, with negations pushed down to the letters; shares what occurs twice."""
+class FormulaTranslation:
+    """A translation of formulas to shared nodes, with negations pushed down to the letters."""
 
-    def __init__(self, nodes: Nodes, atoms: Mapping[str, int]) -> None:
+    def __init__(self, nodes: FormulaNodes, atoms: Mapping[str, int]) -> None:
         self._nodes = nodes
         self._known: dict[tuple[int, bool], int] = {}
         self._atoms = atoms
 
     def node(self, formula: Formula, positive: bool) -> int:
-        """The node of a formula, or of its negation."""
+        """Return the node of a formula, or of its negation."""
         key = (id(formula), positive)
         if key not in self._known:
             self._known[key] = self._find(formula, positive)
@@ -112,7 +112,7 @@ class Translation:
         return self._nodes.letters(mask if positive else everything & ~mask)
 
     def _temporal(self, operator: str, parts: list[int], positive: bool) -> int:
-        """A temporal operator, or its dual, over parts that are negated already if need be."""
+        """Return a temporal operator, or its dual, over parts that are already negated if necessary."""
         nodes = self._nodes
         if operator == "next":
             return nodes.next(parts[0])
@@ -124,7 +124,7 @@ class Translation:
         return nodes.until(parts[0], parts[1]) if strong else nodes.release(parts[0], parts[1])
 
     def _parity(self, operands: tuple[Formula, ...], odd: bool) -> int:
-        """An odd (or even) number of the operands holds."""
+        """Return the node that holds if an odd (or even) number of operands hold."""
         nodes = self._nodes
         yes, no = self.node(operands[0], True), self.node(operands[0], False)
         for operand in operands[1:]:

@@ -2,9 +2,9 @@
 
 ``once[0,500ms] a``, ``historically[…] a``, ``a since[…] b``, ``previously[…] a``; without bounds an
 operator means ``[0,inf]``. ``eventually[0,500ms] a``, ``always[…] a``, ``a until[…] b``, ``next[…] a``: about the
-future the upper bound has to be there. Pointwise: a formula is asked only at events, and its operators see events
-only, at the times at which they were received. The category is ``validation`` where the formula holds at an event,
-``violation`` where not; it is told once that is certain, at the latest when the bounds have passed.
+future an upper bound is required. The semantics is pointwise: a formula is evaluated only at events, and its operators
+see only events, at their times of reception. The category is ``validation`` where the formula holds at an event,
+``violation`` where not; it comes once it is certain, at the latest when the bounds have passed.
 """
 
 from rosmop.logics.bounded import BoundedProperty

@@ -1,11 +1,11 @@
-"""A recogniser for any context-free grammar that says after each event whether the trace so far is in the
+"""A recogniser for any context-free grammar, which reports after each event whether the trace so far is in the
 language.
 
-Theory of operation. It is Earley's algorithm (with the nullable symbols of Aycock and Horspool) in which an
-item does not name the position where it began but holds a *continuation*: what waits for its left side to
-be completed there. Positions are then not kept; what nobody waits for any more is freed.
+Theory of operation. It is Earley's algorithm (with the nullable symbols of Aycock and Horspool) in which an item does
+not name the position where it began but holds a *continuation*: the items that wait for its left side to be completed
+there. Positions are therefore not stored, and an item without a waiting continuation is freed.
 
-- A *frame* is an Earley set: a ``Shape`` (items whose continuations are numbered) and the continuations
+- A *frame* is an Earley set: a ``EarleyShape`` (items whose continuations are numbered) and the continuations
   themselves.
 - A continuation is a frame and a symbol: the items of that frame's closure that wait for the symbol. None
   is the continuation of the whole trace: completing it means that the trace is in the language.
@@ -27,11 +27,11 @@ from rosmop.logics.cfg_grammar import Grammar, nullable_symbols
 from rosmop.logics.interface import RunFaultError
 
 MAX_WIDTH = 4_000
-"""How many continuations a frame may have; only ambiguous grammars come near."""
+"""The maximum number of continuations of a frame; only ambiguous grammars come near."""
 MAX_STEP_WORK = 300_000
-"""How many items the completions of one step may bring; bounds its time to a fraction of a second."""
+"""The maximum number of items that one step completes; bounds its time to a fraction of a second."""
 MAX_DEPTH = 1_000_000
-"""How many frames may wait for each other: the nesting of the trace."""
+"""The maximum number of nested frames: the nesting of the trace."""
 KEPT_SHAPE_WIDTH = 8
 KEPT_SHAPE_ITEMS = 400
 KEPT_ENTRIES = 20_000
@@ -41,7 +41,7 @@ Entry = tuple[int, int]
 symbol A."""
 
 
-class Shape:
+class EarleyShape:
     """Items with numbered continuations. ``done``: the continuations that have been completed."""
 
     __slots__ = ("done", "items", "kept", "returned", "scanned", "waiters", "width")
@@ -56,23 +56,23 @@ class Shape:
         self.returned: dict[int, Step] = {}
 
 
-Step = tuple[Shape, tuple[int, ...]]
+Step = tuple[EarleyShape, tuple[int, ...]]
 """A shape, and the references that are its continuations."""
 
 
-class Frame:
+class EarleySet:
     """An Earley set. ``depth`` counts the frames that wait below."""
 
     __slots__ = ("conts", "depth", "shape")
     keeps = __slots__
 
-    def __init__(self, shape: Shape, conts: "Conts", depth: int) -> None:
+    def __init__(self, shape: EarleyShape, conts: "Conts", depth: int) -> None:
         self.shape = shape
         self.conts = conts
         self.depth = depth
 
     def resolve(self, references: Sequence[int]) -> "Conts":
-        """The continuations that references of this frame's shape stand for."""
+        """Return the continuations that the references of this frame's shape mean."""
         if len(references) == 1:
             only = references[0]
             return (self.conts[only] if only >= 0 else (self, only),)
@@ -80,11 +80,11 @@ class Frame:
         return tuple([conts[reference] if reference >= 0 else (self, reference) for reference in references])
 
 
-Continuation = tuple[Frame, int] | None
+Continuation = tuple[EarleySet, int] | None
 Conts = tuple[Continuation, ...]
 
 
-class Recogniser:
+class EarleyRecogniser:
     """The tables of a prepared grammar, filled as they are needed. Shared by all runs."""
 
     def __init__(self, grammar: Grammar) -> None:
@@ -95,20 +95,19 @@ class Recogniser:
         for head, body in grammar.rules:
             self._first.setdefault(head, []).append(len(self._next))
             self._next += [*body, -1]
-        self._shapes: dict[tuple[tuple[Entry, ...], tuple[int, ...], int], Shape] = {}
-        self._joined: dict[tuple[Shape, int, Shape, tuple[int, ...]], Step] = {}
+        self._shapes: dict[tuple[tuple[Entry, ...], tuple[int, ...], int], EarleyShape] = {}
+        self._joined: dict[tuple[EarleyShape, int, EarleyShape, tuple[int, ...]], Step] = {}
         self._nothing = self._shape((), (), 0)
         start = -1 if grammar.start is None else grammar.start
         item = len(self._next)
         self._next += [start, -1]
         items = ((item, 0),) if grammar.rules and grammar.start is not None else ()
-        self.initial = Frame(self._shape(items, (), len(items)), (None,) * len(items), 0)
+        self.initial = EarleySet(self._shape(items, (), len(items)), (None,) * len(items), 0)
 
     # ---- one event
 
-    def step(self, frame: Frame, event: int) -> tuple[Frame, bool] | None:
-        """The frame after an event and whether the trace is in the language, or None if no continuation can
-        be."""
+    def step(self, frame: EarleySet, event: int) -> tuple[EarleySet, bool] | None:
+        """Return the next frame and whether the trace is in the language; None if no continuation can be."""
         scanned = self._scan(frame.shape, event)
         if scanned is None:
             return None
@@ -139,12 +138,12 @@ class Recogniser:
                 depth = cont[0].depth + 1
         if depth > MAX_DEPTH:
             raise RunFaultError(f"the trace is nested more than {MAX_DEPTH} deep")
-        return Frame(shape, conts, depth), accepted
+        return EarleySet(shape, conts, depth), accepted
 
     def _complete_wide(
-        self, shape: Shape, conts: Conts, before: Frame, *, accepted: bool
-    ) -> tuple[Shape, Conts, bool]:
-        """All completions at once, without tables: for the large frames of ambiguous grammars."""
+        self, shape: EarleyShape, conts: Conts, before: EarleySet, *, accepted: bool
+    ) -> tuple[EarleyShape, Conts, bool]:
+        """Return the shape after all completions, without tables, for the large frames of ambiguous grammars."""
         items = {(item, conts[reference]) for item, reference in shape.items}
         waiting = [conts[reference] for reference in shape.done]
         completed = set(waiting)
@@ -172,24 +171,24 @@ class Recogniser:
 
     # ---- tables
 
-    def shape(self, items: tuple[Entry, ...], done: tuple[int, ...], width: int) -> Shape:
-        """The shape of these items."""
+    def shape(self, items: tuple[Entry, ...], done: tuple[int, ...], width: int) -> EarleyShape:
+        """Return the shape of these items."""
         return self._shape(items, done, width)
 
-    def _shape(self, items: tuple[Entry, ...], done: tuple[int, ...], width: int) -> Shape:
+    def _shape(self, items: tuple[Entry, ...], done: tuple[int, ...], width: int) -> EarleyShape:
         if width > KEPT_SHAPE_WIDTH or len(items) > KEPT_SHAPE_ITEMS:
-            return Shape(items, done, width, kept=False)
+            return EarleyShape(items, done, width, kept=False)
         key = (items, done, width)
         shape = self._shapes.get(key)
         if shape is None:
             if len(self._shapes) >= KEPT_ENTRIES:
                 self._shapes.clear()
                 self._joined.clear()
-            shape = self._shapes[key] = Shape(items, done, width, kept=True)
+            shape = self._shapes[key] = EarleyShape(items, done, width, kept=True)
         return shape
 
     def _canonical(self, items: set[Entry], done: set[int]) -> Step:
-        """Number the references that are used; sorted, so that equal sets give equal shapes."""
+        """Number the used references in sorted order, so that equal sets give equal shapes."""
         references = sorted({reference for _, reference in items} | done)
         number = {reference: index for index, reference in enumerate(references)}
         shape = self._shape(
@@ -199,7 +198,7 @@ class Recogniser:
         )
         return shape, tuple(references)
 
-    def _scan(self, shape: Shape, event: int) -> Step | None:
+    def _scan(self, shape: EarleyShape, event: int) -> Step | None:
         known = shape.scanned.get(event, False)
         if known is False:
             _, by_event = self._closure(shape)
@@ -207,16 +206,15 @@ class Recogniser:
             known = shape.scanned[event] = None if entries is None else self._complete(shape, entries)
         return known  # type: ignore[return-value]  # no longer False
 
-    def _return(self, shape: Shape, reference: int) -> Step:
+    def _return(self, shape: EarleyShape, reference: int) -> Step:
         known = shape.returned.get(reference)
         if known is None:
             waiters, _ = self._closure(shape)
             known = shape.returned[reference] = self._complete(shape, waiters[-1 - reference])
         return known
 
-    def _closure(self, shape: Shape) -> tuple[dict[int, set[Entry]], dict[int, set[Entry]]]:
-        """The items that wait for each nonterminal and for each event, predicted ones included; all one symbol
-        further."""
+    def _closure(self, shape: EarleyShape) -> tuple[dict[int, set[Entry]], dict[int, set[Entry]]]:
+        """Return the items, also predicted ones, that wait for each nonterminal and event, advanced by that symbol."""
         if shape.waiters is not None:
             return shape.waiters
         waiters: dict[int, set[Entry]] = {}
@@ -240,15 +238,15 @@ class Recogniser:
         return shape.waiters
 
     def _skip_nullable(self, item: int) -> list[int]:
-        """The item, and further on past symbols that may be empty."""
+        """Return the item, and the items after each of the symbols there that may be empty."""
         items = [item]
         while self._next[item] in self._nullable:
             item += 1
             items.append(item)
         return items
 
-    def _complete(self, shape: Shape, entries: set[Entry]) -> Step:
-        """Entries with all that their completion does inside the frame; what leaves it is ``done``."""
+    def _complete(self, shape: EarleyShape, entries: set[Entry]) -> Step:
+        """Return the entries after all completions inside the frame; those outside it are ``done``."""
         waiters, _ = self._closure(shape)
         items: set[Entry] = set()
         done: set[int] = set()
@@ -267,9 +265,8 @@ class Recogniser:
         aliased = {(item, self._alias(shape, reference)) for item, reference in items}
         return self._canonical(aliased, done)
 
-    def _alias(self, shape: Shape, reference: int) -> int:
-        """What completing this reference comes to, if it is nothing but completing one continuation of the
-        frame."""
+    def _alias(self, shape: EarleyShape, reference: int) -> int:
+        """Return the reference whose completion is the only effect of completing this one (Leo's rule)."""
         if reference >= 0:
             return reference
         waiters, _ = self._closure(shape)
@@ -285,9 +282,9 @@ class Recogniser:
         return reference
 
     def _join(
-        self, shape: Shape, conts: Conts, index: int, other: Shape, others: Conts
-    ) -> tuple[Shape, Conts]:
-        """Both sets of items as one, without ``index`` among what is done."""
+        self, shape: EarleyShape, conts: Conts, index: int, other: EarleyShape, others: Conts
+    ) -> tuple[EarleyShape, Conts]:
+        """Return the union of both sets of items, without ``index`` in ``done``."""
         place = {cont: number for number, cont in enumerate(conts)}
         mapping = tuple(place.get(cont, -1) for cont in others)
         key = (shape, index, other, mapping)
@@ -307,7 +304,7 @@ class Recogniser:
 
 
 def _deepest(done: tuple[int, ...], conts: Conts) -> int:
-    """Of the completed continuations the deepest: it can only complete less deep ones, so each has its turn once."""
+    """Return the deepest of the completed continuations; it completes only less deep ones."""
     deepest, depth = done[0], -2
     if len(done) > 1:
         for index in done:

@@ -1,17 +1,17 @@
 """Monitors for formulas about the past: ptltl, and the past part of mtl (`bounded.py` has the other part).
 
 Theory of operation. A formula becomes a *program*: its distinct subformulas in an order in which each
-follows its operands, with only ``previously`` and ``since`` left of the temporal operators (``once b`` is
-``true since b``). A step computes all of them from the event and from what the last step left behind
-(Havelund and Rosu, 2002):
+follows its operands, whose only temporal operators are ``previously`` and ``since`` (``once b`` is
+``true since b``). A step computes all of them from the event and from the values that the last step
+kept (Havelund and Rosu, 2002):
 
 - ``previously``: the value of the operand at the last event;
 - ``since``: its own last value;
-- either with bounds: the intervals of time in which it will hold if the left operand goes on to hold (`Window`).
+- either with bounds: the intervals of time in which it will hold while the left operand holds (`SinceWindow`).
 
-Which atoms hold is known of each event, so the program is folded beforehand into what is left of it at each of them,
-which is data (`Folded`). Without time bounds the values are bits and the program a finite automaton, which is built if
-it is small enough.
+Each event decides which atoms hold. The program is therefore folded beforehand, for each event, into the operations
+that remain: data (`FoldedProgram`). Without time bounds the values are bits, and the program is a finite automaton,
+which is built if it is small enough.
 """
 
 import copy
@@ -21,14 +21,7 @@ from dataclasses import dataclass
 from functools import partial, reduce
 from typing import Any
 
-from rosmop.logics.automaton import (
-    MAX_STATES,
-    Automaton,
-    TooManyStatesError,
-    explore,
-    letter_classes,
-    spread,
-)
+from rosmop.logics.automaton import MAX_STATES, Automaton, TooManyStatesError, explore, letter_classes, spread
 from rosmop.logics.formula import Bounds, Formula, event_names
 from rosmop.logics.interface import (
     Categories,
@@ -45,17 +38,16 @@ VERDICTS = ("violation", "validation")
 ANEW = "anew"
 TOLD: tuple[Categories, Categories] = VERDICTS[:1], VERDICTS[1:]
 MAX_TABLE_WORK = 2_000_000
-"""How many values may be computed to build a table."""
+"""The maximum number of values computed to build a table."""
 MAX_FOLDED = 50_000
-"""How many operands may be looked at to find what is left at each event; beyond that all is left at all of them."""
+"""The maximum number of operands visited to fold a program; larger programs are not folded."""
 FOREVER = 10**30
 """Later than any time."""
 
 
 @dataclass(frozen=True)
-class Instruction:
-    """One subformula: ``operands`` are earlier instructions; an ``event`` has its index, others their
-    bounds."""
+class PastInstruction:
+    """One subformula: ``operands`` are earlier instructions; an ``event`` has an index, others bounds."""
 
     operator: str
     operands: tuple[int, ...] = ()
@@ -65,28 +57,28 @@ class Instruction:
 
     @property
     def bounded(self) -> bool:
-        """Whether the time of events plays a part."""
+        """Whether the value depends on the time of events."""
         return self.low > 0 or self.high is not None
 
     @property
     def plain(self) -> str:
-        """The operator, whether it is about the abstract past or not."""
+        """Return the operator without ``abstract``."""
         return self.operator.removeprefix("abstract ")
 
 
-class Program:
+class PastProgram:
     """The distinct subformulas of a formula, operands first; the last one is the formula."""
 
     def __init__(self, formula: Formula, events: Sequence[str]) -> None:
         self.events = {name: index for index, name in enumerate(events)}
-        self._numbers: dict[Instruction, int] = {}
-        self.instructions: list[Instruction] = []
+        self._numbers: dict[PastInstruction, int] = {}
+        self.instructions: list[PastInstruction] = []
         self.result = self._add(formula)
 
     def _emit(
         self, operator: str, *operands: int, low: int = 0, high: int | None = None, event: int = -1
     ) -> int:
-        instruction = Instruction(operator, operands, event, low, high)
+        instruction = PastInstruction(operator, operands, event, low, high)
         number = self._numbers.setdefault(instruction, len(self.instructions))
         if number == len(self.instructions):
             self.instructions.append(instruction)
@@ -97,7 +89,7 @@ class Program:
         return instruction.operands[0] if instruction.operator == "not" else self._emit("not", operand)
 
     def _add(self, formula: Formula) -> int:
-        """The number of a subformula, itself and its operands added if they are new."""
+        """Return the number of a subformula; add it and its operands if they are new."""
         if formula.operator == "event":
             return self._emit("event", event=self.events[formula.name])
         operands = [self._add(operand) for operand in formula.operands]
@@ -127,23 +119,22 @@ class Program:
 
 
 _OF_ONE = {"once": "since", "historically": "since", "eventually": "until", "always": "until"}
-"""Operators that are said by another one, whose left operand is `true`."""
+"""Operators that are another operator with `true` as left operand."""
 
 
 Operation = tuple[str, int, int, int, int]
-"""An operator, the place of its value, those of its operands, and that of its `Window`. Of an `event` the number is in
-the place of an operand."""
+"""An operator, and the indexes of its value, its operands and its `SinceWindow`; an `event` has its number there."""
 Residue = tuple[tuple[Operation, ...], tuple[int, ...]]
-"""What is left at an event: operations, and where the values are that were asked for."""
+"""The residue at an event: operations, and the places of the requested values."""
 
 
 @dataclass(frozen=True)
-class Folded:
-    """A program as its runs have it. They keep a list of *values*: `False`, `True` (so a place below 2 says what is in
-    it), what one step leaves to the next, and what is of use within one.
+class FoldedProgram:
+    """A program as runs execute it. A run keeps a list of *values*: `False`, `True` (so a place below 2 is a constant),
+    the values kept for the next step, and those used within one step.
 
-    ``bounds`` are those of the windows among what is left to the next step, ``abstract`` the places in it that abstract
-    operators have. ``residues`` has one for each event, and behind them that of an event that is not named.
+    ``bounds`` has the bounds of each kept window (None for other kept values), ``abstract`` the places of abstract
+    operators. ``residues`` has a residue for each event, and a last one for events that are not named.
     """
 
     bounds: tuple[Bounds | None, ...]
@@ -153,16 +144,16 @@ class Folded:
 
     @property
     def kept(self) -> slice:
-        """The places of what one step leaves to the next."""
+        """Return the places of the values kept for the next step."""
         return slice(2, 2 + len(self.bounds))
 
     def start(self) -> list[Any]:
-        """The values before the first event."""
-        kept = [False if bounds is None else Window(*bounds) for bounds in self.bounds]
+        """Return the values before the first event."""
+        kept = [False if bounds is None else SinceWindow(*bounds) for bounds in self.bounds]
         return [False, True, *kept, *[False] * (self.size - 2 - len(kept))]
 
     def take(self, values: list[Any], event: int, now: int) -> tuple[int, ...]:
-        """Let the event happen; where the values are that were asked for."""
+        """Compute the values at an event; return the places of the requested ones."""
         operations, results = self.residues[event]
         compute(operations, values, event, now)
         return results
@@ -185,8 +176,8 @@ def compute(operations: Sequence[Operation], values: list[Any], event: int, now:
             values[place] = left == event
 
 
-def fold(program: Program, wanted: Sequence[int]) -> Folded:
-    """The program, to compute these instructions."""
+def fold(program: PastProgram, wanted: Sequence[int]) -> FoldedProgram:
+    """Return the folded program that computes these instructions."""
     needed = {*wanted}
     for number in range(max(wanted), -1, -1):
         if number in needed:
@@ -198,7 +189,7 @@ def fold(program: Program, wanted: Sequence[int]) -> Folded:
     known = sum(1 + len(one.operands) for one in chosen.values()) * len(events) <= MAX_FOLDED
     folds = {event: _Fold(chosen, kept, event if known else None) for event in (events if known else {-1})}
     residues = {event: made.residue(wanted) for event, made in folds.items()}
-    return Folded(
+    return FoldedProgram(
         tuple((one.low, one.high) if one.bounded else None for one in looking.values()),
         tuple(kept[number] for number, one in looking.items() if one.plain != one.operator),
         tuple(residues.get(event, residues[-1]) for event in (*program.events.values(), -1)),
@@ -207,9 +198,9 @@ def fold(program: Program, wanted: Sequence[int]) -> Folded:
 
 
 class _Fold:
-    """What is left of instructions at an event (None: at any). ``kept`` are the places of those that look back."""
+    """Folds instructions for an event (None: any event). ``kept`` are the places of those that look back."""
 
-    def __init__(self, chosen: dict[int, Instruction], kept: dict[int, int], event: int | None) -> None:
+    def __init__(self, chosen: dict[int, PastInstruction], kept: dict[int, int], event: int | None) -> None:
         self._chosen = chosen
         self._kept = kept
         self._event = event
@@ -218,7 +209,7 @@ class _Fold:
         self.size = 2 + len(kept)
 
     def residue(self, wanted: Sequence[int]) -> Residue:
-        """The operations without those whose value nobody needs."""
+        """Return the operations whose values are needed."""
         for number, instruction in self._chosen.items():
             self._places[number] = self._place(number, instruction)
         before = {
@@ -226,7 +217,7 @@ class _Fold:
             for number, place in self._kept.items()
             if (one := self._chosen[number]).plain == "previously"
         }
-        # What is wanted of these is looked at after they have become what they will be at the next event.
+        # Requested values of these operations are read after they have been set for the next event.
         places = [self._places[number] for number in wanted]
         results = tuple(self._emit("or", place, 0) if place in before else place for place in places)
         for place, instruction in reversed(before.items()):
@@ -244,8 +235,8 @@ class _Fold:
                 needed.update(operands)
         return tuple(reversed(left)), results
 
-    def _place(self, number: int, instruction: Instruction) -> int:
-        """Where the value of an instruction is: below 2 if it is known."""
+    def _place(self, number: int, instruction: PastInstruction) -> int:
+        """Return the place of an instruction's value; below 2 if it is a constant."""
         operands = [self._places[operand] for operand in instruction.operands]
         operator, kept = instruction.plain, self._kept.get(number, 0)
         if operator == "event" and self._event is None:
@@ -281,8 +272,8 @@ class _Fold:
 
 
 def compile_past(source: Source, formula: Formula) -> CompiledProperty:
-    """The monitor of a past formula: tables where they are finite and small, else the program, folded."""
-    program = Program(formula, source.events)
+    """Return the monitor of a past formula: a table if it is finite and small, else the folded program."""
+    program = PastProgram(formula, source.events)
     folded = fold(program, [program.result])
     bounds = [found for found in folded.bounds if found is not None]
     named = event_names(formula)
@@ -295,17 +286,17 @@ def compile_past(source: Source, formula: Formula) -> CompiledProperty:
         if len(bounds) == 1 and (low == 0 or high is None):
             late = [len(classes) + letter for letter in of_event]
             automaton = spread(_table(folded, letters, clocked=True), [*of_event, *late])
-            return ClockedPast(source, automaton, low - 1 if high is None else high)
+            return ClockedPastProperty(source, automaton, low - 1 if high is None else high)
     except TooManyStatesError:
         pass
     return PastProperty(source, folded)
 
 
-def _table(folded: Folded, letters: Sequence[int], *, clocked: bool = False) -> Automaton:
-    """The automaton over letters, of which the formula names ``letters[i]`` (-1: none of its events).
+def _table(folded: FoldedProgram, letters: Sequence[int], *, clocked: bool = False) -> Automaton:
+    """Return the automaton over letters; letter ``i`` is the event ``letters[i]`` (-1: any that is not named).
 
-    With a clock all letters are there a second time, as they are where it is late; a state that is entered as the clock
-    begins anew has `ANEW` behind its verdict.
+    With a clock, each letter has a second form for events after the clock has run out. A state whose step restarts the
+    clock has `ANEW` after its verdict.
     """
     values, kept, many = folded.start(), folded.kept, len(letters)
 
@@ -330,8 +321,8 @@ def _table(folded: Folded, letters: Sequence[int], *, clocked: bool = False) -> 
 
 
 class _Clock:
-    """A window that begins at once, or never ends (``first``), in a table: whether it is there, for times that are
-    whether more than its bound has passed since it began, at its `first` or its last anchor.
+    """A window in a table that begins at once or never ends (``first``): whether it exists. Its time is only whether
+    more than its bound has passed since its last anchor, or with ``first`` since its first one.
     """
 
     def __init__(self, there: bool, *, first: bool) -> None:
@@ -343,31 +334,31 @@ class _Clock:
         return self._there
 
     def step(self, unbroken: bool, anchor: bool, late: bool) -> bool:
-        """The value, as `Window.step` gives it."""
+        """Return the value, as `SinceWindow.step` does."""
         self._there = self._there and unbroken and (self._first or not late)
         if anchor and not (self._first and self._there):
             self._there = self.anew = True
         return self._there and (not self._first or (late and not self.anew))
 
 
-class ClockedPast(ClockedProperty):
-    """A past formula with one time bound, that one window of `_Clock` has."""
+class ClockedPastProperty(ClockedProperty):
+    """A property for a past formula with one time bound in one window, a `_Clock`."""
 
     def __init__(self, source: Source, automaton: Automaton, within: int) -> None:
         super().__init__(source, VERDICTS)
         self.initial, self.within = automaton.initial, within
-        self.verdicts = tuple(told[:1] for told in automaton.verdicts)
+        self.verdicts = tuple(verdict[:1] for verdict in automaton.verdicts)
         self.waits = (None,) * len(automaton)
         rows = [[(target, ANEW in automaton.verdicts[target]) for target in row] for row in automaton.table]
         self.moves = tuple(tuple(row[: len(self.events)]) for row in rows)
         self.late = tuple(tuple(row[len(self.events) :]) for row in rows)
 
 
-class Window:
-    """``since[low,high]``: the intervals of time in which it will hold if the left operand goes on to hold.
+class SinceWindow:
+    """The state of ``since[low,high]``: the intervals of time in which it will hold while the left operand holds.
 
-    Intervals that touch are merged, so there are at most about ``low/(high-low)`` of them, and never more than events
-    within ``low``.
+    Intervals that touch are merged, so there are at most about ``low/(high-low)``, and never more than the number of
+    events within ``low``.
     """
 
     __slots__ = ("_high", "_intervals", "_low")
@@ -379,7 +370,7 @@ class Window:
         self._intervals: deque[tuple[int, int]] = deque()
 
     def step(self, unbroken: bool, anchor: bool, now: int) -> bool:
-        """The value at ``now``, where the left operand is ``unbroken`` and the right one ``anchor``."""
+        """Return the value at ``now``; ``unbroken`` is the left operand, ``anchor`` the right one."""
         intervals = self._intervals
         if intervals and not unbroken:
             intervals.clear()
@@ -396,8 +387,8 @@ class Window:
             intervals.popleft()
         return False
 
-    def __copy__(self) -> "Window":
-        twin = Window(self._low, self._high)
+    def __copy__(self) -> "SinceWindow":
+        twin = SinceWindow(self._low, self._high)
         twin._intervals = self._intervals.copy()
         return twin
 
@@ -411,7 +402,7 @@ class PastRun(UntimedRun):
     __slots__ = ("_residues", "now", "values")
     keeps = ("now", "values")
 
-    def __init__(self, folded: Folded, time_ns: int) -> None:
+    def __init__(self, folded: FoldedProgram, time_ns: int) -> None:
         self._residues = folded.residues
         self.values = folded.start()
         self.now = time_ns
@@ -423,7 +414,7 @@ class PastRun(UntimedRun):
 
     def step(self, event: int, time_ns: int) -> Categories:
         """Take the event."""
-        if time_ns > self.now:  # noqa: PLR1730  `max` takes as long as the rest
+        if time_ns > self.now:  # noqa: PLR1730  `max` takes as long as the rest of the step
             self.now = time_ns
         operations, (result,) = self._residues[event]
         if operations:
@@ -431,22 +422,22 @@ class PastRun(UntimedRun):
         return TOLD[self.values[result]]
 
     def mark(self) -> list[Any]:
-        """The values."""
+        """Return the values."""
         return list(map(copy.copy, self.values))
 
     def take_back(self, mark: list[Any]) -> None:
-        """Return to them; the time stays."""
+        """Restore the marked values, but keep the time."""
         self.values = mark
 
 
 class PastProperty(CompiledProperty):
-    """A past formula without tables."""
+    """A property for a past formula without tables."""
 
-    def __init__(self, source: Source, folded: Folded) -> None:
+    def __init__(self, source: Source, folded: FoldedProgram) -> None:
         super().__init__(source, VERDICTS)
         self._folded = folded
         self.timed = any(folded.bounds)
 
     def start(self, time_ns: int) -> Run:
-        """A fresh run."""
+        """Return a fresh run."""
         return PastRun(self._folded, time_ns)

@@ -6,8 +6,7 @@ within 1s``, ``… c forbids d``.
 
 Scopes. ``globally`` is open from the start, ``until b`` from the start to the first ``b``, ``after a`` from
 the first ``a`` on; ``after a until b`` opens at an ``a``, closes at the next ``b``, and so on. The events
-that open and close a scope are not inside it. An open scope counts at once, whether it will be closed or
-not.
+that open and close a scope are not inside it. An open scope counts at once, even if it is never closed.
 
 Patterns, all about events inside one scope; a time bound is closed:
 
@@ -24,12 +23,12 @@ violate it any more. Both are for good. A pattern that waits (``some``, ``causes
 silence violates nothing unless there is a time bound, and validates nothing.
 
 ``some c within t enforced by f`` and ``… causes d within t enforced by f``: when the deadline passes, ``f`` publishes
-what was due, which counts as having come. The category is ``enforced`` then.
+the due message, which counts as received. The category is then ``enforced``.
 
-Theory of operation. A run is in a *mode*: the scope is waited for, is over, or is open and *quiet* or
-*stirred*. What stirs is: for ``some`` and ``requires`` that the good event came, for ``causes`` that an
-answer is due, for ``forbids`` that the first event came. With the time of one event this is the whole
-state. Which modes settle the verdict is found by looking at which modes can follow.
+Theory of operation. A run is in a *mode*: the scope has not opened, is over, or is open and *quiet* or *stirred*. A run
+is stirred for ``some`` and ``requires`` once the good event came, for ``causes`` while an answer is due, for
+``forbids`` once the first event came. The mode and the time of one event are the whole state. Whether a mode settles
+the verdict follows from the modes that are reachable from it.
 """
 
 from dataclasses import dataclass
@@ -45,7 +44,7 @@ from rosmop.logics.interface import (
     Source,
     Wait,
 )
-from rosmop.logics.lexer import Token, TokenReader
+from rosmop.logics.lexer import FormulaToken, TokenReader
 
 VIOLATION: Categories = ("violation",)
 VALIDATION: Categories = ("validation",)
@@ -54,9 +53,9 @@ UNDECIDED: Categories = ()
 Mode = Literal["waiting", "quiet", "stirred", "over", "violated"]
 MODES: tuple[Mode, ...] = ("waiting", "quiet", "stirred", "over", "violated")
 _DUE: dict[str, Mode] = {"some": "quiet", "causes": "stirred"}
-"""The mode in which something has to come yet."""
+"""The mode that waits for an event."""
 _DONE: dict[str, Mode] = {"some": "stirred", "causes": "quiet"}
-"""The mode in which it has come."""
+"""The mode after that event."""
 ENFORCED: Categories = ("enforced",)
 
 
@@ -74,11 +73,11 @@ class Pattern:
     enforced: bool = False
 
     def initial(self) -> Mode:
-        """The mode of a fresh run."""
+        """Return the mode of a fresh run."""
         return "quiet" if self.opens is None else "waiting"
 
     def after_event(self, mode: Mode, event: int, *, late: bool) -> Mode:
-        """The next mode. ``late``: more than ``within_ns`` after what the clock of the mode runs from."""
+        """Return the next mode. ``late``: more than ``within_ns`` after the start of the mode's clock."""
         if mode == "waiting":
             return "quiet" if event == self.opens else "waiting"
         if mode in ("over", "violated"):
@@ -98,7 +97,7 @@ class Pattern:
         return "quiet" if second and self.kind == "causes" else mode
 
     def restarts_clock(self, before: Mode, event: int, mode: Mode) -> bool:
-        """Whether the bound counts anew: from the opening, the oldest event unanswered, or the latest one."""
+        """Whether the clock restarts: at the opening, the oldest unanswered event, or the latest event."""
         if before == "waiting":
             return mode == "quiet"
         if mode != "stirred":
@@ -115,7 +114,7 @@ class Pattern:
         return "over" if self.opens is None else "waiting"
 
     def after_deadline(self, mode: Mode) -> Mode:
-        """The next mode when the clock of the mode has run out."""
+        """Return the next mode when the clock of the mode has run out."""
         if self.within_ns is None:
             return mode
         if self.kind == "no" and mode == "quiet" and (self.opens is None or self.closes is None):
@@ -126,9 +125,9 @@ class Pattern:
 
 
 def verdicts(pattern: Pattern, events: int) -> dict[Mode, Categories]:
-    """The verdict of each mode: what is certain in it, whatever follows.
+    """Return the verdict of each mode: `violation` or `validation` if it is certain.
 
-    What is due can always still come (be published, too), unless the event that is waited for closes the scope.
+    A due event can always still come or be published, unless it is the event that closes the scope.
     """
     unmet = {"violated", _DUE.get(pattern.kind, "violated")}
     found: dict[Mode, Categories] = {}
@@ -141,7 +140,7 @@ def verdicts(pattern: Pattern, events: int) -> dict[Mode, Categories]:
 
 
 def _reachable(pattern: Pattern, mode: Mode, events: int) -> set[Mode]:
-    """The mode and all that events and deadlines can lead to from it."""
+    """Return the mode and all modes that events and deadlines can lead to from it."""
     lateness = (False,) if pattern.within_ns is None else (False, True)
     found: set[Mode] = set()
     waiting = [mode]
@@ -158,10 +157,10 @@ def _reachable(pattern: Pattern, mode: Mode, events: int) -> set[Mode]:
 
 
 class TimedPattern(ClockedProperty):
-    """A pattern with a time bound, as tables: a state is a mode's number.
+    """A property for a pattern with a time bound, as tables; a state is the number of a mode.
 
-    ``expiries[mode]`` is the mode after the deadline, or None where there is none; ``at_expiry`` is told then, before
-    the verdict.
+    ``expiries[mode]`` is the mode after the deadline, or None where there is none; ``at_expiry`` are the
+    categories then, before the verdict.
     """
 
     def __init__(self, source: Source, pattern: Pattern, remedy: str | None) -> None:
@@ -199,7 +198,7 @@ class TimedPattern(ClockedProperty):
         return tuple(table)
 
     def blocking_refused(self, category: str) -> str | None:
-        """What a deadline decides is decided when no message comes."""
+        """Return why: a deadline decides without a message."""
         super().blocking_refused(category)
         kind = self.pattern.kind
         comes_along = kind == "no" or self.pattern.enforced
@@ -262,7 +261,7 @@ def _untimed(source: Source, pattern: Pattern) -> FiniteProperty:
     return FiniteProperty(source, ("violation", "validation"), automaton)
 
 
-def _read_scope(reader: TokenReader) -> tuple[Token | None, Token | None]:
+def _read_scope(reader: TokenReader) -> tuple[FormulaToken | None, FormulaToken | None]:
     word = reader.token
     if word.text not in ("globally", "after", "until"):
         raise reader.unexpected("a scope: `globally:`, `after a:`, `until b:` or `after a until b:`")
@@ -278,7 +277,7 @@ def _read_scope(reader: TokenReader) -> tuple[Token | None, Token | None]:
     return event, _read_event(reader, "the event that closes the scope")
 
 
-def _read_body(reader: TokenReader) -> tuple[str, Token | None, Token]:
+def _read_body(reader: TokenReader) -> tuple[str, FormulaToken | None, FormulaToken]:
     word = reader.token
     if word.text in ("no", "some") and reader.ahead(1).text not in ("causes", "requires", "forbids"):
         reader.take()
@@ -291,7 +290,7 @@ def _read_body(reader: TokenReader) -> tuple[str, Token | None, Token]:
     return verb.text, first, _read_event(reader, f"an event after `{verb.text}`")
 
 
-def _read_event(reader: TokenReader, what: str) -> Token:
+def _read_event(reader: TokenReader, what: str) -> FormulaToken:
     token = reader.expect("name", what)
     reader.check_event(token)
     return token

@@ -1,10 +1,10 @@
-"""The automata of properties as pictures: for Graphviz, and drawn here (SVG), so that nothing needs to be installed.
+"""Draw the automata of properties, for Graphviz or as SVG, which needs no installed program.
 
-Colours and sizes are attributes, not styles: a page whose content security policy forbids styles shows them too, and
-one that has a style sheet can give the classes `title`, `event`, `state` and `edge` its own.
+Colours and sizes are attributes, not styles: they also work on pages whose content security policy forbids
+styles. A style sheet can change the classes `title`, `event`, `state` and `edge`.
 
-States are in columns by their distance from the start; there is one curve for each pair of states, with all events
-that lead from one to the other.
+The column of a state is its distance from the start. Each pair of states has one curve, with all events that lead
+from one to the other.
 """
 
 from collections import Counter, deque
@@ -32,13 +32,13 @@ class _State:
 
 
 def dot_of(properties: Sequence[CompiledProperty]) -> str | None:
-    """The automata in Graphviz's language, one `digraph` after the other; None if there is none."""
+    """Return the automata in Graphviz's language, one `digraph` after the other, or None."""
     graphs = [graph for graph in map(to_dot, properties) if graph is not None]
     return "\n".join(graphs) if graphs else None
 
 
 def svg_of(properties: Sequence[CompiledProperty]) -> str | None:
-    """The automata as a picture, one below the other; None if there is none."""
+    """Return the automata as a picture, one below the other, or None."""
     parts: list[str] = []
     top, right = 0, 0
     for compiled in properties:
@@ -80,7 +80,7 @@ def _document(parts: Sequence[str], width: int, height: int) -> str:
 
 
 def _placed(diagram: Diagram, top: int) -> dict[int, _State]:
-    """Every state at its place: the column is the distance from the start."""
+    """Return the position of every state."""
     distance = {diagram.initial: 0}
     waiting = deque([diagram.initial])
     while waiting:
@@ -95,7 +95,7 @@ def _placed(diagram: Diagram, top: int) -> dict[int, _State]:
         column = distance[number]
         x, y = _MARGIN + column * _COLUMN, top + rows[column] * _ROW + (column % 2) * 30 + 30
         rows[column] += 1
-        states[number] = _State(" · ".join(filter(None, (box.name, box.told))), box.double, x, y)
+        states[number] = _State(" · ".join(filter(None, (box.name, box.other_categories))), box.double, x, y)
     return states
 
 

@@ -1,8 +1,7 @@
-"""What can be said of a property before it runs: handlers that never run, and verdicts that are always the
-same.
+"""Find facts about a property before it runs: handlers that never run, and constant verdicts.
 
-Only what is certain is told. Of a grammar that needs a stack, of a formula with several time bounds, and of one about
-the future with bounds, nothing is told.
+Only certain facts are reported. There are none for a grammar that needs a stack, or for a formula with several time
+bounds or with bounds about the future.
 """
 
 from collections import deque
@@ -10,21 +9,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from rosmop.logics.catalogue import LOGICS
 from rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty
-from rosmop.logics.past_monitors import ClockedPast
+from rosmop.logics.past_monitors import ClockedPastProperty
 from rosmop.logics.pattern import TimedPattern
-from rosmop.logics.tfsm import TimedMachine
+from rosmop.logics.tfsm import TimedStateMachine
 
 TIME = "<time>"
-"""Stands in a trace for the passing of a deadline or of the time bound."""
-
-_VIOLATION = {"ltl": "violation", "ptltl": "violation", "mtl": "violation", "pattern": "violation"}
-_FAILURE = {"ere": "fail", "cfg": "fail"}
+"""An element of traces: a deadline or a time bound passes."""
 
 
 @dataclass(frozen=True)
-class Fact:
-    """Something certain about a property. ``trace`` is a shortest trace that shows it, where there is one."""
+class PropertyFact:
+    """Something certain about a property. ``trace`` is a shortest trace that shows it, if there is one."""
 
     kind: Literal["never runs", "never violated", "violated at once"]
     category: str
@@ -33,39 +30,40 @@ class Fact:
 
 
 @dataclass(frozen=True)
-class Graph:
-    """States, what leads from one to the next, and what is told on entering each."""
+class VerdictGraph:
+    """A graph of states, transitions, and the categories on entering each state."""
 
     initial: int
     edges: tuple[tuple[tuple[tuple[str, ...], int], ...], ...]
     verdicts: tuple[Categories, ...]
 
 
-def analyse(compiled: CompiledProperty, handled: Sequence[str]) -> list[Fact]:
-    """The facts about a property whose handlers are for the categories ``handled``."""
+def analyse(compiled: CompiledProperty, handled: Sequence[str]) -> list[PropertyFact]:
+    """Return the facts about a property with handlers for the categories ``handled``."""
     graph = graph_of(compiled)
     if graph is None:
         return []
     traces = _shortest_traces(graph)
     facts = [
-        Fact("never runs", category, f"no trace leads to `{category}`: the handler @{category} never runs")
+        PropertyFact(
+            "never runs", category, f"no trace leads to `{category}`: the handler @{category} never runs"
+        )
         for category in dict.fromkeys(handled)
         if category not in traces
     ]
-    violation = _VIOLATION.get(compiled.logic)
-    if violation is not None and violation not in traces and compiled.remedy is None:
-        facts.append(Fact("never violated", violation, "no trace violates this property"))
-    category = violation or _FAILURE.get(compiled.logic)
+    category = LOGICS[compiled.logic].failure
+    if category == "violation" and category not in traces and compiled.remedy is None:
+        facts.append(PropertyFact("never violated", category, "no trace violates this property"))
     firsts = [(trace, state) for trace, state in graph.edges[graph.initial] if trace[0] != TIME]
     if category is not None and all(category in graph.verdicts[state] for _, state in firsts):
         word = "violated" if category == "violation" else "failed"
         text = f"the property is {word} at the first event, whatever it is"
-        facts.append(Fact("violated at once", category, text, firsts[0][0]))
+        facts.append(PropertyFact("violated at once", category, text, firsts[0][0]))
     return facts
 
 
 def shortest_trace_to(compiled: CompiledProperty, category: str) -> tuple[str, ...] | None:
-    """The events of a shortest trace after which the property is in a category; None if none is known.
+    """Return a shortest trace of events that leads to a category; None if none is known.
 
     ``TIME`` among them means that a deadline or a time bound passes.
     """
@@ -73,8 +71,8 @@ def shortest_trace_to(compiled: CompiledProperty, category: str) -> tuple[str, .
     return None if graph is None else _shortest_traces(graph).get(category)
 
 
-def _shortest_traces(graph: Graph) -> dict[str, tuple[str, ...]]:
-    """For each category that a trace can lead to, a shortest one."""
+def _shortest_traces(graph: VerdictGraph) -> dict[str, tuple[str, ...]]:
+    """Return a shortest trace for each category that a trace can lead to."""
     found: dict[str, tuple[str, ...]] = {}
     traces: dict[int, tuple[str, ...]] = {graph.initial: ()}
     waiting = deque([graph.initial])
@@ -90,24 +88,24 @@ def _shortest_traces(graph: Graph) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def graph_of(compiled: CompiledProperty) -> Graph | None:
-    """The states of a property and what leads from one to the next, or None if they are not finitely many."""
+def graph_of(compiled: CompiledProperty) -> VerdictGraph | None:
+    """Return the graph of a property's states, or None if it is not known to be finite."""
     if isinstance(compiled, FiniteProperty):
         automaton = compiled.automaton
         labels = [(event,) for event in compiled.events]
         edges = tuple(tuple(zip(labels, row, strict=True)) for row in automaton.table)
-        return Graph(automaton.initial, edges, automaton.verdicts)
-    if isinstance(compiled, TimedMachine):
+        return VerdictGraph(automaton.initial, edges, automaton.verdicts)
+    if isinstance(compiled, TimedStateMachine):
         return _machine_graph(compiled)
     if isinstance(compiled, TimedPattern):
         return _pattern_graph(compiled)
-    if isinstance(compiled, ClockedPast):
+    if isinstance(compiled, ClockedPastProperty):
         return _past_graph(compiled)
     return None
 
 
-def _past_graph(compiled: ClockedPast) -> Graph:
-    """Each state before the time bound has passed since the clock began, and each after that."""
+def _past_graph(compiled: ClockedPastProperty) -> VerdictGraph:
+    """Return the graph, which has each state twice: before and after the time bound has passed."""
     size = len(compiled.moves)
     late = [
         [
@@ -124,11 +122,11 @@ def _past_graph(compiled: ClockedPast) -> Graph:
         for row, after in zip(compiled.moves, late, strict=True)
     )
     after = (tuple(((name,), target) for name, target in row) for row in late)
-    return Graph(compiled.initial, (*early, *after), (*compiled.verdicts, *compiled.verdicts))
+    return VerdictGraph(compiled.initial, (*early, *after), (*compiled.verdicts, *compiled.verdicts))
 
 
-def _machine_graph(compiled: TimedMachine) -> Graph:
-    """Each state by event, each after a timeout, and the start (which no event has led to)."""
+def _machine_graph(compiled: TimedStateMachine) -> VerdictGraph:
+    """Return the graph: each state entered by an event, each entered by a timeout, and the start."""
     base = compiled.automaton
     size = len(base)
     silent = compiled.silence_ns is not None
@@ -143,14 +141,14 @@ def _machine_graph(compiled: TimedMachine) -> Graph:
     clocked = [events + timeout for events, timeout in zip(by_event, timeouts, strict=True)]
     after_timeout = by_event if silent else clocked
     start = (by_event if silent else clocked)[base.initial]
-    told = tuple(("timeout",) if silent else ("timeout", *verdict) for verdict in base.verdicts)
-    return Graph(2 * size, (*clocked, *after_timeout, start), (*base.verdicts, *told, ()))
+    late_verdicts = tuple(("timeout",) if silent else ("timeout", *verdict) for verdict in base.verdicts)
+    return VerdictGraph(2 * size, (*clocked, *after_timeout, start), (*base.verdicts, *late_verdicts, ()))
 
 
-def _pattern_graph(compiled: TimedPattern) -> Graph:
-    """The modes; with a remedy each also as it is entered by that.
+def _pattern_graph(compiled: TimedPattern) -> VerdictGraph:
+    """Return the graph of the modes; with a remedy, each mode also as entered by the remedy.
 
-    Where no deadline is waited for, an event may still come too late for the time bound.
+    In a mode without a deadline, an event may still come too late for the time bound.
     """
     edges = []
     size = len(compiled.expiries) if compiled.at_expiry else 0
@@ -163,8 +161,8 @@ def _pattern_graph(compiled: TimedPattern) -> Graph:
         if expiry is not None:
             row.append(((TIME,), size + expiry))
         edges.append(tuple(row))
-    told = tuple((*compiled.at_expiry, *verdict) for verdict in compiled.verdicts)
+    late_verdicts = tuple((*compiled.at_expiry, *verdict) for verdict in compiled.verdicts)
     initial = compiled.initial
     if not size:
-        return Graph(initial, tuple(edges), told)
-    return Graph(initial, (*edges, *edges), (*compiled.verdicts, *told))
+        return VerdictGraph(initial, tuple(edges), late_verdicts)
+    return VerdictGraph(initial, (*edges, *edges), (*compiled.verdicts, *late_verdicts))

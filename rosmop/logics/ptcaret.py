@@ -1,8 +1,8 @@
 """``ptcaret``: past-time linear temporal logic with calls and returns, as MOP's PTCaRet plugin reads it.
 
-``ptltl``, and operators about the *abstract* past, in which every call that has returned is one step that nobody looks
-into: from the event ``begin`` to the ``end`` that belongs to it, both included, nothing is seen any more once the
-``end`` is over. ``(*a) x``, ``<*a> x``, ``[*a] x`` and ``x Sa y`` look at that past. Derived from them:
+``ptltl``, and operators about the *abstract* past, in which every call that has returned is one opaque step: after its
+``end``, all events from ``begin`` to ``end``, both included, are invisible. ``(*a) x``, ``<*a> x``, ``[*a]
+x`` and ``x Sa y`` look at that past. Derived from them:
 
 - ``@b x``: ``x`` held at the ``begin`` of the innermost open call; ``@c x``: at the event before it;
 - ``x Ss@b y``: ``y`` held at the ``begin`` of an open call, and ``x`` at those since; ``…s@c``, ``…s@bc`` as below;
@@ -10,27 +10,19 @@ into: from the event ``begin`` to the ``end`` that belongs to it, both included,
   at an event ``begin`` or ``call`` that is not within a call that has returned. ``[*s@c] x`` is ``!<*s@c> !x``: a
   ``begin`` that is the first event has no event before it, and violates nothing.
 
-An ``end`` to which no ``begin`` belongs begins the abstract past anew. Calls that are open are remembered, up to a
-bound beyond which a ``begin`` is a fault of the specification. (Rosu, Chen and Ball, 2008.)
+An ``end`` without a ``begin`` restarts the abstract past. Open calls are remembered up to a bound; a ``begin`` beyond
+it is a fault of the specification. (Rosu, Chen and Ball, 2008.)
 """
 
 from itertools import zip_longest
 
 from rosmop.logics.formula import Formula, Level, Syntax, boolean_levels, nodes, read_formula
-from rosmop.logics.interface import (
-    Categories,
-    CompiledProperty,
-    Run,
-    RunFaultError,
-    Source,
-    UntimedRun,
-    twin,
-)
-from rosmop.logics.past_monitors import TOLD, VERDICTS, Folded, Program, fold
+from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, UntimedRun, twin
+from rosmop.logics.past_monitors import TOLD, VERDICTS, FoldedProgram, PastProgram, fold
 from rosmop.logics.ptltl import SYNTAX as PTLTL
 
 MAX_DEPTH = 10_000
-"""Calls that may be open at once."""
+"""The maximum number of open calls."""
 
 BEGIN, END, CALL = "begin", "end", "call"
 
@@ -67,26 +59,26 @@ def compile_ptcaret(source: Source) -> CompiledProperty:
         )
     if CALL not in source.events and any(node.name == CALL for node in nodes(formula)):
         raise source.error(0, "this formula needs the event `call` of the specification")
-    program = Program(formula, source.events)
+    program = PastProgram(formula, source.events)
     return CaretProperty(source, fold(program, [program.result]))
 
 
 class CaretProperty(CompiledProperty):
-    """A formula with a stack: what the abstract operators remember, for each call that is open."""
+    """A property with a stack: the state of the abstract operators for each open call."""
 
-    def __init__(self, source: Source, folded: Folded) -> None:
+    def __init__(self, source: Source, folded: FoldedProgram) -> None:
         super().__init__(source, VERDICTS)
         self.folded = folded
         places = [source.events.index(name) if name in source.events else -1 for name in (BEGIN, END)]
         self.begin, self.end = places
 
     def start(self, _time_ns: int) -> Run:
-        """A run with no open call; the time plays no part."""
+        """Return a run without open calls; the time does not matter."""
         return CaretRun(self)
 
 
 class CaretRun(UntimedRun):
-    """A run: its values, and those about the abstract past before each open call."""
+    """A run: its values, and those about the abstract past from before each open call."""
 
     __slots__ = ("_compiled", "_stack", "_values")
     keeps = ("_stack", "_values")
@@ -102,7 +94,7 @@ class CaretRun(UntimedRun):
         return made
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """Take the event; the time plays no part. Raises RunFaultError, and is unchanged then."""
+        """Take the event; the time does not matter. If it raises RunFaultError, the run is unchanged."""
         compiled, values, stack = self._compiled, self._values, self._stack
         abstract = compiled.folded.abstract
         if event == compiled.begin:
@@ -118,7 +110,7 @@ class CaretRun(UntimedRun):
 
 
 def plain(formula: Formula) -> Formula:
-    """The formula without the derived operators."""
+    """Return the formula without the derived operators."""
     operands = tuple(plain(operand) for operand in formula.operands)
     operator, _, where = formula.operator.partition(" ")
     if operator == "stack-since":
@@ -140,7 +132,7 @@ def plain(formula: Formula) -> Formula:
 
 
 def _stack_since(where: str, left: Formula, right: Formula) -> Formula:
-    """`left Ss@where right`, as MOP's plugin writes it out."""
+    """Return `left Ss@where right`, expanded as in MOP's plugin."""
     begin, call = Formula("event", name=BEGIN), Formula("event", name=CALL)
     both = Formula("or", (begin, call))
     guard = {"b": begin, "c": call, "bc": both}[where]

@@ -1,7 +1,7 @@
 """``ptltl``: past-time linear temporal logic, as MOP's PTLTL plugin reads it.
 
-The category is ``validation`` where the formula holds at this event, ``violation`` where not; it is told at
-each event. At an event that the formula does not name all its atoms are false. At the first event there is
+The category is ``validation`` where the formula holds at this event, ``violation`` where not; it comes
+after each event. At an event that the formula does not name, all its atoms are false. At the first event there is
 no previous one: ``(*) a`` is false there, ``[*] a`` is ``a``.
 """
 
@@ -12,13 +12,7 @@ from rosmop.logics.past_monitors import compile_past
 _FUTURE = "is about the future; write `ltl:` as the logic, or a past operator: (*) <*> [*] S"
 
 SYNTAX = Syntax(
-    unary={
-        **NOT,
-        "(*)": "previously",
-        "~(*)": "dual previously",
-        "<*>": "once",
-        "[*]": "historically",
-    },
+    unary={**NOT, "(*)": "previously", "~(*)": "dual previously", "<*>": "once", "[*]": "historically"},
     levels=boolean_levels([Level({"S": "since", "~S": "dual since"}, "left")]),
     refused={
         **dict.fromkeys(("[]", "<>", "o", "~o", "U", "~U", "R"), _FUTURE),

@@ -1,38 +1,30 @@
 """``srs``: string rewriting systems, as MOP's SRS plugin reads them.
 
 ``hasnext next -> #epsilon . ^ next -> #fail .``: each event is appended to a string, which is then rewritten until no
-rule matches. The rule that matches furthest to the left is applied, of several there the one that is written first.
-``^`` and ``$`` stand for the beginning and the end of the string and are never replaced. Symbols that are no events are
-the author's own. ``#fail`` and ``#succeed`` are the categories; either is for good.
+rule matches. The rule that matches furthest to the left is applied; if several match there, the one that is written
+first. ``^`` and ``$`` stand for the beginning and the end of the string and are never replaced. A symbol that is not an
+event is an auxiliary symbol of the author. The categories ``#fail`` and ``#succeed`` are permanent.
 
-A run has bounds on its string and on the work of one event; what exceeds them is a fault of the specification.
+A run limits the length of its string and the work for one event; exceeding a limit is a fault of the specification.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rosmop.logics.interface import (
-    Categories,
-    CompiledProperty,
-    Run,
-    RunFaultError,
-    Source,
-    UntimedRun,
-    twin,
-)
-from rosmop.logics.lexer import Token, TokenReader
+from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, UntimedRun, twin
+from rosmop.logics.lexer import FormulaToken, TokenReader
 
 CATEGORIES: Categories = ("fail", "succeed")
 MAX_RULES = 1_000
 MAX_STRING = 100_000
-"""Symbols that a run's string may have."""
+"""The maximum number of symbols in a run's string."""
 MAX_WORK = 200_000
-"""Rules that may be looked at for one event, and symbols that may be moved; comparing sixteen counts as moving one."""
+"""The maximum number of rules tried and symbols moved for one event; sixteen comparisons count as one move."""
 
 
 @dataclass(frozen=True)
-class Rule:
-    """``left -> right``; ``verdict`` instead of a right side. ``begins``, ``ends``: at the string's beginning, end."""
+class RewriteRule:
+    """A rule ``left -> right`` or ``left -> verdict``. ``begins``, ``ends``: only at the string's beginning, end."""
 
     left: tuple[int, ...]
     right: tuple[int, ...]
@@ -42,27 +34,27 @@ class Rule:
 
 
 class RewritingProperty(CompiledProperty):
-    """A rewriting system. Symbols are numbers, events first."""
+    """A property for a rewriting system. Symbols are numbers, events first."""
 
-    def __init__(self, source: Source, rules: Sequence[Rule]) -> None:
+    def __init__(self, source: Source, rules: Sequence[RewriteRule]) -> None:
         super().__init__(source, CATEGORIES)
         self.rules = tuple(rules)
         self.longest = max(len(rule.left) for rule in rules)
-        self.by_first: dict[int, tuple[Rule, ...]] = {}
+        self.by_first: dict[int, tuple[RewriteRule, ...]] = {}
         for rule in rules:
             self.by_first[rule.left[0]] = (*self.by_first.get(rule.left[0], ()), rule)
 
     def start(self, _time_ns: int) -> Run:
-        """A run with an empty string; the time plays no part."""
+        """Return a run with an empty string; the time does not matter."""
         return RewritingRun(self)
 
     def categories_after(self, _event: int) -> frozenset[str]:
-        """The verdicts that are written; any event can lead to them."""
+        """Return the verdicts of all rules; any event can lead to them."""
         return frozenset(rule.verdict for rule in self.rules if rule.verdict)
 
 
 class RewritingRun(UntimedRun):
-    """A run: its string, to which no rule applies between two events, or the verdict that it came to."""
+    """A run: its string, to which no rule applies between two events, or its final verdict."""
 
     __slots__ = ("_property", "string", "verdict")
     keeps = ("string", "verdict")
@@ -74,13 +66,16 @@ class RewritingRun(UntimedRun):
         self.verdict: Categories = ()
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """Append the event and rewrite; the time plays no part. Raises RunFaultError, and is unchanged then."""
+        """Append the event and rewrite; the time does not matter. If it raises RunFaultError, the run is unchanged."""
         if not self.verdict:
             self.string, self.verdict = self._rewritten([*self.string, event])
         return self.verdict
 
     def _rewritten(self, string: list[int]) -> tuple[list[int], Categories]:
-        """Nothing matches before ``place``: that was looked at, and what has changed since is further behind."""
+        """Return the rewritten string, and its verdict.
+
+        Invariant: no rule matches before `place`.
+        """
         longest, work = self._property.longest, MAX_WORK
         place = max(0, len(string) - longest)
         while place < len(string):
@@ -102,8 +97,8 @@ class RewritingRun(UntimedRun):
         return string, ()
 
 
-def _matching(rules: Sequence[Rule], string: list[int], place: int) -> tuple[Rule | None, int]:
-    """The first of the rules that matches at a place, and the work of finding it."""
+def _matching(rules: Sequence[RewriteRule], string: list[int], place: int) -> tuple[RewriteRule | None, int]:
+    """Return the first rule that matches at a place, and the work of finding it."""
     work = 1
     for rule in rules:
         end = place + len(rule.left)
@@ -137,7 +132,7 @@ def compile_srs(source: Source) -> RewritingProperty:
     return RewritingProperty(source, rules)
 
 
-def _read_rule(reader: TokenReader, numbers: dict[str, int]) -> Rule:
+def _read_rule(reader: TokenReader, numbers: dict[str, int]) -> RewriteRule:
     begins = reader.accept("^")
     left = _read_symbols(reader, numbers)
     if not left:
@@ -159,11 +154,11 @@ def _read_rule(reader: TokenReader, numbers: dict[str, int]) -> Rule:
         if not right:
             raise reader.unexpected("symbols, `#epsilon`, `#fail` or `#succeed`")
     reader.expect(".", "`.` at the end of the rule")
-    return Rule(left, right, begins, ends, verdict)
+    return RewriteRule(left, right, begins, ends, verdict)
 
 
 def _read_symbols(reader: TokenReader, numbers: dict[str, int]) -> tuple[int, ...]:
-    found: list[Token] = []
+    found: list[FormulaToken] = []
     while reader.token.kind == "name":
         found.append(reader.take())
     return tuple(numbers.setdefault(token.text, len(numbers)) for token in found)

@@ -1,28 +1,27 @@
 """``tfsm``: state machines with time bounds.
 
-``s1 [ b -> s0, timeout 2s -> late ]``: after 2 s in ``s1`` without an event the machine moves to ``late``.
-The category ``timeout`` is that of having moved so; it is told before those of the state entered. The new
-state counts as entered at the deadline, not when somebody looked. Every event of the specification starts
-the clock of the state it leads to.
+``s1 [ b -> s0, timeout 2s -> late ]``: after 2 s in ``s1`` without an event the machine moves to ``late``. This move
+has the category ``timeout`` before the categories of the new state. The new state counts as entered at the deadline,
+not when the expiry is noticed. Every event of the specification starts the clock of the state it leads to.
 
-A machine without any timeout clause behaves as MOP's: the category ``timeout`` is told once whenever one
-second passes after an event without another; the state stays.
+A machine without any timeout clause behaves as MOP's: when one second passes after an
+event without another, the category ``timeout`` comes once and the state stays.
 """
 
 from rosmop.logics.automaton import Automaton
-from rosmop.logics.fsm import FAIL, TIMEOUT, machine_automaton, read_machine
+from rosmop.logics.fsm import FAIL, TIMEOUT, machine_automaton, read_state_machine
 from rosmop.logics.interface import ClockedProperty, Source, Wait
 
 SILENCE_NS = 10**9
-"""How long a machine without timeout clauses waits for the next event."""
+"""The time that a machine without timeout clauses waits for the next event."""
 
 
-class TimedMachine(ClockedProperty):
+class TimedStateMachine(ClockedProperty):
     """A compiled ``tfsm``.
 
     ``automaton`` has the transitions on events; ``timeouts[state]`` is (nanoseconds, next state) or None.
-    With ``silence_ns`` set there are no timeout clauses, and the clock runs after each event: each state is
-    there twice, as it is after an event and, behind those, as it is where nothing is waited for.
+    With ``silence_ns`` set there are no timeout clauses, and the clock runs after each event. Then each state
+    occurs twice: after an event, and (in the second half) while nothing is waited for.
     """
 
     expiry = TIMEOUT
@@ -54,21 +53,21 @@ class TimedMachine(ClockedProperty):
             self.waits = (*silent, *[None] * size)
 
     def categories_after(self, event: int) -> frozenset[str]:
-        """The categories of the states this event leads to (``timeout`` needs no event)."""
+        """Return the categories of the states that this event leads to (``timeout`` needs no event)."""
         verdicts = self.automaton.verdicts
         return frozenset(name for row in self.automaton.table for name in verdicts[row[event]])
 
     def blocking_refused(self, category: str) -> str | None:
-        """``timeout`` comes without a message; a state that only a timeout enters may still be stayed in."""
+        """Return why: ``timeout`` comes without a message. An event may stay in a state that only a timeout enters."""
         super().blocking_refused(category)
         if category == TIMEOUT:
             return "`timeout` happens when no message comes, so there is none to drop"
         return None
 
 
-def compile_tfsm(source: Source) -> TimedMachine:
+def compile_tfsm(source: Source) -> TimedStateMachine:
     """Compile a ``tfsm`` formula. Raises FormulaError."""
-    machine = read_machine(source, timed=True)
+    machine = read_state_machine(source, timed=True)
     number = {name: index for index, name in enumerate(machine.order)}
     timeouts: list[tuple[int, int] | None] = [
         None if state.timeout is None else (state.timeout[0], number[state.timeout[1].text])
@@ -76,4 +75,4 @@ def compile_tfsm(source: Source) -> TimedMachine:
     ]
     timeouts.append(None)
     categories = [*machine.states, *machine.aliases, FAIL, TIMEOUT]
-    return TimedMachine(source, categories, machine_automaton(source, machine), tuple(timeouts))
+    return TimedStateMachine(source, categories, machine_automaton(source, machine), tuple(timeouts))

@@ -1,1 +1,1 @@
-"""The meaning of specifications: interpreter, engine, slices, timers, explanations. No I/O, no clock."""
+"""Runs specifications: interpreter, engine, slices, timers, explanations. No I/O, no clock."""

@@ -1,24 +1,20 @@
-"""The running monitors: a message goes in, what is to be done with it comes out. No I/O, no clock.
+"""The running monitors: `MonitorSet` decides what happens to each message. It does no I/O and reads no clock.
 
 Theory of operation:
 
-1. `MonitorSet.of` takes what was compiled; `start` gives the variables their first values.
+1. `MonitorSet.of` takes compiled specifications; `start` gives the variables their first values.
 2. `process` gives a message to the events on its topic (`execution.py`).
-3. Time is what the caller says: nanoseconds, with every message. Ticks and deadlines that are due (`agenda.py`) happen
-   before a message; `process` returns them in `before`. While no message comes, the caller calls `advance` when
-   `next_due` has come; a deadline may have been put off since.
-4. `walker` offers, for most topics, a lane of the fast path (`fast_path.py`), which does what `process` does to many
-   messages at once, as far as these need nothing that is recorded or explained. Its results differ in nothing but
-   the time that they take.
-5. A new set takes the place of another one with `succeed`, in one swap between two messages. Specifications whose
-   text is the same keep their variables and runs.
-6. Specifications on trial are sets of their own (`trials`), one for those that share variables: nothing that one does
-   or uses up is seen by others. Where the first of such a set would stand among the others, a copy of the message as
-   it is there is left in `tapped`; the caller gives it to them when the message is passed on (`Tapped.give`), and what
-   comes of it is what would have been done. The copies for one set are given in their order.
+3. The caller gives the time, in nanoseconds, with every message. Ticks and deadlines that are due (`timers.py`) happen
+   before a message; `process` returns them in `before`. While no message comes, the caller calls `advance` at
+   `next_due`; deadlines may move in the meantime.
+4. `lane` returns, for most topics, a lane of the fast path (`fast_path.py`). It processes many messages at once, as
+   long as none has to be recorded or explained. The results are those of `process`.
+5. `succeed` replaces another set between two messages. Specifications with the same text keep their variables and runs.
+6. Specifications in shadow mode are in separate sets (`shadows`), one for those that share variables, so that they do
+   not affect others. `tapped` collects copies of their messages. The caller hands these over in order once the message
+   is passed on (`ShadowCopy.give`); the outcome has the actions that they would have taken.
 """
 
-import math
 import sys
 import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -27,18 +23,17 @@ from typing import Any, NamedTuple
 
 from rosmop.form.compiled import Compiled, EventCode
 from rosmop.form.connected_groups import way_of
-from rosmop.form.positions import Finding, Position
+from rosmop.form.positions import Diagnostic
 from rosmop.form.specification_groups import groups
-from rosmop.run.causes import NOBODY, Sender
-from rosmop.run.execution import Asked, Execution, OnFault
-from rosmop.run.fast_path import MESSAGE_FUEL, FastLane, FastPath, Lanes, Prepared
+from rosmop.run.execution import Asked, MonitorExecution, OnFault
+from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, FastLane, FastPath, Lanes
 from rosmop.run.interpreter import Interpreter
-from rosmop.run.monitor import Group, Monitor, Step, monitors_of
-from rosmop.run.outcomes import Outcome
+from rosmop.run.monitor import MonitorGroup, MonitorInstance, Step, monitors_of
+from rosmop.run.outcomes import NOBODY, MessageSender, Outcome
 from rosmop.run.slice_quota import HolderOf, no_holder
 from rosmop.run.slices import LIMIT
 from rosmop.run.state import (
-    KeptGroup,
+    GroupSnapshot,
     encoded,
     guards,
     kept_monitor,
@@ -51,8 +46,8 @@ from rosmop.run.state import (
 from rosmop.run.state_of_runs import StateTooLargeError
 from rosmop.run.state_of_slices import SliceParts
 from rosmop.run.timers import Agenda, Patience
-from rosmop.runtime.action_context import TRIAL_BUDGET, Context
-from rosmop.runtime.wire import Buffer, Message
+from rosmop.runtime.action_context import SHADOW_BUDGET, Context
+from rosmop.runtime.wire import Buffer, WireMessage
 from roswire.definitions import Definitions
 
 _CHANGED = "its text, or the definition of a message, has changed, and its state is lost"
@@ -63,79 +58,53 @@ def _never() -> bool:
 
 
 class _Tap(Step):
-    """Where specifications on trial would stand: it copies the message, and never happens."""
+    """A pseudo-event that never happens: it copies messages for specifications in shadow mode."""
 
     __slots__ = ()
 
 
-class Tapped(NamedTuple):
-    """A copy of a message for specifications on trial: where it came, as which part of a service, and when."""
+class ShadowCopy(NamedTuple):
+    """A copy of a message for specifications in shadow mode: topic or service, part of the service, time."""
 
-    trial: "MonitorSet"
+    shadow: "MonitorSet"
     resource: str
     part: str | None
     data: bytes
     time: int
 
-    def give(self, sender: Sender = NOBODY) -> Outcome:
-        """What they would have done with it."""
+    def give(self, sender: MessageSender = NOBODY) -> Outcome:
+        """Process the copy, and return the outcome as if they were in force."""
         if self.part is None:
-            return self.trial.process(self.resource, self.data, self.time, sender)
-        return self.trial.process_service(self.resource, self.part, self.data, self.time, sender)
-
-
-class Margin(NamedTuple):
-    """How close a comparison of numbers came while it was true (`holds`) or while it was not: its two sides.
-
-    `number` counts the monitor's comparisons in the order of the text; `threshold` is the side that is a constant, 0
-    or 1 (None: neither is).
-    """
-
-    monitor: str
-    number: int
-    position: Position
-    threshold: int | None
-    holds: bool
-    left: float
-    right: float
-
-    @property
-    def distance(self) -> float:
-        """How far the sides are apart."""
-        return abs(self.left - self.right)
-
-    @property
-    def threshold_at(self) -> float | None:
-        """Where the constant would have to stand to be reached; None where neither side is one."""
-        return None if self.threshold is None else (self.right, self.left)[self.threshold]
+            return self.shadow.process(self.resource, self.data, self.time, sender)
+        return self.shadow.process_service(self.resource, self.part, self.data, self.time, sender)
 
 
 class MonitorSet:
-    """Specifications in force together."""
+    """A set of specifications that run together."""
 
     def __init__(
         self,
         compiled: Compiled,
         on_fault: OnFault,
         patience: Patience,
-        trials: Sequence["MonitorSet"] = (),
+        shadows: Sequence["MonitorSet"] = (),
         *,
         fast: FastPath | None = None,
         slices: int = LIMIT,
         deadlines: int = sys.maxsize,
         holder_of: HolderOf = no_holder,
     ) -> None:
-        """`compiled` is all of them in their order; what is on trial is in `trials`. `fast` was compiled from the
-        others; without it the engine processes every message. At most so many `deadlines` of slices pass at a time.
-        Slices are charged to `holder_of` the source whose message makes them (`quota.py`).
+        """`compiled` has all specifications in order; those in shadow mode are in `shadows`. `fast` was compiled from
+        the others; without it the engine processes every message. At most `deadlines` deadlines of slices pass at a
+        time. `holder_of(source)` is charged for slices (`slice_quota.py`).
         """
-        tried = {name for trial in trials for name in trial.names}
+        shadowed = {name for shadow in shadows for name in shadow.names}
         self.names: tuple[str, ...] = tuple(one.name for one in compiled.specifications)
-        compiled = compiled.part(frozenset(self.names).difference(tried)) if tried else compiled
-        self.trials = trials
-        self.tapped: list[Tapped] = []
+        compiled = compiled.part(frozenset(self.names).difference(shadowed)) if shadowed else compiled
+        self.shadows = shadows
+        self.tapped: list[ShadowCopy] = []
         self._tapped_ways: frozenset[str] = frozenset()
-        self.warnings: tuple[Finding, ...] = compiled.warnings
+        self.warnings: tuple[Diagnostic, ...] = compiled.warnings
         self.compiled = compiled
         contexts = {one.context: one.name for one in compiled.specifications}
         self.interpreter = Interpreter(
@@ -148,29 +117,22 @@ class MonitorSet:
         self._guards = guards(compiled)
         self._types = types_of(compiled)
         self._beginnings: dict[str, bytes] = {}
-        """The state in which those that guard began (`shape`), as far as it is known."""
+        """The known initial states of monitors that guard (`shape`)."""
         self.steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
-        self._silent: dict[tuple[str, int], Prepared] = {}
-        """What is prepared for `judge`, by topic and source."""
-        self._execution = Execution(self.interpreter, on_fault)
+        self._silent: dict[tuple[str, int], BatchOptions] = {}
+        """The options for `judge`, by topic and source."""
+        self._execution = MonitorExecution(self.interpreter, on_fault)
         self._agenda = Agenda(self._monitors, self._execution, patience, deadlines)
         self.began: tuple[str, ...] = ()
         self._broken = False
-        for comparison in (
-            comparison
-            for specification in compiled.specifications
-            for comparison in specification.comparisons
-        ):
-            for left, right in (comparison.when_true, comparison.when_false):
-                self.interpreter.variables |= {left: math.inf, right: 0.0}
         self._index()
         self._lanes = Lanes()
         if fast is not None:
             self._lanes = fast.lanes(compiled, self.interpreter, self._monitors, self._agenda.when_due)
             for group in self.groups:
                 group.home = group.monitors[0].home
-        # What is replaced goes at once: a garbage collector that had to look for it would hold up all messages.
+        # Replaced parts are freed at once: a search by the garbage collector would delay all messages.
         for part in (self._agenda, self.interpreter):
             weakref.finalize(self, part.let_go).atexit = False
 
@@ -182,58 +144,58 @@ class MonitorSet:
         patience: Patience = lambda: _never,
         *,
         fast: FastPath | None = None,
-        trials: Collection[str] = (),
-        trial_patience: Patience = lambda: _never,
+        shadows: Collection[str] = (),
+        shadow_patience: Patience = lambda: _never,
         slices: int = LIMIT,
         deadlines: int = sys.maxsize,
         holder_of: HolderOf = no_holder,
     ) -> "MonitorSet":
-        """Return the set of what was compiled. With one that is named in `trials`, all that share variables are tried.
+        """Return the set. With a specification in `shadows`, all that share variables with it are in shadow mode.
 
-        `patience()` is asked when something is due: it returns what says whether that has taken too long
-        (`trial_patience` for those on trial). A parametric specification has at most so many `slices`.
+        `patience()` is called when something is due; it returns a function that returns whether that takes too long
+        (`shadow_patience` in shadow mode). A parametric specification has at most `slices` slices.
         """
-        tried = []
-        for group in compiled.groups(trials):
-            trial = cls(
+        shadowed = []
+        for group in compiled.groups(shadows):
+            shadow = cls(
                 compiled.part(group),
                 on_fault,
-                trial_patience,
+                shadow_patience,
                 slices=slices,
                 deadlines=deadlines,
                 holder_of=holder_of,
             )
-            for monitor in trial._monitors:
-                monitor.context.most = TRIAL_BUDGET
-            tried.append(trial)
+            for monitor in shadow._monitors:
+                monitor.context.most = SHADOW_BUDGET
+            shadowed.append(shadow)
         return cls(
             compiled,
             on_fault,
             patience,
-            tried,
+            shadowed,
             fast=fast,
             slices=slices,
             deadlines=deadlines,
             holder_of=holder_of,
         )
 
-    # What there is
+    # Queries
 
     @property
-    def monitors(self) -> tuple[Monitor, ...]:
-        """The running specifications, in order, with their state."""
+    def monitors(self) -> tuple[MonitorInstance, ...]:
+        """Return the running specifications in order, with their state in Python."""
         for monitor in self._monitors:
             monitor.come_home()
         return self._monitors
 
     @property
-    def tried(self) -> tuple[Monitor, ...]:
-        """The specifications on trial, with their state."""
-        return tuple(monitor for trial in self.trials for monitor in trial.monitors)
+    def shadowed(self) -> tuple[MonitorInstance, ...]:
+        """Return the specifications in shadow mode, with their state in Python."""
+        return tuple(monitor for shadow in self.shadows for monitor in shadow.monitors)
 
     @property
     def topics(self) -> Mapping[str, str]:
-        """The topics with events, and their message types."""
+        """Return the topics with events, and their message types."""
         return MappingProxyType(
             {
                 step.event.topic: step.event.type
@@ -245,7 +207,7 @@ class MonitorSet:
 
     @property
     def services(self) -> Mapping[str, str]:
-        """The services with events, and their types."""
+        """Return the services with events, and their types."""
         return MappingProxyType(
             {
                 step.event.topic: step.event.service_type
@@ -257,8 +219,8 @@ class MonitorSet:
 
     @property
     def publications(self) -> Mapping[str, str]:
-        """The topics that specifications publish, or would if they were not on trial, and their message types."""
-        sets = (self, *self.trials)
+        """Return the topics that specifications publish (or would, in shadow mode), and their message types."""
+        sets = (self, *self.shadows)
         return MappingProxyType(
             {
                 publication.topic: publication.type
@@ -268,7 +230,7 @@ class MonitorSet:
         )
 
     def published_by(self, file: str) -> frozenset[str]:
-        """The topics that the specifications of a file publish."""
+        """Return the topics that the specifications of a file publish."""
         return frozenset(
             publication.topic
             for publication in self.compiled.publications
@@ -276,132 +238,112 @@ class MonitorSet:
         )
 
     def md5sum(self, message_type: str) -> str:
-        """The md5sum of a message type as the specifications understand it."""
+        """Return the md5sum of a message type by the definitions of this set."""
         return self.compiled.messages.definitions.md5sum(message_type)
 
     @property
     def definitions(self) -> Definitions:
-        """The definitions that the specifications were compiled against."""
+        """Return the definitions that the set was compiled with."""
         return self.compiled.messages.definitions
 
     def wants(self, topic: str) -> bool:
-        """Whether an enabled monitor has an event on this topic."""
+        """Return whether an enabled monitor has an event on this topic."""
         return topic in self.steps
 
     def taps(self, topic: str) -> bool:
-        """Whether messages on this topic may be copied into `tapped`."""
+        """Return whether messages on this topic may be copied into `tapped`."""
         return topic in self._tapped_ways
 
-    def type_of(self, topic: str, *, tried: bool = False) -> str | None:
-        """The message type of a topic that `wants`; None where none does, or (unless `tried`) only on trial."""
+    def type_of(self, topic: str, *, shadowed: bool = False) -> str | None:
+        """Return the message type of a topic with enabled events, or None. Shadow mode counts only if `shadowed`."""
         steps = self.steps.get(topic, ())
-        return next((step.event.type for step in steps if tried or not isinstance(step, _Tap)), None)
+        return next((step.event.type for step in steps if shadowed or not isinstance(step, _Tap)), None)
 
     def stamped(self, topic: str) -> bool:
-        """Whether the messages of a topic begin with a `std_msgs/Header`, as their type is known here."""
-        return self.compiled.is_stamped(self.type_of(topic, tried=True))
+        """Return whether messages of a topic begin with a `std_msgs/Header`, by the type in this set."""
+        return self.compiled.is_stamped(self.type_of(topic, shadowed=True))
 
-    def service_type_of(self, service: str, *, tried: bool = False) -> str | None:
-        """The type of a service with an enabled event; None of another, or (unless `tried`) where it is on trial."""
+    def service_type_of(self, service: str, *, shadowed: bool = False) -> str | None:
+        """Return the type of a service with an enabled event, or None. Shadow mode counts only if `shadowed`."""
         for part in ("request", "response"):
             for step in self.steps.get(way_of(service, part), ()):
-                if tried or not isinstance(step, _Tap):
+                if shadowed or not isinstance(step, _Tap):
                     return step.event.service_type
         return None
 
     def limit_time(self, clock: Callable[[], float], seconds: float) -> None:
-        """Bound the processor time that a message may take, over all monitors, by a clock that shows it (seconds).
+        """Bound the processor time of a message, over all monitors, by a clock (seconds).
 
-        The message that takes longer is cut off: that is a fault. The same holds for a tick, a deadline, and for the
-        monitors on trial.
+        Exceeding it is a fault. The same bound holds for ticks, deadlines, and monitors in shadow mode.
         """
-        for part in (self, *self.trials):
+        for part in (self, *self.shadows):
             part.interpreter.turn.limit(clock, seconds)
 
     def hurry(self, part: float) -> None:
-        """Let messages take this part of the time that `limit_time` gives them."""
+        """Set the part of the time from `limit_time` that messages may take."""
         self.interpreter.turn.part = part
 
     @property
     def late(self) -> bool:
-        """Whether the last message, tick or deadline took all of its time."""
+        """Whether the last message, tick or deadline used up its time."""
         return self.interpreter.turn.late()
 
-    def explain_when(self, asked: Asked, tried: Asked) -> None:
-        """Explain only verdicts that are asked for, by themselves and the source of the message; and those on trial."""
+    def explain_when(self, asked: Asked, shadowed: Asked) -> None:
+        """Explain only verdicts for which `asked` (in shadow mode: `shadowed`) is true of the message's source."""
         self._execution.asked = asked
-        for trial in self.trials:
-            trial.explain_when(tried, tried)
+        for shadow in self.shadows:
+            shadow.explain_when(shadowed, shadowed)
 
     @property
     def area(self) -> memoryview | None:
-        """Where to receive frames that walks take without a copy; None where there are no walks."""
+        """Return memory to receive frames into, so that lanes need no copy; None without lanes."""
         return self._lanes.area
 
     def contexts(self, topic: str) -> tuple[Context, ...]:
-        """What the monitors of a topic have left of their budgets after a message of it."""
+        """Return the contexts of a topic's monitors, with the rest of their budgets."""
         return self._contexts.get(topic, ())
 
-    def walker(self, topic: str) -> FastLane | None:
-        """The walk for messages on this topic, or `way_of` a service; None if there is none."""
+    def lane(self, topic: str) -> FastLane | None:
+        """Return the lane for a topic, or `way_of` a service; None if there is none."""
         return self._lanes.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
 
-    def walks(self, walker: FastLane, time_ns: int) -> bool:
-        """Whether walks may be used now: nothing is due, no monitor waits for its first message or could not begin."""
-        return not self._agenda.has_come(time_ns) and not self._broken and walker.ready()
+    def lane_ready(self, lane: FastLane, time_ns: int) -> bool:
+        """Return whether the lane may be used: nothing is due, and no monitor waits for its first message or failed to
+        start.
+        """
+        return not self._agenda.has_come(time_ns) and not self._broken and lane.ready()
 
-    def monitor(self, name: str) -> Monitor:
-        """A running specification by name; raises KeyError."""
+    def monitor(self, name: str) -> MonitorInstance:
+        """Return a running specification by name; raises KeyError."""
         for monitor in self._monitors:
             if monitor.name == name:
                 return monitor
         raise KeyError(name)
 
     def value(self, name: str, variable: str) -> Any:
-        """What a shared variable of a running specification is now; raises KeyError."""
+        """Return the value of a shared variable of a running specification; raises KeyError."""
         monitor = self.monitor(name)
         monitor.come_home()
         return self.interpreter.variables[monitor.code.variables[variable]]
 
-    def take_margins(self) -> Iterator[Margin]:
-        """How close the comparisons of numbers came since this was asked last: of each that came up in this time, the
-        nearest while it was true and the nearest while it was not.
-        """
-        variables = self.interpreter.variables
-        for monitor in self.monitors:
-            for number, comparison in enumerate(monitor.code.comparisons):
-                for holds, sides in ((True, comparison.when_true), (False, comparison.when_false)):
-                    left, right = (variables[name] for name in sides)
-                    if not math.isinf(left):
-                        variables[sides[0]] = math.inf
-                        yield Margin(
-                            monitor.name,
-                            number,
-                            comparison.position,
-                            comparison.threshold,
-                            holds,
-                            left,
-                            right,
-                        )
-
-    # What is done to them
+    # Changes
 
     def start(
         self, time_ns: int, expected: frozenset[str] | None = None, *, restarted: bool = False
     ) -> Outcome:
-        """Begin: first values, `init`, timers. Everything that `init` put out is in the outcome.
+        """Start: first values, `init`, timers. The outcome has the output of `init`.
 
-        `expected` are the topics that are known to carry messages (of a recording); a specification with events
-        on one of them starts its timers with its first message. With `restarted`, specifications with the
-        modifier `hold` block their topics until `resume`; none on trial does.
+        `expected` are topics that are known to carry messages (in a recording): a specification with events on one of
+        them starts its timers at its first message. With `restarted`, specifications with the modifier `hold` block
+        their topics until `resume`; in shadow mode none does.
         """
         outcome = self._start(self._monitors, time_ns, expected)
         for monitor in self._monitors if restarted else ():
             monitor.held = monitor.code.hold
-        return self._with_trials(outcome, [trial.start(time_ns, expected) for trial in self.trials])
+        return self._with_shadows(outcome, [shadow.start(time_ns, expected) for shadow in self.shadows])
 
-    def state_of(self, group: Group) -> bytes:
-        """The state of a group as data; of one that is too large, why it is not kept."""
+    def state_of(self, group: MonitorGroup) -> bytes:
+        """Return the state of a group as data; if it is too large, the reason why it is not kept."""
         try:
             states = [
                 kept_monitor(monitor, self.interpreter.variables, self._types[monitor.name])
@@ -415,18 +357,18 @@ class MonitorSet:
             group.home.left = False
         return data
 
-    def slice_parts(self, group: Group) -> list[tuple[str, SliceParts]]:
-        """Keep the slices of a group's parametric specifications by parts: what they have changed, by name."""
+    def slice_parts(self, group: MonitorGroup) -> list[tuple[str, SliceParts]]:
+        """Return the slices of a group's parametric specifications, to be saved in parts, by name."""
         sliced = [(monitor.name, monitor.slices) for monitor in group.monitors]
         return [(name, SliceParts(slices)) for name, slices in sliced if slices is not None]
 
     def recover(
-        self, kept: Sequence[KeptGroup], lost: Mapping[str, str], time_ns: int, *, restarted: bool = False
+        self, kept: Sequence[GroupSnapshot], lost: Mapping[str, str], time_ns: int, *, restarted: bool = False
     ) -> Outcome:
-        """Begin where earlier processes ended: specifications go on with the state that was `kept`, the last of each.
+        """Start with the state of earlier processes: `kept` has the state of specifications, of each the last.
 
-        Those of which the state is `lost` (why; "": of all), or cannot be used, begin; they hold their topics if
-        `hold_lost` says so. With `restarted`, those with the modifier `hold` hold them in any case.
+        Those whose state is `lost` (with the reason; key "": all) or unusable start again, and hold their topics as
+        `hold_lost` decides. With `restarted`, those with the modifier `hold` always hold them.
         """
         states, slices, unread = states_of(kept)
         fresh, reasons = [], {**lost, **unread}
@@ -458,16 +400,18 @@ class MonitorSet:
                 self.hold_lost(monitor, reasons[monitor.name])
         for monitor in self._monitors if restarted else ():
             monitor.held = monitor.held or monitor.code.hold
-        return self._with_trials(outcome, [trial.start(time_ns) for trial in self.trials])
+        return self._with_shadows(outcome, [shadow.start(time_ns) for shadow in self.shadows])
 
-    def hold_lost(self, monitor: Monitor, why: str) -> None:
-        """The monitor began again because its state is lost: it holds its topics if it is declared `hold`, or acts by a
-        state and is not declared `begin`.
+    def hold_lost(self, monitor: MonitorInstance, why: str) -> None:
+        """Handle the lost state of a monitor that has restarted: it holds its topics if it is declared `hold`, or acts
+        by a state and is not declared `begin`.
         """
         if monitor.code.hold or (monitor.name in self._guards and not monitor.code.begins):
             monitor.hold(why)
 
-    def _start(self, monitors: Sequence[Monitor], time_ns: int, expected: frozenset[str] | None) -> Outcome:
+    def _start(
+        self, monitors: Sequence[MonitorInstance], time_ns: int, expected: frozenset[str] | None
+    ) -> Outcome:
         self.began = tuple(monitor.name for monitor in monitors)
         outcome = self._execution.begin(monitors, time_ns)
         for monitor in monitors:
@@ -484,37 +428,40 @@ class MonitorSet:
     def succeed(
         self, before: "MonitorSet", time_ns: int, incomplete: Collection[str] = frozenset()
     ) -> Outcome:
-        """Take the place of another set and start; `began` names the specifications that begin with this one.
+        """Replace another set and start; `began` names the specifications that start with this one.
 
-        Specifications with the same text keep their state, `init` included, unless a message type that they use has
-        another definition now. One that begins anew goes on holding its topics if it did and is still declared `hold`.
-        What goes on trial, or comes from it, keeps its state as others do; on trial it holds no topic. Those that are
-        `incomplete` have not seen all messages on trial: they begin anew when they are not on trial any more.
+        Specifications with the same text keep their state, `init` included, unless the definition of a message type
+        that they use has changed. One that restarts goes on holding its topics if it did and is still declared `hold`.
+        A specification that enters or leaves shadow mode keeps its state; in shadow mode it holds no topic. Those in
+        `incomplete` have missed messages in shadow mode: they restart when they leave it.
         """
         known = {
             monitor.name: (monitor, part.interpreter.variables)
-            for part in (before, *before.trials)
+            for part in (before, *before.shadows)
             for monitor in part.monitors
         }
         departed = {monitor.name for monitor in before.monitors if before.has_departed(monitor)}
         self._beginnings |= before._beginnings
         others = _redefined(before.definitions, self.definitions)
-        tried = [trial._follow(known, others, time_ns) for trial in self.trials]
-        for monitor in self.tried:
+        shadowed = [shadow._follow(known, others, time_ns) for shadow in self.shadows]
+        for monitor in self.shadowed:
             monitor.resume()
         known = {name: found for name, found in known.items() if name not in incomplete}
         outcome = self._follow(known, others, time_ns)
         for monitor in self._monitors:
             if monitor.name in departed.intersection(self.began):
                 self.hold_lost(monitor, _CHANGED)
-        was_tried, is_tried = ({monitor.name for monitor in part.tried} for part in (before, self))
-        for monitor in (*self._monitors, *self.tried):
+        was_tried, is_tried = ({monitor.name for monitor in part.shadowed} for part in (before, self))
+        for monitor in (*self._monitors, *self.shadowed):
             if (monitor.name in was_tried) is not (monitor.name in is_tried):
                 monitor.faults = 0
-        return self._with_trials(outcome, tried)
+        return self._with_shadows(outcome, shadowed)
 
     def _follow(
-        self, known: Mapping[str, tuple[Monitor, Mapping[str, Any]]], redefined: frozenset[str], time_ns: int
+        self,
+        known: Mapping[str, tuple[MonitorInstance, Mapping[str, Any]]],
+        redefined: frozenset[str],
+        time_ns: int,
     ) -> Outcome:
         fresh = []
         for monitor in self.monitors:
@@ -534,24 +481,24 @@ class MonitorSet:
                 self.hold_lost(monitor, earlier.why_held)
         return outcome
 
-    def has_departed(self, monitor: Monitor) -> bool:
-        """Whether a monitor that guards is, or may be, in another state than that in which it began."""
+    def has_departed(self, monitor: MonitorInstance) -> bool:
+        """Return whether a monitor that guards may have left its initial state."""
         if monitor.name not in self._guards:
             return False
         beginning = self._beginnings.get(monitor.name)
         return beginning is None or shape(monitor, self.interpreter.variables) != beginning
 
-    def _with_trials(self, outcome: Outcome, tried: Sequence[Outcome]) -> Outcome:
-        outcome.tried = tried
-        self.began += tuple(name for trial in self.trials for name in trial.began)
+    def _with_shadows(self, outcome: Outcome, shadowed: Sequence[Outcome]) -> Outcome:
+        outcome.shadowed = shadowed
+        self.began += tuple(name for shadow in self.shadows for name in shadow.began)
         return outcome
 
-    def switch(self, enabled: Mapping[str, bool], time_ns: int) -> tuple[Monitor, ...]:
-        """Let the events of monitors happen, or not, and leave unknown names out; the monitors that this changed.
+    def switch(self, enabled: Mapping[str, bool], time_ns: int) -> tuple[MonitorInstance, ...]:
+        """Enable or disable monitors, ignoring unknown names; return the monitors that changed.
 
-        Time that passed meanwhile does not count: timers and properties with time bounds begin anew.
+        The time in between does not count: timers and properties with time bounds restart.
         """
-        changed = [monitor for trial in self.trials for monitor in trial.switch(enabled, time_ns)]
+        changed = [monitor for shadow in self.shadows for monitor in shadow.switch(enabled, time_ns)]
         for monitor in self._monitors:
             wanted = enabled.get(monitor.name, monitor.enabled)
             if wanted is monitor.enabled:
@@ -574,15 +521,15 @@ class MonitorSet:
         return tuple(changed)
 
     def resume(self, name: str) -> None:
-        """Let a held specification carry its topics again; raises KeyError."""
+        """Let a specification that holds its topics pass messages again; raises KeyError."""
         monitor = self.monitor(name)
         monitor.resume()
         monitor.touch()
 
-    # What happens
+    # Events
 
-    def process(self, topic: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY) -> Outcome:
-        """What is to be done with a message: the bytes of its fields, received at this time on this topic."""
+    def process(self, topic: str, buffer: Buffer, time_ns: int, sender: MessageSender = NOBODY) -> Outcome:
+        """Process a message: the bytes of its fields, received at this time on this topic."""
         outcome, steps = Outcome(buffer, time_ns), self.steps.get(topic, ())
         if self._agenda.has_come(time_ns):
             outcome.before = self._agenda.advance(time_ns)
@@ -591,53 +538,55 @@ class MonitorSet:
             self._agenda.schedule()
         return outcome
 
-    def judge(self, topic: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY) -> Outcome:
-        """What `process` says, by the walk where that takes the message: as in the relay."""
+    def judge(self, topic: str, buffer: Buffer, time_ns: int, sender: MessageSender = NOBODY) -> Outcome:
+        """Process a message by its lane if possible, as the relay does."""
 
-        def silent(walker: FastLane) -> Prepared:
+        def silent(lane: FastLane) -> BatchOptions:
             key = topic, sender.source
             if key not in self._silent:
-                told = [True] * len(walker.events)
-                self._silent[key] = walker.prepare(loud=True, told=told, source=sender.source)
+                told = [True] * len(lane.events)
+                self._silent[key] = lane.prepare(loud=True, told=told, source=sender.source)
             return self._silent[key]
 
-        taken = self.taken(topic, buffer, time_ns, silent)
+        taken = self.process_fast(topic, buffer, time_ns, silent)
         return self.process(topic, buffer, time_ns, sender) if taken is None else taken
 
-    def taken(
+    def process_fast(
         self,
         topic: str,
         buffer: Buffer,
         time_ns: int,
-        prepare: Callable[[FastLane], Prepared],
+        prepare: Callable[[FastLane], BatchOptions],
         fuel: int = MESSAGE_FUEL,
     ) -> Outcome | None:
-        """What `process` says of a message on a topic, or `way_of` a service, if its lane takes it (`FastLane.take`,
-        with what `prepare` says, and so many instructions); None: nothing was done.
+        """Process a message on a topic, or `way_of` a service, if its lane takes it (`FastLane.process_message`, with
+        the options from `prepare` and this fuel); None: nothing was done.
         """
-        walker = self.walker(topic)
-        if walker is None or not self.walks(walker, time_ns):
+        lane = self.lane(topic)
+        if lane is None or not self.lane_ready(lane, time_ns):
             return None
-        return walker.take(buffer, time_ns, prepare(walker), fuel)
+        return lane.process_message(buffer, time_ns, prepare(lane), fuel)
 
     def process_service(
-        self, service: str, part: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY
+        self, service: str, part: str, buffer: Buffer, time_ns: int, sender: MessageSender = NOBODY
     ) -> Outcome:
-        """The same for the `request` or `response` (the `part`) of a service."""
+        """Process the `request` or `response` (the `part`) of a service."""
         return self.process(way_of(service, part), buffer, time_ns, sender)
 
     @property
     def next_due(self) -> int | None:
-        """When the next tick is due or the next deadline has passed; None if nothing is waited for."""
+        """Return the time of the next tick or deadline; None if there is none."""
         return self._agenda.due
 
     def advance(self, time_ns: int) -> list[Outcome]:
-        """Let the ticks up to this time and the deadlines before it happen, in the order of their times."""
+        """Process the ticks up to this time and the deadlines before it, in the order of their times."""
         return self._agenda.advance(time_ns)
 
     # The set
 
-    def _take_over(self, monitor: Monitor, before: Monitor, variables: Mapping[str, Any]) -> None:
+    def _take_over(
+        self, monitor: MonitorInstance, before: MonitorInstance, variables: Mapping[str, Any]
+    ) -> None:
         for name, code in monitor.code.variables.items():
             self.interpreter.variables[code] = variables[before.code.variables[name]]
         for running, old in zip(monitor.properties, before.properties, strict=True):
@@ -656,11 +605,11 @@ class MonitorSet:
         monitor.faults = before.faults
 
     def _index(self) -> None:
-        """Which steps a message on which topic, or part of a service, takes."""
+        """Index the steps by topic, or part of a service."""
         self._silent.clear()
         steps: dict[str, list[Step]] = {}
         standing = {monitor.name: monitor.steps for monitor in self._monitors if monitor.enabled}
-        standing |= {trial.names[0]: self._taps(trial) for trial in self.trials}
+        standing |= {shadow.names[0]: self._taps(shadow) for shadow in self.shadows}
         for step in (step for name in self.names for step in standing.get(name, ())):
             steps.setdefault(step.event.way or "", []).append(step)
         for found in steps.values():
@@ -669,7 +618,7 @@ class MonitorSet:
                 step.first = not place or acting[place - 1].monitor is not step.monitor
             for step in found if acting else ():
                 if isinstance(step, _Tap):
-                    step.monitor = acting[0].monitor  # whose state has to come home
+                    step.monitor = acting[0].monitor  # whose state must be copied back to Python
         self._tapped_ways = frozenset(
             way for way, found in steps.items() if any(isinstance(step, _Tap) for step in found)
         )
@@ -679,36 +628,36 @@ class MonitorSet:
             for way, found in self.steps.items()
         }
 
-    def _taps(self, trial: "MonitorSet") -> tuple[Step, ...]:
-        """A tap for each topic and part of a service on which the trial has an enabled event."""
+    def _taps(self, shadow: "MonitorSet") -> tuple[Step, ...]:
+        """Return a tap for each topic and part of a service with an enabled event in shadow mode."""
         return tuple(
-            _Tap(found[0].monitor, found[0].event, 0, "", self._tap(trial, found[0].event))
-            for found in trial.steps.values()
+            _Tap(found[0].monitor, found[0].event, 0, "", self._tap(shadow, found[0].event))
+            for found in shadow.steps.values()
         )
 
-    def _tap(self, trial: "MonitorSet", event: EventCode) -> Callable[[Message | None], bool]:
+    def _tap(self, shadow: "MonitorSet", event: EventCode) -> Callable[[WireMessage | None], bool]:
         resource, part, tapped = event.topic or "", event.part, self.tapped
 
-        def tap(message: Message | None) -> bool:
+        def tap(message: WireMessage | None) -> bool:
             assert message is not None  # noqa: S101  no timer stands here
-            tapped.append(Tapped(trial, resource, part, bytes(message.buffer), message.time))
+            tapped.append(ShadowCopy(shadow, resource, part, bytes(message.buffer), message.time))
             return False
 
         return tap
 
 
-def _groups(compiled: Compiled, monitors: Sequence[Monitor]) -> Iterator[Group]:
+def _groups(compiled: Compiled, monitors: Sequence[MonitorInstance]) -> Iterator[MonitorGroup]:
     for found in groups(compiled.specifications):
         own = tuple(monitors[number] for number in found.specifications)
         ways = {step.event.way for monitor in own for step in monitor.steps if step.event.way is not None}
-        group = Group(own, frozenset(ways))
+        group = MonitorGroup(own, frozenset(ways))
         for monitor in own:
             monitor.group = group
         yield group
 
 
 def _redefined(before: Definitions, after: Definitions) -> frozenset[str]:
-    """The message types that are in both and not the same."""
+    """Return the message types that both have with different definitions."""
     if before is after:
         return frozenset()
     both = set(before.message_types) & set(after.message_types)

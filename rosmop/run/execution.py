@@ -1,15 +1,16 @@
-"""What happens to one message, or at one tick or deadline: events, properties, handlers, faults. No I/O, no clock.
+"""Processes one message, tick or deadline: events, properties, handlers, faults. No I/O, no clock.
 
 The events of a message happen specification by specification, in source order. After the action of an event that did
-not drop the message, every property of its specification steps, and the handlers of the categories it is in run.
-What drops the message ends its way; what faults drops it, too, or with `on_fault="pass"` is passed over. Of a
-parametric specification each slice that an event belongs to takes its turn (`slices.py`).
+not drop the message, every property of its specification steps, and the handlers of its new categories run. A drop
+stops the processing of the message. A fault also drops it, unless `on_fault="pass"`. In a parametric specification
+each slice of an event takes its turn (`slices.py`).
 
-A dropped message has not happened for properties that are formulas (`CompiledProperty.suppresses`): whatever dropped
-it, all of them, of all specifications, take back the steps that they made for it. So the trace that such a property has
-seen is the trace that subscribers saw. Variables, output and the other properties keep what came of the message.
+For properties that are formulas (`CompiledProperty.suppresses`), a dropped message has not happened: all of them, in
+all specifications, undo the steps that they made for it, so that their trace is the one that subscribers saw.
+Variables, output and the other properties keep its effects.
 """
 
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
@@ -18,55 +19,52 @@ from math import inf
 from typing import Literal
 
 from rosmop.form.positions import Position
+from rosmop.form.sites import Site, showing
 from rosmop.logics.interface import Categories, RunFaultError
-from rosmop.run.causes import NOBODY, Sender
 from rosmop.run.explain import Bound, of_slice
-from rosmop.run.faults import explain
-from rosmop.run.interpreter import Interpreter
-from rosmop.run.monitor import Handler, Monitor, RunningProperty, Step
-from rosmop.run.outcomes import DROPPED, Fault, Outcome, Verdict
+from rosmop.run.interpreter import Interpreter, LastFailure
+from rosmop.run.monitor import Handler, MonitorInstance, RunningProperty, Step
+from rosmop.run.outcomes import DROPPED, NOBODY, Fault, MessageSender, Outcome, Verdict
 from rosmop.run.slices import Key, Slice, Slices
-from rosmop.runtime.action_context import FOLDED_NS, LogLine
-from rosmop.runtime.wire import Buffer, Message
+from rosmop.runtime.action_context import FOLDED_NS, FaultError, LogLine, MalformedError
+from rosmop.runtime.wire import Buffer, WireMessage
 
 OnFault = Literal["drop", "pass"]
 Asked = Callable[[Verdict, int], bool]
 
 EXPLAINED = 3
-"""Verdicts of slices that are explained of those which one message, or one go of deadlines, brings about: each takes a
-millisecond.
-"""
+"""Most verdicts of slices that are explained for one message, or one call with deadlines: each takes a millisecond."""
 
 SLICE_SECONDS = 50e-6
-"""Processor time that a message has more for each slice that it concerns."""
+"""Additional processor time of a message for each slice that it concerns."""
 
 TICK_BUDGET = 2_000
-"""Instructions that a slice may spend on a tick that concerns several."""
+"""Instructions of a slice for a tick that concerns several slices."""
 
 
-class Execution:
-    """Carries out what compiled specifications say, on the state that their monitors have."""
+class MonitorExecution:
+    """Runs the events, properties and handlers of compiled specifications on the state of their monitors."""
 
     def __init__(self, interpreter: Interpreter, on_fault: OnFault) -> None:
         self.on_fault: OnFault = on_fault
         self.asked: Asked | None = None
-        """Which verdicts to explain: by themselves and the source of the message; None: all."""
+        """Chooses the verdicts to explain, given the source of the message; None: all."""
         self._interpreter = interpreter
         self._turn = interpreter.turn
         self._sender = NOBODY
         self._bound: Bound | None = None
         self._explains = True
         self._taking_back: dict[int, Callable[[], None]] = {}
-        """What takes back the steps for the message at hand, by the run or slice that made them."""
-        self._trailed: dict[Monitor, int] = {}
-        """How many entries the message at hand has in trails."""
+        """Undo functions for the steps of the current message, by run or slice."""
+        self._trailed: dict[MonitorInstance, int] = {}
+        """Number of entries of the current message in trails."""
         self._copies = False
-        """Whether what happens in a slice may be taken back."""
+        """Whether steps in a slice may be undone."""
         self._passed: int | None = None
-        """The deadline of a slice that passes now."""
+        """The deadline of a slice that is passing."""
 
-    def begin(self, monitors: Sequence[Monitor], time_ns: int) -> Outcome:
-        """Constants, first values, `init`: each for all before the next, as one may read another's variables."""
+    def begin(self, monitors: Sequence[MonitorInstance], time_ns: int) -> Outcome:
+        """Start monitors in stages (constants, first values, `init`), because one may read another's variables."""
         outcome = Outcome(time=time_ns)
         self._turn.now, self._turn.until = time_ns, inf  # operators wait for it; instructions bound it
         for monitor in monitors:
@@ -81,8 +79,8 @@ class Execution:
         self.collect(outcome)
         return outcome
 
-    def message(self, steps: Sequence[Step], buffer: Buffer, outcome: Outcome, sender: Sender) -> None:
-        """Let the events of a message happen that is received at the time of the outcome; at least one step."""
+    def message(self, steps: Sequence[Step], buffer: Buffer, outcome: Outcome, sender: MessageSender) -> None:
+        """Process a message received at the time of the outcome; `steps` is not empty."""
         steps[0].monitor.come_home()
         steps[0].monitor.touch()
         self._turn.now = outcome.time
@@ -90,7 +88,7 @@ class Execution:
         self._sender = sender
         self._taking_back.clear()
         self._trailed.clear()
-        message = Message(buffer, outcome.time)
+        message = WireMessage(buffer, outcome.time)
         writers: tuple[tuple[Step, Sequence[int]], ...] = ()
         for step in steps:
             if step.first:
@@ -109,7 +107,7 @@ class Execution:
         self._finish(message, writers, outcome)
 
     def tick(self, step: Step, time_ns: int) -> Outcome:
-        """Let an event without a topic happen; `collect` is the caller's."""
+        """Process a tick; the caller calls `collect`."""
         self._sender = NOBODY
         self._taking_back.clear()
         step.monitor.come_home()
@@ -120,7 +118,7 @@ class Execution:
         self._turn.begin()
         step.monitor.context.begin()
 
-        def act(outcome: Outcome, message: Message | None) -> bool:
+        def act(outcome: Outcome, message: WireMessage | None) -> bool:
             outcome.events = (step.name,)
             try:
                 step.function(message)
@@ -138,9 +136,11 @@ class Execution:
             outcome.events = (step.name,)
         return outcome
 
-    def expire(self, monitor: Monitor, running: RunningProperty | None, *, explains: bool) -> list[Outcome]:
-        """Let the deadline of a property pass, or (None) the first one of a slice; the outcomes that are told. Where
-        not `explains`, a slice's verdict is not explained.
+    def expire(
+        self, monitor: MonitorInstance, running: RunningProperty | None, *, explains: bool
+    ) -> list[Outcome]:
+        """Process the deadline of a property, or (None) the first one of a slice; return the outcomes to report. A
+        slice's verdict is explained only if `explains`.
         """
         self._sender, self._bound = NOBODY, None
         monitor.come_home()
@@ -157,8 +157,8 @@ class Execution:
         self.collect(outcome)
         return [outcome]
 
-    def _expiry(self, monitor: Monitor, deadline: int, running: RunningProperty) -> Outcome:
-        """Begin what comes of the deadline of a property."""
+    def _expiry(self, monitor: MonitorInstance, deadline: int, running: RunningProperty) -> Outcome:
+        """Start the outcome of the deadline of a property."""
         word = "timeout" if running.code.property.logic == "tfsm" else "deadline"
         outcome = Outcome(time=deadline)
         outcome.timer = f"{monitor.name}.{word}"
@@ -167,8 +167,8 @@ class Execution:
         monitor.context.begin()
         return outcome
 
-    def _expire_in_slice(self, monitor: Monitor, slice_: Slice) -> list[Outcome]:
-        """Let the first deadline of a slice pass. Nothing is told of one that lacks a parameter."""
+    def _expire_in_slice(self, monitor: MonitorInstance, slice_: Slice) -> list[Outcome]:
+        """Process the first deadline of a slice. A slice that lacks a parameter reports nothing."""
         slices = monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
         deadline = slice_.deadline or 0
@@ -176,7 +176,7 @@ class Execution:
         running = monitor.properties[number]
         outcome = self._expiry(monitor, deadline, running)
 
-        def act(outcome: Outcome, _: Message | None) -> bool:
+        def act(outcome: Outcome, _: WireMessage | None) -> bool:
             self._passed = deadline
             self._tell(monitor, running, running.run.expire(), None, outcome, in_order_told=True)
             self._passed = None
@@ -187,8 +187,8 @@ class Execution:
         self.collect(outcome)
         return [outcome] if whole else []
 
-    def _catch_up(self, monitor: Monitor, behind: Sequence[Slice], outcome: Outcome) -> None:
-        """Let the deadlines of slices pass that are before a message, where there were too many to pass in time."""
+    def _catch_up(self, monitor: MonitorInstance, behind: Sequence[Slice], outcome: Outcome) -> None:
+        """Process the deadlines of slices before a message, if there were too many to process in time."""
         turn, go_on = self._turn, monitor.context.put_off()
         kept = turn.log, turn.published, turn.looked, self._sender, self._bound
         turn.log, turn.published, turn.looked = [], [], {}
@@ -201,12 +201,12 @@ class Execution:
         turn.log, turn.published, turn.looked, self._sender, self._bound = kept
         go_on()
 
-    def warn(self, monitor: Monitor, text: str) -> None:
-        """A line of the monitor's log, for the next `collect`."""
+    def warn(self, monitor: MonitorInstance, text: str) -> None:
+        """Add a line to the monitor's log, for the next `collect`."""
         self._turn.log.append(LogLine("WARN", text, monitor.name))
 
     def collect(self, outcome: Outcome) -> None:
-        """Take what was put out, published and looked at since it was collected last."""
+        """Move output, publications and conditions since the last call into the outcome."""
         turn = self._turn
         outcome.log, outcome.published, outcome.looked = turn.log, turn.published, turn.looked
         outcome.sites = self._interpreter.sites
@@ -214,8 +214,8 @@ class Execution:
 
     # One event
 
-    def _happen(self, step: Step, message: Message, outcome: Outcome) -> bool:
-        """Give the message to an event; whether it was dropped."""
+    def _happen(self, step: Step, message: WireMessage, outcome: Outcome) -> bool:
+        """Run an event on the message; return whether it was dropped."""
         try:
             has_happened = step.function(message)
         except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
@@ -236,8 +236,8 @@ class Execution:
             return message.dropped
         return False
 
-    def _happen_in_slices(self, step: Step, message: Message, outcome: Outcome) -> bool:
-        """Give the message to an event of a parametric specification; whether it was dropped."""
+    def _happen_in_slices(self, step: Step, message: WireMessage, outcome: Outcome) -> bool:
+        """Run an event of a parametric specification on the message; return whether it was dropped."""
         assert step.key is not None  # noqa: S101  who asks has looked
         try:
             found = step.key(message)
@@ -262,7 +262,7 @@ class Execution:
                 outcome.events = (*outcome.events, step.name)
             return False
 
-        def act(outcome: Outcome, message: Message | None) -> bool:
+        def act(outcome: Outcome, message: WireMessage | None) -> bool:
             assert message is not None  # noqa: S101  each has one
             if not step.event.plain:
                 return self._happen(step, message, outcome)
@@ -277,14 +277,13 @@ class Execution:
         self,
         step: Step,
         key: Key,
-        message: Message | None,
+        message: WireMessage | None,
         outcome: Outcome,
-        act: Callable[[Outcome, Message | None], bool],
+        act: Callable[[Outcome, WireMessage | None], bool],
     ) -> None:
-        """Let an event happen in each slice that it belongs to, until one has dropped the message.
+        """Run an event in each of its slices, until one has dropped the message.
 
-        A message whose budget ends on the way has happened in no slice. At a tick each slice has a budget of its own,
-        so that none takes it from others.
+        A message that exceeds its budget on the way has happened in no slice. At a tick each slice has its own budget.
         """
         monitor, slices, turn = step.monitor, step.monitor.slices, self._turn
         assert slices is not None  # noqa: S101  who asks has looked
@@ -316,7 +315,7 @@ class Execution:
                 self._copies, self._explains = False, True
                 return
             faults += outcome.faults
-            verdicts += outcome.verdicts  # many slices: a tuple would be copied with each
+            verdicts += outcome.verdicts  # many slices: a tuple would be copied for each
             if outcome.events is not before:
                 reached += 1
                 events = outcome.events if slices.is_whole(slice_) else events
@@ -342,10 +341,10 @@ class Execution:
         step: Step,
         slice_: Slice,
         outcome: Outcome,
-        message: Message | None,
-        act: Callable[[Outcome, Message | None], bool],
+        message: WireMessage | None,
+        act: Callable[[Outcome, WireMessage | None], bool],
     ) -> Callable[[], None]:
-        """Let an event happen in a slice; return how the slice takes the state."""
+        """Run an event in a slice; return a function that stores the state in the slice."""
         slices = step.monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
         if message is not None:
@@ -360,16 +359,16 @@ class Execution:
 
     def _in_seed(
         self,
-        monitor: Monitor,
+        monitor: MonitorInstance,
         slice_: Slice,
         outcome: Outcome,
-        message: Message | None,
-        act: Callable[[Outcome, Message | None], bool],
+        message: WireMessage | None,
+        act: Callable[[Outcome, WireMessage | None], bool],
     ) -> Callable[[], None]:
-        """Let the event happen in a slice that lacks a parameter, to a copy of the message; leave out its output."""
+        """Run the event in a slice that lacks a parameter, on a copy of the message and without output."""
         turn, explains = self._turn, self._explains
         lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
-        copied = None if message is None else Message(bytes(message.buffer), message.time)
+        copied = None if message is None else WireMessage(bytes(message.buffer), message.time)
         self._explains = False
         commit = self._in_slice(monitor, slice_, outcome, copied, act)
         self._explains = explains
@@ -379,13 +378,13 @@ class Execution:
 
     def _in_slice(
         self,
-        monitor: Monitor,
+        monitor: MonitorInstance,
         slice_: Slice,
         outcome: Outcome,
-        message: Message | None,
-        act: Callable[[Outcome, Message | None], bool],
+        message: WireMessage | None,
+        act: Callable[[Outcome, WireMessage | None], bool],
     ) -> Callable[[], None]:
-        """Make the slice the state of the monitor and let the event happen; return how the slice takes the state."""
+        """Load the slice into the monitor and run the event; return a function that stores the state in the slice."""
         slices = monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
         for running, run in zip(monitor.properties, slices.select(slice_), strict=True):
@@ -400,10 +399,10 @@ class Execution:
         step: Step,
         binding: Mapping[str, object],
         why: str,
-        message: Message | None,
+        message: WireMessage | None,
         outcome: Outcome,
     ) -> None:
-        """There can be no slice of what an event binds: that is a fault."""
+        """Report as a fault that an event's binding cannot have a slice."""
         monitor = step.monitor
         monitor.faults += 1
         text = f"{why}: {step.name} is not monitored for this binding"
@@ -411,7 +410,7 @@ class Execution:
         self._block(message, outcome)
 
     def _finish(
-        self, message: Message, writers: tuple[tuple[Step, Sequence[int]], ...], outcome: Outcome
+        self, message: WireMessage, writers: tuple[tuple[Step, Sequence[int]], ...], outcome: Outcome
     ) -> None:
         turn = self._turn
         if turn.log or turn.published or turn.looked:
@@ -431,8 +430,8 @@ class Execution:
             outcome.changed_by = tuple([step.name for step, _ in writers])
             outcome.changed_at = tuple([sites[site].position for _, at in writers for site in at])
 
-    def _first(self, monitor: Monitor, message: Message, outcome: Outcome) -> bool:
-        """A message for a monitor that has seen none yet, or that holds its topics; whether it was dropped."""
+    def _first(self, monitor: MonitorInstance, message: WireMessage, outcome: Outcome) -> bool:
+        """Handle a monitor's first message, or a message on a topic that it holds; return whether it was dropped."""
         if monitor.held:
             why = f" ({monitor.why_held})" if monitor.why_held else ""
             outcome.reason = f"{monitor.name} holds its topics until it is resumed{why}"
@@ -448,12 +447,14 @@ class Execution:
                 timer.due = message.time + timer.period
         return False
 
-    def _note(self, monitor: Monitor) -> None:
-        """Keep what the event has bound, which has happened in a slice."""
+    def _note(self, monitor: MonitorInstance) -> None:
+        """Add an event that happened in a slice to the trail."""
         if self._bound is not None and (not monitor.trail or monitor.trail[-1] is not self._bound):
             self._append_to_trail(monitor, self._bound)
 
-    def _step_properties(self, step: Step, message: Message | None, time_ns: int, outcome: Outcome) -> None:
+    def _step_properties(
+        self, step: Step, message: WireMessage | None, time_ns: int, outcome: Outcome
+    ) -> None:
         if step.monitor.slices is not None:
             self._note(step.monitor)
         for running in step.monitor.properties:
@@ -475,12 +476,12 @@ class Execution:
         if slices.suppresses and id(slice_) not in self._taking_back:
             self._taking_back[id(slice_)] = slices.mark(slice_)
 
-    def _append_to_trail(self, monitor: Monitor, bound: Bound) -> None:
+    def _append_to_trail(self, monitor: MonitorInstance, bound: Bound) -> None:
         monitor.trail.append(bound)
         self._trailed[monitor] = self._trailed.get(monitor, 0) + 1
 
     def _take_back(self) -> None:
-        """Undo what the message has done to formulas, the last step first."""
+        """Undo the steps of formulas at this message, the last one first."""
         for take_back in reversed(self._taking_back.values()):
             take_back()
         for monitor, entries in self._trailed.items():
@@ -489,15 +490,15 @@ class Execution:
 
     def _tell(
         self,
-        monitor: Monitor,
+        monitor: MonitorInstance,
         running: RunningProperty,
         categories: Categories,
-        message: Message | None,
+        message: WireMessage | None,
         outcome: Outcome,
         *,
         in_order_told: bool = False,
     ) -> None:
-        """Run the handlers of these categories, in source order (after a deadline: in the order they are told)."""
+        """Run the handlers of these categories, in source order (after a deadline: in the order given)."""
         handlers = [(category, handler) for category, handler in running.handlers if category in categories]
         if in_order_told:
             handlers.sort(key=lambda pair: categories.index(pair[0]))
@@ -515,7 +516,7 @@ class Execution:
         if self._turn.reset:
             running.begin(self._turn.now)
 
-    def _verdict(self, monitor: Monitor, running: RunningProperty, category: str) -> Verdict:
+    def _verdict(self, monitor: MonitorInstance, running: RunningProperty, category: str) -> Verdict:
         source, index = running.code.property.source, running.index
         slices, slice_ = monitor.slices, monitor.slice
         binding = {} if slices is None or slice_ is None else slices.binding(slice_)
@@ -533,9 +534,9 @@ class Execution:
 
     def _handle(
         self,
-        monitor: Monitor,
+        monitor: MonitorInstance,
         handler: Handler,
-        message: Message | None,
+        message: WireMessage | None,
         running: RunningProperty,
         outcome: Outcome,
     ) -> None:
@@ -545,19 +546,21 @@ class Execution:
             self._fault(error, monitor, running.code.property.source.origin, outcome)
             self._block(message, outcome)
 
-    def _block(self, message: Message | None, outcome: Outcome) -> None:
-        """What the last fault does to the message."""
+    def _block(self, message: WireMessage | None, outcome: Outcome) -> None:
+        """Apply the last fault to the message."""
         if message is not None and self.on_fault == "drop":
             message.dropped = True
             outcome.fatal = outcome.faults[-1]
 
-    def _fault(self, error: Exception, monitor: Monitor, otherwise: Position, outcome: Outcome) -> None:
-        fault: Fault = explain(error, self._interpreter, monitor.name, otherwise)
+    def _fault(
+        self, error: Exception, monitor: MonitorInstance, otherwise: Position, outcome: Outcome
+    ) -> None:
+        fault: Fault = _fault_of(error, self._interpreter, monitor.name, otherwise)
         monitor.faults += 1
         outcome.faults = (*outcome.faults, fault)
 
-    def _past(self, step: Step, message: Message) -> None:
-        """Count an event that did not happen, and tell it once in a while."""
+    def _past(self, step: Step, message: WireMessage) -> None:
+        """Count an event that did not happen because an index was past the end, and report it now and then."""
         step.past += 1
         now = message.time
         if step.told is None or now - step.told >= FOLDED_NS:
@@ -568,7 +571,7 @@ class Execution:
             step.told, step.past = now, 0
         message.past = None
 
-    def _begin_variables(self, monitors: Sequence[Monitor], outcome: Outcome) -> None:
+    def _begin_variables(self, monitors: Sequence[MonitorInstance], outcome: Outcome) -> None:
         beginning = list(monitors)
         for stage in range(3):
             for monitor in tuple(beginning):
@@ -578,3 +581,28 @@ class Execution:
                     self._fault(error, monitor, monitor.code.position, outcome)
                     monitor.broken = True
                     beginning.remove(monitor)
+
+
+def _fault_of(error: Exception, interpreter: Interpreter, monitor: str, otherwise: Position) -> Fault:
+    """Return the fault for an exception. `otherwise` is its position if no better one is known."""
+    failed = interpreter.failed if error is interpreter.failed.error else LastFailure()
+    interpreter.failed = LastFailure()  # the error refers to its callers, and so to much else
+    site = interpreter.sites[failed.site] if failed.site >= 0 else Site(otherwise)
+    values = {}
+    for variable in site.variables:
+        try:
+            value = interpreter.value(variable.code, failed.variables)
+        except KeyError:  # not computed yet
+            continue
+        values[variable.name] = showing(variable.type)(value)
+    return Fault(monitor, site.position, _text(error), values)
+
+
+def _text(error: Exception) -> str:
+    if isinstance(error, FaultError):
+        return error.text
+    if isinstance(error, MalformedError):
+        return f"the bytes are not a message of this type: {error}"
+    if isinstance(error, struct.error):
+        return "the bytes are not a message of this type: it ends before its last field"
+    return f"{type(error).__name__}: {error}"

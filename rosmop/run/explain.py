@@ -1,19 +1,18 @@
-"""What made a verdict: of the events so far as few as give it alone, and who sent the messages that they were.
+"""Explains verdicts: as few of the events so far as give the verdict alone, and the senders of their messages.
 
 Theory of operation:
 
-1. Of a property with tables (`Exits`) it is kept for each state by which event it was left last. From the initial state
-   these lead to the present one, and each is later than the one before: the events so far without all that came back
-   to where it had been. So nothing is cut, however long the trace; and since what happened before `__RESET;` is not on
-   the way, it need not be forgotten either. The module keeps the same, in the same place.
-2. Of the others (`Steps`; with a clock `ClockedSteps`, which the module keeps, too) the last events are kept, and the
-   run as it was before them. Where they give the verdict to a run that begins anew they explain it alone; where not,
-   only to the run as it was before them, and that is said (`Explanation.since`). A run about the future cannot be
-   copied; of it more events are kept, and it knows at which of them the formula is what was told: from there on they
-   are enough, unless the formula looks back, too. Where they are not, nothing explains it.
-3. Of a parametric specification the last `TRAIL` events are kept with what they bound; those of the slice explain its
-   verdict alone, or nothing does.
-4. An explanation is found by trying: what is named has given the verdict.
+1. For a property with tables, `Exits` stores the event by which each state was left last. From the initial state these
+   lead to the present one, each later than the one before: the trace without its loops. So nothing is cut, however long
+   the trace, and events before `__RESET;` are left out. The module stores the same data in the same place.
+2. For other properties, `Steps` (with a clock `ClockedSteps`, which the module also stores) keeps the last events and
+   the run before them. If the events give the verdict to a new run, they explain it alone; otherwise only together with
+   the run before them (`Explanation.since`). A run about the future cannot be copied: more events are kept, and the run
+   knows at which of them the formula is the one that was decided. From there on they suffice, unless the formula also
+   looks back; then there is no explanation.
+3. For a parametric specification, the last `TRAIL` events are kept with their bindings. The events of the slice explain
+   its verdict alone, or there is no explanation.
+4. Each explanation is tested: the events in it gave the verdict.
 """
 
 import copy
@@ -32,56 +31,58 @@ from rosmop.logics.interface import (
     Run,
     RunFaultError,
 )
-from rosmop.run.causes import NOBODY, Explanation, Happened, Sender
+from rosmop.run.outcomes import NOBODY, EventOccurrence, Explanation, MessageSender
 
 TRAIL = 4096
-"""Events that are kept of a parametric specification, of all its slices together."""
+"""Events kept for all slices of a parametric specification together."""
 
 KEPT = 64
-"""Of so many events, and as many more at most, what happened is kept where there are no tables."""
+"""Events kept for a property without tables, at least; at most twice as many."""
 
 FUTURE_KEPT = 1024
-"""The same of `mtl` about the future."""
+"""Events kept for `mtl` about the future."""
 
 ENTRY = struct.Struct("<qqI4x")
-"""How a state was left: time (ns); `Sender.source`, `Sender.kind` (from bit 24) and the event; `Sender.number`."""
+"""How a state was left: time (ns); the sender's source, its kind (from bit 24) and the event; the sender's number."""
 
 RUNS, RING = 4, 256
-"""Of a property with a clock: runs and steps that are kept, twice as many as are asked for. So what the module notes of
-a message that it leaves overwrites nothing that counts.
+"""Runs and steps kept for a property with a clock: twice as many as needed. So the entries of a message that the module
+leaves to the engine overwrite no needed one.
 """
 
 _COUNT = struct.Struct("<q")
 _RUN = struct.Struct("<qqq")
 _EVENT = 0xFFFFFF
-_LONGEST = 300  # ways through an automaton that are shortened
-_MOST_STEPS = 5_000  # that are tried for one explanation: some milliseconds
+_LONGEST = 300  # longest path through an automaton that is shortened
+_MOST_STEPS = 5_000  # tried for one explanation: some milliseconds
 _DEADLINE = -1
 
 CLOCKED_ROOM = _COUNT.size + _RUN.size * RUNS + ENTRY.size * RING
-"""Bytes of `ClockedSteps.room`."""
+"""Size of `ClockedSteps.room`."""
 
 
 class Bound(NamedTuple):
-    """An event of a parametric specification that happened: which parameters (by number) it bound, and to what (`key`
-    has True before the values).
+    """An event of a parametric specification that happened: the parameters that it bound (by number), and their values
+    (`key`, after True).
 
-    `creates`: a slice may begin with it. `everywhere`: it happened in each slice that it belongs to; a `when` may look
-    at what slices differ in, and what one has dropped comes to no other. `passed`: its message was not dropped.
+    `creates`: a slice may begin with it. `everywhere`: it happened in each of its slices (a `when` may depend on the
+    slice, and a message that one slice drops reaches no other). `passed`: its message was not dropped.
     """
 
     event: int
     binds: tuple[int, ...]
     key: tuple[Any, ...]
     time: int
-    sender: Sender
+    sender: MessageSender
     creates: bool
     everywhere: bool = True
     passed: bool = True
 
 
 class Exits:
-    """How each state of an automaton was left last, in `room` (`ENTRY` for each state), whose `owner` lives as long."""
+    """The history of how each state of an automaton was left last, in `room` (`ENTRY` for each state), which `owner`
+    keeps alive.
+    """
 
     def __init__(self, automaton: Automaton) -> None:
         self._automaton = automaton
@@ -90,8 +91,8 @@ class Exits:
         self.room = memoryview(bytearray(ENTRY.size * len(automaton)))
         self.owner: object = None
 
-    def step(self, run: Any, event: int, time_ns: int, sender: Sender) -> Categories:
-        """Let the run take the event."""
+    def step(self, run: Any, event: int, time_ns: int, sender: MessageSender) -> Categories:
+        """Step the run with the event."""
         self._at = state = run.state
         self._last = event, time_ns, sender
         categories: Categories = run.step(event, time_ns)
@@ -102,46 +103,46 @@ class Exits:
         return categories
 
     def expire(self, run: Run) -> Categories:
-        """Let the deadline of the run pass."""
+        """Expire the deadline of the run."""
         return run.expire()
 
     def begin(self, time_ns: int) -> None:
-        """What happened before stays on no way: it need not be forgotten."""
+        """Do nothing: no path from the initial state has earlier events."""
 
     def mark(self) -> None:
-        """Nothing: how the present state was left is on no way, so a step taken back need not be forgotten."""
+        """Return nothing: no path from the initial state has an undone step."""
 
     def take_back(self, mark: object) -> None:
-        """As `mark`."""
+        """Do nothing, as `mark`."""
 
     def move(self, owner: object, room: memoryview) -> None:
-        """Keep it from now on where the owner has it."""
+        """Move the history into the owner's memory."""
         self.room, self.owner = room[: len(self.room)], owner
 
     def forget(self, run: Any, _time_ns: int) -> None:
-        """The run goes on from where another process left it: nothing is known of how it got there."""
+        """Forget everything: the run continues that of another process."""
         self._at = run.state
         for state in range(len(self._automaton)):
             ENTRY.pack_into(self.room, ENTRY.size * state, 0, _EVENT, 0)
 
     def follow(self, earlier: "Exits | Steps") -> "Exits":
-        """Go on from what another has kept of the same property."""
+        """Continue the history of the same property."""
         assert isinstance(earlier, Exits)  # noqa: S101  it has the same tables
         self.room[:] = bytes(earlier.room)
         return self
 
     def explain(self, category: str) -> Explanation | None:
-        """What made the last step's verdict."""
+        """Explain the last step's verdict."""
         way = self._way()
         if way is None:
             return None
-        way.append(Happened(*self._last))
+        way.append(EventOccurrence(*self._last))
         fewest = len(way) <= _LONGEST
         return Explanation(self._named(_shortest(self._automaton, way, category) if fewest else way), fewest)
 
-    def _way(self) -> list[Happened] | None:
-        """From the initial state to where the last step began."""
-        found: list[Happened] = []
+    def _way(self) -> list[EventOccurrence] | None:
+        """Return the events from the initial state to the last step."""
+        found: list[EventOccurrence] = []
         state = self._automaton.initial
         while state != self._at:
             time, who, number = ENTRY.unpack_from(self.room, ENTRY.size * state)
@@ -151,12 +152,12 @@ class Exits:
                 or (found and time < found[-1].time)
             ):
                 return None
-            sender = Sender(who >> 32, number, who >> 24 & 0xFF)
-            found.append(Happened(who & 0xFFFFFF, time, sender))
+            sender = MessageSender(who >> 32, number, who >> 24 & 0xFF)
+            found.append(EventOccurrence(who & 0xFFFFFF, time, sender))
             state = self._automaton.table[state][found[-1].event]
         return found
 
-    def _named(self, way: Sequence[Happened]) -> tuple[Happened, ...]:
+    def _named(self, way: Sequence[EventOccurrence]) -> tuple[EventOccurrence, ...]:
         automaton, state, found = self._automaton, self._automaton.initial, []
         for event in way:
             state = automaton.table[state][event.event]
@@ -164,8 +165,10 @@ class Exits:
         return tuple(found)
 
 
-def _shortest(automaton: Automaton, way: Sequence[Happened], category: str) -> Sequence[Happened]:
-    """The fewest that give the category, the latest of such; with the last of the way, unless they do without it."""
+def _shortest(
+    automaton: Automaton, way: Sequence[EventOccurrence], category: str
+) -> Sequence[EventOccurrence]:
+    """Return the fewest events, and of these the latest, that give the category."""
     best: dict[int, tuple[int, ...]] = {automaton.initial: ()}
     fewest: tuple[int, ...] = ()
     mine: tuple[int, ...] = ()
@@ -190,7 +193,7 @@ def _shortest(automaton: Automaton, way: Sequence[Happened], category: str) -> S
 
 
 class Steps:
-    """What happened last to a property without tables: at least `KEPT` steps, and the run before them."""
+    """The history of a property without tables: at least the last `KEPT` steps, and the run before them."""
 
     _run: Run | None = None
 
@@ -199,9 +202,9 @@ class Steps:
         self.begin(time_ns)
 
     def begin(self, time_ns: int) -> None:
-        """Forget everything: the run has begun anew."""
+        """Forget everything: the run has restarted."""
         self._started = time_ns
-        self._steps: list[Happened] = []
+        self._steps: list[EventOccurrence] = []
         self._before: Run | None = None
         self._following: Run | None = None
 
@@ -214,34 +217,34 @@ class Steps:
         self._started, self._steps, size, self._before, self._following = mark
         del self._steps[size:]
 
-    def step(self, run: Run, event: int, time_ns: int, sender: Sender) -> Categories:
-        """Let the run take the event. Raises `RunFaultError`."""
+    def step(self, run: Run, event: int, time_ns: int, sender: MessageSender) -> Categories:
+        """Step the run with the event. Raises `RunFaultError`."""
         self._make_room(run)
         categories = run.step(event, time_ns)
-        self._steps.append(Happened(event, time_ns, sender))
+        self._steps.append(EventOccurrence(event, time_ns, sender))
         return categories
 
     def forget(self, run: Run, time_ns: int) -> None:
-        """The run goes on from where another process left it: what happens next is explained by it as it is now."""
+        """Explain from the present state: the run continues that of another process."""
         self.begin(time_ns)
         self._before = None if isinstance(run, BoundedRun) else copy.copy(run)
 
-    def add(self, happened: Happened) -> None:
-        """It has happened."""
+    def add(self, happened: EventOccurrence) -> None:
+        """Add an event."""
         self._steps.append(happened)
 
     def expire(self, run: Run) -> Categories:
-        """Let the deadline of the run pass."""
+        """Expire the deadline of the run."""
         self._make_room(run)
-        self._steps.append(Happened(_DEADLINE, run.deadline or 0, NOBODY))
+        self._steps.append(EventOccurrence(_DEADLINE, run.deadline or 0, NOBODY))
         return run.expire()
 
     def follow(self, earlier: "Exits | Steps") -> "Exits | Steps":
-        """Go on from what another has kept of the same property."""
+        """Continue the history of the same property."""
         return earlier
 
-    def _kept(self) -> tuple[Sequence[Happened], Run | None]:
-        """The last steps, and the run before them if they are not all."""
+    def _kept(self) -> tuple[Sequence[EventOccurrence], Run | None]:
+        """Return the last steps, and the run before them if there were earlier ones."""
         return self._steps, self._before
 
     def _make_room(self, run: Run) -> None:
@@ -254,14 +257,14 @@ class Steps:
             self._following = None if isinstance(run, BoundedRun) else copy.copy(run)
 
     def explain(self, category: str) -> Explanation | None:
-        """What made the last step's verdict; None where that cannot be said."""
+        """Explain the last step's verdict; None if unknown."""
         steps, earlier = self._kept()
         if not steps:
             return None
         ended = steps[-1].time if steps[-1].event == _DEADLINE else None
         events = [step for step in steps if step.event != _DEADLINE]
         last = events[-1:] if ended is None else []
-        tries: list[tuple[Run | None, list[Happened]]] = [(None, events)]
+        tries: list[tuple[Run | None, list[EventOccurrence]]] = [(None, events)]
         if earlier is not None:
             tries.append((earlier, events))
         if isinstance(self._run, BoundedRun):
@@ -277,7 +280,7 @@ class Steps:
 
 
 class ClockedSteps(Steps):
-    """The same of an automaton with a clock, in `room`, where the module notes it, too: how many steps there were
+    """Like `Steps`, for an automaton with a clock, in `room`, where the module also notes it: the number of steps
     (i64), the runs before each `KEPT` of them (state, `since` and `now`; the last `RUNS`), and the last `RING` steps.
     """
 
@@ -289,45 +292,45 @@ class ClockedSteps(Steps):
         super().__init__(compiled, time_ns)
 
     def begin(self, time_ns: int) -> None:
-        """Forget everything: the run has begun anew."""
+        """Forget everything: the run has restarted."""
         self._started = time_ns
         _COUNT.pack_into(self.room, 0, 0)
 
     def mark(self) -> tuple[int, bytes]:
-        """All of it."""
+        """Return a copy of everything."""
         return self._started, bytes(self.room)
 
     def take_back(self, mark: tuple[int, bytes]) -> None:
-        """Return to it."""
+        """Restore the copy."""
         self._started, self.room[:] = mark
 
-    def step(self, run: Run, event: int, time_ns: int, sender: Sender) -> Categories:
-        """Let the run take the event."""
+    def step(self, run: Run, event: int, time_ns: int, sender: MessageSender) -> Categories:
+        """Step the run with the event."""
         self._note(run, event, time_ns, sender)
         return run.step(event, time_ns)
 
     def forget(self, run: Run, time_ns: int) -> None:
-        """The run goes on from where another process left it."""
+        """Forget everything: the run continues that of another process."""
         del run
         self.begin(time_ns)
 
     def expire(self, run: Run) -> Categories:
-        """Let the deadline of the run pass."""
+        """Expire the deadline of the run."""
         self._note(run, _DEADLINE & _EVENT, run.deadline or 0, NOBODY)
         return run.expire()
 
     def move(self, owner: object, room: memoryview) -> None:
-        """Keep it from now on where the owner has it."""
+        """Move the history into the owner's memory."""
         self.room, self.owner = room[:CLOCKED_ROOM], owner
 
     def follow(self, earlier: Exits | Steps) -> "ClockedSteps":
-        """Go on from what another has kept of the same property."""
+        """Continue the history of the same property."""
         assert isinstance(earlier, ClockedSteps)  # noqa: S101  it has the same tables
         self._started = earlier._started
         self.room[:] = bytes(earlier.room)
         return self
 
-    def _note(self, run: Any, event: int, time_ns: int, sender: Sender) -> None:
+    def _note(self, run: Any, event: int, time_ns: int, sender: MessageSender) -> None:
         (count,) = _COUNT.unpack_from(self.room)
         if not count % KEPT:
             _RUN.pack_into(self.room, _run_at(count // KEPT), run.state, run.since, run.now)
@@ -336,14 +339,14 @@ class ClockedSteps(Steps):
         ENTRY.pack_into(self.room, _step_at(count), time_ns, who, number & 0xFFFFFFFF)
         _COUNT.pack_into(self.room, 0, count + 1)
 
-    def _kept(self) -> tuple[Sequence[Happened], Run | None]:
+    def _kept(self) -> tuple[Sequence[EventOccurrence], Run | None]:
         (count,) = _COUNT.unpack_from(self.room)
         first = max((count - 1) // KEPT - 1, 0)
         steps = []
         for number in range(first * KEPT, count):
             time, who, of_sender = ENTRY.unpack_from(self.room, _step_at(number))
             event = _DEADLINE if who & _EVENT == _EVENT else who & _EVENT
-            steps.append(Happened(event, time, Sender(who >> 32, of_sender, who >> 24 & 0xFF)))
+            steps.append(EventOccurrence(event, time, MessageSender(who >> 32, of_sender, who >> 24 & 0xFF)))
         if not first:
             return steps, None
         run = ClockedRun(self._compiled, 0)
@@ -360,7 +363,7 @@ def _step_at(number: int) -> int:
 
 
 class _Trial:
-    """Whether events give a category: told with the last of them, or by a deadline when it has `ended`."""
+    """A test whether events lead to a category, at the last event, or at a deadline if it has `ended`."""
 
     def __init__(
         self, compiled: CompiledProperty, before: Run | None, started: int, category: str, ended: int | None
@@ -372,8 +375,8 @@ class _Trial:
         self._ended = ended
         self._left = _MOST_STEPS
 
-    def gives(self, events: Sequence[Happened]) -> bool:
-        """Whether these do, and nothing else that happened."""
+    def gives(self, events: Sequence[EventOccurrence]) -> bool:
+        """Return whether these events alone give the category."""
         self._left -= 1 + len(events)
         run = self._start()
         told: Categories = ()
@@ -386,22 +389,22 @@ class _Trial:
         return self._category in (told if self._ended is None else self._expire(run, self._ended + 1))
 
     def _expire(self, run: Run, time_ns: int) -> Categories:
-        """Let the deadlines before a time pass; what is told by those right before it."""
+        """Expire the deadlines before a time; return the categories of the last one."""
         told: Categories = ()
         while (deadline := run.deadline) is not None and deadline < time_ns:
             categories = run.expire()
             told += categories if deadline == time_ns - 1 else ()
         return told
 
-    def fewest(self, events: list[Happened]) -> tuple[tuple[Happened, ...], bool]:
-        """As few of these as will do, and whether none of them can be left out; the last is left out last."""
+    def fewest(self, events: list[EventOccurrence]) -> tuple[tuple[EventOccurrence, ...], bool]:
+        """Return as few of the events as suffice, and whether none can be left out."""
         last = events[-1:] if self._ended is None else []
         some = self._fewer(events[: len(events) - len(last)], last)
         if last and some and self._left > 0 and self.gives(some):
             some, last = self._fewer(some, []), []
         return (*some, *last), self._left > 0
 
-    def _fewer(self, some: list[Happened], last: list[Happened]) -> list[Happened]:
+    def _fewer(self, some: list[EventOccurrence], last: list[EventOccurrence]) -> list[EventOccurrence]:
         size = max(1, len(some) // 2)
         while some and self._left > 0:
             place, before = 0, len(some)
@@ -424,18 +427,18 @@ def of_slice(
     category: str,
     passed: int | None = None,
 ) -> Explanation | None:
-    """What made the verdict in the slice of a binding (parameters by number): it is the last that happened, or the
-    deadline that has `passed`.
+    """Return the events of the verdict in the slice of a binding (parameters by number), whose cause is the last event,
+    or the deadline that has `passed`.
 
-    None where it takes an event of which it is not known whether it happened in this slice.
+    None if it is unknown whether a needed event happened in this slice.
     """
-    own: dict[Happened, bool] = {}
-    happened: list[Happened] = []
+    own: dict[EventOccurrence, bool] = {}
+    happened: list[EventOccurrence] = []
     for bound in trail:
         if not bound.passed and compiled.suppresses:
             continue
         if all(map(_same, map(values.get, bound.binds), bound.key[1:])) and (own or bound.creates):
-            happened.append(Happened(bound.event, bound.time, bound.sender))
+            happened.append(EventOccurrence(bound.event, bound.time, bound.sender))
             own[happened[-1]] = bound.everywhere
     if not happened:
         return None
@@ -443,7 +446,7 @@ def of_slice(
     for event in happened:
         found.add(event)
     if passed is not None:
-        found.add(Happened(_DEADLINE, passed, NOBODY))
+        found.add(EventOccurrence(_DEADLINE, passed, NOBODY))
     why = found.explain(category)
     return why if why is not None and all(own[event] for event in why.events) else None
 
@@ -453,7 +456,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def history_of(compiled: CompiledProperty, time_ns: int) -> Exits | Steps:
-    """What is kept of a run that begins."""
+    """Return the empty history of a run."""
     if isinstance(compiled, ClockedProperty):
         return ClockedSteps(compiled, time_ns)
     return Exits(compiled.automaton) if isinstance(compiled, FiniteProperty) else Steps(compiled, time_ns)

@@ -1,24 +1,23 @@
-"""What came of a message, a tick or a deadline, as data for a record, for the CLI and for REST: what led to it.
+"""The outcome of a message, a tick or a deadline and its causes, as data for a record, for the CLI and for REST.
 
-Bounded, and in the words of the specification. `who` names the source of a message.
+The data are bounded, and in the words of the specification. `who` names the source of a message.
 """
 
 import datetime
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rosmop.run.causes import SEQ, Happened
-from rosmop.run.outcomes import DROPPED, Fault, Outcome, Verdict, named
+from rosmop.run.outcomes import DROPPED, SEQ, EventOccurrence, Fault, Outcome, Verdict, named
 from rosmop.run.subformulas import deciding
 
 _EACH_END = 5
-"""So many of the first and of the last events are told; how many there are between them is said."""
+"""Number of the first and of the last events that are listed; those between are counted."""
 
 Who = Callable[[int], Mapping[str, Any]]
 
 
 def of_drop(outcome: Outcome, who: Who) -> dict[str, Any]:
-    """What led to the drop of the message, and where that is written."""
+    """Return the causes of the drop of the message, with the position of the statement."""
     return {
         **({"at": [str(outcome.dropped_at)]} if outcome.dropped_at is not None else {}),
         **({"values": dict(outcome.fatal.values)} if outcome.fatal is not None else {}),
@@ -27,7 +26,7 @@ def of_drop(outcome: Outcome, who: Who) -> dict[str, Any]:
 
 
 def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
-    """What led to the change of the message, and where the events are written that made it."""
+    """Return the causes of the change of the message, with the positions of the statements."""
     return {
         "changed_by": list(outcome.changed_by),
         "at": [str(position) for position in outcome.changed_at],
@@ -36,14 +35,14 @@ def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
 
 
 def of_published(outcome: Outcome, number: int, who: Who) -> dict[str, Any]:
-    """What led to one of the messages that were published, and where that is written."""
+    """Return the causes of a published message, with the position of the statement."""
     message = outcome.published[number]
     position = outcome.sites[message.site].position
     return {"type": message.type, "at": [str(position)], **_led(outcome, who, outcome.handling.get(number))}
 
 
 def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, Any]:
-    """What led to the fault, where it is, and the values of the variables there."""
+    """Return the causes of the fault, its position, and the values of variables there."""
     where = fault.position
     return {
         "file": where.file,
@@ -57,7 +56,7 @@ def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, Any]:
 
 
 def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, Any]:
-    """What led to the verdict, and where its property is written."""
+    """Return the causes of the verdict, with the position of its property."""
     return {
         "property": verdict.property,
         "logic": verdict.logic,
@@ -70,7 +69,7 @@ def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, Any]:
 
 
 def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str, Any]:
-    """Events, or the timer; conditions that were met, with what they compared; the verdict in whose handler it is."""
+    """Return the events (or the timer), the conditions with the values compared, and the verdict of the handler."""
     return {
         "events": list(outcome.events),
         **({"timer": outcome.timer} if outcome.timer is not None else {}),
@@ -80,7 +79,7 @@ def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str
 
 
 def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
-    """`why` of a verdict; nothing where it was not asked or is not known."""
+    """Return `why` of a verdict; empty if it was not requested or is unknown."""
     why = verdict.why
     if why is None:
         return {}
@@ -99,11 +98,11 @@ def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
 
 
 def moment(time_ns: int) -> str:
-    """A time in UTC, with microseconds."""
+    """Return a time in UTC, with microseconds."""
     return datetime.datetime.fromtimestamp(time_ns / 1e9, datetime.UTC).isoformat(timespec="microseconds")
 
 
-def _event(verdict: Verdict, happened: Happened, who: Who) -> dict[str, Any]:
+def _event(verdict: Verdict, happened: EventOccurrence, who: Who) -> dict[str, Any]:
     event: dict[str, Any] = {"event": verdict.source.events[happened.event], "time": moment(happened.time)}
     event |= {"state": happened.state} if happened.state else {}
     event |= who(happened.sender.source) if happened.sender.source else {}

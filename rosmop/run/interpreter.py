@@ -1,17 +1,17 @@
-"""What the form means, plainly. Every faster way to carry it out is held against this one.
+"""The interpreter, which defines the meaning of the form. Every faster way to run it is compared with this one.
 
-Each expression is made a Python function from the variables of a call to a value, each statement one that says how
-it ends the block that it stands in (None: it does not). One method for each kind of them, in the order of `form.py`.
-What the functions of the form do is in `runtime/`, how values stand in a message in `values.py`. A function is made
-when it is first called. Strings are bytes, vectors and messages lists, times and durations integers; all else is the
-Python value that is closest. All of it is in one file, because it is the definition.
+Each expression becomes a Python function from the variables of a call to a value, each statement one that returns how
+it ends its block (None: it does not). There is one method for each kind of node (`STATEMENTS`, `EXPRESSIONS`).
+`runtime/` has the functions of the form, `runtime/values.py` the encoding of values in messages. A function is built on
+its first call. Strings are bytes, vectors and messages lists, times and durations integers; all else is the closest
+Python value. It is one file because it is the definition.
 
 Invariants:
 
-1. A name is that of a variable of the set (`g…`), or of one call: nothing outlives a call but those and what is in
-   them. Of a call `m` is the message, `b` its bytes as they were at first, `p` where an element begins that is
-   skipped, `n` how deep a recursion is.
-2. `_site` is that of the statement that runs. A fault stops the function that faults and all that have called it.
+1. A name is a variable of the set (`g…`), or of one call: only the former, and what they refer to, outlive a call. In a
+   call `m` is the message, `b` its original bytes, `p` the start of an element that is skipped, `n` the depth of a
+   recursion.
+2. `_site` is the site of the running statement. A fault stops the function and all its callers.
 """
 
 import operator
@@ -28,13 +28,13 @@ from rosmop.form.sites import Site
 from rosmop.runtime import formatting, numbers, strings, times, vectors, wire
 from rosmop.runtime.action_context import MAX_CALLS, Context, FaultError, Turn
 from rosmop.runtime.builtin_functions import CHARGING, FAULTING, FUNCTIONS
-from rosmop.runtime.values import BILLION, Values, struct_code, struct_size
+from rosmop.runtime.values import BILLION, ValueCodec, struct_code, struct_size
 from rosmop.types import value_types
-from rosmop.types.messages import Messages
+from rosmop.types.messages import MessageTypes
 from rosmop.types.value_types import Type
 from roswire.definitions import Definitions
 
-_FRAMES = 40_000  # of Python's: those of `MAX_CALLS` calls, each deep in expressions
+_FRAMES = 40_000  # Python's frames for `MAX_CALLS` calls, each deep in expressions
 
 _CALCULATED: Mapping[str, Callable[[Any, Any], Any]] = MappingProxyType(
     {
@@ -66,10 +66,8 @@ _RESULT = "result"
 
 
 @dataclass(frozen=True)
-class Failed:
-    """Where the last error came: at which site (-1: nowhere in particular), with which variables of the call, and
-    whether the event had happened by then.
-    """
+class LastFailure:
+    """The last error: its site (-1: unknown), the variables of the call, whether the event had happened before it."""
 
     error: Exception | None = None
     site: int = -1
@@ -78,7 +76,7 @@ class Failed:
 
 
 class Interpreter:
-    """Runs the functions of one set of specifications, on values of its own.
+    """The interpreter of one set's functions, with its own values.
 
     `variables` are the values of the variables of the set by name, `contexts` the budgets by name.
     """
@@ -89,14 +87,14 @@ class Interpreter:
         sites: Sequence[Site],
         types: Mapping[str, Type],
         contexts: Mapping[str, str],
-        messages: Messages,
+        messages: MessageTypes,
     ) -> None:
-        """`types` of the variables by name, `contexts` the names of the specifications."""
+        """`types` has the types of variables by name, `contexts` the names of the specifications."""
         self.sites = sites
         self.turn = Turn()
         self.variables: dict[str, Any] = {}
-        self.failed = Failed()
-        self._values = Values(messages, self.turn.check)
+        self.failed = LastFailure()
+        self._values = ValueCodec(messages, self.turn.check)
         self._functions = functions
         self._made: dict[str, Callable[[Variables], Any]] = {}
         self._calls: list[Variables] = []
@@ -109,25 +107,25 @@ class Interpreter:
         self._site = -1
 
     def had_happened(self, error: Exception) -> bool:
-        """Whether the event that an error stopped had happened by then."""
+        """Return whether the event had happened before the error stopped it."""
         return error is self.failed.error and self.failed.happened
 
     def let_go(self) -> None:
-        """The set is gone: its functions have no part any more that has them."""
+        """Drop all functions, so that no reference cycle keeps the set alive."""
         self._made.clear()
 
     def value(self, name: str, variables: Mapping[str, Any]) -> Any:
-        """What a variable of the set, or of a call with these variables, is now. Raises KeyError."""
+        """Return the value of a variable of the set, or of a call with these variables. Raises KeyError."""
         return variables[name] if name in variables else self.variables[name]
 
     def function(self, name: str) -> Callable[..., Any]:
-        """A function to be given a message, or None where there is none; what it gives back (see `form.Function`).
+        """Return a function that takes a message, or None without one; for its result see `nodes.Function`.
 
-        Raises whatever stops it, which `failed` tells more of.
+        It raises whatever stops it; `failed` has the details.
         """
         deep = any(isinstance(node, nodes.Invoke) for node in nodes.walk(self._functions[name].body))
 
-        def run(message: wire.Message | None = None) -> Any:
+        def run(message: wire.WireMessage | None = None) -> Any:
             variables = {"m": message} if message is None else {"m": message, "b": message.buffer}
             if not deep:
                 return self._call(name, variables)
@@ -163,8 +161,8 @@ class Interpreter:
             except Exception as error:
                 if error is not self.failed.error:
                     site = error.site if isinstance(error, FaultError) and error.site >= 0 else self._site
-                    self.failed = Failed(error, site, variables, happened)
-                elif events:  # it came out of a function that was called
+                    self.failed = LastFailure(error, site, variables, happened)
+                elif events:  # it came from a called function
                     self.failed = replace(self.failed, happened=happened)
                 raise
             finally:
@@ -175,7 +173,7 @@ class Interpreter:
 
 
 def constant_of(node: nodes.Expression) -> bool | int | float:
-    """The value of an expression of numbers without variables. Raises `FaultError`."""
+    """Return the value of an expression of numbers without variables. Raises `FaultError`."""
     nowhere = nodes.Function("", "", (), ())
     maker = _Maker(_nobody(), nowhere)
     value: bool | int | float = maker.value(node)({})
@@ -184,11 +182,11 @@ def constant_of(node: nodes.Expression) -> bool | int | float:
 
 @cache
 def _nobody() -> Interpreter:
-    return Interpreter({}, (), {}, {"": ""}, Messages(Definitions({})))
+    return Interpreter({}, (), {}, {"": ""}, MessageTypes(Definitions({})))
 
 
 class _Maker:
-    """Makes what one function is made of."""
+    """Builds one function."""
 
     def __init__(self, interpreter: Interpreter, function: nodes.Function) -> None:
         self._interpreter = interpreter
@@ -208,7 +206,7 @@ class _Maker:
     # Statements
 
     def block(self, statements: Sequence[nodes.Statement]) -> _Run:
-        """Some statements in order."""
+        """Build a sequence of statements."""
         runs = [(node.site, self._statement(node)) for node in statements]
         interpreter = self._interpreter
 
@@ -231,14 +229,14 @@ class _Maker:
 
     def _statement(self, node: nodes.Statement) -> _Run:
         self._at = node.site
-        made: _Run = _STATEMENTS[type(node)](self, node)
+        made: _Run = STATEMENTS[type(node)](self, node)
         return made
 
     def _evaluate(self, node: nodes.Evaluate) -> _Run:
         return self._effect(node.value)
 
     def _effect(self, node: nodes.Expression) -> _Run:
-        """An expression whose value nobody wants."""
+        """Build an expression whose value is not used."""
         if isinstance(node, nodes.Assign):
             return self._store(node)
         if isinstance(node, nodes.Sequence):
@@ -280,7 +278,7 @@ class _Maker:
         return run if node.no else run_yes
 
     def _branch(self, site: int, statements: Sequence[nodes.Statement]) -> _Run:
-        """What drops or changes the message, or publishes one, can say which conditions led there."""
+        """Build a branch; its condition is noted if the branch drops, changes or publishes a message."""
         block = self.block(statements)
         if not any(isinstance(node, nodes.Drop | nodes.Publish) or self._marks_field(node)
                    for node in nodes.walk(tuple(statements))):  # fmt: skip
@@ -294,7 +292,7 @@ class _Maker:
         return run
 
     def _look(self, site: int) -> _Run:
-        """Note what a condition that was met has compared."""
+        """Note the values that a met condition has compared."""
         turn = self._interpreter.turn
         compared = [self._variable(variable.code) for variable in self._interpreter.sites[site].compared]
 
@@ -538,7 +536,7 @@ class _Maker:
         return lambda _: None
 
     def _write_back(self, node: nodes.WriteBack) -> _Run:
-        """What can fault, the encoding of fields of variable size, comes before the first byte is written."""
+        """Encode fields of variable size, which can fault, before the first byte is written."""
         marks, writes = tuple(self._marks), []
         for write in sorted(node.writes, key=lambda write: write.end is None):
             value, encode = self.value(write.value), self._values.encoder(write.value.type)
@@ -573,8 +571,8 @@ class _Maker:
     # Expressions
 
     def value(self, node: nodes.Expression) -> _Value:
-        """An expression."""
-        made: _Value = _EXPRESSIONS[type(node)](self, node)
+        """Build an expression."""
+        made: _Value = EXPRESSIONS[type(node)](self, node)
         return made
 
     def _literal(self, node: nodes.Literal) -> _Value:
@@ -598,14 +596,14 @@ class _Maker:
         return assign
 
     def _marks_field(self, node: object) -> bool:
-        """Whether it says that a field of the message gets another value."""
+        """Return whether a node marks a field of the message as assigned."""
         if not isinstance(node, nodes.Assign) or node.name not in self._flags:
             return False
         value = node.value.value if isinstance(node.value, nodes.Convert) else node.value
         return isinstance(value, nodes.Literal) and value.value is True
 
     def _assigned(self, node: nodes.Assign) -> _Value:
-        """The value; of the flag of a field, which gets another value: the sites that have assigned to it, as bits."""
+        """Build the assigned value; for the flag of a field, the sites that have assigned to it, as bits."""
         if not self._marks_field(node):
             return self.value(node.value)
         if self._at not in self._marks:
@@ -630,10 +628,10 @@ class _Maker:
 
     def _arithmetic(self, node: nodes.Arithmetic) -> _Value:
         kind, sign, site = node.type, node.operator, node.site
-        if isinstance(kind, value_types.Floating):
+        if isinstance(kind, value_types.FloatingType):
             result = self._both(numbers.ratio if sign == "/" else _CALCULATED[sign], node.left, node.right)
             return self._then(result, numbers.f32 if kind.bits == 32 else None)
-        assert isinstance(kind, value_types.Integer)  # noqa: S101  the common type of two numbers
+        assert isinstance(kind, value_types.IntegerType)  # noqa: S101  the common type of two numbers
         last = kind.bits - 1
         calculate = {
             "/": lambda left, right: numbers.divide(left, right, site),
@@ -646,7 +644,9 @@ class _Maker:
 
     def _unary(self, node: nodes.Unary) -> _Value:
         result = self._then(self.value(node.value), _CALCULATED_OF_ONE[node.operator])
-        return self._then(result, wrapping(node.type) if isinstance(node.type, value_types.Integer) else None)
+        return self._then(
+            result, wrapping(node.type) if isinstance(node.type, value_types.IntegerType) else None
+        )
 
     def _moment(self, node: nodes.Moment) -> _Value:
         result = self._both(_CALCULATED[node.operator], node.left, node.right)
@@ -660,7 +660,7 @@ class _Maker:
 
     def _compare(self, node: nodes.Compare) -> _Value:
         kind, compare = node.left.type, _CALCULATED[node.operator]
-        if not isinstance(kind, value_types.Vector | value_types.Record):
+        if not isinstance(kind, value_types.VectorType | value_types.RecordType):
             return self._both(compare, node.left, node.right)
         left, right, measure = self.value(node.left), self.value(node.right), self._values.measure(kind)
         context, site = self._context, node.site
@@ -705,7 +705,9 @@ class _Maker:
 
     def _vector(self, node: nodes.Vector) -> _Value:
         items = [self.value(item) for item in node.items]
-        zeros: Callable[[], list[Any]] = self._values.maker(value_types.Vector(node.type.element, node.zeros))
+        zeros: Callable[[], list[Any]] = self._values.maker(
+            value_types.VectorType(node.type.element, node.zeros)
+        )
         return lambda v: [item(v) for item in items] + zeros()
 
     def _zero(self, node: nodes.Zero) -> _Value:
@@ -742,7 +744,11 @@ class _Maker:
         arguments = [self.value(argument) for argument in node.arguments]
         after = (site,) if node.function in FAULTING else ()
         if len(arguments) == 1 and not after:
-            return self._then(arguments[0], function)
+            value = self._then(arguments[0], function)
+            if node.function == "m_sec" and isinstance(node.type, value_types.IntegerType):
+                # A message may have more nanoseconds than a second has: the seconds overflow their type.
+                return self._then(value, wrapping(node.type))
+            return value
         if len(arguments) == 2:  # for speed: as below
             one, other = arguments
             if after:
@@ -751,10 +757,10 @@ class _Maker:
         return lambda v: function(*[argument(v) for argument in arguments], *after)
 
     def _accumulate(self, node: nodes.Accumulate) -> _Value:
-        assert isinstance(node.vector.type, value_types.Vector)  # noqa: S101  of which there are sums
+        assert isinstance(node.vector.type, value_types.VectorType)  # noqa: S101  of which there are sums
         context, site, wide = self._context, node.site, node.wide
         widened, added = _converting(node.type, wide), _converting(node.vector.type.element, wide)
-        wrapped = wrapping(wide) if isinstance(wide, value_types.Integer) else float
+        wrapped = wrapping(wide) if isinstance(wide, value_types.IntegerType) else float
         narrowed = _converting(wide, node.type)
         parts = [self.value(part) for part in (node.vector, node.first, node.last, node.start)]
 
@@ -830,22 +836,22 @@ def _is_shared(name: str) -> bool:
 def conversion(  # noqa: PLR0911  one for each kind
     source: Type, target: Type
 ) -> Callable[[Any], Any] | None:
-    """Makes a number of one type one of another; None where it is that."""
+    """Return the conversion of numbers between two types; None if it changes nothing."""
     if source == target:
         return None
-    if isinstance(target, value_types.Bool):
+    if isinstance(target, value_types.BoolType):
         return bool
-    if isinstance(target, value_types.Floating):
+    if isinstance(target, value_types.FloatingType):
         if target.bits == 64:
             return float
-        return numbers.f32_of_integer if isinstance(source, value_types.Integer) else numbers.f32
-    assert isinstance(target, value_types.Integer)  # noqa: S101  numbers are one of the three
-    if isinstance(source, value_types.Floating):
+        return numbers.f32_of_integer if isinstance(source, value_types.IntegerType) else numbers.f32
+    assert isinstance(target, value_types.IntegerType)  # noqa: S101  numbers are one of the three
+    if isinstance(source, value_types.FloatingType):
         least, most = target.least, target.most
         return lambda value: numbers.truncate(value, least, most)
-    if isinstance(source, value_types.Bool):
+    if isinstance(source, value_types.BoolType):
         return int
-    assert isinstance(source, value_types.Integer)  # noqa: S101  as above
+    assert isinstance(source, value_types.IntegerType)  # noqa: S101  as above
     return None if target.holds(source) else wrapping(target)
 
 
@@ -853,8 +859,8 @@ def _converting(source: Type, target: Type) -> Callable[[Any], Any]:
     return conversion(source, target) or (lambda value: value)
 
 
-def wrapping(kind: value_types.Integer) -> Callable[[int], int]:
-    """Wraps an integer that may have overflowed into its type."""
+def wrapping(kind: value_types.IntegerType) -> Callable[[int], int]:
+    """Return a function that wraps an integer into its type."""
     mask, half = (1 << kind.bits) - 1, 1 << (kind.bits - 1) if kind.signed else 0
     return lambda value: (value + half & mask) - half
 
@@ -865,15 +871,76 @@ def _limited(kind: Type, site: int) -> Callable[[int], int]:
 
 
 def _recast(context: Context, values: list[Any], element: Type, site: int) -> list[Any]:
-    if isinstance(element, value_types.Vector):
+    if isinstance(element, value_types.VectorType):
         inner = partial(_recast, context, element=element.element, site=site)
         return vectors.recast_each(context, values, inner, site)
-    signed = isinstance(element, value_types.Integer) and element.signed
+    signed = isinstance(element, value_types.IntegerType) and element.signed
     to_bytes = vectors.signed if signed else vectors.unsigned
     return vectors.recast(
-        context, values, vectors.truths if isinstance(element, value_types.Bool) else to_bytes, site
+        context, values, vectors.truths if isinstance(element, value_types.BoolType) else to_bytes, site
     )
 
 
-_EXPRESSIONS: Mapping[type[Any], Callable[[_Maker, Any], _Value]] = nodes.methods_of(_Maker, nodes.Expression)
-_STATEMENTS: Mapping[type[Any], Callable[[_Maker, Any], _Run]] = nodes.methods_of(_Maker, nodes.Statement)
+EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[_Maker, Any], _Value]] = MappingProxyType(
+    {
+        nodes.Literal: _Maker._literal,
+        nodes.Read: _Maker._read,
+        nodes.Assign: _Maker._assign,
+        nodes.Convert: _Maker._convert,
+        nodes.Arithmetic: _Maker._arithmetic,
+        nodes.Unary: _Maker._unary,
+        nodes.Moment: _Maker._moment,
+        nodes.MomentOf: _Maker._moment_of,
+        nodes.Compare: _Maker._compare,
+        nodes.CompareTexts: _Maker._compare_texts,
+        nodes.Logical: _Maker._logical,
+        nodes.Not: _Maker._not,
+        nodes.Conditional: _Maker._conditional,
+        nodes.Sequence: _Maker._sequence,
+        nodes.Discard: _Maker._discard,
+        nodes.Item: _Maker._item,
+        nodes.Vector: _Maker._vector,
+        nodes.Zero: _Maker._zero,
+        nodes.Copy: _Maker._copy,
+        nodes.Recast: _Maker._recast,
+        nodes.OfType: _Maker._of_type,
+        nodes.Call: _Maker._call,
+        nodes.Accumulate: _Maker._accumulate,
+        nodes.Invoke: _Maker._invoke,
+        nodes.Format: _Maker._format,
+        nodes.Join: _Maker._join,
+        nodes.Log: _Maker._log,
+        nodes.Throttle: _Maker._throttle,
+        nodes.Now: _Maker._now,
+        nodes.Whole: _Maker._whole,
+    }
+)
+STATEMENTS: Mapping[type[nodes.FormNode], Callable[[_Maker, Any], _Run]] = MappingProxyType(
+    {
+        nodes.Evaluate: _Maker._evaluate,
+        nodes.If: _Maker._if,
+        nodes.Loop: _Maker._loop,
+        nodes.ForEach: _Maker._for_each,
+        nodes.Break: _Maker._break,
+        nodes.Continue: _Maker._continue,
+        nodes.Select: _Maker._select,
+        nodes.Return: _Maker._return,
+        nodes.Leave: _Maker._leave,
+        nodes.Charge: _Maker._charge,
+        nodes.Allocate: _Maker._allocate,
+        nodes.LimitDepth: _Maker._limit_depth,
+        nodes.Drop: _Maker._drop,
+        nodes.Reset: _Maker._reset,
+        nodes.Publish: _Maker._publish,
+        nodes.AfterText: _Maker._after_text,
+        nodes.Count: _Maker._count,
+        nodes.AfterElements: _Maker._after_elements,
+        nodes.Skip: _Maker._skip,
+        nodes.NotPast: _Maker._not_past,
+        nodes.ReadNumbers: _Maker._read_numbers,
+        nodes.ReadValue: _Maker._read_value,
+        nodes.Require: _Maker._require,
+        nodes.Pending: _Maker._pending,
+        nodes.WriteBack: _Maker._write_back,
+    }
+)

@@ -15,17 +15,17 @@ from rosmop.run.interpreter import Interpreter
 from rosmop.run.slice_quota import HolderOf
 from rosmop.run.slices import Slice, Slices
 from rosmop.runtime.action_context import Context
-from rosmop.runtime.wire import Message
+from rosmop.runtime.wire import WireMessage
 
 FAILING_AFTER = 10
 """Faults after which a monitor is shown as failing."""
 
 
 class CellNames(msgspec.Struct, frozen=True, array_like=True):
-    """What is in the bytes that a module has of a group's state.
+    """The layout of a group's state in a module.
 
-    First the states of properties (monitor, number), then the variables (monitor, name; None for one that is not state)
-    with their `struct` codes, then the clocks of the properties with these numbers.
+    First the states of properties (monitor, number), then the variables (monitor, name; None if it is not state) with
+    their `struct` codes, then the clocks of the properties with these numbers.
     """
 
     properties: list[tuple[str, int]] = []
@@ -34,51 +34,51 @@ class CellNames(msgspec.Struct, frozen=True, array_like=True):
     clocks: list[int] = []
 
 
-class Home(Protocol):
-    """Where the state of monitors is: with Python, or in a module."""
+class StateHolder(Protocol):
+    """The holder of the state of monitors, in Python or in a module."""
 
     names: CellNames
-    """What `cells` are."""
+    """The layout of `cells`."""
 
     def leave(self) -> None:
-        """See that Python has it."""
+        """Move the state to Python."""
 
     def show(self) -> None:
-        """Give Python a copy of it."""
+        """Copy the state to Python."""
 
     size: int
-    """Bytes of `cells`; 0 where the state is more than numbers."""
+    """Size of `cells`; 0 if the state is more than numbers."""
 
     left: bool
-    """Python has had the state since it was last kept."""
+    """Whether the state has been in Python since it was last saved."""
 
     def cells(self) -> bytes | None:
-        """The state as it is in the module's memory, if it is only numbers; empty if Python has it, and had it when it
-        was last kept. None: it is to be kept as Python has it.
+        """Return the state in the module's memory if it is only numbers; empty if Python has had it since it was last
+        saved; None if the state must be saved as Python has it.
         """
 
 
 @dataclass(eq=False, slots=True)
-class Group:
-    """The monitors that share topics or variables, so that a message changes the state of one group at most.
+class MonitorGroup:
+    """Monitors that share topics or variables, so that a message changes the state of at most one group.
 
-    `ways` are their topics and parts of services; `changed`: something else than the module may have changed their
-    state since that was last kept.
+    `ways` are their topics and parts of services. `changed`: the state may have changed outside the module since it was
+    last saved.
     """
 
-    monitors: tuple["Monitor", ...]
+    monitors: tuple["MonitorInstance", ...]
     ways: frozenset[str]
-    home: Home | None = None
+    home: StateHolder | None = None
     changed: bool = True
 
 
-Handler = Callable[[Message | None], None]
+Handler = Callable[[WireMessage | None], None]
 
 
 @dataclass(eq=False, slots=True)
 class RunningProperty:
-    """A property of a running specification: the monitor of its formula, what is kept of it to explain a verdict, and
-    its handlers in source order.
+    """A property of a running specification: its run, the history that explains verdicts, and its handlers in source
+    order.
     """
 
     index: int
@@ -88,12 +88,12 @@ class RunningProperty:
     history: Exits | Steps
 
     def begin(self, time_ns: int) -> None:
-        """Begin anew."""
+        """Restart."""
         self.run = self.code.property.start(time_ns)
         self.history.begin(time_ns)
 
     def mark(self) -> Callable[[], None]:
-        """Return what takes back all that comes to the property from here on, but time."""
+        """Return a function that undoes everything after this call except the passing of time."""
         run = cast("FormulaRun", self.run)
         before, history = run.mark(), self.history.mark()
 
@@ -107,27 +107,27 @@ class RunningProperty:
 
 @dataclass(eq=False, slots=True)
 class Step:
-    """What one event does with a message: its function, then its properties.
+    """One event's processing of a message: its function, then its properties.
 
-    `past` counts how often the event did not happen because an index was past the end, since `told`.
+    `past` counts how often since `told` the event did not happen because an index was past the end.
     """
 
-    monitor: "Monitor"
+    monitor: "MonitorInstance"
     event: EventCode
     index: int
     name: str
-    function: Callable[[Message | None], bool]
+    function: Callable[[WireMessage | None], bool]
     first: bool = False
-    """The first of its monitor on its topic."""
+    """Whether it is the first of its monitor on its topic."""
     past: int = 0
     told: int | None = None
-    key: Callable[[Message], Any] | None = None
-    """Of a parametric specification: what a message binds of its parameters (see `compile/events.py`)."""
+    key: Callable[[WireMessage], Any] | None = None
+    """For a parametric specification: the parameters that a message binds."""
 
 
 @dataclass(eq=False, slots=True)
 class Timer:
-    """An event that happens every so often; `due` is the time of its next tick, None while it does not run."""
+    """A periodic event; `due` is the time of its next tick, None while it does not run."""
 
     step: Step
     period: int
@@ -136,7 +136,7 @@ class Timer:
 
 
 @dataclass(eq=False, slots=True)
-class Monitor:
+class MonitorInstance:
     """A running specification."""
 
     code: SpecificationCode
@@ -147,48 +147,48 @@ class Monitor:
     enabled: bool = True
     held: bool = False
     why_held: str = ""
-    """Why, if it is because its state was lost."""
+    """Why its state was lost, if it holds its topics for that."""
     broken: bool = False
-    """Its first values or `init` faulted, so it has no state to judge by."""
+    """Whether its first values or `init` faulted, so that it has no valid state."""
     faults: int = 0
     seen: bool = False
-    """A message of one of its events has come."""
-    home: Home | None = None
-    """Where its state is, if that may be in a module."""
+    """Whether a message of one of its events has come."""
+    home: StateHolder | None = None
+    """The holder of its state, if that may be in a module."""
     slices: Slices | None = None
-    """Of a parametric specification: its states. `properties` have the runs of the one that was looked at last."""
+    """The slices of a parametric specification. `properties` has the runs of the slice used last."""
     slice: Slice | None = None
-    """The slice that was looked at last."""
-    group: Group | None = None
-    """Those whose state changes together with its own."""
+    """The slice used last."""
+    group: MonitorGroup | None = None
+    """The monitors whose state changes together with its own."""
     trail: deque[Bound] = field(default_factory=partial(deque, maxlen=TRAIL))
-    """Of a parametric specification: what happened last in all slices."""
+    """The last events of all slices of a parametric specification."""
 
     @property
     def name(self) -> str:
-        """The name of the specification."""
+        """Return the name of the specification."""
         return self.code.name
 
     @property
     def failing(self) -> bool:
-        """Whether it has faulted so often, or could not even begin, that somebody should look."""
+        """Whether it failed to start, or has faulted often."""
         return self.broken or self.faults >= FAILING_AFTER
 
     def hold(self, why: str = "") -> None:
-        """Drop the messages of its topics until `resume`."""
+        """Drop messages of its topics until `resume`."""
         self.held, self.why_held = True, why
 
     def resume(self) -> None:
-        """Let the messages of its topics go on."""
+        """Let messages of its topics pass again."""
         self.held, self.why_held = False, ""
 
     def touch(self) -> None:
-        """Note that its state, or that of others in its group, is about to change."""
+        """Note that the state of its group is about to change."""
         if self.group is not None:
             self.group.changed = True
 
     def come_home(self) -> None:
-        """Before Python looks at its state, or at that of others on its topics, it is with Python."""
+        """Move its state to Python, before Python reads the state of this monitor or of others on its topics."""
         if self.home is not None:
             self.home.leave()
 
@@ -199,7 +199,7 @@ def monitors_of(
     time_ns: int,
     slices: int,
     holder_of: HolderOf,
-) -> tuple[Monitor, ...]:
+) -> tuple[MonitorInstance, ...]:
     """Return the running forms of compiled specifications, in their initial state.
 
     Each has at most `slices` slices, which are charged to `holder_of(source)`.
@@ -209,7 +209,7 @@ def monitors_of(
 
 def _monitor(
     interpreter: Interpreter, code: SpecificationCode, time_ns: int, slices: int, holder_of: HolderOf
-) -> Monitor:
+) -> MonitorInstance:
     function = interpreter.function
     properties = tuple(
         RunningProperty(
@@ -221,7 +221,7 @@ def _monitor(
         )
         for index, declared in enumerate(code.properties)
     )
-    monitor = Monitor(code, interpreter.contexts[code.context], properties)
+    monitor = MonitorInstance(code, interpreter.contexts[code.context], properties)
     if code.slicing is not None:
         monitor.slices = Slices(code, interpreter.variables, slices, holder_of)
     steps = [

@@ -1,27 +1,59 @@
-"""What comes of a message, of a tick and of a deadline, as values for the relay and for `rosrv monitor run`."""
+"""Outcomes of messages, ticks and deadlines, as values for the relay and for `rosmop run`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from rosmop.form.positions import Position
 from rosmop.form.sites import Site, showing
 from rosmop.logics.interface import Source
-from rosmop.run.causes import Explanation
 from rosmop.runtime.action_context import LogLine, Published
 from rosmop.runtime.wire import Buffer
 
 Result = Literal["passed", "changed", "dropped"]
 
 DROPPED = -1
-"""The place of the drop in `Outcome.handling`."""
+"""The key of the drop in `Outcome.handling`."""
+
+
+class MessageSender(NamedTuple):
+    """The source of a message (a number chosen by the caller; 0: none), and its sequence number, of this `kind`."""
+
+    source: int = 0
+    number: int = 0
+    kind: int = 0
+
+
+NOBODY = MessageSender()
+NO_NUMBER, SEQ = range(2)
+"""Kinds of sequence numbers: none; `seq` of the header."""
+
+
+class EventOccurrence(NamedTuple):
+    """An event (its number in the specification), its time and sender, and the name of the state after it, if any."""
+
+    event: int
+    time: int
+    sender: MessageSender
+    state: str = ""
+
+
+class Explanation(NamedTuple):
+    """Events that alone give a verdict. If they are the `fewest`, none of them can be left out.
+
+    With `since`, they lead to it from the property's state at this time (ns), after events that are no longer kept.
+    """
+
+    events: tuple[EventOccurrence, ...]
+    fewest: bool = True
+    since: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A property is in a category that has a handler. `property` counts from 0 in its specification; `source` is its
-    formula. `why` is None where nobody has asked (`MonitorSet.explain_when`), or it cannot be said.
+    """A property's arrival in a category that has a handler. `property` counts from 0 in its specification; `source` is
+    its formula. `why` is None if an explanation was not wanted (`MonitorSet.explain_when`) or is impossible.
 
     `binding` has the values of the parameters of a parametric specification, by name.
     """
@@ -37,7 +69,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """An action that could not go on: where it stands, why, and the values of the variables involved."""
+    """A fault, which stopped an action: position, reason, and the values of the variables involved."""
 
     monitor: str
     position: Position
@@ -46,42 +78,40 @@ class Fault:
 
 
 def named(verdict: Verdict) -> str:
-    """Which property of which monitor, with its binding, and the category that it is in."""
+    """Return monitor, property, binding and category of a verdict as text."""
     name = f"property {verdict.property + 1} of {verdict.monitor} ({verdict.logic}){bound(verdict)}"
     return f"{name}: {verdict.category}"
 
 
 def bound(verdict: Verdict) -> str:
-    """The binding as text that goes on from the name of the property; empty without parameters."""
+    """Return the binding as text after the name of the property; empty without parameters."""
     if not verdict.binding:
         return ""
     return f" with {', '.join(f'{name} = {value}' for name, value in verdict.binding.items())}"
 
 
 class Outcome:
-    """What is to be done with a message, and everything that happened on the way.
+    """The result of processing a message, and all events on the way.
 
-    `buffer` is what to relay: the buffer that came in (changed in place where that was possible), or another.
-    `events` are named `specification.event`. `timer` names what a tick or deadline belongs to
-    (`specification.tick`, `specification.timeout`, `specification.deadline`); `time` is in nanoseconds. `before`
-    are ticks and deadlines that were due before this message. `tried` is, of the beginning of a set, that of each of
-    its sets on trial.
+    `buffer` is the message to relay: the buffer that came in (changed in place where that was possible), or another.
+    `events` are named `specification.event`. `timer` names the source of a tick or deadline (`specification.tick`,
+    `specification.timeout`, `specification.deadline`); `time` is in nanoseconds. `before` are ticks and deadlines that
+    were due before this message. `shadowed` are, at the start of a set, the outcomes of its sets in shadow mode.
 
-    `changed_by` are the events whose actions made its bytes others than they found them, in order; empty unless the
-    result is `changed`; at `changed_at` stand the statements that assigned to the fields whose bytes are others. An
-    event that happened without a change, or assigned what was there, is not among them.
-    `dropped_by` is the specification that dropped it: by its last event, by `fatal` (a fault that dropped it), or for
-    `reason` (it is held, or could not begin); `dropped_at` is where the statement, the action or the specification
-    stands. `handling` has the verdicts in whose handlers the message was dropped (under `DROPPED`) and messages were
-    published (under their places in `published`).
+    `changed_by` are the events whose actions changed bytes of the message, in order; empty unless the result is
+    `changed`. `changed_at` are the positions of the statements that assigned to the changed fields. An event that
+    assigned nothing, or the same value, is not included. `dropped_by` is the specification that dropped the message:
+    by its last event, by `fatal` (a fault that dropped it), or for `reason` (it is held, or could not begin).
+    `dropped_at` is the position of the statement, the action or the specification. `handling` has the verdicts whose
+    handlers dropped the message (under `DROPPED`) or published messages (under their places in `published`).
 
     `looked` are the conditions that were met on the way, by their sites, with the values that they compared: each
     `when` of an event that happened, each `if` around a statement that dropped or changed the message, or published.
 
-    `overwritten` is, of a dropped message, what stood in the buffer that came in where actions have written into it
-    (place and bytes, in order): `restore` puts it back.
+    `overwritten` has, for a dropped message, the original bytes of the buffer that actions overwrote (place and bytes,
+    in order): `restore` writes them again.
 
-    Most messages have nothing to tell; so there is nothing to make for them but the object itself.
+    Most messages have none of this, so only the object itself is made for them.
     """
 
     result: Result = "passed"
@@ -92,7 +122,7 @@ class Outcome:
     log: Sequence[LogLine] = ()
     faults: Sequence[Fault] = ()
     before: Sequence["Outcome"] = ()
-    tried: Sequence["Outcome"] = ()
+    shadowed: Sequence["Outcome"] = ()
     reason: str | None = None
     changed_by: Sequence[str] = ()
     changed_at: Sequence[Position] = ()
@@ -109,14 +139,14 @@ class Outcome:
         self.time = time
 
     def restore(self, buffer: memoryview) -> None:
-        """Make of the buffer that came in what was received; one that cannot be written was left alone."""
+        """Restore the received bytes in the buffer, unless it is read-only."""
         if not buffer.readonly:
             for start, old in reversed(self.overwritten):
                 buffer[start : start + len(old)] = old
 
     @property
     def conditions(self) -> dict[str, dict[str, object]]:
-        """Where the conditions stand that were met, and the values that they compared."""
+        """Return the positions of conditions that were met, with the values that they compared."""
         return {
             str(site.position): {
                 each.name: showing(each.type)(value)

@@ -1,4 +1,4 @@
-"""Counts what hosts have of something finite, the oldest first."""
+"""Count each host's holdings of a bounded resource, oldest first."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
@@ -7,21 +7,21 @@ from typing import Generic, TypeVar
 Thing = TypeVar("Thing", bound=Hashable)
 
 Holder = Hashable | None
-"""Who has something, as whoever runs the monitors names it; None where nobody is told apart."""
+"""The holder of a slice, named by the caller; None if holders are not distinguished."""
 
 
 HolderOf = Callable[[int], Holder]
-"""Return who is charged for what the messages of a source make (`Sender.source`)."""
+"""Returns the holder that is charged for the slices of a source (`MessageSender.source`)."""
 
 
 def no_holder(_source: int) -> Holder:
-    """Charge nobody, where sources are not told apart."""
+    """Charge no holder: sources are not distinguished."""
     return None
 
 
 class Quota(Generic[Thing]):
-    """A holder has no more than is left for all others: whoever comes later finds room, and nobody loses anything for
-    them. None is bounded by the whole alone.
+    """The holdings of a bounded resource. A holder has at most as much as is free, so a later holder finds room, and no
+    other loses anything for it. The holder None is only bounded by the whole.
     """
 
     def __init__(self, whole: int) -> None:
@@ -34,17 +34,17 @@ class Quota(Generic[Thing]):
         return len(self._of.get(holder, ()))
 
     def fits(self, holder: Holder, more: int) -> bool:
-        """Whether the holder may have so many more."""
+        """Return whether the holder may have this number more."""
         left = self.whole - self.total - more
         return left >= 0 and (holder is None or self.held(holder) + more <= max(left, 1))
 
     def take(self, holder: Holder, thing: Thing) -> None:
-        """The holder has this."""
+        """Charge the holder for a thing."""
         self._of.setdefault(holder, OrderedDict())[thing] = None
         self.total += 1
 
     def give_back(self, holder: Holder, thing: Thing) -> None:
-        """The holder has this no more."""
+        """Release a thing of the holder."""
         mine = self._of[holder]
         del mine[thing]
         self.total -= 1
@@ -52,7 +52,7 @@ class Quota(Generic[Thing]):
             del self._of[holder]
 
     def oldest(self, holder: Holder) -> Thing:
-        """Return what the holder has had for longest."""
+        """Return the oldest thing of the holder."""
         return next(iter(self._of[holder]))
 
     def all(self) -> Iterator[tuple[Holder, Thing]]:
@@ -60,10 +60,10 @@ class Quota(Generic[Thing]):
         return ((holder, thing) for holder, things in self._of.items() for thing in things)
 
     def clear(self) -> None:
-        """Nobody has anything."""
+        """Release everything."""
         self._of.clear()
         self.total = 0
 
     def take_over(self, other: "Quota[Thing]") -> None:
-        """Go on from the counts of another, with the bound of this one."""
+        """Take over the counts of another quota, with the bound of this one."""
         self._of, self.total = other._of, other.total

@@ -1,31 +1,30 @@
 """The slices of a running parametric specification (Chen and Roşu, "Parametric trace slicing and monitoring", 2012).
 
-A *binding* gives some or all of the parameters a value. The *slice* of a binding are the events that bind nothing else
-than it does, from the first on that is a `creation event` (where there is none: from the first on). Each slice whose
-events bind all parameters is monitored, as if the specification stood there for it alone.
+A *binding* gives some or all of the parameters a value. The *slice* of a binding has the events that bind nothing
+beyond it, from the first `creation event` on (if there are none: from the first event on). Each slice whose events bind
+all parameters is monitored like a specification of its own.
 
 Theory of operation:
 
-1. `targets` returns the slices that an event belongs to: those whose bindings agree with what it binds, joined with it.
-   A slice that is not there yet begins with the state of the largest known binding in it; there is one such, because
-   with two known bindings that agree their union is known, too. Slices that lack a parameter (`seeds`) are kept for
-   that, and the output of their actions and handlers is left out.
-2. The engine makes each of them in turn the state of the monitor (`select`), steps it as any other, and takes the state
-   back (`settle`): the tables, functions and handlers are the ones of specifications without parameters. Where an
-   event only moves automata to other states, `step` and `quiet` do that.
-3. Each slice has its own clocks. `deadline` is the first deadline of all slices (a heap), `due` the slice that it
-   belongs to. A slice has one entry in the heap that counts (`Slice.due`), which may be too early, never too late.
-4. A slice ends when nothing of it can act any more: no event and no deadline leads to a handler, and no action, of
-   messages or of ticks, does more than to change its variables. Its binding is remembered, so that none begins anew
-   with it. A slice that is as at its beginning, and would begin with any event that matters to it, is forgotten at
-   once: nothing differs then.
-5. There are never more than `limit` slices, and each host (*holder*) has no more than are left for all others
-   (`quota.py`). A host that is at its bound pays itself: where the specification only observes, its own oldest slice is
-   forgotten; where it acts on messages or publishes, its new binding is `refused`, so that no host can have an
-   obligation of its own forgotten. No slice is removed for another host's. Bindings that have ended are
-   remembered under the same rule. No binding has more than `MAX_BINDING` bytes.
-6. What one message costs is bounded by these numbers. Where an event does not bind all parameters it may concern all
-   slices, and there are at most `TOGETHER_LIMIT`.
+1. `targets` returns the slices of an event: those whose bindings agree with the event's, joined with it. A new slice
+   starts with the state of the largest known binding within it; that is unique, because the union of two known
+   bindings that agree is also known. Slices that lack a parameter (`seeds`) are kept for this, without output of their
+   actions and handlers.
+2. The engine loads each slice in turn into the monitor (`select`), steps it like any other, and stores the state again
+   (`settle`): tables, functions and handlers are those of specifications without parameters. If an event only changes
+   the states of automata, `step` and `quiet` do so directly.
+3. Each slice has its own clocks. `deadline` is the first deadline of all slices (a heap), `due` its slice. A slice has
+   one valid entry in the heap (`Slice.due`), which may be too early, but never too late.
+4. A slice ends when it cannot act any more: no event and no deadline leads to a handler, and actions only change its
+   own variables. Its binding is remembered, so that it does not start again. A slice in its initial state that any
+   relevant event would create again is forgotten at once.
+5. There are at most `limit` slices, and no host (*holder*) has more than are left for all others (`slice_quota.py`). At
+   its bound a host pays itself. If the specification only observes, the host's oldest slice is forgotten; if it acts on
+   messages or publishes, the new binding is `refused`, so that no host can get rid of an obligation. A host never
+   causes the removal of another host's slice. Ended bindings are remembered under the same rule. No binding has more
+   than `MAX_BINDING` bytes.
+6. These numbers bound the cost of one message. An event that does not bind all parameters may concern all slices; then
+   there are at most `TOGETHER_LIMIT`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -52,29 +51,29 @@ from rosmop.runtime.action_context import FOLDED_NS
 from rosmop.types import value_types
 
 LIMIT = 100_000
-"""Slices of one specification, unless it is set otherwise."""
+"""Default limit of slices of one specification."""
 
 GROWING_LIMIT = 1_000
-"""The same where a run is more than the state of an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
+"""Limit if a run is more than the state of an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
 
-TOGETHER_LIMIT = 1_000
-"""The same where an event, or a tick, may concern all slices at once."""
+TOGETHER_LIMIT = 250
+"""Limit if an event, or a tick, may concern all slices at once: 2 µs each, 20 µs with a verdict, in one turn."""
 
 MAX_BINDING = 256
-"""Bytes of the strings in a binding."""
+"""Most bytes of the strings in a binding."""
 
 Key = tuple[Any, ...]
-"""A binding: True, and the values of the parameters that it has, in their order."""
+"""A binding: True, and the values of its parameters, in their order."""
 
 Binding = tuple[int, Key]
-"""The parameters that are bound, as a set of bits, and their values."""
+"""The bound parameters, as a set of bits, and their values."""
 
-_NAN = float("nan")  # one is found again, though it is not equal to itself
+_NAN = float("nan")  # this one object is found again, although NaN is not equal to itself
 
 
 @dataclass(eq=False, slots=True)
 class Slice:
-    """One slice: which parameters its binding has (a set of bits), their values, its state, and who has made it.
+    """One slice: the parameters of its binding (a set of bits), their values, its state, and the host that made it.
 
     It is `kept` once an event has happened in it, and `gone` once it has ended or was forgotten.
     """
@@ -87,18 +86,18 @@ class Slice:
     kept: bool = False
     gone: bool = False
     due: int | None = None
-    """The time of its entry in the heap of deadlines that counts."""
+    """The time of its valid entry in the heap of deadlines."""
     turn: int = 0
-    """The number of that entry: of several at one time the least comes first."""
+    """The number of that entry; at equal times the smallest comes first."""
 
     @property
     def deadline(self) -> int | None:
-        """The first deadline of its properties."""
+        """Return the first deadline of its properties."""
         times = [time for run in self.runs if (time := run.deadline) is not None]
         return min(times, default=None)
 
     def stand(self, states: Sequence[int]) -> None:
-        """Its automata are in these states."""
+        """Set the states of its automata."""
         for run, state in zip(self.runs, states, strict=True):
             run.state = state  # type: ignore[attr-defined]  # of tables
 
@@ -107,7 +106,7 @@ class Slice:
 class _Known:
     """The slices whose bindings have the same parameters; None for one that has ended.
 
-    `parts` has the keys again by the values of some of the parameters, for each set of parameters that is asked for.
+    `parts` has the same keys by the values of some of the parameters, for each set of parameters in use.
     """
 
     slices: dict[Key, Slice | None] = field(default_factory=dict)
@@ -137,13 +136,13 @@ class Slices:
         if any(_domain(event) != self._all for event in code.events):
             self.limit = min(self.limit, TOGETHER_LIMIT)
         self.refused: Mapping[str, object] | None = None
-        """The binding of the last event of which there can be no slice."""
+        """The binding of the last event that cannot have a slice."""
         self.why = ""
-        """Why not."""
+        """The reason."""
         self.changed: dict[Binding, Holder] | None = None
-        """The bindings whose state has changed since it was last kept, with their hosts; None if it is not kept."""
+        """Bindings whose state has changed since it was last saved, with their hosts; None if it is not saved."""
         self.behind: list[Slice] = []
-        """The slices that matter to the last event and have deadlines before it that have not passed yet."""
+        """Slices of the last event with earlier deadlines that are not processed yet."""
         self._code = code
         self._holder_of = holder_of
         self._namespace = namespace
@@ -151,13 +150,13 @@ class Slices:
         self._own = code.slicing.own
         self._forgets = not code.slicing.enforces
         self._timed = any(one.timed for one in properties)
-        self._floating = any(isinstance(kind, value_types.Floating) for _, _, kind in self._parameters)
+        self._floating = any(isinstance(kind, value_types.FloatingType) for _, _, kind in self._parameters)
         self._first: Slice
         self._holder: Holder = None
         self._now = 0
         self._known = {domain: _Known() for domain in _joined(_domain(event) for event in code.events)}
         self.quota: Quota[Binding] = Quota(self.limit)
-        """The bindings of the slices that there are, by the hosts that are charged for them."""
+        """Bindings of all slices, by the hosts that are charged for them."""
         self._ended: Quota[tuple[int, Key]] = Quota(self.limit)
         self._forgotten = 0
         self._told: int | None = None
@@ -166,7 +165,7 @@ class Slices:
         self._whole = self._known[self._all].slices
         self._formulas = [declared.property.suppresses for declared in code.properties]
         self.suppresses = any(self._formulas)
-        """Whether a dropped message is taken back in some of its properties."""
+        """Whether some of its properties undo dropped messages."""
         self._look_at(code.properties)
         for wanted in {_domain(event) for event in code.events}:
             for domain, known in self._known.items():
@@ -175,11 +174,11 @@ class Slices:
 
     @property
     def live(self) -> int:
-        """How many slices there are, with those that lack a parameter."""
+        """Return the number of slices, including those that lack a parameter."""
         return self.quota.total
 
     def _look_at(self, properties: Sequence[PropertyCode]) -> None:
-        """Find out in which states of automata a slice is over, as if there were none, or nothing but a state."""
+        """Compute the states of automata in which a slice is over, counts as absent, or is only a state."""
         self._properties, events = properties, self._code.events
         finite = [declared for declared in properties if isinstance(declared.property, FiniteProperty)]
         every = len(finite) == len(properties)
@@ -198,7 +197,7 @@ class Slices:
         ]
 
     def begin(self, properties: Sequence[PropertyCode], runs: tuple[Run, ...]) -> None:
-        """The specification begins: there are no slices, and the next ones begin as it has."""
+        """Start without slices; new ones begin with the present state of the specification."""
         self._look_at(properties)
         zero = tuple(self._namespace[code] for _, code, _ in self._parameters)
         values = self.own()
@@ -212,26 +211,26 @@ class Slices:
                 part.clear()
 
     def take_over(self, before: "Slices") -> None:
-        """Go on with those of the same specification before it was loaded again."""
+        """Take over the slices of the same specification before it was loaded again."""
         self._first, self._known = before._first, before._known
         self.quota.take_over(before.quota)
         self._ended.take_over(before._ended)
         self._deadlines, self._order = before._deadlines, before._order
         self._whole = before._whole
 
-    # What an event belongs to
+    # The slices of an event
 
     def step(self, event: int, key: Key) -> bool | None:
-        """Step the one slice that an event binds all parameters of, if nothing comes of it but states.
+        """Step the slice of an event that binds all parameters, if the only effect is new states.
 
-        Whether it has happened (not where the slice is over); None: there is more to do, and nothing is done.
+        Return whether it happened (False if the slice is over). None: there is more to do, and nothing is done.
         """
         if key not in self._whole:
             return None
         slice_, calm = self._whole[key], self._calm[event]
         if slice_ is None or calm is None:
             return False if slice_ is None else None
-        if len(calm) == 1:  # as below, for most
+        if len(calm) == 1:  # the most common case
             run: Any = slice_.runs[0]
             state = calm[0][run.state]
             if state < 0:
@@ -247,11 +246,11 @@ class Slices:
         return None
 
     def at(self, key: Key) -> Slice | None:
-        """The slice of all parameters with this key, if there is one."""
+        """Return the slice of all parameters with this key, if there is one."""
         return self._whole.get(key)
 
     def quiet(self, event: int, slice_: Slice) -> Sequence[int] | None:
-        """The states of a slice after an event, if nothing comes of it but those."""
+        """Return the states of a slice after an event, if the event has no other effect."""
         calm = self._calm[event]
         if calm is None or not slice_.kept:
             return None
@@ -259,15 +258,14 @@ class Slices:
         return after if min(after, default=0) >= 0 else None
 
     def stand(self, slice_: Slice, states: Sequence[int]) -> None:
-        """The automata of a slice are in these states."""
+        """Set the states of the automata of a slice."""
         slice_.stand(states)
         self._note(slice_)
 
     def targets(self, event: EventCode, key: Key, time_ns: int, source: int) -> Sequence[Slice]:
-        """The slices that an event belongs to: first those with all parameters, in the order in which they began.
+        """Return the slices of an event: first those with all parameters, in the order in which they began.
 
-        A slice that begins begins now, and its host is that of the `source`. `refused` says afterwards whether there
-        would be more of them.
+        New slices begin at this time, and belong to the host of `source`. `refused` is set if there would be more.
         """
         self.refused = None
         self.behind = []
@@ -292,7 +290,7 @@ class Slices:
         return [*whole, *seeds]
 
     def _agreeing(self, domain: int, key: Key) -> Iterator[Slice]:
-        """The slices that bind what the event binds, with the same values."""
+        """Return the slices that agree with the binding of the event."""
         for other, known in self._known.items():
             if other & domain == domain:
                 for known_key in self._with(other, domain, key):
@@ -306,14 +304,14 @@ class Slices:
         return slice_
 
     def _with(self, domain: int, part: int, key: Key) -> Sequence[Key]:
-        """The keys of this domain that have these values of the parameters in `part`."""
+        """Return the keys of this domain with these values of the parameters in `part`."""
         known = self._known[domain]
         if part == domain:
             return (key,) if key in known.slices else ()
         return [*known.slices] if not part else [*known.parts[part].get(key, ())]
 
     def _fresh(self, event: EventCode, domain: int, key: Key) -> list[Slice]:
-        """Those that begin with this event."""
+        """Return the slices that begin with this event."""
         own = dict(zip(event.binds, key[1:], strict=True))
         wanted = {(domain, key)} if event.creates and key not in self._known[domain].slices else set()
         order = [*wanted]
@@ -331,7 +329,7 @@ class Slices:
         return [slice_ for slice_ in found if slice_ is not None]
 
     def _derived(self, domain: int, key: Key, most: int) -> Slice | None:
-        """A slice with the state of the largest binding in this one that is known; None if that has ended."""
+        """Return a slice with the state of the largest known binding within this one; None if that has ended."""
         values = dict(zip(_members(domain), key[1:], strict=True))
         parent: Slice | None = self._first
         for other in sorted(self._known, key=int.bit_count, reverse=True):
@@ -357,14 +355,14 @@ class Slices:
         return Slice(domain, key, runs, parent.values, self._holder)
 
     def _full(self) -> str:
-        """Why the host can have no slice more."""
+        """Return why the host cannot have another slice."""
         if self._holder is None:
             return f"more than {self.limit} slices"
         held = self.quota.held(self._holder)
         return f"its host has {held} of {self.limit} slices, which is as many as are left for all others"
 
     def _has_room(self, most: int) -> bool:
-        """Whether the host may have so many slices more, or has some of its own to forget for them."""
+        """Return whether the host may have this number of slices more, or can forget some of its own."""
         return self.quota.fits(self._holder, most) or (self._forgets and self.quota.held(self._holder) > 0)
 
     def _refuse(self, domain: int, key: Key, why: str) -> None:
@@ -373,7 +371,7 @@ class Slices:
     # The state of the monitor
 
     def select(self, slice_: Slice) -> tuple[Run, ...]:
-        """Give the variables the values that they have in this slice; its runs, for the properties."""
+        """Load the values of variables of this slice; return its runs, for the properties."""
         namespace = self._namespace
         if slice_.domain == self._all:
             for (_, code, _), value in zip(self._parameters, slice_.key[1:], strict=True):
@@ -387,13 +385,13 @@ class Slices:
         return slice_.runs
 
     def own(self) -> tuple[Any, ...]:
-        """The values of the variables that each slice has of its own."""
+        """Return the values of the slices' own variables."""
         return tuple(self._namespace[name] for name in self._own)
 
     def settle(
         self, slice_: Slice, runs: tuple[Run, ...], values: tuple[Any, ...], *, happened: bool
     ) -> None:
-        """Take the state back; a slice that has begun with this event stays only if it `happened`."""
+        """Store the state in the slice; a slice that begins with this event stays only if the event `happened`."""
         slice_.runs, slice_.values = runs, values
         if slice_.gone:
             return
@@ -412,7 +410,7 @@ class Slices:
             self._await(slice_)
 
     def forgotten(self, time_ns: int) -> str:
-        """How many slices were forgotten for others of their host, in words; once in a while, else empty."""
+        """Return the number of slices forgotten for others of their host, as text; only now and then, else empty."""
         number = self._forgotten
         if not number or (self._told is not None and time_ns - self._told < FOLDED_NS):
             return ""
@@ -426,7 +424,7 @@ class Slices:
 
     @property
     def deadline(self) -> int | None:
-        """The first deadline of all slices; None if none waits."""
+        """Return the first deadline of all slices; None if there is none."""
         while self._deadlines:
             time, _, slice_ = self._deadlines[0]
             if time == slice_.due and not slice_.gone:
@@ -443,11 +441,11 @@ class Slices:
 
     @property
     def due(self) -> Slice:
-        """The slice whose deadline that is."""
+        """Return the slice with this deadline."""
         return self._deadlines[0][2]
 
     def _await(self, slice_: Slice) -> None:
-        """See that the deadline of a slice is in the heap, or an earlier time."""
+        """Ensure that the deadline of a slice, or an earlier time, is in the heap."""
         deadline = slice_.deadline
         if deadline is None or (slice_.due is not None and slice_.due <= deadline):
             return
@@ -458,12 +456,12 @@ class Slices:
             self._tidy()
 
     def _tidy(self) -> None:
-        """Take out the entries that count no more: most of them."""
+        """Remove invalid entries, which are most of them."""
         self._deadlines = [one for one in self._deadlines if one[0] == one[2].due and not one[2].gone]
         heapify(self._deadlines)
 
     def restart(self, time_ns: int) -> None:
-        """Let the properties with time begin anew in each slice."""
+        """Restart the properties with time bounds in each slice."""
         self._deadlines.clear()
         for known in self._known.values():
             for slice_ in known.slices.values():
@@ -479,7 +477,7 @@ class Slices:
     # State
 
     def keep(self) -> None:
-        """Note from now on which bindings change; those that there are now, at once."""
+        """Track changed bindings from now on, starting with all present ones."""
         self.changed = {
             (domain, key): None if slice_ is None else slice_.holder
             for domain, known in self._known.items()
@@ -494,11 +492,11 @@ class Slices:
 
     @property
     def first(self) -> Slice:
-        """What the first slices begin as."""
+        """Return the initial state of slices."""
         return self._first
 
     def state(self, binding: Binding) -> Slice | None:
-        """The slice of a binding; None for one that has ended. Raises `KeyError` for one that is not known."""
+        """Return the slice of a binding; None if it has ended. Raises `KeyError` for an unknown binding."""
         domain, key = binding
         return self._known[domain].slices[key]
 
@@ -509,9 +507,9 @@ class Slices:
         live: Sequence[Slice],
         ended: Sequence[tuple[Binding, Holder]],
     ) -> None:
-        """Go on with the slices that another process had, in the order in which they began or ended (keys: `of_nan`).
+        """Continue with the slices of another process, in the order in which they began or ended (keys: `of_nan`).
 
-        Raises `KeyError` for a binding that there cannot be.
+        Raises `KeyError` for an impossible binding.
         """
         for code, value in zip(self._parameters, zero, strict=True):
             self._namespace[code[1]] = value
@@ -529,15 +527,15 @@ class Slices:
             self._put(domain, key, None)
             self._ended.take(holder, (domain, key))
 
-    # What is known
+    # Queries
 
     def is_whole(self, slice_: Slice) -> bool:
-        """Whether a slice has all parameters."""
+        """Return whether a slice has all parameters."""
         return slice_.domain == self._all
 
     def mark(self, slice_: Slice) -> Callable[[], None]:
-        """Return what takes back all that comes to the formulas of a slice from here on, but time; one that begins
-        with the message at hand has not begun, if there are only formulas.
+        """Return a function that undoes everything in the formulas of a slice from here on, except time. With formulas
+        only, it also undoes the beginning of a slice.
         """
         runs = slice_.runs
         begun = not slice_.kept and all(self._formulas)
@@ -563,13 +561,13 @@ class Slices:
         return take_back
 
     def _undo_end(self, slice_: Slice) -> None:
-        """Make a slice that has ended or was forgotten live again."""
+        """Revive a slice that has ended or was forgotten."""
         if not slice_.gone:
             return
         binding = (slice_.domain, slice_.key)
         known = self._known[slice_.domain].slices
         if known.get(slice_.key) is not None:
-            return  # another has begun since
+            return  # another slice has begun since
         if slice_.key in known:
             self._ended.give_back(slice_.holder, binding)
         slice_.gone = False
@@ -577,11 +575,11 @@ class Slices:
         self._put(*binding, slice_)
 
     def values(self, slice_: Slice) -> Mapping[int, Any]:
-        """The values of the parameters, by their numbers."""
+        """Return the values of parameters, by number."""
         return dict(zip(_members(slice_.domain), slice_.key[1:], strict=True))
 
     def binding(self, slice_: Slice) -> Mapping[str, object]:
-        """The values of the parameters, as they are told."""
+        """Return the values of parameters, as they are reported."""
         return self._shown(slice_.domain, slice_.key)
 
     def _shown(self, domain: int, key: Key) -> Mapping[str, object]:
@@ -604,7 +602,7 @@ class Slices:
         self._put(slice_.domain, slice_.key, slice_)
 
     def _leave(self, slice_: Slice) -> None:
-        """A slice is live no more."""
+        """Remove a slice from the live ones."""
         slice_.gone = True
         self.quota.give_back(slice_.holder, (slice_.domain, slice_.key))
 
@@ -619,7 +617,7 @@ class Slices:
             self._note(slice_)
 
     def _remember(self, domain: int, key: Key, holder: Holder) -> None:
-        """No slice begins with this binding, until the host has so many of them that it is forgotten."""
+        """Remember that this binding has ended, until the host has too many of these."""
         while not self._ended.fits(holder, 1):
             if not self._ended.held(holder):
                 if key in self._known[domain].slices:
@@ -647,12 +645,12 @@ class Slices:
 
 
 def of_nan(key: Key) -> Key:
-    """The key with the one NaN that is found again."""
+    """Return the key with all NaNs replaced by one object, so that it is found again."""
     return tuple(_NAN if value != value else value for value in key)  # noqa: PLR0124  NaN
 
 
 def _states(runs: Sequence[Run]) -> list[int]:
-    """Those of automata."""
+    """Return the states of automata."""
     return [run.state for run in runs]  # type: ignore[attr-defined]  # of tables
 
 
@@ -669,7 +667,7 @@ def _key(values: Mapping[int, Any], domain: int) -> Key:
 
 
 def _joined(domains: Iterator[int]) -> list[int]:
-    """What bindings can have: the parameters of one event, or of several together."""
+    """Return the possible sets of bound parameters: those of one event, or of several together."""
     found: set[int] = set()
     for domain in domains:
         found |= {domain, *(domain | other for other in found)}
@@ -677,7 +675,7 @@ def _joined(domains: Iterator[int]) -> list[int]:
 
 
 def _calm(code: PropertyCode, event: int, lost: frozenset[int], renews: bool) -> list[int]:
-    """The state after an event for each state; -1 where a handler runs, or the slice may be over or forgotten."""
+    """Return the state after an event for each state; -1 if a handler runs or the slice may end."""
     assert isinstance(code.property, FiniteProperty)  # noqa: S101  who asks has looked
     automaton, handled = code.property.automaton, {*code.order}
     return [
@@ -691,7 +689,7 @@ def _calm(code: PropertyCode, event: int, lost: frozenset[int], renews: bool) ->
 
 
 def _lost(code: PropertyCode) -> frozenset[int]:
-    """The states from which no event and no deadline leads to a handler any more, now or later."""
+    """Return the states from which no handler can run any more."""
     steps = _steps(code.property)
     handled = {*code.order}
     hopeful: set[int] = set()
@@ -707,7 +705,7 @@ def _lost(code: PropertyCode) -> frozenset[int]:
 
 
 def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
-    """For each state where an event or a deadline leads, and what is told then."""
+    """Return for each state the next states at events and deadlines, with their categories."""
     if isinstance(compiled, FiniteProperty):
         automaton = compiled.automaton
         return [[(target, automaton.verdicts[target]) for target in row] for row in automaton.table]
@@ -716,12 +714,12 @@ def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
     found = []
     for early, late, wait in zip(compiled.moves, compiled.late, compiled.waits, strict=True):
         ways = [(target, verdicts[target]) for target, _ in (*early, *late)]
-        found.append(ways if wait is None else [*ways, (wait.move[0], wait.told)])
+        found.append(ways if wait is None else [*ways, (wait.move[0], wait.categories)])
     return found
 
 
 def _renews(events: Sequence[EventCode], properties: Sequence[PropertyCode], everything: int) -> bool:
-    """Whether a slice that is as at its beginning may be forgotten: each event begins one, or changes nothing in it."""
+    """Return whether a slice in its initial state may be forgotten: each event begins one, or does not change it."""
     return all(
         _domain(event) == everything
         and (event.creates or (event.plain and all(_stays(one, number) for one in properties)))

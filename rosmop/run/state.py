@@ -1,13 +1,11 @@
 """The state of monitors as data that outlives their process: written group by group, read back under limits.
 
-A group is the specifications that share topics or variables, so a message changes the state of one group at most. What
-is kept of a monitor is all that decides what it does with the next message: variables, runs of properties, timers,
-whether it holds its topics. Not kept is what only explains: the events before a verdict, and when output that is
-throttled was last put out.
+A group has the specifications that share topics or variables, so a message changes the state of at most one group. The
+saved state is everything that affects the next message: variables, runs of properties, timers, and whether a monitor
+holds its topics. The events that explain a verdict, and the times of throttled output, are not saved.
 
-The state of a group whose variables are numbers is kept as the bytes that the module has in its memory (`CellNames`
-says what they are): that is what the common path costs. Times are those of the caller's clock, which the next process
-goes on with.
+The state of a group whose variables are numbers is saved as the bytes in the module's memory (`CellNames` describes
+them), which keeps the common path cheap. Times are those of the caller's clock, which the next process continues.
 """
 
 import hashlib
@@ -21,28 +19,28 @@ import msgspec
 
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
-from rosmop.run.monitor import CellNames, Monitor
+from rosmop.run.monitor import CellNames, MonitorInstance
 from rosmop.run.state_of_runs import StateTooLargeError, kept, run_of
-from rosmop.run.state_of_slices import KeptPart, KeptSlice, restore_slices
-from rosmop.runtime.values import Values
+from rosmop.run.state_of_slices import PartSnapshot, SliceSnapshot, restore_slices
+from rosmop.runtime.values import ValueCodec
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 MOST_BYTES = 64 << 10
-"""Bytes of a group's state, without slices. It is written with each batch that changes it."""
+"""Most bytes of a group's state, without slices. It is written with each batch that changes it."""
 
 _CLOCK = struct.Struct("<qq")
 
 
-class KeptTimer(msgspec.Struct, frozen=True, array_like=True):
-    """An event that happens every so often: when its next tick is due."""
+class TimerSnapshot(msgspec.Struct, frozen=True, array_like=True):
+    """A periodic event: the time of its next tick."""
 
     due: int | None
     ticked: bool
 
 
-class KeptMonitor(msgspec.Struct, frozen=True, array_like=True):
-    """A monitor's state; `identity` and `types` say of which text, and of which definitions of messages."""
+class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
+    """A monitor's state; `identity` and `types` identify its text and its message definitions."""
 
     name: str
     identity: bytes
@@ -53,15 +51,15 @@ class KeptMonitor(msgspec.Struct, frozen=True, array_like=True):
     faults: int
     held: bool
     why_held: str
-    timers: list[KeptTimer]
+    timers: list[TimerSnapshot]
     runs: list[Any]
     variables: dict[str, Any]
     first: tuple[list[Any], list[Any]] = ([], [])
-    """Of a parametric specification the values of its parameters, and its slices' own variables, as slices begin."""
+    """For a parametric specification: initial values of parameters and of the slices' own variables."""
 
 
-def encoded(states: Sequence[KeptMonitor]) -> bytes:
-    """The state of a group as bytes. Raises `StateTooLargeError`."""
+def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
+    """Serialize the state of a group. Raises `StateTooLargeError`."""
     data = msgspec.msgpack.encode(states)
     if len(data) > MOST_BYTES:
         raise StateTooLargeError(f"its state has {len(data)} bytes; {MOST_BYTES} are kept")
@@ -69,29 +67,29 @@ def encoded(states: Sequence[KeptMonitor]) -> bytes:
 
 
 def refused(why: str) -> bytes:
-    """What is written in the place of a state that is not kept."""
+    """Return the bytes that are written instead of a state that is not kept."""
     return msgspec.msgpack.encode(why)
 
 
-KeptGroup = tuple[Sequence[str], bytes, bytes, bytes | None]
-"""What was written of a group: the names of its monitors, what its cells are (`CellNames` as MessagePack), their state
-(`encoded`, `refused`), and the cells of the module if these are later.
+GroupSnapshot = tuple[Sequence[str], bytes, bytes, bytes | None]
+"""The saved state of a group: the names of its monitors, the layout of its cells (`CellNames` as MessagePack), their
+state (`encoded`, `refused`), and the cells of the module if these are later.
 """
 
 
 def states_of(
-    groups: Sequence[KeptGroup],
-) -> tuple[dict[str, KeptMonitor], dict[str, list[KeptSlice]], dict[str, str]]:
-    """The states that were kept, of a monitor that is in several the last, their slices, and why others are lost."""
-    found: dict[str, KeptMonitor] = {}
-    slices: dict[str, list[KeptSlice]] = {}
+    groups: Sequence[GroupSnapshot],
+) -> tuple[dict[str, MonitorSnapshot], dict[str, list[SliceSnapshot]], dict[str, str]]:
+    """Return the saved states (for each monitor the last), their slices, and why others are lost."""
+    found: dict[str, MonitorSnapshot] = {}
+    slices: dict[str, list[SliceSnapshot]] = {}
     lost: dict[str, str] = {}
     for group in groups:
         try:
             states = _decoded(group)
         except (msgspec.MsgspecError, ValueError, struct.error, LookupError, TypeError) as error:
             states = f"its state cannot be read: {error}"
-        if isinstance(states, KeptPart):
+        if isinstance(states, PartSnapshot):
             slices.setdefault(group[0][0], []).extend(states.slices)
             continue
         for name in group[0]:
@@ -99,17 +97,17 @@ def states_of(
                 slices[name] = []
             found.pop(name, None)
             lost[name] = states if isinstance(states, str) else "its state was not written"
-        found |= {state.name: state for state in states if isinstance(state, KeptMonitor)}
+        found |= {state.name: state for state in states if isinstance(state, MonitorSnapshot)}
     return found, slices, {name: why for name, why in lost.items() if name not in found}
 
 
-_DECODER: msgspec.msgpack.Decoder[list[KeptMonitor] | KeptPart | str] = msgspec.msgpack.Decoder(
-    list[KeptMonitor] | KeptPart | str
+_DECODER: msgspec.msgpack.Decoder[list[MonitorSnapshot] | PartSnapshot | str] = msgspec.msgpack.Decoder(
+    list[MonitorSnapshot] | PartSnapshot | str
 )
 _NAMES = msgspec.msgpack.Decoder(CellNames | None)
 
 
-def _decoded(group: KeptGroup) -> list[KeptMonitor] | KeptPart | str:
+def _decoded(group: GroupSnapshot) -> list[MonitorSnapshot] | PartSnapshot | str:
     _, names_of, base, cells = group
     states, names = _DECODER.decode(base), _NAMES.decode(names_of)
     if not isinstance(states, list) or cells is None or names is None:
@@ -117,7 +115,7 @@ def _decoded(group: KeptGroup) -> list[KeptMonitor] | KeptPart | str:
     return _with_cells(states, cells, names)
 
 
-def _with_cells(states: list[KeptMonitor], cells: bytes, names: CellNames) -> list[KeptMonitor]:
+def _with_cells(states: list[MonitorSnapshot], cells: bytes, names: CellNames) -> list[MonitorSnapshot]:
     found = {state.name: state for state in states}
     layout = struct.Struct(f"<{len(names.properties)}q{names.code}")
     values = layout.unpack_from(cells)
@@ -132,15 +130,15 @@ def _with_cells(states: list[KeptMonitor], cells: bytes, names: CellNames) -> li
     return states
 
 
-def kept_monitor(monitor: Monitor, variables: Mapping[str, Any], types: bytes) -> KeptMonitor:
-    """The state of a monitor as data. Raises `StateTooLargeError`."""
+def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: bytes) -> MonitorSnapshot:
+    """Return the state of a monitor as data. Raises `StateTooLargeError`."""
     slices = monitor.slices
     first: tuple[list[Any], list[Any]] = ([], [])
     if slices is not None:
         first = [*slices.first.key[1:]], [*slices.first.values]
     if monitor.home is not None:
         monitor.home.show()
-    return KeptMonitor(
+    return MonitorSnapshot(
         monitor.name,
         monitor.code.identity,
         types,
@@ -150,15 +148,15 @@ def kept_monitor(monitor: Monitor, variables: Mapping[str, Any], types: bytes) -
         monitor.faults,
         monitor.held,
         monitor.why_held,
-        [KeptTimer(timer.due, timer.ticked) for timer in monitor.timers],
+        [TimerSnapshot(timer.due, timer.ticked) for timer in monitor.timers],
         [kept(running.run) for running in monitor.properties] if slices is None else [],
         {name: variables[code] for name, code in monitor.code.variables.items()},
         first,
     )
 
 
-def shape(monitor: Monitor, variables: Mapping[str, Any]) -> bytes:
-    """What of a state tells whether anything has happened since the beginning: all but times."""
+def shape(monitor: MonitorInstance, variables: Mapping[str, Any]) -> bytes:
+    """Return a state without times, to compare it with the initial one."""
     monitor.come_home()
     runs = [
         kept(running.run)[0][:1] if hasattr(running.run, "state") else kept(running.run)
@@ -170,17 +168,17 @@ def shape(monitor: Monitor, variables: Mapping[str, Any]) -> bytes:
 
 
 def restore(
-    monitor: Monitor,
-    state: KeptMonitor,
-    slices: Sequence[KeptSlice],
+    monitor: MonitorInstance,
+    state: MonitorSnapshot,
+    slices: Sequence[SliceSnapshot],
     variables: dict[str, Any],
     compiled: Compiled,
     *,
     time_ns: int,
 ) -> None:
-    """Give a monitor that has just been made this state. Raises `ValueError`; then it has to begin."""
+    """Restore the state of a new monitor. Raises `ValueError`; the monitor must then start."""
     code, values, types = monitor.code, state.variables, compiled.types
-    fits = partial(_fits, Values(compiled.messages))
+    fits = partial(_fits, ValueCodec(compiled.messages))
     properties = monitor.properties if monitor.slices is None else ()
     if (len(state.runs), len(state.timers)) != (len(properties), len(monitor.timers)):
         raise ValueError("it has other properties or timers")
@@ -208,26 +206,26 @@ def restore(
 
 _HELD: Mapping[type, type | tuple[type, ...]] = MappingProxyType(
     {
-        value_types.Bool: bool,
-        value_types.Integer: int,
-        value_types.Time: int,
-        value_types.Duration: int,
-        value_types.Floating: (float, int),
-        value_types.String: bytes,
-        value_types.Characters: bytes,
+        value_types.BoolType: bool,
+        value_types.IntegerType: int,
+        value_types.TimeType: int,
+        value_types.DurationType: int,
+        value_types.FloatingType: (float, int),
+        value_types.StringType: bytes,
+        value_types.CharactersType: bytes,
     }
 )
 
 
-def _fits(known: Values, kind: Type, value: Any) -> bool:
-    """Whether a value is one of a type, as variables hold it."""
-    if isinstance(kind, value_types.Vector):
+def _fits(known: ValueCodec, kind: Type, value: Any) -> bool:
+    """Return whether a value has a type, as variables hold it."""
+    if isinstance(kind, value_types.VectorType):
         return (
             isinstance(value, list)
             and kind.length in (None, len(value))
             and all(_fits(known, kind.element, one) for one in value)
         )
-    if isinstance(kind, value_types.Record):
+    if isinstance(kind, value_types.RecordType):
         parts = known.fields(kind)
         return (
             isinstance(value, list)
@@ -237,11 +235,11 @@ def _fits(known: Values, kind: Type, value: Any) -> bool:
     return isinstance(value, _HELD.get(type(kind), ()))
 
 
-# --- which specifications act, and have something to remember ---
+# --- specifications that act and have a state ---
 
 
 def types_of(compiled: Compiled) -> dict[str, bytes]:
-    """Of each specification a digest of the definitions of messages that it uses."""
+    """Return for each specification a digest of the message definitions that it uses."""
     definitions = compiled.messages.definitions
     return {
         code.name: hashlib.sha256(
@@ -252,9 +250,9 @@ def types_of(compiled: Compiled) -> dict[str, bytes]:
 
 
 def guards(compiled: Compiled) -> frozenset[str]:
-    """The specifications that can drop, change or publish a message and have a state by which they judge.
+    """Return the specifications that can drop, change or publish a message, depending on a state.
 
-    One whose state is lost holds its topics.
+    If its state is lost, such a specification holds its topics.
     """
     starts = {name for code in compiled.specifications for name in code.start}
     acting: set[str] = set()
@@ -267,8 +265,8 @@ def guards(compiled: Compiled) -> frozenset[str]:
                 acting.add(function.context)
             elif isinstance(node, nodes.Assign) or (
                 isinstance(node, nodes.Read)
-                and isinstance(node.type, value_types.Vector | value_types.Record)
-            ):  # what a vector or message holds may change in place
+                and isinstance(node.type, value_types.VectorType | value_types.RecordType)
+            ):  # the contents of a vector or message may change in place
                 used.add(node.name)
     return frozenset(
         code.name

@@ -1,8 +1,8 @@
 """Runs of properties as plain data that outlives a process, and back.
 
-A run names the attributes that change (`keeps`). Their values become numbers, strings and arrays that MessagePack has:
-a container is `[tag, item, …]`, an object that may be referred to twice `["o", number]`, and its fields are the entry
-of that number in a table. Only the classes below are made again, and no code is run but theirs.
+A run names the attributes that change (`keeps`). Their values become numbers, strings and arrays of MessagePack: a
+container is `[tag, item, …]`, an object with several references `["o", number]`, with its fields in the entry of that
+number in a table. Reading creates only objects of the classes below.
 """
 
 from collections import deque
@@ -10,36 +10,36 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
-from rosmop.logics.bounded import PARTS, BoundedRun, Cell
+from rosmop.logics.bounded import PARTS, BoundedRun, FormulaCell
 from rosmop.logics.cfg import GrammarProperty
 from rosmop.logics.interface import ClockedRun, CompiledProperty, FiniteRun, Run
-from rosmop.logics.parsing import Frame, Shape
+from rosmop.logics.parsing import EarleySet, EarleyShape
 
 MOST_PARTS = 5_000
-"""Objects of one run: more than a hundred times what a usual run has."""
+"""Most objects of one run: more than a hundred times the usual number."""
 
 _CONTAINERS: Mapping[str, Callable[[list[Any]], Any]] = MappingProxyType(
     {"l": list, "t": tuple, "d": deque, "s": set}
 )
 _TAGS = MappingProxyType({made: tag for tag, made in _CONTAINERS.items()})
-_PARTS: Mapping[str, type[Any]] = MappingProxyType({**PARTS, "frame": Frame})
+_PARTS: Mapping[str, type[Any]] = MappingProxyType({**PARTS, "frame": EarleySet})
 _NAMES = MappingProxyType({part: name for name, part in _PARTS.items()})
 _SMALL = 1 << 63
 
 
 class StateTooLargeError(Exception):
-    """A state has more parts, or bytes, than are kept."""
+    """A state has too many parts, or bytes, to be saved."""
 
 
 def kept(run: Any) -> list[Any]:
-    """The state of a `Run` as plain data. Raises `StateTooLargeError`."""
+    """Return the state of a `Run` as plain data. Raises `StateTooLargeError`."""
     if isinstance(run, FiniteRun | ClockedRun):
         return [[getattr(run, name) for name in run.keeps], []]
     return _Writer(run).written()
 
 
 def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
-    """The run of a property whose state is `data`. Raises `ValueError` for data that no such run has."""
+    """Return the run of a property with the state `data`. Raises `ValueError` for invalid data."""
     run = compiled.start(time_ns)
     try:
         _Reader(compiled, run, data).read()
@@ -50,7 +50,7 @@ def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
 
 
 class _Writer:
-    """Writes the parts of one run, each once."""
+    """A writer of the parts of one run, each once."""
 
     def __init__(self, run: Any) -> None:
         self._run = run
@@ -81,7 +81,7 @@ class _Writer:
         ]
 
     def _part(self, part: Any) -> list[Any]:
-        if isinstance(part, Shape):
+        if isinstance(part, EarleyShape):
             return ["shape", *map(self._value, (part.items, part.done, part.width))]
         return [_NAMES[type(part)], *(self._value(getattr(part, name)) for name in part.keeps)]
 
@@ -104,7 +104,7 @@ class _Writer:
 
 
 class _Reader:
-    """Gives a run that has just begun the state that was written."""
+    """A reader that restores the written state in a new run."""
 
     def __init__(self, compiled: CompiledProperty, run: Any, data: Any) -> None:
         self._compiled = compiled
@@ -138,7 +138,7 @@ class _Reader:
     def _made(self, entry: list[Any]) -> Any:
         if entry[0] != "shape":
             made = object.__new__(_PARTS[entry[0]])
-            if isinstance(made, Cell):
+            if isinstance(made, FormulaCell):
                 made.journal = self._run.journal
             return made
         if not isinstance(self._compiled, GrammarProperty):
@@ -153,11 +153,11 @@ class _Reader:
             self._fill(run.operators[number], run.operators[number].keeps, fields)
 
     def _fill_run(self, names: tuple[str, ...], fields: list[Any]) -> None:
-        """Fill the run itself: its attributes stay what they were at its beginning (a grammar's frame may be gone)."""
+        """Fill the run itself; each attribute keeps the type of its first value (a grammar's frame may be gone)."""
         kinds = [type(getattr(self._run, name)) for name in names]
         self._fill(self._run, names, fields)
         for name, kind in zip(names, kinds, strict=True):
-            if not isinstance(getattr(self._run, name), kind if kind is not Frame else Frame | None):
+            if not isinstance(getattr(self._run, name), kind if kind is not EarleySet else EarleySet | None):
                 raise ValueError(f"a property has no such {name}")
 
     def _fill(self, target: Any, names: tuple[str, ...], fields: list[Any]) -> None:

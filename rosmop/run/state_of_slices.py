@@ -1,7 +1,8 @@
-"""The slices of a running parametric specification as data: what a message changes is written, and no more.
+"""The slices of a running parametric specification as data: only what a message changes is written.
 
-The slices are in `BUCKETS` parts by their bindings, each of which is written as a whole when one of its slices has
-changed. So a message costs what a part has, a hundredth of all slices, and a part is as it was before or after.
+The slices are divided by their bindings into `BUCKETS` parts. A part is written as a whole when one of its slices has
+changed. So a message costs as much as a part, a hundredth of all slices, and a part is written completely or not at
+all.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,8 +18,8 @@ from rosmop.types.value_types import Type
 BUCKETS = 128
 
 
-class KeptSlice(msgspec.Struct, frozen=True, array_like=True):
-    """A slice: which parameters its binding has (a set of bits), their values, who is charged for it, its state.
+class SliceSnapshot(msgspec.Struct, frozen=True, array_like=True):
+    """A slice: the parameters of its binding (a set of bits), their values, the host that is charged for it, its state.
 
     `number` counts in the order in which they began, or ended. One that has `ended` has no state.
     """
@@ -34,18 +35,18 @@ class KeptSlice(msgspec.Struct, frozen=True, array_like=True):
     turn: int = 0
 
 
-class KeptPart(msgspec.Struct, frozen=True, tag=True):
-    """A part of the slices of a specification."""
+class PartSnapshot(msgspec.Struct, frozen=True, tag="PartSnapshot"):
+    """Some of the slices of a specification."""
 
-    slices: list[KeptSlice]
+    slices: list[SliceSnapshot]
 
 
-class _Written(msgspec.Struct, frozen=True, tag="KeptPart"):
+class _Written(msgspec.Struct, frozen=True, tag="PartSnapshot"):
     slices: list[msgspec.Raw]
 
 
 class SliceParts:
-    """The parts of one specification as they were written last."""
+    """The parts of one specification, as last written."""
 
     def __init__(self, slices: Slices) -> None:
         self._slices = slices
@@ -55,7 +56,7 @@ class SliceParts:
         slices.keep()
 
     def changed(self) -> dict[int, bytes]:
-        """The parts that have changed since this was asked, by their number; why none is kept where one cannot be."""
+        """Return the parts that have changed since the last call, by number, or the reason why one cannot be saved."""
         bindings, dirty = self._slices.changed or {}, set()
         self._slices.changed = {}
         for binding, holder in bindings.items():
@@ -68,7 +69,7 @@ class SliceParts:
         return {number: self._encoded(number) for number in dirty}
 
     def all(self) -> list[bytes]:
-        """All parts."""
+        """Return all parts."""
         self.changed()
         return [self._encoded(number) for number in range(BUCKETS)]
 
@@ -88,7 +89,7 @@ class SliceParts:
         state: tuple[Any, ...] = ()
         if slice_ is not None:
             state = [*map(kept, slice_.runs)], [*slice_.values], slice_.due, slice_.turn
-        record = KeptSlice(number, domain, [*key[1:]], holder, ended, *state)
+        record = SliceSnapshot(number, domain, [*key[1:]], holder, ended, *state)
         part[binding] = number, ended, msgspec.Raw(msgspec.msgpack.encode(record))
 
     def _encoded(self, number: int) -> bytes:
@@ -101,14 +102,14 @@ def restore_slices(
     slices: Slices,
     code: SpecificationCode,
     first: tuple[Sequence[Any], Sequence[Any]],
-    records: Sequence[KeptSlice],
+    records: Sequence[SliceSnapshot],
     *,
     types: Mapping[str, Type],
     fits: Callable[[Type, Any], bool],
     time_ns: int,
 ) -> None:
-    """Give a specification that has just been made these slices; `first`: the values of parameters and of its own
-    variables as slices begin. Raises `ValueError`.
+    """Give a new specification these slices; `first` has the initial values of parameters and of the slices' own
+    variables. Raises `ValueError`.
     """
     assert code.slicing is not None  # noqa: S101  it is parametric
     parameters = [kind for _, _, kind in code.slicing.parameters]

@@ -1,6 +1,6 @@
-"""Which sub-formulas decide a formula about the past, over the events that explain a verdict: their texts and values.
+"""Finds the sub-formulas that decide a past-time formula over the events that explain a verdict.
 
-What is looked at are the few events of an explanation, so this is the meaning itself, position by position.
+An explanation has few events, so the formula is evaluated by its definition, position by position.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from rosmop.logics import mtl, ptcaret, ptltl
 from rosmop.logics.formula import Bounds, Formula, Syntax, nodes, read_formula
 from rosmop.logics.interface import Source
-from rosmop.run.causes import Explanation
+from rosmop.run.outcomes import Explanation
 
 _SYNTAXES: dict[str, Syntax] = {"ptltl": ptltl.SYNTAX, "mtl": mtl.SYNTAX, "ptcaret": ptcaret.SYNTAX}
 _BOOLEAN: dict[str, Callable[[list[bool]], bool]] = {
@@ -26,9 +26,9 @@ _MOST = 8
 
 
 def deciding(source: Source, why: Explanation) -> list[str]:
-    """Each sub-formula that decides the formula at the last of the events, with its value there.
+    """Return the sub-formulas that decide the formula at the last of the events, with their values there.
 
-    Nothing for other logics, for formulas about the future, and where what came before the events matters, too.
+    Empty for other logics, for formulas about the future, and if earlier events also matter.
     """
     syntax = _SYNTAXES.get(source.logic)
     if syntax is None or why.since is not None or not 0 < len(why.events) <= _MOST_EVENTS:
@@ -52,7 +52,7 @@ def _decisive(meaning: "Meaning", formula: Formula, at: int) -> Iterator[tuple[F
     if operator == "not":
         yield from _decisive(meaning, formula.operands[0], at)
     elif operator in ("and", "or", "implies", "xor", "iff"):
-        # one that is true decides `or`, one that is false `and`; else all do
+        # a true operand decides `or`, a false one `and`; otherwise all decide
         wanted = [
             meaning.holds(part, at) != (operator == "implies" and not number)
             for number, part in enumerate(formula.operands)
@@ -66,7 +66,7 @@ def _decisive(meaning: "Meaning", formula: Formula, at: int) -> Iterator[tuple[F
 
 
 class Meaning:
-    """Whether formulas hold at the positions of a trace."""
+    """The values of formulas at the positions of a trace."""
 
     def __init__(self, events: Sequence[str], times: Sequence[int]) -> None:
         self._events = events
@@ -76,14 +76,14 @@ class Meaning:
         self._plain: dict[int, Formula] = {}
 
     def holds(self, formula: Formula, at: int) -> bool:
-        """Whether a formula holds at a position."""
+        """Return whether a formula holds at a position."""
         key = id(formula), at
         if key not in self._known:
             self._known[key] = self._value(formula, at)
         return self._known[key]
 
     def _seen(self, at: int) -> list[int]:
-        """The positions up to this one without calls that have returned."""
+        """Return the positions up to this one, without calls that have returned."""
         seen: list[int] = []
         for place, event in enumerate(self._events[:at]):
             seen.append(place)
@@ -109,7 +109,7 @@ class Meaning:
         )
 
     def _past(self, operator: str, formula: Formula, places: list[int], *, dual: bool) -> bool:
-        """Over these positions; `dual` is the operator of the negated operands, negated."""
+        """Evaluate an operator over these positions; `dual` negates operands and result."""
         low, high = formula.bounds or (0, None)
         *first, last = formula.operands
         now = self._times[places[-1]]
@@ -133,14 +133,14 @@ class Meaning:
 
 
 class _Words:
-    """Formulas as text, in the words of a logic."""
+    """A formatter of formulas in the syntax of a logic."""
 
     def __init__(self, syntax: Syntax) -> None:
         levels = [syntax.unary, *(level.operators for level in syntax.levels)]
         self._spelled = {meant: word for words in levels for word, meant in reversed([*words.items()])}
 
     def text(self, formula: Formula) -> str:
-        """A formula; what has operands stands in parentheses inside another."""
+        """Return a formula as text; nested operators are in parentheses."""
         if not formula.operands:
             return formula.name or formula.operator
         parts = [

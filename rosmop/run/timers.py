@@ -1,34 +1,34 @@
-"""What time brings about: ticks (`every`) and deadlines, in the order of their times.
+"""Ticks (`every`) and deadlines, in the order of their times.
 
-Time is what the caller says, in nanoseconds. Ticks up to and including a time happen, and deadlines before it. Ticks
-that take longer than the caller's `patience` allows are left out, and that is logged; deadlines wait for the next time.
+The caller gives the time, in nanoseconds. Ticks up to and including a time happen, and deadlines before it. Ticks that
+take longer than the caller's `patience` are skipped, which is logged; deadlines wait for the next call.
 
-Slices of parametric specifications have deadlines of their own. Whoever makes up bindings chooses how many of them pass
-at one moment, so `advance` lets at most `most` of them pass; the others are due at once again. A slice takes no message
-before its own deadlines have passed (`Execution`).
+Slices of parametric specifications have their own deadlines. Senders choose the bindings, and so how many deadlines
+pass at one time. Therefore `advance` processes at most `most` of them; the others are due again at once. A slice takes
+no message before its own deadlines have passed (`MonitorExecution`).
 """
 
 from collections.abc import Callable, Sequence
 
-from rosmop.run.execution import EXPLAINED, Execution
-from rosmop.run.monitor import Monitor, RunningProperty, Timer
+from rosmop.run.execution import EXPLAINED, MonitorExecution
+from rosmop.run.monitor import MonitorInstance, RunningProperty, Timer
 from rosmop.run.outcomes import Outcome
 
 Patience = Callable[[], Callable[[], bool]]
 
 MAX_TICKS = 100_000
-"""Ticks of one timer between two messages; a clock that jumps further leaves the rest out, and says so."""
+"""Most ticks of one timer between two messages; after a larger jump of the clock the rest is skipped and reported."""
 
 
 class Agenda:
     """The timers and deadlines of monitors."""
 
     def __init__(
-        self, monitors: Sequence[Monitor], execution: Execution, patience: Patience, most: int
+        self, monitors: Sequence[MonitorInstance], execution: MonitorExecution, patience: Patience, most: int
     ) -> None:
-        """`patience()` is asked when something is due: what says whether that has taken too long."""
+        """`patience()` is called when something is due; its result returns whether that takes too long."""
         self.due: int | None = None
-        """When the next tick is due or the next deadline has passed; None if nothing is waited for."""
+        """Time of the next tick or deadline; None if there is none."""
         self._monitors = monitors
         self._execution = execution
         self._patience = patience
@@ -39,17 +39,17 @@ class Agenda:
         )
 
     def let_go(self) -> None:
-        """The set is gone: its monitors have no part any more that has them."""
+        """Drop all monitors, so that no reference cycle keeps the set alive."""
         for monitor in self._monitors:
             monitor.steps, monitor.timers, monitor.home, monitor.group = (), (), None, None
         self._monitors = ()
 
     def has_come(self, time_ns: int) -> bool:
-        """Whether something is due at this time."""
+        """Return whether something is due at this time."""
         return self.due is not None and self.due <= time_ns
 
     def schedule(self) -> None:
-        """Work out when something is due next. A deadline has passed only after its last nanosecond."""
+        """Compute the next time that something is due. A deadline passes after its last nanosecond."""
         if not self._timed:
             return
         timer, deadline = self._next_timer(), self._next_deadline()
@@ -59,18 +59,18 @@ class Agenda:
         self.due = min(times, default=None)
 
     def when_due(self, *, anew: bool) -> int | None:
-        """When something is due; worked out `anew` where walks may have moved deadlines on."""
+        """Return the next time that something is due; with `anew`, compute it: lanes may have moved deadlines."""
         if anew:
             self.schedule()
         return self.due
 
     def advance(self, time_ns: int) -> list[Outcome]:
-        """Let the ticks up to this time and the deadlines before it happen, in the order of their times."""
+        """Process the ticks up to this time and the deadlines before it, in the order of their times."""
         outcomes: list[Outcome] = []
         ticks: dict[int, int] = {}
         left = self._most
         over = self._patience()
-        self.schedule()  # walks may have moved deadlines on
+        self.schedule()  # lanes may have moved deadlines
         while self.has_come(time_ns):
             timer = self._next_timer()
             deadline = self._next_deadline(slices=left > 0)
@@ -104,7 +104,7 @@ class Agenda:
         return outcome
 
     def _leave_out(self, time_ns: int) -> Outcome:
-        """No tick up to this time happens any more."""
+        """Skip the ticks up to this time."""
         outcome = Outcome(time=time_ns)
         for monitor in self._monitors:
             for timer in monitor.timers:
@@ -131,9 +131,11 @@ class Agenda:
         ]
         return min(timers, key=lambda timer: timer.due or 0, default=None)
 
-    def _next_deadline(self, *, slices: bool = True) -> tuple[int, Monitor, RunningProperty | None] | None:
-        """The next deadline, and of which property it is; None there: of a slice (only with `slices`)."""
-        found: tuple[int, Monitor, RunningProperty | None] | None = None
+    def _next_deadline(
+        self, *, slices: bool = True
+    ) -> tuple[int, MonitorInstance, RunningProperty | None] | None:
+        """Return the next deadline and its property (None: it is a slice's; only with `slices`)."""
+        found: tuple[int, MonitorInstance, RunningProperty | None] | None = None
         for monitor in self._monitors:
             if monitor.enabled and monitor.slices is not None:
                 deadline = monitor.slices.deadline if slices else None

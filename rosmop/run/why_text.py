@@ -1,11 +1,11 @@
-"""The events of an explanation (`explanations.why_of`), a line for each, for people."""
+"""Formats the events of an explanation (`explanations.why_of`), one line each."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 
 def lines_of_why(why: Mapping[str, Any]) -> Iterator[str]:
-    """The events of an explanation, and how far they explain it."""
+    """Return a line for each event of an explanation, and one on how far they explain it."""
     events = list_of(why.get("events"))
     if not why:
         return
@@ -27,7 +27,7 @@ def lines_of_why(why: Mapping[str, Any]) -> Iterator[str]:
 
 
 def named(event: Mapping[str, Any]) -> str:
-    """One event: what, when, whose message, and the state that it led to."""
+    """Return one event: name, time, sender, and the state after it."""
     index = f" #{event['index']}" if "index" in event else ""
     seq = f" seq {event['seq']}" if "seq" in event else ""
     who = "".join(

@@ -1,5 +1,5 @@
-"""What the functions of a specification call: arithmetic as in C++, strings, vectors, output, bounds.
+"""The functions that specifications call: arithmetic as in C++, strings, vectors, output, bounds.
 
-Pure: time comes in with each message, and output goes out as values. Every function that can fault takes the
-number of the *site* (a place in the text of the specification) as its last argument.
+They do no I/O: each message brings the time, and output is returned as values. The last argument of a function that
+can fault is the number of the *site* (a position in the specification).
 """

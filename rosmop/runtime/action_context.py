@@ -1,12 +1,12 @@
-"""The bounds of one specification's actions, and what they hand out: log lines, published messages, faults.
+"""The bounds of one specification's actions, and their output: log lines, published messages, faults.
 
 Invariants:
 
-1. Between two calls of `begin` a specification spends at most its budget of instructions; loops, calls, copies of
-   anything long and walks over many elements of a message are charged before they are done. Where processor time is
-   bounded (`Turn.limit`), it is read every `STEP` instructions, and every `PART` elements of a walk or a copy.
-2. The values of a specification never hold more than `MAX_BYTES` plus `UNMEASURED` bytes. Whatever makes
-   something long says so to `allocate`; when enough has been said, the live values are measured.
+1. Between two calls of `begin` a specification spends at most its budget of instructions. Loops, calls, copies of long
+   values and reading many elements of a message are charged first. If processor time is bounded (`Turn.limit`), it is
+   read every `STEP` instructions, and every `PART` elements of a loop or copy.
+2. The values of a specification never exceed `MAX_BYTES` plus `UNMEASURED` bytes. Code that makes long values calls
+   `allocate`; after `UNMEASURED` bytes the live values are measured.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,42 +15,41 @@ from math import inf
 from typing import Any, NamedTuple
 
 BUDGET = 1_000_000
-"""Instructions that a specification may spend on one message."""
+"""The maximum number of instructions of a specification for one message."""
 
-TRIAL_BUDGET = 100_000
-"""Instructions that a specification on trial may spend on one message: what waits meanwhile waits some tens of
-milliseconds.
-"""
+SHADOW_BUDGET = 100_000
+"""The same for a specification in shadow mode: some tens of milliseconds, for which other messages wait."""
 
 FUEL_PER_SECOND = 1_500_000_000
-"""Instructions of a module that take about a second."""
+"""The number of a module's instructions that take about a second."""
 
 STEP = 250
 """Instructions between two readings of the processor time."""
 
 PART = 250
-"""Elements that are walked or made between two readings of the processor time."""
+"""Elements read or made between two readings of the processor time."""
 
-_AT_ONCE = 10e-9  # seconds that an instruction takes at least, of many that are charged before they are done
+_AT_ONCE = 10e-9  # minimum seconds of an instruction, for many that are charged in advance
 
 MAX_BYTES = 16 << 20
-"""Bytes that the values of a specification may hold together."""
+"""The maximum size in bytes of all values of a specification together."""
 
 UNMEASURED = 1 << 20
-"""Bytes that may be made between two measurements."""
+"""The number of bytes that may be allocated between two measurements."""
 
 MAX_CALLS = 100
-"""Calls of recursive helper functions inside each other."""
+"""The maximum depth of recursive calls of helper functions."""
 
 BYTES_PER_INSTRUCTION = 64
 OUTPUT_COST = 100  # instructions for a line of output or a published message
-FOLDED_NS = 60 * 10**9  # an event that does not happen for an index past the end is told once in this time
+# an event that does not happen because of an index past the end is reported once in this time
+FOLDED_NS = 60 * 10**9
 
 Measure = Callable[[object], int]
 
 
 class FaultError(Exception):
-    """An action cannot go on: at which site, and why."""
+    """A fault that stops an action: its site and reason."""
 
     def __init__(self, site: int, text: str) -> None:
         super().__init__(text)
@@ -72,12 +71,12 @@ class LogLine:
 
 
 def line_of(level: str, text: bytes, monitor: str) -> LogLine:
-    """A line with this text. Bytes that are not UTF-8 are shown as U+FFFD."""
+    """Return a line of output; U+FFFD replaces bytes that are not UTF-8."""
     return LogLine(level, text.decode("utf-8", "replace").rstrip("\n"), monitor)
 
 
 class Published(NamedTuple):
-    """A message to be published by a monitor; `site` is that of the statement."""
+    """A message that a monitor publishes; `site` is that of the statement."""
 
     monitor: str
     topic: str
@@ -88,41 +87,39 @@ class Published(NamedTuple):
 
 @dataclass(slots=True)
 class Turn:
-    """What the actions run for one message (or one tick) share: its time, what comes out, and what conditions that were
-    met have compared, by their sites.
-    """
+    """The state that all actions of one message or tick share: time, output, and values of evaluated conditions."""
 
     now: int = 0
     log: list[LogLine] = field(default_factory=list)
     published: list[Published] = field(default_factory=list)
     looked: dict[int, tuple[Any, ...]] = field(default_factory=dict)
-    reset: bool = False  # `__RESET;` was met, for the property whose handlers run
-    clock: Callable[[], float] | None = None  # seconds of processor time; None: they are not bounded
+    reset: bool = False  # `__RESET;` ran, for the property whose handlers run
+    clock: Callable[[], float] | None = None  # returns seconds of processor time; None: no bound
     seconds: float = inf
-    part: float = 1.0  # of them
+    part: float = 1.0  # of `seconds`
     until: float = inf
 
     def limit(self, clock: Callable[[], float], seconds: float) -> None:
-        """Bound the processor time of each message, tick or deadline from the next one on."""
+        """Limit the processor time of each message, tick or deadline from the next one on."""
         self.clock, self.seconds = clock, seconds
 
     def begin(self) -> None:
-        """Start the time of a message, a tick or a deadline."""
+        """Start the processor time of a message, a tick or a deadline."""
         if self.clock is not None:
             self.until = self.clock() + self.seconds * self.part
 
     def late(self, more: float = 0.0) -> bool:
-        """Whether the time is over, or will be after so many seconds."""
+        """Whether the time is over, or will be after `more` seconds."""
         return self.clock is not None and self.clock() + more > self.until
 
     def check(self) -> None:
-        """Raise a fault if the time is over."""
+        """Fault if the time is over."""
         if self.late():
             raise FaultError(-1, self.too_late)
 
     @property
     def too_late(self) -> str:
-        """The text of the fault."""
+        """Return the text of the fault."""
         return (
             f"more than {self.seconds * self.part * 1000:g} ms of processor time for one message: it has too many"
             f" elements or characters for its monitors (relay.budget is {self.seconds * 1000:g} ms; for a second after"
@@ -130,7 +127,7 @@ class Turn:
         )
 
     def exclude(self, make: Callable[[], Any]) -> Any:
-        """Return what `make` returns; its time does not count."""
+        """Call `make` without charging its time."""
         if self.clock is None:
             return make()
         began = self.clock()
@@ -140,7 +137,7 @@ class Turn:
 
 
 class Context:
-    """One specification: its name, what it has left of its budget, and where its output goes."""
+    """The bounds and the output of one specification: its name, and the rest of its budget."""
 
     __slots__ = (
         "_allocated",
@@ -162,14 +159,12 @@ class Context:
         measures: Mapping[str, Measure],
         live: Callable[[], Sequence[Mapping[str, object]]],
     ) -> None:
-        """`live` says which variables have values, once for those that specifications share and once for each call;
-        `measures` how much one holds, by their names.
-        """
+        """`live` returns the values of the set's and each call's variables; `measures` has a function for each name."""
         self.monitor = monitor
         self.turn = turn
         self.most = BUDGET
-        self.budget = BUDGET  # until the time is read again
-        self._left = 0  # beyond that
+        self.budget = BUDGET  # until the processor time is read again
+        self._left = 0  # of the budget after that
         self.throttled: dict[int, int] = {}
         self._allocated = 0
         self._measures = measures
@@ -177,13 +172,13 @@ class Context:
         self._pending = 0
 
     def begin(self, most: int | None = None) -> None:
-        """A new message: the whole budget, or at most so much of it."""
+        """Start a message with the whole budget, or with at most `most` instructions."""
         whole = self.most if most is None else min(most, self.most)
         self.budget = whole if self.turn.clock is None else min(STEP, whole)
         self._left = whole - self.budget
 
     def put_off(self) -> Callable[[], None]:
-        """Return what gives back the budget that is left now, and the time."""
+        """Return a function that restores the current budget and time."""
         budget, left, until = self.budget, self._left, self.turn.until
 
         def go_on() -> None:
@@ -192,19 +187,19 @@ class Context:
         return go_on
 
     def spend(self, instructions: int, site: int) -> None:
-        """Take from the budget; a fault if nothing is left."""
+        """Charge instructions to the budget; fault if it is used up."""
         self.budget -= instructions
         if self.budget < 0:
             self._go_on(site, "; is there a loop without end?")
 
     def walk(self, elements: int) -> None:
-        """Charge for a walk over so many elements of arrays, one by one, to a field behind them."""
+        """Charge for reading elements of arrays one by one, to reach a field after them."""
         self.budget -= elements
         if self.budget < 0:
             self._go_on(-1, ": too many elements stand before a field")
 
     def _go_on(self, site: int, otherwise: str) -> None:
-        """Take the next step from what is left; a fault if nothing is, or the time is over."""
+        """Release the next step of the budget; fault if the budget is used up or the time is over."""
         missing = -self.budget
         if missing > self._left:
             self._left = 0
@@ -217,7 +212,7 @@ class Context:
         self.budget += given
 
     def allocate(self, size: int, site: int, replaced: int = 0) -> None:
-        """`size` bytes are about to be made, or copied, in the place of `replaced` bytes of a variable."""
+        """Charge for making or copying `size` bytes, which replace `replaced` bytes of a variable."""
         if size > MAX_BYTES:
             raise FaultError(site, f"{_TOO_LARGE}: a value of {size} bytes")
         self.spend(size // BYTES_PER_INSTRUCTION, site)
@@ -226,12 +221,12 @@ class Context:
             self._measure(size - replaced, site)
 
     def log(self, level: str, text: bytes, site: int) -> None:
-        """A line of output."""
+        """Add a line of output."""
         self.spend(OUTPUT_COST + len(text) // BYTES_PER_INSTRUCTION, site)
         self.turn.log.append(line_of(level, text, self.monitor))
 
     def throttle(self, period: float, site: int) -> bool:
-        """Whether output at this site is due: the last was at least `period` seconds ago."""
+        """Whether output at this site is due: the last one was at least `period` seconds ago."""
         now = self.turn.now
         last = self.throttled.get(site)
         if last is not None and last <= now < last + period * 1e9:
@@ -240,7 +235,7 @@ class Context:
         return True
 
     def publish(self, topic: str, kind: str, data: bytes, site: int) -> None:
-        """A message to be published."""
+        """Add a message to publish."""
         self.spend(OUTPUT_COST, site)
         self.allocate(len(data), site)
         self._pending += len(data)

@@ -1,7 +1,7 @@
 """The functions that the form may call, by name.
 
-Those whose first parameter is `context` are handed that of the running specification, to charge it; those whose last
-one is `site` fault there.
+A first parameter `context` gets the context of the running specification, to charge it; a last parameter `site` gets
+the position of a fault.
 """
 
 import inspect
@@ -110,14 +110,14 @@ FUNCTIONS: Mapping[str, Function] = MappingProxyType(
 def _parameters(function: Function) -> tuple[str, ...]:
     try:
         return tuple(inspect.signature(function).parameters)
-    except ValueError:  # a function of Python's own that does not say
+    except ValueError:  # a builtin of Python without a signature
         return ()
 
 
 CHARGING = frozenset(
     name for name, function in FUNCTIONS.items() if _parameters(function)[:1] == ("context",)
 )
-"""Functions that are handed the context."""
+"""Functions that take the context."""
 
 FAULTING = frozenset(name for name, function in FUNCTIONS.items() if _parameters(function)[-1:] == ("site",))
-"""Functions that are handed the site."""
+"""Functions that take the site."""

@@ -1,42 +1,42 @@
-"""Values as text, as C++ prints them."""
+"""Format values as C++ prints them."""
 
 from rosmop.runtime.action_context import Context, FaultError
 
 MAX_PRECISION = 100
-_LONG = 1024  # bytes; a shorter text is not charged before it is made
+_LONG = 1024  # bytes; shorter text is not charged in advance
 
 
 def to_text_integer(value: int) -> bytes:
-    """`std::to_string` of an integer, and `<<` of one."""
+    """Return `std::to_string` of an integer, and `<<` of one."""
     return b"%d" % value
 
 
 def to_text_streamed(value: float) -> bytes:
-    """`std::cout << value`: six digits in all."""
+    """Return the text of `std::cout << value`: six digits in all."""
     return b"%g" % value
 
 
 def to_text_fixed(value: float, precision: int, site: int) -> bytes:
-    """`std::cout << std::fixed << std::setprecision(precision) << value`."""
+    """Return the text of `std::cout << std::fixed << std::setprecision(precision) << value`."""
     if not 0 <= precision <= MAX_PRECISION:
         raise FaultError(site, f"a precision of {precision}")
     return b"%.*f" % (precision, value)
 
 
 def to_text_precise(value: float, precision: int, site: int) -> bytes:
-    """`std::cout << std::setprecision(precision) << value`."""
+    """Return the text of `std::cout << std::setprecision(precision) << value`."""
     if not 0 <= precision <= MAX_PRECISION:
         raise FaultError(site, f"a precision of {precision}")
     return b"%.*g" % (precision, value)
 
 
 def to_text_character(value: int) -> bytes:
-    """`std::cout << character`."""
+    """Return the text of `std::cout << character`."""
     return bytes((value & 0xFF,))
 
 
 def to_text_alternate(template: bytes, value: int) -> bytes:
-    """`printf` with the flag `#`: octal begins with a 0, hexadecimal with 0x unless it is zero."""
+    """Return the text of `printf` with the flag `#`: octal begins with a 0, hexadecimal with 0x unless it is zero."""
     if not value:
         return template % value
     if template[-1:] != b"o":
@@ -52,7 +52,7 @@ def to_text_alternate(template: bytes, value: int) -> bytes:
 
 
 def to_text_hexadecimal(value: float, plus: bool, upper: bool) -> bytes:
-    """`%a`: the shortest hexadecimal form of a floating-point number."""
+    """Return the text of `%a`: the shortest hexadecimal form of a floating-point number."""
     digits, exponent, power = value.hex().partition("p")
     text = (digits.rstrip("0").rstrip(".") if "." in digits else digits) + exponent + power
     if plus and value >= 0:
@@ -61,13 +61,13 @@ def to_text_hexadecimal(value: float, plus: bool, upper: bool) -> bytes:
 
 
 def to_text_moment(nanoseconds: int) -> bytes:
-    """`std::cout << time`: seconds, a point, nine digits."""
+    """Return the text of `std::cout << time`: seconds, a point, nine digits."""
     sign = b"-" if nanoseconds < 0 else b""
     return b"%s%d.%09d" % (sign, *divmod(abs(nanoseconds), 1_000_000_000))
 
 
 def join_all(context: Context, pieces: tuple[bytes, ...], site: int) -> bytes:
-    """The pieces in a row."""
+    """Return the concatenated pieces."""
     size = sum(map(len, pieces))
     if size > _LONG:
         context.allocate(size, site)
@@ -77,7 +77,7 @@ def join_all(context: Context, pieces: tuple[bytes, ...], site: int) -> bytes:
 def formatted(
     context: Context, template: bytes, arguments: tuple[object, ...], size: int, site: int
 ) -> bytes:
-    """`template % arguments`, charged before it is made; `size` is how long it is without its strings."""
+    """Return `template % arguments`, charged in advance; `size` is its length without strings."""
     size += sum(len(argument) for argument in arguments if isinstance(argument, bytes))
     if size > _LONG:
         context.allocate(size, site)

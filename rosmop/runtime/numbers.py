@@ -10,11 +10,11 @@ from rosmop.runtime.action_context import FaultError
 
 _F32 = struct.Struct("<f")
 _EXACT = 1 << 53
-_F32_LIMIT = 3.4028235677973366e38  # from here on the nearest float is infinite
+_F32_LIMIT = 3.4028235677973366e38  # from this number on, the nearest float is infinite
 
 
 def f32(value: float) -> float:
-    """The nearest 32-bit float."""
+    """Return the nearest 32-bit float."""
     if -_F32_LIMIT < value < _F32_LIMIT:
         result: float = _F32.unpack(_F32.pack(value))[0]
         return result
@@ -22,8 +22,8 @@ def f32(value: float) -> float:
 
 
 def f32_of_integer(value: int) -> float:
-    """The nearest 32-bit float. A double holds integers up to 2 to the 53rd; of a larger one the low bits are first
-    gathered into one, so that it is rounded only once.
+    """Return the nearest 32-bit float. The low bits of an integer beyond 2**53, which a double cannot hold, are first
+    merged into one bit, so that it is rounded only once.
     """
     if -_EXACT <= value <= _EXACT:
         return f32(value)
@@ -34,7 +34,7 @@ def f32_of_integer(value: int) -> float:
 
 
 def truncate(value: float, least: int, most: int) -> int:
-    """A floating-point number as an integer: toward zero, at most the limits, NaN is 0."""
+    """Return a floating-point number as an integer: truncated, clamped to the limits, 0 for NaN."""
     if value != value:  # noqa: PLR0124  NaN
         return 0
     if value <= least:
@@ -43,13 +43,13 @@ def truncate(value: float, least: int, most: int) -> int:
 
 
 def wrap(value: int, bits: int, signed: bool) -> int:
-    """The integer of so many bits that `value` overflows to."""
+    """Wrap an integer to this number of bits."""
     value &= (1 << bits) - 1
     return value - (1 << bits) if signed and value >> (bits - 1) else value
 
 
 def divide(left: int, right: int, site: int) -> int:
-    """Integer division toward zero."""
+    """Divide integers, rounding toward zero."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) // abs(right)
@@ -57,7 +57,7 @@ def divide(left: int, right: int, site: int) -> int:
 
 
 def remainder(left: int, right: int, site: int) -> int:
-    """What is left of an integer division; it has the sign of `left`."""
+    """Return the remainder of an integer division, with the sign of `left`."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) % abs(right)
@@ -65,7 +65,7 @@ def remainder(left: int, right: int, site: int) -> int:
 
 
 def ratio(left: float, right: float) -> float:
-    """Floating-point division: by zero it is infinite, or NaN."""
+    """Divide floating-point numbers; division by zero gives infinity or NaN."""
     try:
         return left / right
     except ZeroDivisionError:
@@ -75,7 +75,7 @@ def ratio(left: float, right: float) -> float:
 
 
 def _total(function: Callable[..., float]) -> Callable[..., float]:
-    """The function with C's answers where Python's raises."""
+    """Return the function with C's results where Python's function raises."""
 
     def answer(*arguments: float) -> float:
         try:
@@ -98,7 +98,7 @@ def _log(function: Callable[[float], float]) -> Callable[[float], float]:
 
 
 def power(base: float, exponent: float) -> float:
-    """C's `pow`."""
+    """Return C's `pow`."""
     try:
         return math.pow(base, exponent)
     except ValueError:
@@ -112,7 +112,7 @@ def power(base: float, exponent: float) -> float:
 
 
 def round_half_away(value: float) -> float:
-    """C's `round`."""
+    """Return C's `round`."""
     if not math.isfinite(value):
         return value
     whole = math.floor(abs(value))
@@ -120,27 +120,27 @@ def round_half_away(value: float) -> float:
 
 
 def round_half_even(value: float) -> float:
-    """C's `rint`."""
+    """Return C's `rint`."""
     return math.copysign(float(round(value)), value) if math.isfinite(value) else value
 
 
 def floor(value: float) -> float:
-    """C's `floor`."""
+    """Return C's `floor`."""
     return math.copysign(float(math.floor(value)), value) if math.isfinite(value) else value
 
 
 def ceil(value: float) -> float:
-    """C's `ceil`."""
+    """Return C's `ceil`."""
     return math.copysign(float(math.ceil(value)), value) if math.isfinite(value) else value
 
 
 def trunc(value: float) -> float:
-    """C's `trunc`."""
+    """Return C's `trunc`."""
     return math.copysign(float(math.trunc(value)), value) if math.isfinite(value) else value
 
 
 def fma(left: float, right: float, added: float) -> float:
-    """C's `fma`: rounded once."""
+    """Return C's `fma`: rounded once."""
     if not (math.isfinite(left) and math.isfinite(right)):
         return left * right + added
     if not math.isfinite(added):
@@ -155,7 +155,7 @@ def fma(left: float, right: float, added: float) -> float:
 
 
 def signbit(value: float) -> bool:
-    """C's `signbit`: of -0.0, too."""
+    """Return C's `signbit`, also for -0.0."""
     return math.copysign(1.0, value) < 0
 
 
@@ -164,17 +164,17 @@ def _inverse_hyperbolic_tangent(value: float) -> float:
 
 
 def fmin(left: float, right: float) -> float:
-    """C's `fmin`: a number wins over NaN."""
+    """Return C's `fmin`: a number wins over NaN."""
     return right if left != left or right < left else left  # noqa: PLR0124  NaN
 
 
 def fmax(left: float, right: float) -> float:
-    """C's `fmax`: a number wins over NaN."""
+    """Return C's `fmax`: a number wins over NaN."""
     return right if left != left or right > left else left  # noqa: PLR0124  NaN
 
 
 def positive_difference(left: float, right: float) -> float:
-    """C's `fdim`."""
+    """Return C's `fdim`."""
     if math.isnan(left) or math.isnan(right):
         return math.nan
     return left - right if left > right else 0.0
@@ -229,15 +229,15 @@ MATH: dict[str, tuple[int, Callable[..., float]]] = {
     "erf": (1, math.erf),
     "erfc": (1, math.erfc),
 }
-"""Functions of `<math.h>` on doubles: how many arguments, and what they do."""
+"""Functions of `<math.h>` on doubles: number of arguments, and implementation."""
 
 
 def _of_floats(name: str, count: int) -> Callable[..., float]:
-    """A function of the C library on floats: what a compiled C++ monitor would call, to the last bit."""
+    """Return a function of the C library on floats, with the bits that a compiled C++ monitor would get."""
     function = getattr(ctypes.CDLL("libm.so.6"), f"{name}f")
     function.argtypes, function.restype = [ctypes.c_float] * count, ctypes.c_float
 
-    def call(*values: float) -> float:  # and nothing else that the library's object could do
+    def call(*values: float) -> float:  # hides the other attributes of the library's object
         result: float = function(*values)
         return result
 
@@ -247,4 +247,4 @@ def _of_floats(name: str, count: int) -> Callable[..., float]:
 FLOAT_MATH: dict[str, Callable[..., float]] = {
     name: _of_floats(name, count) for name, (count, _) in MATH.items()
 }
-"""The same on floats. Their results are not those on doubles, rounded: `sinf` of 380738.94 is another number."""
+"""Functions on floats. Their results can differ from rounded doubles, as for `sinf(380738.94)`."""

@@ -1,4 +1,4 @@
-"""Strings: bytes, as in C++. They never change; a change of one character makes a new string."""
+"""Operations on strings, which are immutable bytes: changing one character makes a new string."""
 
 import math
 import re
@@ -22,7 +22,7 @@ _FLOATING = re.compile(
 
 
 def join(context: Context, left: bytes, right: bytes, site: int) -> bytes:
-    """`left + right`."""
+    """Return `left + right`."""
     size = len(left) + len(right)
     if size > _LONG:
         context.allocate(size, site)
@@ -30,7 +30,7 @@ def join(context: Context, left: bytes, right: bytes, site: int) -> bytes:
 
 
 def extend(context: Context, text: bytes, added: bytes, site: int) -> bytes:
-    """`text` after `text += added`."""
+    """Return `text` after `text += added`."""
     size = len(text) + len(added)
     if size > _LONG:
         context.allocate(size, site, len(text))
@@ -38,13 +38,13 @@ def extend(context: Context, text: bytes, added: bytes, site: int) -> bytes:
 
 
 def repeat(context: Context, count: int, character: int, site: int) -> bytes:
-    """`std::string(count, character)`."""
+    """Return `std::string(count, character)`."""
     context.allocate(count, site)
     return bytes((character & 0xFF,)) * count
 
 
 def character(text: bytes, index: int, site: int) -> int:
-    """`text[index]`, a signed char. The one after the last is 0."""
+    """Return `text[index]`, a signed char; the one after the last is 0."""
     if 0 <= index < len(text):
         value = text[index]
         return value - 256 if value > 127 else value
@@ -54,14 +54,14 @@ def character(text: bytes, index: int, site: int) -> int:
 
 
 def member(text: bytes, index: int, site: int) -> int:
-    """`text.at(index)`, `front` and `back`: like `character`, but the one after the last is a fault."""
+    """Return `text.at(index)`, `front` or `back`: like `character`, but the one after the last is a fault."""
     if index == len(text):
         raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
     return character(text, index, site)
 
 
 def with_character(context: Context, text: bytes, index: int, value: int, site: int) -> bytes:
-    """`text` after `text[index] = value`."""
+    """Return `text` after `text[index] = value`."""
     if not 0 <= index < len(text):
         raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
     if len(text) > _LONG:
@@ -70,7 +70,7 @@ def with_character(context: Context, text: bytes, index: int, value: int, site: 
 
 
 def substring(context: Context, text: bytes, start: int, count: int, site: int) -> bytes:
-    """`text.substr(start, count)`."""
+    """Return `text.substr(start, count)`."""
     if start > len(text):
         raise FaultError(site, f"substr from {start}, past the end of a string of {len(text)} characters")
     result = text[start : start + count]
@@ -80,21 +80,21 @@ def substring(context: Context, text: bytes, start: int, count: int, site: int) 
 
 
 def find(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
-    """`text.find(wanted, start)`."""
+    """Return `text.find(wanted, start)`."""
     context.spend(len(text) // 16, site)
     found = text.find(wanted, start) if start <= len(text) else -1
     return NOT_FOUND if found < 0 else found
 
 
 def find_last(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
-    """`text.rfind(wanted, start)`."""
+    """Return `text.rfind(wanted, start)`."""
     context.spend(len(text) // 16, site)
     found = text.rfind(wanted, 0, min(start, len(text)) + len(wanted))
     return NOT_FOUND if found < 0 else found
 
 
 def find_any(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
-    """`text.find_first_of(wanted, start)`."""
+    """Return `text.find_first_of(wanted, start)`."""
     context.spend(len(text), site)
     for first in range(start, len(text), PART):
         context.turn.check()
@@ -105,25 +105,25 @@ def find_any(context: Context, text: bytes, wanted: bytes, start: int, site: int
 
 
 def charged(context: Context, text: bytes, site: int) -> bytes:
-    """The text, all bytes of which are about to be looked at or copied."""
+    """Charge for reading or copying a text, and return it."""
     if len(text) > _LONG:
         context.spend(len(text) // BYTES_PER_INSTRUCTION, site)
     return text
 
 
 def compare(left: bytes, right: bytes) -> int:
-    """`left.compare(right)`, `strcmp`."""
+    """Return `left.compare(right)`, which is also `strcmp`."""
     return (left > right) - (left < right)
 
 
 def resize(context: Context, text: bytes, size: int, value: int, site: int) -> bytes:
-    """`text` after `text.resize(size, value)`."""
+    """Return `text` after `text.resize(size, value)`."""
     context.allocate(size, site, len(text))
     return text[:size].ljust(size, bytes((value & 0xFF,)))
 
 
 def erase(context: Context, text: bytes, start: int, count: int, site: int) -> bytes:
-    """`text` after `text.erase(start, count)`."""
+    """Return `text` after `text.erase(start, count)`."""
     if start > len(text):
         raise FaultError(site, f"erase from {start}, past the end of a string of {len(text)} characters")
     context.allocate(len(text), site, len(text))
@@ -131,7 +131,7 @@ def erase(context: Context, text: bytes, start: int, count: int, site: int) -> b
 
 
 def insert(context: Context, text: bytes, start: int, added: bytes, site: int) -> bytes:
-    """`text` after `text.insert(start, added)`."""
+    """Return `text` after `text.insert(start, added)`."""
     if start > len(text):
         raise FaultError(site, f"insert at {start}, past the end of a string of {len(text)} characters")
     context.allocate(len(text) + len(added), site, len(text))
@@ -139,7 +139,7 @@ def insert(context: Context, text: bytes, start: int, added: bytes, site: int) -
 
 
 def replace(context: Context, text: bytes, start: int, count: int, added: bytes, site: int) -> bytes:  # noqa: PLR0917  the arguments are C++'s
-    """`text` after `text.replace(start, count, added)`."""
+    """Return `text` after `text.replace(start, count, added)`."""
     if start > len(text):
         raise FaultError(site, f"replace at {start}, past the end of a string of {len(text)} characters")
     context.allocate(len(text) + len(added), site, len(text))
@@ -147,14 +147,14 @@ def replace(context: Context, text: bytes, start: int, count: int, added: bytes,
 
 
 def shorten(context: Context, text: bytes, site: int) -> bytes:
-    """`text` after `text.pop_back()`."""
+    """Return `text` after `text.pop_back()`."""
     if not text:
         raise FaultError(site, "pop_back of an empty string")
     return charged(context, text, site)[:-1]
 
 
 def filled(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
-    """A `char` buffer after `strcpy(buffer, text)`."""
+    """Return a `char` buffer after `strcpy(buffer, text)`."""
     _allocate(context, buffer, site)
     copied = _cut(text) + b"\0"
     if len(copied) > len(buffer):
@@ -163,7 +163,7 @@ def filled(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
 
 
 def filled_at_most(context: Context, buffer: bytes, text: bytes, count: int, site: int) -> bytes:
-    """A `char` buffer after `strncpy(buffer, text, count)`."""
+    """Return a `char` buffer after `strncpy(buffer, text, count)`."""
     _allocate(context, buffer, site)
     if count > len(buffer):
         raise FaultError(site, f"strncpy of {count} characters into a buffer of {len(buffer)}")
@@ -172,18 +172,18 @@ def filled_at_most(context: Context, buffer: bytes, text: bytes, count: int, sit
 
 
 def printed(context: Context, buffer: bytes, text: bytes, limit: int, site: int) -> bytes:
-    """A `char` buffer after `snprintf(buffer, limit, "%s", text)`."""
+    """Return a `char` buffer after `snprintf(buffer, limit, "%s", text)`."""
     return filled(context, buffer, text[: limit - 1], site) if limit else buffer
 
 
 def extended(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
-    """A `char` buffer after `strcat(buffer, text)`."""
+    """Return a `char` buffer after `strcat(buffer, text)`."""
     _allocate(context, buffer, site)
     return filled(context, buffer, _cut(buffer) + _cut(text), site)
 
 
 def terminated(context: Context, buffer: bytes, site: int) -> bytes:
-    """The string in a `char` buffer: up to the first zero."""
+    """Return the string in a `char` buffer: up to the first zero."""
     return _cut(charged(context, buffer, site))
 
 
@@ -193,13 +193,13 @@ def _cut(buffer: bytes) -> bytes:
 
 
 def _allocate(context: Context, buffer: bytes, site: int) -> None:
-    """A buffer is about to be made anew."""
+    """Charge for a new buffer."""
     if len(buffer) > _LONG:
         context.allocate(len(buffer), site, len(buffer))
 
 
 def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> int:
-    """`std::stoi` and its like; a fault where C++ throws."""
+    """Return the result of `std::stoi` and similar functions; fault where C++ throws."""
     found = _INTEGERS[base].match(text[:1000])
     if found is None:
         raise FaultError(site, "the string does not begin with a number")
@@ -212,7 +212,7 @@ def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> i
 
 
 def parse_floating(text: bytes, bits: int, site: int) -> float:
-    """`std::stod`, `std::stof`; a fault where C++ throws."""
+    """Return the result of `std::stod` or `std::stof`; fault where C++ throws."""
     found = _FLOATING.match(text[:1000])
     if found is None:
         raise FaultError(site, "the string does not begin with a number")
@@ -224,12 +224,12 @@ def parse_floating(text: bytes, bits: int, site: int) -> float:
 
 
 def lenient_integer(text: bytes) -> int:
-    """`atoi`: 0 for what is no number."""
+    """Return `atoi`: 0 for text that is not a number."""
     found = re.match(rb"\s*[+-]?[0-9]{1,18}", text[:1000])
     return int(found[0]) if found else 0
 
 
 def lenient_floating(text: bytes) -> float:
-    """`atof`: 0 for what is no number."""
+    """Return `atof`: 0 for text that is not a number."""
     found = _FLOATING.match(text[:1000])
     return float(found[1]) if found else 0.0

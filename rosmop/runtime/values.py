@@ -1,6 +1,6 @@
-"""Values by their types: the bytes they take, zeros, copies, and how they stand in a message.
+"""Operations on values by type: size, zeros, copies, and encoding in messages.
 
-A message is the list of its fields.
+The value of a message is the list of its fields.
 """
 
 import struct
@@ -12,7 +12,7 @@ from typing import Any
 from rosmop.runtime import vectors, wire
 from rosmop.runtime.action_context import Context
 from rosmop.types import value_types
-from rosmop.types.messages import Messages
+from rosmop.types.messages import MessageTypes
 from rosmop.types.value_types import Type
 
 _CODES = {
@@ -30,81 +30,83 @@ BILLION = 1_000_000_000
 
 
 def struct_code(kind: Type) -> str | None:
-    """The `struct` code of a type of fixed size (of times two: seconds and nanoseconds), None for others."""
-    if isinstance(kind, value_types.Bool):
+    """Return the `struct` code of a type of fixed size (two for seconds and nanoseconds of a time), or None."""
+    if isinstance(kind, value_types.BoolType):
         return "?"
-    if isinstance(kind, value_types.Integer):
+    if isinstance(kind, value_types.IntegerType):
         return _CODES[kind.signed, kind.bits]
-    if isinstance(kind, value_types.Floating):
+    if isinstance(kind, value_types.FloatingType):
         return "f" if kind.bits == 32 else "d"
     return _MOMENTS.get(kind)
 
 
 def struct_size(codes: str) -> int:
-    """The bytes of values with these `struct` codes."""
+    """Return the size of values with these `struct` codes."""
     return sum({"?": 1, "b": 1, "h": 2, "i": 4, "q": 8, "f": 4, "d": 8}[code.lower()] for code in codes)
 
 
-class Values:
-    """The values of the types of a set of message definitions. What deals with those of a type is made once."""
+class ValueCodec:
+    """Encodes, decodes, copies and measures values of a set of definitions; functions are cached by type."""
 
-    def __init__(self, messages: Messages, check: Callable[[], None] = lambda: None) -> None:
-        """`check` is called now and then while many elements are decoded; it may raise what stops that."""
+    def __init__(self, messages: MessageTypes, check: Callable[[], None] = lambda: None) -> None:
+        """`check` is called now and then while many elements are decoded; it may raise to stop the decoding."""
         self._messages = messages
         self._check = check
-        self._made: dict[tuple[Callable[[Values, Any], Any], Type], Callable[..., Any]] = {}
+        self._made: dict[tuple[Callable[[ValueCodec, Any], Any], Type], Callable[..., Any]] = {}
 
-    def _once(self, make: Callable[["Values", Any], Callable[..., Any]], kind: Type) -> Callable[..., Any]:
+    def _once(
+        self, make: Callable[["ValueCodec", Any], Callable[..., Any]], kind: Type
+    ) -> Callable[..., Any]:
         if (make, kind) not in self._made:
             self._made[make, kind] = make(self, kind)
         return self._made[make, kind]
 
-    def fields(self, kind: value_types.Record) -> list[Type]:
-        """The types of a message's fields, in order."""
+    def fields(self, kind: value_types.RecordType) -> list[Type]:
+        """Return the types of a message's fields, in order."""
         return [slot.type for slot in self._messages.slots(kind.name).values()]
 
     # Sizes
 
     def width(self, kind: Type) -> int:
-        """The bytes that C++ takes for a value (without what a string or vector in it points to)."""
-        if isinstance(kind, value_types.Integer | value_types.Floating):
+        """Return the size of a value in C++ (without the memory of strings and vectors)."""
+        if isinstance(kind, value_types.IntegerType | value_types.FloatingType):
             return kind.bits // 8
-        if isinstance(kind, value_types.Record):
+        if isinstance(kind, value_types.RecordType):
             return sum(map(self.width, self.fields(kind))) or 1
-        if isinstance(kind, value_types.Vector) and kind.length is not None:
+        if isinstance(kind, value_types.VectorType) and kind.length is not None:
             return kind.length * self.width(kind.element)
         return (
             1
-            if isinstance(kind, value_types.Bool)
+            if isinstance(kind, value_types.BoolType)
             else 8
             if kind in (value_types.TIME, value_types.DURATION)
             else 32
         )
 
     def least(self, kind: Type) -> int:
-        """The bytes of the shortest value in a message."""
+        """Return the encoded size of the shortest value."""
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
-        if isinstance(kind, value_types.Record):
+        if isinstance(kind, value_types.RecordType):
             return self._messages.definitions.layout(kind.name).minimum
-        if isinstance(kind, value_types.Vector) and kind.length is not None:
+        if isinstance(kind, value_types.VectorType) and kind.length is not None:
             return kind.length * self.least(kind.element)
         return 4
 
     def measure(self, kind: Type) -> Callable[[Any], int]:
-        """A function that says how many bytes a value holds."""
-        return self._once(Values._measure, kind)
+        """Return a function that measures a value."""
+        return self._once(ValueCodec._measure, kind)
 
     def _measure(self, kind: Type) -> Callable[[Any], int]:
-        if isinstance(kind, value_types.String | value_types.Characters):
+        if isinstance(kind, value_types.StringType | value_types.CharactersType):
             return len
-        if isinstance(kind, value_types.Vector):
+        if isinstance(kind, value_types.VectorType):
             width, inner = self.width(kind.element), self.measure(kind.element)
             if struct_code(kind.element):
                 return lambda values: len(values) * width
             return lambda values: len(values) * width + sum(map(inner, values))
-        if isinstance(kind, value_types.Record):
+        if isinstance(kind, value_types.RecordType):
             large = [
                 (index, self.measure(field))
                 for index, field in enumerate(self.fields(kind))
@@ -117,25 +119,25 @@ class Values:
     # Zeros and copies
 
     def maker(self, kind: Type) -> Callable[[], Any]:
-        """A function that makes a zero value (of void: None)."""
-        return self._once(Values._maker, kind)
+        """Return a function that makes a zero value (of void: None)."""
+        return self._once(ValueCodec._maker, kind)
 
     def _maker(self, kind: Type) -> Callable[[], Any]:
-        if isinstance(kind, value_types.Vector):
+        if isinstance(kind, value_types.VectorType):
             make, length, element = self.maker(kind.element), kind.length or 0, zero_of(kind.element)
             return lambda: [make() for _ in range(length)] if element is None else [element] * length
-        if isinstance(kind, value_types.Record):
+        if isinstance(kind, value_types.RecordType):
             makers = [self.maker(field) for field in self.fields(kind)]
             return lambda: [make() for make in makers]
         zero = zero_of(kind)
         return lambda: zero
 
     def copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
-        """A function that copies a value with all that is in it, charged: from context, value and site."""
-        return self._once(Values._copier, kind)
+        """Return a function of context, value and site that charges for a deep copy and makes it."""
+        return self._once(ValueCodec._copier, kind)
 
     def _copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
-        if isinstance(kind, value_types.Record):
+        if isinstance(kind, value_types.RecordType):
             copies = [
                 None if value_types.is_scalar(field) else self.copier(field) for field in self.fields(kind)
             ]
@@ -143,7 +145,7 @@ class Values:
                 part if copy is None else copy(context, part, site)
                 for copy, part in zip(copies, record, strict=True)
             ]
-        if not isinstance(kind, value_types.Vector):
+        if not isinstance(kind, value_types.VectorType):
             return lambda _context, value, _site: value
         width, element = self.width(kind.element), self.copier(kind.element)
         if value_types.is_scalar(kind.element):
@@ -153,13 +155,15 @@ class Values:
     # In a message
 
     def decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
-        """A function that finds the value at a position, and where it ends."""
-        return wire.text if isinstance(kind, value_types.String) else self._once(Values._decoder, kind)
+        """Return a function that decodes the value at a position, and returns its end."""
+        return (
+            wire.text if isinstance(kind, value_types.StringType) else self._once(ValueCodec._decoder, kind)
+        )
 
     def _decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
-        if isinstance(kind, value_types.Vector):
+        if isinstance(kind, value_types.VectorType):
             return self._decoder_of_vectors(kind)
-        if not isinstance(kind, value_types.Record):
+        if not isinstance(kind, value_types.RecordType):
             numbers = unpacker([struct_code(kind) or ""])
 
             def number(buffer: wire.Buffer, start: int) -> tuple[Any, int]:
@@ -186,7 +190,9 @@ class Values:
 
         return record
 
-    def _decoder_of_vectors(self, kind: value_types.Vector) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
+    def _decoder_of_vectors(
+        self, kind: value_types.VectorType
+    ) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
         code, least, element = struct_code(kind.element), self.least(kind.element), kind.element
         decode: Callable[[wire.Buffer, int, int], tuple[Any, int]]
         if code is None:
@@ -201,13 +207,17 @@ class Values:
         return lambda buffer, start: decode(buffer, start + 4, wire.count(buffer, start, least))
 
     def encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
-        """A function that appends the bytes of a value."""
-        return wire.put_text if isinstance(kind, value_types.String) else self._once(Values._encoder, kind)
+        """Return a function that appends the bytes of a value."""
+        return (
+            wire.put_text
+            if isinstance(kind, value_types.StringType)
+            else self._once(ValueCodec._encoder, kind)
+        )
 
     def _encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
-        if isinstance(kind, value_types.Vector):
+        if isinstance(kind, value_types.VectorType):
             return self._encoder_of_vectors(kind)
-        if not isinstance(kind, value_types.Record):
+        if not isinstance(kind, value_types.RecordType):
             pack_one = packer([struct_code(kind) or ""])
             return lambda value, out: out.extend(pack_one((value,)))
         parts: list[tuple[int, int, Any, Any]] = []
@@ -226,7 +236,7 @@ class Values:
 
         return record
 
-    def _encoder_of_vectors(self, kind: value_types.Vector) -> Callable[[Any, bytearray], None]:
+    def _encoder_of_vectors(self, kind: value_types.VectorType) -> Callable[[Any, bytearray], None]:
         code, length = struct_code(kind.element) or "", kind.length
         encode = None if code else self.encoder(kind.element)
 
@@ -245,8 +255,8 @@ class Values:
 
         return vector
 
-    def _runs(self, kind: value_types.Record) -> Iterator[tuple[bool, list[Type]]]:
-        """The fields in groups: numbers that follow each other, or one field of another kind."""
+    def _runs(self, kind: value_types.RecordType) -> Iterator[tuple[bool, list[Type]]]:
+        """Yield groups of fields: adjacent numbers, or one field of another kind."""
         for fixed, run in groupby(self.fields(kind), lambda field: struct_code(field) is not None):
             if fixed:
                 yield True, list(run)
@@ -255,18 +265,18 @@ class Values:
 
 
 def zero_of(kind: Type) -> bool | float | bytes | None:
-    """The zero of a type whose values do not change; None of void."""
-    if isinstance(kind, value_types.Bool):
+    """Return the zero of a type with immutable values; None for void."""
+    if isinstance(kind, value_types.BoolType):
         return False
-    if isinstance(kind, value_types.Floating):
+    if isinstance(kind, value_types.FloatingType):
         return 0.0
-    if isinstance(kind, value_types.Integer | value_types.Time | value_types.Duration):
+    if isinstance(kind, value_types.IntegerType | value_types.TimeType | value_types.DurationType):
         return 0
-    return b"" if isinstance(kind, value_types.String | value_types.Characters) else None
+    return b"" if isinstance(kind, value_types.StringType | value_types.CharactersType) else None
 
 
 def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[Any], int]]:
-    """Finds numbers with these `struct` codes, one after the other, and where they end; of two parts, nanoseconds."""
+    """Return a function that decodes numbers with these `struct` codes; two codes are nanoseconds."""
     plain = struct.Struct("<" + "".join(codes))
     unpack, size = plain.unpack_from, plain.size
     if all(len(code) == 1 for code in codes):
@@ -282,7 +292,7 @@ def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequenc
 
 
 def packer(codes: Sequence[str]) -> Callable[[Sequence[Any]], bytes]:
-    """The bytes of such numbers."""
+    """Return a function that encodes such numbers."""
     pack = struct.Struct("<" + "".join(codes)).pack
     if all(len(code) == 1 for code in codes):
         return lambda values: pack(*values)

@@ -1,6 +1,6 @@
-"""Vectors: Python lists. Functions that make something long charge for it first.
+"""Operations on vectors, which are Python lists. Functions that make long values charge first.
 
-`width` is the bytes that C++ takes for an element; it is what counts for the limit on memory.
+`width` is the size of an element in C++, in bytes; it counts for the limit on memory.
 """
 
 from collections.abc import Callable
@@ -10,18 +10,18 @@ from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, PART, Context, 
 
 Values = list[Any]
 
-LARGE = 1024  # bytes; what holds less is not charged when it is looked at
+LARGE = 1024  # bytes; reading a smaller value is not charged
 
 
 def element(values: Values, index: int, site: int) -> Any:
-    """`values[index]`."""
+    """Return `values[index]`."""
     if 0 <= index < len(values):
         return values[index]
     raise FaultError(site, f"index {index} is past the end of a vector of {len(values)}")
 
 
 def put(values: Values, index: int, value: Any, site: int) -> Any:
-    """`values[index] = value`; the value."""
+    """Assign `values[index] = value`; return the value."""
     if 0 <= index < len(values):
         values[index] = value
         return value
@@ -29,25 +29,25 @@ def put(values: Values, index: int, value: Any, site: int) -> Any:
 
 
 def put_slot(record: Values, slot: int, value: Any) -> Any:
-    """Set a field of a message; the value."""
+    """Set a field of a message; return the value."""
     record[slot] = value
     return value
 
 
 def append(context: Context, values: Values, value: Any, width: int, site: int) -> None:
-    """`values.push_back(value)`."""
+    """Append a value: `values.push_back(value)`."""
     context.allocate(width, site)
     values.append(value)
 
 
 def append_text(context: Context, values: Values, value: bytes, width: int, site: int) -> None:
-    """`values.push_back(text)`."""
+    """Append a string: `values.push_back(text)`."""
     context.allocate(width + len(value), site)
     values.append(value)
 
 
 def weighed(context: Context, values: Values, measure: Callable[[Values], int], site: int) -> Values:
-    """The vector or message, all of which is about to be looked at; `measure` says how many bytes it holds."""
+    """Charge for reading all of a vector or message, and return it; `measure` returns its size."""
     size = measure(values)
     if size > LARGE:
         context.spend(size // BYTES_PER_INSTRUCTION, site)
@@ -55,7 +55,7 @@ def weighed(context: Context, values: Values, measure: Callable[[Values], int], 
 
 
 def same(left: Any, right: Any) -> bool:
-    """Whether two vectors or messages hold the same. A NaN is like nothing, also not like itself."""
+    """Whether two vectors or messages are equal. A NaN equals nothing, not even itself."""
     return left == right and _numbers(left)
 
 
@@ -64,53 +64,53 @@ def _numbers(value: Any) -> bool:
 
 
 def pop(values: Values, site: int) -> None:
-    """`values.pop_back()`."""
+    """Remove the last element: `values.pop_back()`."""
     if not values:
         raise FaultError(site, "pop_back of an empty vector")
     values.pop()
 
 
 def copied(context: Context, values: Values, width: int, site: int) -> Values:
-    """A copy of a vector of numbers, strings or times."""
+    """Return a copy of a vector of numbers, strings or times."""
     context.allocate(len(values) * width, site)
     return values.copy()
 
 
 def copied_deep(context: Context, values: Values, width: int, copy: Callable[..., Any], site: int) -> Values:
-    """A copy of a vector of vectors or messages; `copy` copies an element."""
+    """Return a copy of a vector of vectors or messages; `copy` copies an element."""
     context.allocate(len(values) * width, site)
     return [copy(context, value, site) for value in values]
 
 
 def recast(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
-    """A vector of bytes as one of bytes of another kind."""
+    """Convert a vector of bytes to one of bytes of another kind."""
     context.allocate(len(values), site)
     return convert(values)
 
 
 def recast_each(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
-    """The same for the vectors in a vector."""
+    """Do the same for each vector in a vector."""
     context.allocate(len(values), site)
     return [convert(value) for value in values]
 
 
 def signed(values: Values) -> Values:
-    """`uint8_t` or `bool` as `int8_t`."""
+    """Return `uint8_t` or `bool` values as `int8_t`."""
     return memoryview(bytes(values)).cast("b").tolist()
 
 
 def unsigned(values: Values) -> Values:
-    """`int8_t` or `bool` as `uint8_t`."""
+    """Return `int8_t` or `bool` values as `uint8_t`."""
     return [value & 0xFF for value in values]
 
 
 def truths(values: Values) -> Values:
-    """Bytes as `bool`."""
+    """Return bytes as `bool`."""
     return list(map(bool, values))
 
 
 def filled(context: Context, count: int, make: Callable[[], Any], width: int, site: int) -> Values:
-    """`count` new elements."""
+    """Return `count` new elements."""
     context.allocate(count * width, site)
     context.spend(count // 4, site)
     return _made(context, count, make)
@@ -127,7 +127,7 @@ def _made(context: Context, count: int, make: Callable[[], Any]) -> Values:
 def resized(  # noqa: PLR0917  the arguments are C++'s
     context: Context, values: Values, count: int, make: Callable[[], Any], width: int, site: int
 ) -> None:
-    """`values.resize(count)`."""
+    """Change the number of elements: `values.resize(count)`."""
     more = count - len(values)
     if more <= 0:
         del values[count:]
@@ -136,7 +136,7 @@ def resized(  # noqa: PLR0917  the arguments are C++'s
 
 
 def assigned(values: Values, others: Values) -> Values:
-    """Put other elements in the place of all of a vector's."""
+    """Replace all elements of a vector."""
     values[:] = others
     return values
 
@@ -149,14 +149,14 @@ def filled_with(  # noqa: PLR0917  the arguments are C++'s
     measure: Callable[[Any], int],
     site: int,
 ) -> Values:
-    """`std::vector<T>(count, value)`; `measure` says how many bytes a value holds."""
+    """Return `std::vector<T>(count, value)`; `measure` returns the size of a value."""
     context.allocate(count * max(measure(value), 1), site)
     context.spend(count // 4, site)
     return _made(context, count, lambda: copy(value))
 
 
 def fixed(values: Values, count: int, site: int) -> Values:
-    """The elements for an array of fixed length: exactly so many."""
+    """Return the elements for an array of fixed length; fault if their number differs."""
     if len(values) != count:
         raise FaultError(site, f"{len(values)} elements for an array of exactly {count}")
     return values
@@ -168,7 +168,7 @@ def _check_span(values: Values, first: int, last: int, site: int) -> None:
 
 
 def erase(context: Context, values: Values, first: int, last: int | None, site: int) -> None:
-    """`values.erase(first)`, `values.erase(first, last)`."""
+    """Remove elements: `values.erase(first)`, `values.erase(first, last)`."""
     last = first + 1 if last is None else last
     _check_span(values, first, last, site)
     context.spend((len(values) - first) // 64, site)
@@ -176,7 +176,7 @@ def erase(context: Context, values: Values, first: int, last: int | None, site: 
 
 
 def insert(context: Context, values: Values, at: int, value: Any, width: int, site: int) -> None:  # noqa: PLR0917  the arguments are C++'s
-    """`values.insert(at, value)`."""
+    """Insert an element: `values.insert(at, value)`."""
     _check_span(values, at, len(values), site)
     context.allocate(width, site)
     context.spend(len(values) // 64, site)
@@ -184,7 +184,7 @@ def insert(context: Context, values: Values, at: int, value: Any, width: int, si
 
 
 def sort(context: Context, values: Values, first: int, last: int, site: int) -> None:
-    """`std::sort`: ascending."""
+    """Sort elements in ascending order: `std::sort`."""
     _check_span(values, first, last, site)
     steps = (last - first).bit_length()
     context.spend((last - first) * steps, site)
@@ -194,7 +194,7 @@ def sort(context: Context, values: Values, first: int, last: int, site: int) -> 
 
 
 def reverse(context: Context, values: Values, first: int, last: int, site: int) -> None:
-    """`std::reverse`."""
+    """Reverse elements: `std::reverse`."""
     _check_span(values, first, last, site)
     context.spend((last - first) // 4, site)
     values[first:last] = values[first:last][::-1]
@@ -209,7 +209,7 @@ def accumulate(  # noqa: PLR0917  the arguments are C++'s, and how to add
     start: Any,
     add: Callable[[Any, Any], Any],
 ) -> Any:
-    """`std::accumulate`."""
+    """Return the sum of elements: `std::accumulate`."""
     _check_span(values, first, last, site)
     context.spend(last - first, site)
     for index in range(first, last):

@@ -1,4 +1,4 @@
-"""The bytes of messages: pieces of decoding and encoding.
+"""Decode and encode the parts of messages.
 
 `buffer` is anything with the buffer interface that indexes bytes (bytes, bytearray, memoryview); positions count
 from its start. Reading past the end raises `MalformedError` or `struct.error`.
@@ -15,14 +15,14 @@ Buffer = bytes | bytearray | memoryview
 
 _LENGTH = struct.Struct("<I")
 MAX_EMPTY = 1_000_000
-"""Elements without bytes that one array may have."""
+"""The maximum number of elements of an array whose elements have no bytes."""
 
 _MAX_DECODED = 1_000_000  # elements that are decoded one by one
-FEW = 64  # elements that cost less than an instruction's worth of counting them
+FEW = 64  # elements that together take less time than one instruction
 
 
 def text(buffer: Buffer, start: int) -> tuple[bytes, int]:
-    """The string at `start`, and where it ends."""
+    """Return the string at `start`, and its end."""
     first = start + 4
     end = first + _LENGTH.unpack_from(buffer, start)[0]
     if end > len(buffer):
@@ -31,12 +31,12 @@ def text(buffer: Buffer, start: int) -> tuple[bytes, int]:
 
 
 def text_end(buffer: Buffer, start: int) -> int:
-    """Where the string at `start` ends."""
+    """Return the end of the string at `start`."""
     return int(start + 4 + _LENGTH.unpack_from(buffer, start)[0])
 
 
 def count(buffer: Buffer, start: int, least: int) -> int:
-    """How many elements the array at `start` has; each takes at least so many bytes."""
+    """Return the number of elements of the array at `start`; each has at least `least` bytes."""
     number: int = _LENGTH.unpack_from(buffer, start)[0]
     if number * least > len(buffer) - start - 4 or (not least and number > MAX_EMPTY):
         raise MalformedError(f"an array of {number} elements in a message of {len(buffer)} bytes")
@@ -44,7 +44,7 @@ def count(buffer: Buffer, start: int, least: int) -> int:
 
 
 def numbers(buffer: Buffer, start: int, number: int, code: str, size: int) -> tuple[list[Any], int]:
-    """`number` values of one `struct` code, and where they end."""
+    """Return `number` values of one `struct` code, and their end."""
     end = start + number * size
     if end > len(buffer):
         raise MalformedError(f"an array ends at byte {end} of a message of {len(buffer)}")
@@ -54,7 +54,7 @@ def numbers(buffer: Buffer, start: int, number: int, code: str, size: int) -> tu
 
 
 def moments(buffer: Buffer, start: int, number: int, code: str) -> tuple[list[int], int]:
-    """`number` times (code `I`) or durations (`i`) as nanoseconds, and where they end."""
+    """Return `number` times (code `I`) or durations (`i`) as nanoseconds, and their end."""
     pairs, end = numbers(buffer, start, 2 * number, code, 4)
     return [pairs[i] * 1_000_000_000 + pairs[i + 1] for i in range(0, len(pairs), 2)], end
 
@@ -66,7 +66,7 @@ def elements(
     decode: Callable[[Buffer, int], tuple[Any, int]],
     check: Callable[[], None],
 ) -> tuple[list[Any], int]:
-    """Return `number` values, each by `decode`, and where they end; `check` is called now and then."""
+    """Return `number` values decoded with `decode`, and their end; `check` is called now and then."""
     if number > _MAX_DECODED:
         raise MalformedError(
             f"an array of {number} elements; at most {_MAX_DECODED} that are no numbers are read"
@@ -81,7 +81,7 @@ def elements(
 
 
 def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context) -> int:
-    """Where `number` elements end, each of which ends where `end` says. Many are charged before they are walked."""
+    """Return the end of `number` elements; `end` returns the end of each. Many elements are charged first."""
     if number > FEW:
         context.walk(number)
     return _skipped(buffer, start, number, end, context)
@@ -90,7 +90,7 @@ def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], i
 def skip_inner(
     buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context
 ) -> int:
-    """As `skip`, within an element that is skipped: a few are charged, too, since there may be many such elements."""
+    """Do the same as `skip` within a skipped element: there may be many, so even a few elements are charged."""
     context.walk(number + 1)
     return _skipped(buffer, start, number, end, context)
 
@@ -124,13 +124,12 @@ def put_moments(values: list[int], code: str, out: bytearray) -> None:
     )
 
 
-class Message:
-    """The message that events look at: its bytes as changed so far, and what has become of it.
+class WireMessage:
+    """The message of an event: its bytes with all changes so far, and whether it is dropped.
 
-    Numbers are written where they stand, and only the bytes that were there are kept: a picture of a camera is not
-    copied for a changed stamp. `touched` has bits of every write of other bytes than were there; cleared after each
-    event, it says whether the event wrote, and by which of its statements at the sites `marks`. `cause` is the site of
-    the statement that dropped it.
+    Numbers are written in place, and only the replaced bytes are kept, so that an image is not copied for a changed
+    stamp. `touched` has a bit for each statement, at the sites `marks`, whose write changed bytes; it is cleared after
+    each event. `cause` is the site of the statement that dropped it.
     """
 
     __slots__ = (
@@ -148,8 +147,8 @@ class Message:
     def __init__(self, buffer: Buffer, time: int) -> None:
         self.buffer = buffer
         self.time = time
-        self.written: list[tuple[int, bytes]] | None = None  # where bytes were others, and which, in order
-        self._replaced: bytes | None = None  # the bytes as received, once the buffer is another
+        self.written: list[tuple[int, bytes]] | None = None  # where bytes changed, and the old ones, in order
+        self._replaced: bytes | None = None  # the bytes as received, once another buffer is used
         self.dropped = False
         self.cause: int | None = None
         self.touched = 0
@@ -165,18 +164,18 @@ class Message:
             return False
         ends = -1
         for start, old in sorted(self.written):
-            if start < ends:  # written twice: it may be as it was
+            if start < ends:  # written twice: the bytes may be as received
                 return bytes(self.buffer) != self._original()
             ends = start + len(old)
         return True  # `patch` has compared them
 
     @property
     def overwritten(self) -> Sequence[tuple[int, bytes]]:
-        """Where the buffer that came in had other bytes, and which, in order."""
+        """Return the positions of changed bytes, and the bytes that they replaced, in order."""
         return self.written or ()
 
     def patch(self, start: int, new: bytes, by: int = 1) -> None:
-        """Put bytes in the place of as many; `by` are the bits that `touched` gets if they are others."""
+        """Replace bytes with the same number of bytes; if they differ, `touched` gets the bits `by`."""
         end = start + len(new)
         old = self.buffer[start:end]
         if old == new:
@@ -193,7 +192,7 @@ class Message:
         self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
 
     def splice(self, edits: list[tuple[int, int, bytes, int]]) -> None:
-        """Put bytes in the place of those from the first to before the second number, for every edit; see `patch`."""
+        """Replace the bytes of each edit (start, end, new bytes, bits); see `patch`."""
         if all(len(new) == end - start for start, end, new, _ in edits):
             for start, _, new, by in edits:
                 self.patch(start, new, by)
@@ -210,7 +209,7 @@ class Message:
         self.buffer = bytearray(b"".join(pieces))
 
     def _original(self) -> bytes:
-        """The bytes as received, while the buffer is as long."""
+        """Return the bytes as received, while the buffer has the same length."""
         if not self.written:
             return bytes(self.buffer)
         original = bytearray(self.buffer)
@@ -220,13 +219,13 @@ class Message:
 
 
 def whole(
-    message: Message,
+    message: WireMessage,
     context: Context,
     decode: Callable[[Buffer, int], tuple[Any, int]],
     pending: tuple[tuple[bool, tuple[int | str, ...], Any], ...],
     site: int,
 ) -> list[Any]:
-    """All of a message, with the fields that the running action has assigned: (whether it has, path, value)."""
+    """Return a whole message with the fields that the action assigned; `pending`: (assigned, path, value)."""
     context.allocate(len(message.buffer), site)
     value: list[Any] = decode(message.buffer, 0)[0]
     for assigned, path, new in pending:
