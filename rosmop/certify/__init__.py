@@ -1,5 +1,6 @@
-"""Holds what the compilers of the logics make against the logics' definitions, with code of its own.
+"""Check compiled automata against the definitions of their logics, with code of its own.
 
-Nothing here is shared with `rosmop/logics`: the formula is read again from its text, and its meaning is followed event
-by event beside the automaton (`check.py`). What was not followed to its end is said so, never passed over.
+The certifier shares no code with `rosmop/logics`: it parses the formula again, and follows its meaning beside the
+automaton (`check.py`). It reports every property that it did not check to the end. `steps.py` then runs the compiled
+module against the certified automata, and lists what it shares with the writer of modules.
 """

@@ -1,12 +1,12 @@
-"""Whether an automaton gives, after every trace, the verdict that its formula's definition gives.
+"""Check that an automaton gives, after every trace, the verdict of its formula's definition.
 
-The formula is followed event by event beside the automaton, from the start on: a pair is what the definition has left
-and the state that the automaton is in. There are finitely many pairs, and each is looked at, with every event: so what
-holds for all pairs holds after every trace. The automaton's own words for its states play no part, nor does how it was
-made or made smaller.
+The check follows the formula and the automaton side by side, event by event, from the start. A pair is the remaining
+obligation of the definition and the state of the automaton. There are finitely many pairs, and the check visits each
+with every event, so a property of all pairs holds after every trace. The names of states do not matter, nor how the
+automaton was built or minimised.
 
-What is not certified is said with the reason: bounds of time and grammars (their monitors are no automata), and what
-would take too long.
+Properties that are not certified are reported with the reason: time bounds and grammars (their monitors are not finite
+automata), and properties that exceed the work limit.
 """
 
 import itertools
@@ -16,15 +16,15 @@ from functools import partial
 from typing import TypeVar
 
 from rosmop.certify import formula_reader, patterns
-from rosmop.certify.formula_reader import TooMuchError, UnreadError
-from rosmop.certify.future import Future, State, positive
-from rosmop.certify.guesses import Guesses
-from rosmop.certify.machines import Machine
-from rosmop.certify.past_formulas import Past
-from rosmop.certify.words import Words
+from rosmop.certify.formula_reader import UnsupportedFormulaError, WorkLimitError
+from rosmop.certify.future import FutureFollower, State, positive
+from rosmop.certify.guesses import PastGuesses
+from rosmop.certify.machines import StateMachineFollower
+from rosmop.certify.past_formulas import PastFollower
+from rosmop.certify.words import ExpressionDerivatives
 
 MOST_STEPS = 200_000
-"""Events after pairs that may be looked at for one property."""
+"""The maximum number of (pair, event) combinations for one property."""
 MOST_WORK = 400_000
 """Clauses, or parts of expressions, that may be made for one formula. Each of the two is some tenths of a second."""
 
@@ -33,8 +33,8 @@ Verdicts = tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Tables:
-    """What is certified: the automaton of a property, by event name; `verdicts` are told after a step into a state."""
+class AutomatonTables:
+    """An automaton to certify; columns are events in order, `verdicts[s]` hold after a step into `s`."""
 
     initial: int
     table: Sequence[Sequence[int]]
@@ -45,7 +45,7 @@ class Tables:
 
 @dataclass(frozen=True)
 class Certificate:
-    """`proved`: after every trace the verdict is that of the definition; `text` says what was looked at.
+    """The result for one property. `proved`: every trace's verdict is that of the definition; `text` states the check.
 
     `wrong`: it is not, and `text` has a trace. Neither: it was not certified, and `text` says why.
     """
@@ -56,30 +56,32 @@ class Certificate:
 
 
 class _WrongError(Exception):
-    """The automaton says something else than the definition."""
+    """The automaton differs from the definition."""
 
 
-def certify(logic: str, formula: str, events: Sequence[str], tables: Tables | None) -> Certificate:
+def certify(logic: str, formula: str, events: Sequence[str], tables: AutomatonTables | None) -> Certificate:
     """Hold the automaton of a property (None: it has none) against its formula."""
     check = _CHECKS.get(logic)
     if check is None or tables is None:
-        return Certificate(
-            False, False, f"{_NO_AUTOMATON.get(logic, 'it has no automaton')}: tested, not proved"
-        )
+        known = "it has no automaton" if tables is None else "the certifier does not know this logic"
+        return Certificate(False, False, f"{_NO_AUTOMATON.get(logic, known)}: tested, not proved")
     try:
         _look_at_form(logic, events, tables)
         pairs = check(formula, events, tables)
     except _WrongError as error:
         return Certificate(False, True, str(error))
-    except UnreadError as error:
+    except UnsupportedFormulaError as error:
         return Certificate(False, False, f"the certifier does not read it ({error}): tested, not proved")
-    except TooMuchError:
+    except WorkLimitError:
         return Certificate(False, False, "there is too much to look at: tested, not proved")
     return Certificate(True, False, f"proved: its automaton is what is written ({pairs} cases followed)")
 
 
-def _look_at_form(logic: str, events: Sequence[str], tables: Tables) -> None:
-    """What is no state is one to Python where it is negative, and another to the module; time is for `tfsm` alone."""
+def _look_at_form(logic: str, events: Sequence[str], tables: AutomatonTables) -> None:
+    """Raise for tables that are not an automaton. Python would index a negative state from the end.
+
+    Only `tfsm` has time limits.
+    """
     limits = [limit for limit in tables.timeouts if limit is not None]
     if len(tables.verdicts) != len(tables.table) or (
         tables.timeouts and len(tables.timeouts) != len(tables.table)
@@ -107,15 +109,15 @@ _NO_AUTOMATON = {
 def _follow(
     start: S,
     step: Callable[[S, str], S],
-    told: Callable[[S, S, str], Verdicts],
+    verdicts_of: Callable[[S, S, str], Verdicts],
     events: Sequence[str],
-    tables: Tables,
+    tables: AutomatonTables,
     *,
     silently: Callable[[S, int], S | None] = lambda _before, _state: None,
 ) -> int:
-    """Look at all pairs; `told(before, after, event)` are the verdicts that the definition has for a step.
+    """Visit all pairs; `verdicts_of(before, after, event)` returns the verdicts of the definition for a step.
 
-    `silently(before, state)` is what the passing of time leaves, where it does anything.
+    `silently(before, state)` returns the result of passing time, if time has an effect.
     """
     first = start, tables.initial
     came: dict[tuple[S, int], tuple[tuple[S, int], str] | None] = {first: None}
@@ -126,13 +128,13 @@ def _follow(
             came[following] = pair, event
             waiting.append(following)
             if len(waiting) * len(events) > MOST_STEPS:
-                raise TooMuchError
+                raise WorkLimitError
 
     for pair in waiting:
         before, state = pair
         for event, target in zip(events, tables.table[state], strict=True):
             after = step(before, event)
-            wanted = told(before, after, event)
+            wanted = verdicts_of(before, after, event)
             if tables.verdicts[target] != wanted:
                 trace = [*_trace(came, pair), event]
                 raise _WrongError(
@@ -158,8 +160,10 @@ def _said(verdicts: Verdicts) -> str:
     return " and ".join(verdicts) or "nothing"
 
 
-def _check_past(grammar: formula_reader.Grammar, formula: str, events: Sequence[str], tables: Tables) -> int:
-    past = Past(formula_reader.formula(formula, events, grammar))
+def _check_past(
+    grammar: formula_reader.Grammar, formula: str, events: Sequence[str], tables: AutomatonTables
+) -> int:
+    past = PastFollower(formula_reader.formula(formula, events, grammar))
     steps: dict[tuple[object, str], tuple[tuple[bool, ...], bool]] = {}
 
     def step(state: tuple[tuple[bool, ...], bool], event: str) -> tuple[tuple[bool, ...], bool]:
@@ -177,9 +181,9 @@ def _check_past(grammar: formula_reader.Grammar, formula: str, events: Sequence[
     )
 
 
-def _check_words(formula: str, events: Sequence[str], tables: Tables) -> int:
-    """`fail` once no continuation matches: nothing that a derivative leads to has the empty word."""
-    words = Words(formula_reader.expression(formula, events), MOST_WORK)
+def _check_words(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
+    """Check that `fail` is given once no continuation matches: no later derivative contains the empty word."""
+    words = ExpressionDerivatives(formula_reader.expression(formula, events), MOST_WORK)
     dead: dict[int, bool] = {}
 
     def is_dead(state: int) -> bool:
@@ -187,14 +191,14 @@ def _check_words(formula: str, events: Sequence[str], tables: Tables) -> int:
             dead.update(_dead(words, state, events))
         return dead[state]
 
-    def told(_before: int, after: int, _event: str) -> Verdicts:
+    def verdicts_of(_before: int, after: int, _event: str) -> Verdicts:
         return ("match",) if words.matches(after) else ("fail",) if is_dead(after) else ()
 
-    return _follow(words.initial, words.step, told, events, tables)
+    return _follow(words.initial, words.step, verdicts_of, events, tables)
 
 
-def _dead(words: Words, start: int, events: Sequence[str]) -> dict[int, bool]:
-    """For all that this leads to: whether nothing matches any more."""
+def _dead(words: ExpressionDerivatives, start: int, events: Sequence[str]) -> dict[int, bool]:
+    """Return for each reachable derivative whether nothing matches any more."""
     leading: dict[int, set[int]] = {start: set()}
     waiting = [start]
     for state in waiting:
@@ -204,7 +208,7 @@ def _dead(words: Words, start: int, events: Sequence[str]) -> dict[int, bool]:
                 leading[after] = set()
                 waiting.append(after)
                 if len(waiting) * len(events) > MOST_STEPS:
-                    raise TooMuchError
+                    raise WorkLimitError
             leading[after].add(state)
     alive = {state for state in waiting if words.matches(state)}
     reached = list(alive)
@@ -216,12 +220,12 @@ def _dead(words: Words, start: int, events: Sequence[str]) -> dict[int, bool]:
     return {state: state not in alive for state in waiting}
 
 
-def _check_future(formula: str, events: Sequence[str], tables: Tables) -> int:
+def _check_future(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
     return _check_endless(formula_reader.formula(formula, events, formula_reader.LTL), events, events, tables)
 
 
-def _check_pattern(formula: str, events: Sequence[str], tables: Tables) -> int:
-    """There may be silence for ever, which is an event that the pattern does not name."""
+def _check_pattern(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
+    """Check a pattern. Endless silence is possible: an event that the pattern does not name."""
     return _check_endless(patterns.meaning(formula, events), events, [*events, _SILENCE], tables)
 
 
@@ -229,28 +233,28 @@ _SILENCE = "(silence)"
 
 
 def _check_endless(
-    formula: formula_reader.Node, events: Sequence[str], letters: Sequence[str], tables: Tables
+    formula: formula_reader.Node, events: Sequence[str], letters: Sequence[str], tables: AutomatonTables
 ) -> int:
-    """`violation` once no endless continuation makes it true, `validation` once all do. Follows it and its opposite."""
-    guesses = Guesses(formula, letters)
-    future = Future(guesses.count, MOST_WORK)
+    """Check `violation` once no endless continuation makes it true, `validation` once none makes it false."""
+    guesses = PastGuesses(formula, letters)
+    future = FutureFollower(guesses.count, MOST_WORK)
     sides = (guesses.formula, ("not", guesses.formula))
     start = tuple(future.start(positive(guesses.kept(side), guesses.count)) for side in sides)
 
     def step(state: tuple[State, ...], event: str) -> tuple[State, ...]:
         return tuple(future.steps(side, guesses.letters[event]) for side in state)
 
-    def told(_before: object, after: tuple[State, ...], _event: str) -> Verdicts:
+    def verdicts_of(_before: object, after: tuple[State, ...], _event: str) -> Verdicts:
         if not future.possible(after[0]):
             return ("violation",)
         return () if future.possible(after[1]) else ("validation",)
 
-    return _follow(start, step, told, events, tables)
+    return _follow(start, step, verdicts_of, events, tables)
 
 
-def _check_machine(formula: str, events: Sequence[str], tables: Tables) -> int:
-    """With time limits: that they are as written, and lead where they should."""
-    machine = Machine(formula, events)
+def _check_machine(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
+    """Check a state machine; time limits must be as written and lead to the written states."""
+    machine = StateMachineFollower(formula, events)
 
     def silently(before: str, state: int) -> str | None:
         written = machine.timeout(before)
@@ -259,7 +263,7 @@ def _check_machine(formula: str, events: Sequence[str], tables: Tables) -> int:
             raise _WrongError(f"the time limit of the state {before} is {made and made[0]} ns")
         if written is None or made is None:
             return None
-        if tables.verdicts[made[1]] != machine.told(written[1]):
+        if tables.verdicts[made[1]] != machine.verdicts(written[1]):
             raise _WrongError(
                 f"the time limit of the state {before} leads to {_said(tables.verdicts[made[1]])}"
             )
@@ -268,14 +272,14 @@ def _check_machine(formula: str, events: Sequence[str], tables: Tables) -> int:
     return _follow(
         machine.initial,
         machine.step,
-        lambda _before, after, _event: machine.told(after),
+        lambda _before, after, _event: machine.verdicts(after),
         events,
         tables,
         silently=silently,
     )
 
 
-_CHECKS: dict[str, Callable[[str, Sequence[str], Tables], int]] = {
+_CHECKS: dict[str, Callable[[str, Sequence[str], AutomatonTables], int]] = {
     "ere": _check_words,
     "fsm": _check_machine,
     "ltl": _check_future,

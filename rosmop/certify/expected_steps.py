@@ -1,28 +1,26 @@
-"""What a walk has to do with messages whose events happen as a case says: the order and effects of `execution.py`,
-over the automata that were certified.
-"""
+"""The expected effect of a walk on messages: the order and effects of `run/execution.py`, over certified automata."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from rosmop.fast.abi import LEFT, SOONER, TOLD
-from rosmop.fast.batch_codegen import WrittenModule
+from rosmop.fast.batch_codegen import WasmModule
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
-from rosmop.form.specification_groups import Group
+from rosmop.form.specification_groups import SpecificationGroup
 from rosmop.logics.interface import ClockedProperty, ClockedRun, CompiledProperty, FiniteProperty
 
 HAPPENED, DROPPED, CHANGED, ELSEWHERE, RESET = 1, 2, 4, 8, 16
 NEVER, BEGAN = (1 << 63) - 1, 1_000
 
 States = dict[int, Any]
-"""The state of each property by its number: of one with a clock also when that began, and its time."""
+"""The state of each property by its number; for one with a clock also its start and its time."""
 
 
 @dataclass(frozen=True)
-class Case:
-    """What is put down before a walk: what each function returns, and what `Prepared` has."""
+class StepCase:
+    """The input of a walk: the result of each function, and the fields of `BatchOptions`."""
 
     script: Mapping[int, int]
     now: int = BEGAN
@@ -36,8 +34,8 @@ class Case:
 
 
 @dataclass
-class Result:
-    """What a walk has to come to."""
+class ExpectedResult:
+    """The expected result of a walk."""
 
     states: States
     position: int = 0
@@ -52,18 +50,18 @@ class Result:
 
     @property
     def answer(self) -> int:
-        """What the walk answers, but for where frames begin."""
+        """Return the expected answer, without the positions of frames."""
         flags = TOLD * bool(self.verdicts) | SOONER * self.sooner | LEFT * self.left
         return len(self.effects) << 32 | flags
 
 
-class LeftError(Exception):
-    """The message is for the engine."""
+class LeftToEngineError(Exception):
+    """The walk leaves the message to the engine."""
 
 
 @dataclass(frozen=True)
-class Handled:
-    """A handler: its category, its verdict and function in the walk (None: not there), and whether it may drop."""
+class ExpectedHandler:
+    """A handler: its category, its verdict and function in the walk (None: not compiled), and whether it may drop."""
 
     category: str
     verdict: int | None
@@ -72,30 +70,30 @@ class Handled:
 
 
 @dataclass(frozen=True)
-class Stepped:
+class PropertyStep:
     """A property that an event steps: its number (None: the module has none), automaton and handlers."""
 
     number: int | None
     compiled: CompiledProperty
     event: int
-    handlers: Sequence[Handled]
+    handlers: Sequence[ExpectedHandler]
 
     @property
     def states(self) -> int:
-        """How many it has."""
+        """Return the number of states."""
         tables = self.compiled
         assert isinstance(tables, FiniteProperty | ClockedProperty)  # noqa: S101  it has a number
         return len(tables.automaton) if isinstance(tables, FiniteProperty) else len(tables.verdicts)
 
 
-class Topic:
-    """The events of a topic and their properties, as the specifications have them, and what a message has to do."""
+class ExpectedTopic:
+    """The events of a topic and their properties, as specified; `walk` computes the expected result."""
 
     def __init__(
         self,
         compiled: Compiled,
-        group: Group,
-        module: WrittenModule,
+        group: SpecificationGroup,
+        module: WasmModule,
         topic: str,
         numbers: Sequence[tuple[int, int]],
     ) -> None:
@@ -110,21 +108,16 @@ class Topic:
             (numbers[event][0], place, handler): (verdict, module.handlers[topic][verdict])
             for verdict, (event, place, handler) in enumerate(feed.verdicts)
         }
-        self.steps: list[list[Stepped]] = []
+        self.steps: list[list[PropertyStep]] = []
         for number, index in numbers:
             rows = []
             for place, code in enumerate(compiled.specifications[number].properties):
                 handled = [
-                    Handled(
-                        category,
-                        verdict,
-                        function,
-                        _drops(compiled, code.handlers[category]),
-                    )
+                    ExpectedHandler(category, verdict, function, _drops(compiled, code.handlers[category]))
                     for handler, category in enumerate(code.order)
                     for verdict, function in [known.get((number, place, handler), (None, -1))]
                 ]
-                rows.append(Stepped(places.get((number, place)), code.property, index, handled))
+                rows.append(PropertyStep(places.get((number, place)), code.property, index, handled))
             self.steps.append(rows)
         self.properties = {one.number: one for rows in self.steps for one in rows if one.number is not None}
         self._begun = {
@@ -133,17 +126,17 @@ class Topic:
         self.clocked = any(isinstance(one.compiled, ClockedProperty) for one in self.properties.values())
 
     def begun(self) -> States:
-        """The states at the beginning."""
+        """Return the states at the beginning."""
         return dict(self._begun)
 
-    def walk(self, states: States, case: Case) -> Result:
-        """What has to come of so many frames."""
-        result = Result(states)
+    def walk(self, states: States, case: StepCase) -> ExpectedResult:
+        """Return the expected result of a number of frames."""
+        result = ExpectedResult(states)
         for frame in range(case.frames):
             before = len(result.happened), len(result.dropped), len(result.verdicts)
             try:
                 after = self._message(dict(result.states), case, frame, result)
-            except LeftError:
+            except LeftToEngineError:
                 for done, kept in zip(
                     (result.happened, result.dropped, result.verdicts), before, strict=True
                 ):
@@ -159,7 +152,7 @@ class Topic:
                 break
         return result
 
-    def _message(self, states: States, case: Case, frame: int, result: Result) -> States:
+    def _message(self, states: States, case: StepCase, frame: int, result: ExpectedResult) -> States:
         before = dict(states)
         for event, function in enumerate(self.functions):
             if not case.enabled >> self.specifications[event] & 1:
@@ -167,7 +160,7 @@ class Topic:
             result.calls.append((function, frame))
             bits = case.script.get(function, 0)
             if bits & ELSEWHERE:
-                raise LeftError
+                raise LeftToEngineError
             if bits & HAPPENED:
                 result.happened.append(event)
             gone = bool(bits & DROPPED)
@@ -175,7 +168,7 @@ class Topic:
                 gone |= self._step(one, states, case, frame, result)
             if gone:
                 if case.told >> event & 1:
-                    raise LeftError
+                    raise LeftToEngineError
                 result.dropped.append(event)
                 return {number: self._taken_back(number, before[number], states[number]) for number in states}
         return states
@@ -185,10 +178,12 @@ class Topic:
             return after
         return before if isinstance(before, int) else (*before[:2], after[2])
 
-    def _step(self, one: Stepped, states: States, case: Case, frame: int, result: Result) -> bool:
+    def _step(
+        self, one: PropertyStep, states: States, case: StepCase, frame: int, result: ExpectedResult
+    ) -> bool:
         """Step a property and run its handlers; whether one has dropped the message."""
         if one.number is None:
-            raise LeftError
+            raise LeftToEngineError
         if isinstance(one.compiled, ClockedProperty):
             run = ClockedRun(one.compiled, 0)
             run.state, run.since, run.now = states[one.number]
@@ -197,20 +192,20 @@ class Topic:
             deadline = run.deadline
             result.sooner |= deadline is not None and deadline < case.until
             if any(handled.category in categories for handled in one.handlers):
-                raise LeftError
+                raise LeftToEngineError
             return False
         assert isinstance(one.compiled, FiniteProperty)  # noqa: S101  it has a number
         automaton = one.compiled.automaton
         state = states[one.number] = automaton.table[states[one.number]][one.event]
         run_now = [handled for handled in one.handlers if handled.category in automaton.verdicts[state]]
         if any(each.verdict is None or not case.counted >> each.verdict & 1 for each in run_now):
-            raise LeftError
+            raise LeftToEngineError
         bits = 0
         for handled in run_now:
             result.calls.append((handled.function, frame))
             bits |= case.script.get(handled.function, 0)
             if bits & ELSEWHERE:
-                raise LeftError
+                raise LeftToEngineError
             result.verdicts.append(handled.verdict or 0)
         if bits & RESET:
             states[one.number] = automaton.initial
@@ -222,7 +217,7 @@ def _initial(property_: CompiledProperty) -> int:
     return property_.automaton.initial if isinstance(property_, FiniteProperty) else property_.initial
 
 
-def begun_in(one: Stepped, state: int) -> Any:
+def begun_in(one: PropertyStep, state: int) -> Any:
     """Return a property's state, with a clock that begins at `BEGAN` if it has one."""
     return state if isinstance(one.compiled, FiniteProperty) else (state, BEGAN, BEGAN)
 

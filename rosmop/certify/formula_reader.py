@@ -1,7 +1,7 @@
-"""Reads a formula once more: text to nested tuples, without a word of what the compilers read.
+"""Parse a formula into nested tuples, with no code of the compilers.
 
-A node is (operator, operand, …); ("event", name), ("true",), ("false",). What cannot be read raises `UnreadError`: the
-property is then not certified, whatever the compiler made of it.
+A node is (operator, operand, …); ("event", name), ("true",), ("false",). An unknown form raises
+`UnsupportedFormulaError`: the property is then not certified.
 """
 
 import re
@@ -18,20 +18,20 @@ _TOKEN = re.compile(
 )
 
 
-class UnreadError(Exception):
-    """The formula has something that the certifier does not read."""
+class UnsupportedFormulaError(Exception):
+    """The certifier does not know a part of the formula."""
 
 
-class TooMuchError(Exception):
-    """What was to be followed is more than may be."""
+class WorkLimitError(Exception):
+    """The check needs more work than its limit."""
 
 
 _NANOSECONDS = {"ns": 0, "us": 3, "ms": 6, "s": 9}
 _SECONDS = {"m": 60, "min": 60, "h": 3600}
 
 
-class Words:
-    """The words and signs of a text, one after the other; `signs` may be of several characters."""
+class WordReader:
+    """The words and signs of a text in order; `signs` may have several characters."""
 
     def __init__(self, text: str, signs: Sequence[str]) -> None:
         self._signs = sorted(signs, key=len, reverse=True)
@@ -41,17 +41,17 @@ class Words:
         self.take()
 
     def take(self) -> str:
-        """The word that is next, and go on to the one behind it; empty at the end."""
+        """Return the next word and go on to the one after it; empty at the end."""
         before = self.word
         match = _TOKEN.match(self._text, self._at)
-        if match is None:  # it matches everything
-            raise UnreadError(self._text[self._at : self._at + 10])
+        if match is None:  # the pattern matches everything
+            raise UnsupportedFormulaError(self._text[self._at : self._at + 10])
         name, start = match.group(1), match.end()
         if match.group(2) is not None:
             start = match.start(2)
             sign = next((sign for sign in self._signs if self._fits(sign, start)), None)
             if sign is None:
-                raise UnreadError(f"the sign {self._text[start]}")
+                raise UnsupportedFormulaError(f"the sign {self._text[start]}")
             name, self._at = sign, start + len(sign)
         else:
             name, self._at = name or "", match.end()
@@ -59,7 +59,7 @@ class Words:
         return before
 
     def _fits(self, sign: str, at: int) -> bool:
-        """Whether the sign stands here; one that ends with a letter ends where the word ends."""
+        """Whether the sign is next. A sign that ends with a letter must be a whole word."""
         end = at + len(sign)
         if not self._text.startswith(sign, at):
             return False
@@ -73,21 +73,21 @@ class Words:
         return True
 
     def expect(self, word: str) -> None:
-        """Take this word; raises `UnreadError` where another one stands."""
+        """Take this word; raises `UnsupportedFormulaError` for another one."""
         if not self.accept(word):
-            raise UnreadError(f"{self.word!r} where {word!r} belongs")
+            raise UnsupportedFormulaError(f"{self.word!r} where {word!r} belongs")
 
     def duration(self) -> int:
-        """Take a number and its unit (seconds where there is none): nanoseconds."""
+        """Take a number and its unit (default: seconds); return nanoseconds."""
         number = Decimal(self.take())
         if self.word in _NANOSECONDS:
             return int(number.scaleb(_NANOSECONDS[self.take()]))
         return int((number * (_SECONDS[self.take()] if self.word in _SECONDS else 1)).scaleb(9))
 
     def end(self) -> None:
-        """Raise `UnreadError` where something is left."""
+        """Raise `UnsupportedFormulaError` if something is left."""
         if self.word:
-            raise UnreadError(f"{self.word!r} behind the end")
+            raise UnsupportedFormulaError(f"{self.word!r} behind the end")
 
 
 _BOOLEAN: tuple[Mapping[str, str], ...] = (
@@ -117,16 +117,16 @@ Grammar = tuple[Mapping[str, str], Sequence[Mapping[str, str]]]
 
 
 def formula(text: str, events: Sequence[str], grammar: Grammar) -> Node:
-    """A formula of temporal logic. Raises `UnreadError`."""
+    """Return a formula of temporal logic. Raises `UnsupportedFormulaError`."""
     unary, levels = grammar
     signs = {"(", ")", "[", "]", ",", *unary, *(sign for level in levels for sign in level)}
-    words = Words(text, [sign for sign in signs if not sign.isidentifier()])
+    words = WordReader(text, [sign for sign in signs if not sign.isidentifier()])
     node = _joined(words, events, grammar, len(levels) - 1, 0)
     words.end()
     return node
 
 
-def _joined(words: Words, events: Sequence[str], grammar: Grammar, level: int, depth: int) -> Node:
+def _joined(words: WordReader, events: Sequence[str], grammar: Grammar, level: int, depth: int) -> Node:
     if level < 0:
         return _operand(words, events, grammar, depth)
     node = _joined(words, events, grammar, level - 1, depth)
@@ -137,9 +137,9 @@ def _joined(words: Words, events: Sequence[str], grammar: Grammar, level: int, d
     return node
 
 
-def _operand(words: Words, events: Sequence[str], grammar: Grammar, depth: int) -> Node:
+def _operand(words: WordReader, events: Sequence[str], grammar: Grammar, depth: int) -> Node:
     if depth > DEEPEST:
-        raise UnreadError("it is nested too deeply")
+        raise UnsupportedFormulaError("it is nested too deeply")
     unary, levels = grammar
     if words.word in unary:
         operator = unary[words.take()]
@@ -153,51 +153,54 @@ def _operand(words: Words, events: Sequence[str], grammar: Grammar, depth: int) 
     if word in ("true", "false"):
         return (word,)
     if word not in events:
-        raise UnreadError(f"{word!r} is no event")
+        raise UnsupportedFormulaError(f"{word!r} is not an event")
     return ("event", word)
 
 
-def _unbounded(words: Words, grammar: Grammar) -> None:
+def _unbounded(words: WordReader, grammar: Grammar) -> None:
     """Take the bounds of mtl that bound nothing."""
     if grammar is MTL and words.accept("["):
         if words.duration() != 0:
-            raise UnreadError("a bound of time")
+            raise UnsupportedFormulaError("a bound of time")
         for word in (",", "inf", "]"):
             words.expect(word)
 
 
 def expression(text: str, events: Sequence[str]) -> Node:
-    """An extended regular expression: union, intersection, sequence, not, star, power. Raises `UnreadError`."""
-    words = Words(text, "|&~*+^()")
+    """Parse an extended regular expression (union, intersection, sequence, not, star, power).
+
+    Raises `UnsupportedFormulaError`.
+    """
+    words = WordReader(text, "|&~*+^()")
     node = _union(words, events, 0)
     words.end()
     return node
 
 
-def _union(words: Words, events: Sequence[str], depth: int) -> Node:
+def _union(words: WordReader, events: Sequence[str], depth: int) -> Node:
     node = _intersection(words, events, depth)
     while words.accept("|"):
         node = ("union", node, _intersection(words, events, depth))
     return node
 
 
-def _intersection(words: Words, events: Sequence[str], depth: int) -> Node:
+def _intersection(words: WordReader, events: Sequence[str], depth: int) -> Node:
     node = _factors(words, events, depth)
     while words.accept("&"):
         node = ("intersection", node, _factors(words, events, depth))
     return node
 
 
-def _factors(words: Words, events: Sequence[str], depth: int) -> Node:
+def _factors(words: WordReader, events: Sequence[str], depth: int) -> Node:
     node = _factor(words, events, depth)
     while words.word in ("(", "~") or words.word[:1].isalpha() or words.word[:1] == "_":
         node = ("sequence", node, _factor(words, events, depth))
     return node
 
 
-def _factor(words: Words, events: Sequence[str], depth: int) -> Node:
+def _factor(words: WordReader, events: Sequence[str], depth: int) -> Node:
     if depth > DEEPEST:
-        raise UnreadError("it is nested too deeply")
+        raise UnsupportedFormulaError("it is nested too deeply")
     if words.accept("~"):
         return ("not", _factor(words, events, depth + 1))
     if words.accept("("):
@@ -210,13 +213,13 @@ def _factor(words: Words, events: Sequence[str], depth: int) -> Node:
         elif word in events:
             node = ("event", word)
         else:
-            raise UnreadError(f"{word!r} is no event")
+            raise UnsupportedFormulaError(f"{word!r} is not an event")
     while words.word in ("*", "+", "^"):
         sign = words.take()
         if sign == "^":
             count = words.take()
             if not count.isdigit():
-                raise UnreadError(f"{count!r} is no power")
+                raise UnsupportedFormulaError(f"{count!r} is not a power")
             node = ("power", node, int(count))
         else:
             node = ("star", node) if sign == "*" else ("sequence", node, ("star", node))

@@ -1,31 +1,30 @@
 """Formulas about the future, over endless traces: what remains to be true after an event, and whether it can be.
 
 A state is what remains, as a set of *clauses*, one of which must come true: a clause is a set of parts of the formula
-that begin with a temporal operator, all of which must. (Clauses that say more than another one are left out, so there
-are finitely many states.) What an event leaves of a part is read off its definition: `x U y` is `y`, or `x` and
-`x U y` at the next event.
+that begin with a temporal operator, all of which must. (Clauses that require more than another one are left out, so
+there are finitely many states.) The remainder of a part after an event follows from its definition: `x U y` is `y`, or
+`x` and `x U y` at the next event.
 
-Whether a clause can come true: its ways from event to event are followed, and there must be a circle on which no
-`until` is put off at every step.
+A clause can come true if its paths from event to event reach a cycle on which no `until` is postponed at every step.
 """
 
 from collections.abc import Sequence
 
-from rosmop.certify.formula_reader import Node, TooMuchError
+from rosmop.certify.formula_reader import Node, WorkLimitError
 
 Clause = frozenset[Node]
 State = frozenset[Clause]
 Way = tuple[Clause, frozenset[Node]]
-"""From one clause on: what remains then, and each `until` that was put off by it."""
+"""One step from a clause: the remainder, and each `until` that the step postpones."""
 
 TRUE: State = frozenset([frozenset()])
 FALSE: State = frozenset()
 
 
-class Future:
-    """Follows a formula over so many letters, which are numbers: at each position exactly one of them happens.
+class FutureFollower:
+    """Follow a formula over `letters` numbered letters; exactly one happens at each position.
 
-    `work` is how many clauses may be made in all; beyond that `TooMuchError` is raised.
+    `work` is the largest number of clauses that may be made; beyond it `WorkLimitError` is raised.
     """
 
     def __init__(self, letters: int, work: int) -> None:
@@ -35,15 +34,15 @@ class Future:
         self._known: dict[Clause, bool] = {}
 
     def start(self, formula: Node) -> State:
-        """Before the first event."""
+        """Return the obligation before the first event."""
         return self._now(formula)
 
     def step(self, state: State, letter: int) -> State:
-        """What remains after a letter."""
+        """Return the remaining obligation after a letter."""
         return self._any([self._after(clause, letter) for clause in state])
 
     def steps(self, state: State, letters: Sequence[int]) -> State:
-        """What remains after one of them, whichever."""
+        """Return the remaining obligation after any one of them."""
         self._work -= len(letters)
         return self._any(
             [self._after(clause, letter) for clause in state for letter in self._among(clause, letters)]
@@ -54,7 +53,7 @@ class Future:
         return any(self._possible(clause) for clause in state)
 
     def _among(self, clause: Clause, letters: Sequence[int]) -> list[int]:
-        """Those letters that no part of the clause rules out by itself."""
+        """Return the letters that no single part of the clause rules out."""
         masks = [part[1] for part in clause if part[0] == "one of"]
         return [letter for letter in letters if all(mask >> letter & 1 for mask in masks)]  # type: ignore[operator]  # sets of letters
 
@@ -84,11 +83,11 @@ class Future:
         return self._all([self._at(second, letter), self._any([self._at(first, letter), again])])
 
     def _at(self, formula: Node, letter: int) -> State:
-        """What remains of a formula that is to hold at a position where the letter happens."""
+        """Return the remainder of a formula after a position with the letter."""
         return self.step(self._now(formula), letter)
 
     def _now(self, formula: Node) -> State:
-        """A formula that is to hold from the next position on, as clauses."""
+        """Return a formula that is to hold from the next position on, as clauses."""
         operator, operands = formula[0], formula[1:]
         if operator == "and":
             return self._all([self._now(operand) for operand in operands])  # type: ignore[arg-type]  # formulas
@@ -108,10 +107,10 @@ class Future:
         return frozenset(together)
 
     def _least(self, clauses: set[Clause]) -> State:
-        """Without those that say more than another."""
+        """Return the clauses without those that require more than another."""
         self._work -= len(clauses)
         if self._work < 0:
-            raise TooMuchError
+            raise WorkLimitError
         ordered = sorted(clauses, key=len)
         kept: list[Clause] = []
         for clause in ordered:
@@ -128,7 +127,7 @@ class Future:
         return self._known[clause]
 
     def _explore(self, start: Clause) -> None:
-        """All clauses that this one leads to, and which of them can come true."""
+        """Find all clauses that this one leads to, and which of them can come true."""
         ways: dict[Clause, set[Way]] = {}
         waiting = [start]
         while waiting:
@@ -155,7 +154,7 @@ class Future:
         self._known.update({clause: clause in good for clause in ways})
 
     def _ways(self, clause: Clause, letter: int) -> set[Way]:
-        """What may remain, with what was put off; without what asks for more and puts off as much as another way."""
+        """Return the possible remainders with their postponed untils, without redundant ones."""
         left = [(part, self._part_after(part, letter)) for part in clause]
         self._work -= 1
         if any(state == FALSE for _, state in left):
@@ -169,7 +168,7 @@ class Future:
             }
             self._work -= len(found)
             if self._work < 0:
-                raise TooMuchError
+                raise WorkLimitError
             ways = {
                 way
                 for way in found
@@ -179,13 +178,13 @@ class Future:
 
 
 def _fulfils(group: set[Clause], ways: dict[Clause, set[Way]]) -> bool:
-    """Whether going round in these clauses puts no `until` off for ever."""
+    """Whether staying in these clauses for ever never postpones an `until` for ever."""
     inside = [off for clause in group for after, off in ways[clause] if after in group]
     return bool(inside) and not frozenset.intersection(*inside)
 
 
 def _circles(ways: dict[Clause, set[Way]]) -> list[set[Clause]]:
-    """The strongly connected sets: what is reached forwards and backwards (Kosaraju)."""
+    """Return the strongly connected sets: what is reached forwards and backwards (Kosaraju)."""
     order: list[Clause] = []
     seen: set[Clause] = set()
     for root in ways:
@@ -219,9 +218,9 @@ def _circles(ways: dict[Clause, set[Way]]) -> list[set[Clause]]:
 
 
 def positive(formula: Node, letters: int, *, wanted: bool = True) -> Node:
-    """The formula (or its opposite) with `one of` some letters, `and`, `or`, `next`, `until`, `release` only.
+    """Return the formula (or its negation) with `one of` some letters, `and`, `or`, `next`, `until`, `release` only.
 
-    `letters` is how many there are; which ones is said by a set of bits.
+    `letters` is the number of letters; a set of bits names those of a `one of`.
     """
     operator, everything = formula[0], (1 << letters) - 1
     if operator in ("one of", "true", "false"):

@@ -1,14 +1,14 @@
 """Formulas about the future with operators about the past in them, as formulas about the future alone.
 
-What an operator about the past is worth is guessed with every event: a letter is an event and one bit for each of these
-operators. Rules say what the guess has to be, from the one before and the operator's definition. On every endless trace
-exactly one guess keeps all rules, so a formula can come true with them where it could without.
+The value of an operator about the past is guessed with every event: a letter is an event and one bit for each of these
+operators. Rules determine the correct guess from the one before and the operator's definition. On every endless trace
+exactly one sequence of guesses keeps all rules, so a formula can come true with them exactly if it could without them.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 
-from rosmop.certify.formula_reader import Node, TooMuchError
+from rosmop.certify.formula_reader import Node, WorkLimitError
 
 MOST_LETTERS = 1024
 
@@ -18,13 +18,13 @@ _DEFINED: Mapping[str, tuple[Callable[[Node, Node, Node], Node], bool]] = {
     "since": (lambda x, y, before: ("or", y, ("and", x, before)), False),
     "dual since": (lambda x, y, before: ("and", y, ("or", x, before)), True),
 }
-"""From the operands and what it was worth at the event before; and what that is at the first event."""
+"""The value from the operands and the value at the event before; and the value at the first event."""
 _BEFORE: Mapping[str, bool] = {"previously": False, "dual previously": True}
-"""What these are worth at the first event; later, what their operand was at the event before."""
+"""The values at the first event; later, the operand's value at the event before."""
 
 
-class Guesses:
-    """The letters of each event, which are numbers below `count`, and the formula over sets of them (`one of`)."""
+class PastGuesses:
+    """The letters of each event, as numbers below `count`, and the formula over sets of them (`one of`)."""
 
     def __init__(self, formula: Node, events: Sequence[str]) -> None:
         self._guessed: dict[Node, int] = {}
@@ -33,7 +33,7 @@ class Guesses:
                 self._guessed.setdefault(node, len(self._guessed))
         count = 1 << len(self._guessed)
         if len(events) * count > MOST_LETTERS:
-            raise TooMuchError
+            raise WorkLimitError
         self.count = len(events) * count
         self.letters = {
             event: range(number * count, (number + 1) * count) for number, event in enumerate(events)
@@ -42,11 +42,11 @@ class Guesses:
         self.rules = [rule for node in self._guessed for rule in self._rules(node)]
 
     def kept(self, formula: Node) -> Node:
-        """The formula, where all rules are kept."""
+        """Return the formula together with all rules."""
         return reduce(lambda left, right: ("and", left, right), self.rules, formula)
 
     def _over(self, node: Node) -> Node:
-        """The same over letters, with guesses for what is about the past."""
+        """Return the formula over letters, with guesses in place of past operators."""
         if node in self._guessed:
             bit = 1 << self._guessed[node]
             return ("one of", sum(1 << letter for letter in range(self.count) if letter & bit))
@@ -74,5 +74,5 @@ def _either(test: Node, yes: Node, no: Node) -> Node:
 
 
 def _within(node: Node) -> list[Node]:
-    """A formula and its parts."""
+    """Return a formula and its parts."""
     return [node, *(inner for part in node[1:] if isinstance(part, tuple) for inner in _within(part))]

@@ -1,16 +1,16 @@
-"""State machines, by what is written.
+"""State machines, as written.
 
 `state [ event -> state, default state, timeout 2s -> state ]`, and `alias name = states`.
 """
 
 from collections.abc import Sequence
 
-from rosmop.certify.formula_reader import UnreadError, Words
+from rosmop.certify.formula_reader import UnsupportedFormulaError, WordReader
 
 FAIL = "fail"
 
 
-class Machine:
+class StateMachineFollower:
     """Follows a machine; a state is its name."""
 
     def __init__(self, formula: str, events: Sequence[str]) -> None:
@@ -19,7 +19,7 @@ class Machine:
         self._aliases: dict[str, list[str]] = {}
         self._timeouts: dict[str, tuple[int, str]] = {}
         self._events = events
-        words = Words(formula, ("->", "[", "]", "=", ","))
+        words = WordReader(formula, ("->", "[", "]", "=", ","))
         while words.word:
             name = words.take()
             if words.accept("["):
@@ -29,12 +29,12 @@ class Machine:
                 words.expect("=")
                 self._aliases[name] = self._read_members(words)
             else:
-                raise UnreadError(f"{name!r} begins no state")
+                raise UnsupportedFormulaError(f"{name!r} begins no state")
         self.initial = next(iter(self._moves), FAIL)
 
-    def _read_state(self, words: Words, state: str) -> None:
+    def _read_state(self, words: WordReader, state: str) -> None:
         if state in self._moves:
-            raise UnreadError(f"the state {state!r} stands twice")
+            raise UnsupportedFormulaError(f"the state {state!r} stands twice")
         moves = self._moves.setdefault(state, {})
         while not words.accept("]"):
             event = words.take()
@@ -51,23 +51,23 @@ class Machine:
             elif arrow and event in self._events:
                 moves[event] = target
             else:
-                raise UnreadError(f"{event!r} is no event")
+                raise UnsupportedFormulaError(f"{event!r} is not an event")
             words.accept(",")
 
-    def _read_members(self, words: Words) -> list[str]:
+    def _read_members(self, words: WordReader) -> list[str]:
         members = [words.take()]
         while words.accept(",") or (words.word and words.word != "alias"):
             members.append(words.take())
         return members
 
     def step(self, state: str, event: str) -> str:
-        """Where an event leads: to `fail` where nothing is written."""
+        """Return the state after an event; `fail` if no transition is written."""
         return self._moves.get(state, {}).get(event, self._default.get(state, FAIL))
 
     def timeout(self, state: str) -> tuple[int, str] | None:
-        """After how many nanoseconds without an event the machine leaves a state, and for which one."""
+        """Return after how many nanoseconds without an event the machine leaves a state, and the next state."""
         return self._timeouts.get(state)
 
-    def told(self, state: str) -> tuple[str, ...]:
-        """The state, and its aliases as they are written."""
+    def verdicts(self, state: str) -> tuple[str, ...]:
+        """Return the state, and its aliases as they are written."""
         return (state, *(alias for alias, members in self._aliases.items() if state in members))

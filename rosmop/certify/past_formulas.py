@@ -1,4 +1,4 @@
-"""Formulas about the past, by their definition: what each part is worth at an event, from what it was worth before."""
+"""Formulas about the past, by their definition: the value of each part at an event, from the values before."""
 
 from collections.abc import Callable, Mapping
 
@@ -7,21 +7,21 @@ from rosmop.certify.formula_reader import Node
 State = tuple[bool, ...]
 
 
-class Past:
-    """Follows a formula: a state is what is to be remembered of the event before, for each part that looks back."""
+class PastFollower:
+    """Follow a past formula; a state has, for each operator that looks back, its memory of the event before."""
 
     def __init__(self, formula: Node) -> None:
         self._parts: dict[Node, int] = {}
         self._looking: list[tuple[Node, int]] = []
         self._file(formula)
         self._order = list(self._parts)
-        # At the first event nothing was before: what asks for all of the past holds, what asks for some does not.
+        # The first event has no past: operators about all of the past are true, those about some of it false.
         self.initial: State = tuple(
             node[0] in ("historically", "dual since", "dual previously") for node, _ in self._looking
         )
 
     def _file(self, node: Node) -> int:
-        """The number of a part; its operands have smaller ones."""
+        """Return the number of a part; its operands have smaller ones."""
         for operand in node[1:]:
             if isinstance(operand, tuple):
                 self._file(operand)
@@ -32,7 +32,7 @@ class Past:
         return self._parts[node]
 
     def step(self, state: State, event: str) -> tuple[State, bool]:
-        """What is remembered after an event, and whether the formula holds at it."""
+        """Return the memory after an event, and whether the formula holds at it."""
         before = {node: state[place] for node, place in self._looking}
         now: dict[Node, bool] = {}
         for node in self._order:

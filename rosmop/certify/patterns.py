@@ -13,14 +13,14 @@ Strictly before and after: no event answers itself. An event that closes the sco
 
 from collections.abc import Sequence
 
-from rosmop.certify.formula_reader import Node, UnreadError, Words
+from rosmop.certify.formula_reader import Node, UnsupportedFormulaError, WordReader
 
 _FALSE: Node = ("false",)
 
 
 def meaning(formula: str, events: Sequence[str]) -> Node:
-    """The pattern as a formula. Raises `UnreadError`."""
-    words = Words(formula, (":", "(", ")"))
+    """Return the pattern as a formula. Raises `UnsupportedFormulaError`."""
+    words = WordReader(formula, (":", "(", ")"))
     opens, closes = _scope(words, events)
     words.expect(":")
     first = words.take()
@@ -33,28 +33,28 @@ def meaning(formula: str, events: Sequence[str]) -> Node:
     if opens is None:
         return inside
     if opens == closes:
-        raise UnreadError("one event opens and closes the scope, which no formula of ltl says")
+        raise UnsupportedFormulaError("one event opens and closes the scope, which no formula of ltl says")
     opened = _weak(("not", opens), ("and", opens, ("next", inside)))
     if closes is None:
         return opened
     return ("and", opened, ("always", ("implies", closes, ("next", opened))))
 
 
-def _scope(words: Words, events: Sequence[str]) -> tuple[Node | None, Node | None]:
+def _scope(words: WordReader, events: Sequence[str]) -> tuple[Node | None, Node | None]:
     word = words.take()
     if word == "globally":
         return None, None
     if word == "until":
         return None, _event(words.take(), events)
     if word != "after":
-        raise UnreadError(f"{word!r} is no scope")
+        raise UnsupportedFormulaError(f"{word!r} is not a scope")
     opens = _event(words.take(), events)
     return opens, _event(words.take(), events) if words.accept("until") else None
 
 
 def _event(word: str, events: Sequence[str]) -> Node:
     if word not in events:
-        raise UnreadError(f"{word!r} is no event")
+        raise UnsupportedFormulaError(f"{word!r} is not an event")
     return ("event", word)
 
 
@@ -76,4 +76,4 @@ def _inside(kind: str, c: Node, d: Node, q: Node) -> Node:
             return _weak(("not", c), ("or", ("and", d, ("not", c)), q))
         case "forbids":
             return _weak(("implies", c, ("next", _weak(("not", d), q))), q)
-    raise UnreadError(f"{kind!r} is no pattern")
+    raise UnsupportedFormulaError(f"{kind!r} is not a pattern")

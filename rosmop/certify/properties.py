@@ -1,30 +1,33 @@
-"""What is certified of the properties of specifications: the one place where the compilers' results come in."""
+"""Certify the compiled properties of specifications.
+
+This is the only place where certificates take results of the logics' compilers.
+"""
 
 from collections.abc import Iterable
 
-from rosmop.certify.check import Certificate, Tables, certify
-from rosmop.form.positions import Finding
+from rosmop.certify.check import AutomatonTables, Certificate, certify
+from rosmop.form.positions import Diagnostic
 from rosmop.logics.interface import CompiledProperty, FiniteProperty
-from rosmop.logics.tfsm import TimedMachine
-from rosmop.run.monitor import Monitor
+from rosmop.logics.tfsm import TimedStateMachine
+from rosmop.run.monitor import MonitorInstance
 
-DEFECT = "this is a defect of the appliance: nothing is loaded with it; report it with the specification"
+DEFECT = "this is a defect of the monitor compiler, and nothing is loaded; report it with the specification"
 
 
 def certificate_of(compiled: CompiledProperty) -> Certificate:
-    """Hold what was made of a formula against the formula."""
+    """Compare a compiled property with its formula."""
     tables = None
-    if isinstance(compiled, FiniteProperty | TimedMachine):
+    if isinstance(compiled, FiniteProperty | TimedStateMachine):
         automaton = compiled.automaton
-        timeouts = compiled.timeouts if isinstance(compiled, TimedMachine) else ()
-        tables = Tables(automaton.initial, automaton.table, automaton.verdicts, timeouts)
+        timeouts = compiled.timeouts if isinstance(compiled, TimedStateMachine) else ()
+        tables = AutomatonTables(automaton.initial, automaton.table, automaton.verdicts, timeouts)
     return certify(compiled.logic, compiled.formula, compiled.events, tables)
 
 
-def certificates_of(monitors: Iterable[Monitor]) -> tuple[dict[str, list[str]], list[Finding]]:
-    """For each monitor a line on each of its properties; and an error for each property whose automaton is wrong."""
+def certificates_of(monitors: Iterable[MonitorInstance]) -> tuple[dict[str, list[str]], list[Diagnostic]]:
+    """Return a line for each property of each monitor, and an error for each wrong automaton."""
     lines: dict[str, list[str]] = {}
-    wrong: list[Finding] = []
+    wrong: list[Diagnostic] = []
     for monitor in monitors:
         mine = lines.setdefault(monitor.name, [])
         for running in monitor.properties:
@@ -32,6 +35,8 @@ def certificates_of(monitors: Iterable[Monitor]) -> tuple[dict[str, list[str]], 
             certificate = certificate_of(compiled)
             mine.append(f"{compiled.logic}: {certificate.text}")
             if certificate.wrong:
-                text = f"the automaton of this property is not what is written: {certificate.text}; {DEFECT}"
+                text = (
+                    f"the automaton of this property differs from its formula: {certificate.text}; {DEFECT}"
+                )
                 wrong.append(compiled.source.finding(0, text))
     return lines, wrong

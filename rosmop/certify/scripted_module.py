@@ -1,25 +1,35 @@
-"""A finished module whose functions of events and handlers return what is put down for them.
+"""Replace the functions of events and handlers in a finished module with stubs that return scripted results.
 
-The walks and the data, tables included, are the same bytes. Behind the frames stand: where calls are noted, what is
-copied over the states before each try, and what each function returns.
+The walks of topics and the data, tables included, stay the same bytes. Behind the frames, the script has: the notes of
+calls, the state to restore before each try, and the result of each function.
+
+The encoders and decoders here are this file's own, and share none with the writer of modules (`fast/wasm.py`): an error
+in the writer's encoding of a number or section is not repeated here. Shared with the writer are only facts about the
+module, from `WasmModule`: the names of the walks, and the addresses of frames and effects. If the writer records a
+wrong address, the module traps or the comparison in `steps.py` fails, unless the writer uses the same wrong address
+everywhere.
 """
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
-from rosmop.fast.batch_codegen import WrittenModule
-from rosmop.fast.wasm import END, I32, I64, IF, NOTHING, constant, load, row, store, text, unsigned
+from rosmop.fast.batch_codegen import WasmModule
 
 RECORD, NOTE = struct.Struct("<qqqii"), struct.Struct("<3i")
-"""What comes of a try: the answer, the first effect, the state, and where notes end. A call: function and arguments."""
+"""The result of a try: answer, first effect, state, end of the notes. A note of a call: function and two arguments."""
 TELL, SCRIPT = 4096, 8192
-"""Where it is noted, behind the first frame, where notes end; and what the functions return."""
+"""Offsets behind the first frame: the end of the notes; the results of the functions."""
+
+_I32, _I64 = b"\x7f", b"\x7e"
+_ADD, _LESS = b"\x6a", b"\x48"  # i32.add, i32.lt_s
+_NO_RESULT, _LOOP, _IF, _END = b"\x40", b"\x03", b"\x04", b"\x0b"
+_COPY_MEMORY = b"\xfc\x0a\x00\x00"
 
 
-def scripted(module: WrittenModule) -> bytes:
-    """The module with each function that is not a walk replaced, and a function that tries a range of states."""
+def scripted(module: WasmModule) -> bytes:
+    """Return the module with stubs, and with a function that tries a range of states (`try` and a walk's name)."""
     sections = sections_of(module.code)
-    types, chosen = _types(sections[1]), _chosen(sections[3])
+    types, chosen = list(_types(sections[1])), list(_chosen(sections[3]))
     exports = _exports(sections[7])
     walks = {exports[feed.name] for feed in module.feeds.values()}
     codes = [
@@ -28,77 +38,95 @@ def scripted(module: WrittenModule) -> bytes:
     ]
     sweeps = []
     for feed in module.feeds.values():
-        sweeps.append(text(f"try {feed.name}") + b"\x00" + unsigned(len(codes)))
-        types.append(b"\x60" + row([bytes((I32,))] * 5 + [bytes((I64,))]) + row([bytes((I32,))]))
-        chosen.append(unsigned(len(types) - 1))
+        name = f"try {feed.name}".encode()
+        sweeps.append(_leb(len(name)) + name + b"\x00" + _leb(len(codes)))
+        types.append(b"\x60" + _vector([*[_I32] * 5, _I64]) + _vector([_I32]))
+        chosen.append(_leb(len(types) - 1))
         codes.append(_sweep(module, exports[feed.name]))
-    sections |= {1: row(types), 3: row(chosen), 10: row(codes)}
-    sections[7] = row([*_raw_exports(sections[7]), *sweeps])
-    content = b"".join(bytes((kind,)) + unsigned(len(part)) + part for kind, part in sections.items())
+    exported = [raw for raw, _name, _number in _read_exports(sections[7])]
+    sections |= {1: _vector(types), 3: _vector(chosen), 7: _vector([*exported, *sweeps]), 10: _vector(codes)}
+    content = b"".join(bytes((kind,)) + _leb(len(part)) + part for kind, part in sections.items())
     return module.code[:8] + content
 
 
-def _stub(module: WrittenModule, number: int, kind: bytes) -> bytes:
-    """A function that notes its number and its first two arguments, and returns what stands in the script for it."""
-    end, result = module.frames + TELL, kind[-1]
-    body = b""
-    if kind[1] >= 2 and kind[2:4] == bytes((I32, I32)):  # of two addresses: an event or a handler
-        note = load(I32, end)
-        for place, value in enumerate((constant(I32, number), b"\x20\x00", b"\x20\x01")):
-            body += note + value + b"\x36\x00" + unsigned(4 * place)
-        body += store(I32, end, note + constant(I32, NOTE.size) + b"\x6a")
-    returned = load(I32, module.frames + SCRIPT + 4 * number) if result == I32 else constant(result, 0)
-    body = row([]) + body + returned + END
-    return unsigned(len(body)) + body
+def _stub(module: WasmModule, number: int, kind: bytes) -> bytes:
+    """Return a function that notes its number and its first two arguments, and returns its result in the script."""
+    end, result = module.frames + TELL, kind[-1:]
+    code = b""
+    if kind[1] >= 2 and kind[2:4] == _I32 + _I32:  # of two addresses: an event or a handler
+        note = _load_i32(end)
+        for index, value in enumerate((_i32(number), _get(0), _get(1))):
+            code += note + value + _store(_I32, 4 * index)
+        code += _i32(0) + note + _i32(NOTE.size) + _ADD + _store(_I32, end)
+    if result == _I32:
+        code += _load_i32(module.frames + SCRIPT + 4 * number)
+    else:
+        code += b"\x42\x00"  # i64.const 0
+    return _function(code)
 
 
-def _sweep(module: WrittenModule, walk: int) -> bytes:
-    """`try(first, behind, cell, out, end, now)`: with each of these states in a cell, over the frames up to `end`; all
-    other state is as it stands behind the script.
+def _sweep(module: WasmModule, walk: int) -> bytes:
+    """Return `try(first, behind, cell, out, end, now)`.
+
+    It runs the walk on the frames up to `end` with each of these states in `cell`, and restores all other state before.
     """
-    state, last, cell, out, end, now, answer = (b"\x20" + unsigned(local) for local in range(7))
+    state, last, cell, out, end, now, answer = range(7)
     told, template = module.frames + TELL, module.frames + TELL + 16
-    restore = load(I32, template) + load(I32, template + 4) + load(I32, template + 8) + b"\xfc\x0a\x00\x00"
-    loop = restore + cell + state + b"\x36\x00\x00"
-    loop += constant(I32, module.frames) + end + now + b"\x10" + unsigned(walk) + b"\x21\x06"
-    for place, value in enumerate((answer, load(I64, module.effects + 16), load(I64, module.effects + 24))):
-        loop += out + value + b"\x37\x00" + unsigned(8 * place)
-    loop += (
-        out
-        + cell
-        + b"\x28\x00\x00\x36\x00"
-        + unsigned(24)
-        + out
-        + load(I32, told)
-        + b"\x36\x00"
-        + unsigned(28)
-    )
-    loop += (
-        out
-        + constant(I32, RECORD.size)
-        + b"\x6a\x21\x03"
-        + state
-        + constant(I32, 1)
-        + b"\x6a\x21\x00\x0c\x01"
-    )
-    body = (
-        row([b"\x01" + bytes((I64,))])
-        + b"\x03"
-        + NOTHING
-        + state
-        + last
-        + b"\x48"
-        + IF
-        + NOTHING
-        + loop
-        + END
-        + END
-    )
-    body += out + END
-    return unsigned(len(body)) + body
+    restore = b"".join(_load_i32(template + 4 * index) for index in range(3)) + _COPY_MEMORY
+    code = restore + _get(cell) + _get(state) + _store(_I32, 0)
+    code += _i32(module.frames) + _get(end) + _get(now) + b"\x10" + _leb(walk) + _set(answer)
+    effects = (_i32(0) + b"\x29\x00" + _leb(module.effects + offset) for offset in (16, 24))  # i64.load
+    for index, value in enumerate((_get(answer), *effects)):
+        code += _get(out) + value + _store(_I64, 8 * index)
+    code += _get(out) + _get(cell) + b"\x28\x00\x00" + _store(_I32, 24)
+    code += _get(out) + _load_i32(told) + _store(_I32, 28)
+    code += _get(out) + _i32(RECORD.size) + _ADD + _set(out)
+    code += _get(state) + _i32(1) + _ADD + _set(state)
+    again = b"\x0c\x01"  # br to the loop
+    loop = _get(state) + _get(last) + _LESS + _IF + _NO_RESULT + code + again + _END
+    return _function(_LOOP + _NO_RESULT + loop + _END + _get(out), locals_=[b"\x01" + _I64])
 
 
-def _unsigned(data: bytes, at: int) -> tuple[int, int]:
+def _leb(value: int) -> bytes:
+    """Encode an unsigned number: seven bits in each byte, the lowest first."""
+    groups = [value >> shift & 0x7F for shift in range(0, max(value.bit_length(), 1), 7)]
+    return bytes(group | 0x80 for group in groups[:-1]) + bytes(groups[-1:])
+
+
+def _i32(value: int) -> bytes:
+    """Encode the constant of an address or small number; five bytes, so its sign bit is clear."""
+    return b"\x41" + bytes(value >> shift & 0x7F | 0x80 for shift in (0, 7, 14, 21)) + bytes((value >> 28,))
+
+
+def _get(local: int) -> bytes:
+    return b"\x20" + _leb(local)
+
+
+def _set(local: int) -> bytes:
+    return b"\x21" + _leb(local)
+
+
+def _load_i32(address: int) -> bytes:
+    return _i32(0) + b"\x28\x00" + _leb(address)
+
+
+def _store(kind: bytes, offset: int) -> bytes:
+    """Encode the store of the value on the stack, at the address below it."""
+    return (b"\x36" if kind == _I32 else b"\x37") + b"\x00" + _leb(offset)
+
+
+def _vector(items: Iterable[bytes]) -> bytes:
+    items = list(items)
+    return _leb(len(items)) + b"".join(items)
+
+
+def _function(code: bytes, locals_: Iterable[bytes] = ()) -> bytes:
+    body = _vector(locals_) + code + _END
+    return _leb(len(body)) + body
+
+
+def _read_leb(data: bytes, at: int) -> tuple[int, int]:
+    """Return the number at `at`, and the position behind it."""
     value = shift = 0
     while True:
         byte = data[at]
@@ -109,58 +137,52 @@ def _unsigned(data: bytes, at: int) -> tuple[int, int]:
 
 
 def sections_of(code: bytes) -> dict[int, bytes]:
-    """The sections of a module by their numbers, in order."""
+    """Return the sections of a module by their numbers, in order."""
     at, found = 8, {}
     while at < len(code):
-        size, begin = _unsigned(code, at + 1)
+        size, begin = _read_leb(code, at + 1)
         found[code[at]] = code[begin : begin + size]
         at = begin + size
     return found
 
 
-def _types(section: bytes) -> list[bytes]:
-    """The types of functions; each has at most 127 arguments."""
-    count, at = _unsigned(section, 0)
-    found = []
+def _types(section: bytes) -> Iterator[bytes]:
+    """Yield the types of functions; each has at most 127 arguments."""
+    count, at = _read_leb(section, 0)
     for _ in range(count):
         begin = at
         at += 2 + section[at + 1]
         at += 1 + section[at]
-        found.append(section[begin:at])
-    return found
+        yield section[begin:at]
 
 
-def _chosen(section: bytes) -> list[bytes]:
-    """The number of each function's type."""
-    count, at = _unsigned(section, 0)
-    found = []
+def _chosen(section: bytes) -> Iterator[bytes]:
+    """Yield the number of each function's type."""
+    count, at = _read_leb(section, 0)
     for _ in range(count):
         begin = at
-        _, at = _unsigned(section, at)
-        found.append(section[begin:at])
-    return found
+        _, at = _read_leb(section, at)
+        yield section[begin:at]
 
 
 def _bodies(section: bytes) -> Iterator[bytes]:
-    count, at = _unsigned(section, 0)
+    """Yield the functions, each with its size."""
+    count, at = _read_leb(section, 0)
     for _ in range(count):
-        size, begin = _unsigned(section, at)
+        size, begin = _read_leb(section, at)
         yield section[at : begin + size]
         at = begin + size
 
 
-def _raw_exports(section: bytes) -> Iterator[bytes]:
-    count, at = _unsigned(section, 0)
+def _read_exports(section: bytes) -> Iterator[tuple[bytes, str, int]]:
+    """Yield the bytes, the name and the number of each export."""
+    count, at = _read_leb(section, 0)
     for _ in range(count):
-        size, begin = _unsigned(section, at)
-        _, end = _unsigned(section, begin + size + 1)
-        yield section[at:end]
+        size, begin = _read_leb(section, at)
+        number, end = _read_leb(section, begin + size + 1)
+        yield section[at:end], section[begin : begin + size].decode(), number
         at = end
 
 
 def _exports(section: bytes) -> Mapping[str, int]:
-    found = {}
-    for one in _raw_exports(section):
-        size, begin = _unsigned(one, 0)
-        found[one[begin : begin + size].decode()] = _unsigned(one, begin + size + 1)[0]
-    return found
+    return {name: number for _raw, name, number in _read_exports(section)}

@@ -1,22 +1,25 @@
-"""Runs the steps of a finished module in every state, and compares them with the automata that were certified.
+"""Run the steps of a finished module in every state, and compare them with the certified automata.
 
-The walk of a topic (`ir/feed.py`) calls the functions of events, looks up states in tables, runs handlers, and notes
-what came of it. Here the same bytes run, tables included, but the functions of events and handlers are replaced
-(`scripted_module.py`): each returns what the check has put down for it (happened, dropped, begin again), and notes that
-it was called. So every event can be made to happen in every state of every property. What the module then does is
-compared with the automaton, which the certificate is about, and with the order and effects of `execution.py`.
+In a module, the walk of a topic (`fast/batch_codegen.py`) calls the functions of events, looks up states in tables,
+and runs handlers. The check runs the same bytes, tables included, but with stubs in place of the functions of events
+and handlers (`scripted_module.py`). A stub notes its call and returns a scripted result, so every event can happen in
+every state of every property. The effect is compared with `expected_steps.py`: the certified automaton, and the order
+and effects of `run/execution.py`.
 
-What is run, for each topic:
+For each topic the check runs:
 
 - each event alone, in every state of every property; with a clock before, at and after its bound;
-- where a handler runs, it returns nothing, a drop, `__RESET;`, both, and that the message is to be left;
-- each event that may drop does so; two events on one message, in every state, the second one dropping if it may, as
-  long as that takes fewer than `MOST` steps for the whole set; and several messages in one read, all with the same
-  results of functions;
-- a monitor that is switched off, a drop and a verdict that are to be left to the engine.
+- each handler with no result, a drop, `__RESET;`, both, and a message that is left to the engine;
+- each event that may drop, dropping; two events on one message in every state, the second dropping if it may, up to
+  `MOST` steps for the whole set; and several messages in one read, all with the same results;
+- a monitor that is switched off, and a drop and a verdict that are left to the engine.
 
-Not run: the functions themselves (`prove` compares those of events with their form), what a changed message leaves in
-the list of effects, the explanations that are kept, and the translation of the module to machine code.
+Not checked: the functions themselves (`prove` compares those of events with their form), the list of effects after a
+changed message, the stored explanations, and the translation of the module to machine code.
+
+Independence ends here: the check takes the addresses of states, clocks, frames and counters from the writer
+(`WasmModule`, `Cells`), the numbers of events and properties from `form/specification_groups.py`, and the steps of
+clocked properties from `ClockedRun`. It encodes its stubs with code of its own.
 """
 
 import struct
@@ -31,17 +34,17 @@ from rosmop.certify.expected_steps import (
     ELSEWHERE,
     HAPPENED,
     RESET,
-    Case,
-    Result,
+    ExpectedResult,
+    ExpectedTopic,
+    PropertyStep,
     States,
-    Stepped,
-    Topic,
+    StepCase,
     begun_in,
 )
 from rosmop.certify.scripted_module import NOTE, RECORD, SCRIPT, TELL, scripted
 from rosmop.fast.abi import AREA, Cells
-from rosmop.fast.batch_codegen import WrittenModule
-from rosmop.fast.wasm_instance import Machine, MachineTrap, translated
+from rosmop.fast.batch_codegen import WasmModule
+from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translated
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
 from rosmop.logics.interface import ClockedProperty, ClockedRun, FiniteProperty
@@ -49,26 +52,26 @@ from rosmop.logics.interface import ClockedProperty, ClockedRun, FiniteProperty
 MOST = 100_000
 """Steps of pairs of events that are run for one set."""
 
-_FEW = 16  # states, where the state plays no part
+_FEW = 16  # states, if the state does not matter
 _FUEL = 100_000  # for each message
 _FRAME = bytes(range(7, 23))
 
 
 class StepDiffersError(Exception):
-    """The module does something else than the automaton; the text says where."""
+    """The module differs from the automaton; the text says where."""
 
 
-def check_steps(compiled: Compiled, module: WrittenModule) -> int:
-    """Run the steps of a module; how many it were. Raises `StepDiffersError` for the first that is wrong."""
+def check_steps(compiled: Compiled, module: WasmModule) -> int:
+    """Run the steps of a module; return how many there were. Raises `StepDiffersError` for the first wrong one."""
     if not module.feeds:
         return 0
     pairs = MOST
-    machine = Machine(translated(scripted(module), module.memory), module.memory)
+    machine = WasmInstance(translated(scripted(module), module.memory), module.memory)
     benches = []
     for group, cells in zip(groups(compiled.specifications), module.cells, strict=True):
         for (name, _), numbers in zip(group.component.topics, group.events, strict=True):
             if name in module.feeds:
-                topic = Topic(compiled, group, module, name, numbers)
+                topic = ExpectedTopic(compiled, group, module, name, numbers)
                 benches.append((topic, _Bench(machine, module, cells, topic, name)))
     steps = sum(
         bench.run(case, number, everywhere=everywhere)
@@ -84,62 +87,62 @@ def check_steps(compiled: Compiled, module: WrittenModule) -> int:
     return steps
 
 
-def _cases(topic: Topic) -> Iterator[tuple[Case, int | None, bool]]:
-    """What is run: a case, the property whose states are tried (None: none), and whether in all of its states."""
+def _cases(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
+    """Yield the cases, each with the property whose states are tried (None: none), and whether all states are."""
     for event, function in enumerate(topic.functions):
         happens = {function: HAPPENED}
         rows = [one for one in topic.steps[event] if one.number is not None]
-        yield Case({}), None, False
-        yield Case({function: ELSEWHERE}), None, False
+        yield StepCase({}), None, False
+        yield StepCase({function: ELSEWHERE}), None, False
         for one in rows:
             for now in _times(one):
-                yield Case(happens, now), one.number, True
+                yield StepCase(happens, now), one.number, True
             for other in rows:
                 beside = _handling(other) if other is not one else None
                 if beside is not None:
                     dropping = happens | _answers(other, DROPPED)
-                    yield Case(dropping, beside=beside), one.number, True
-                    yield Case(happens | _answers(one, DROPPED), beside=beside), one.number, True
-            yield Case(happens, until=BEGAN), one.number, True
-            yield Case(happens, frames=3), one.number, True
-            yield Case(happens, counted=0), one.number, True
+                    yield StepCase(dropping, beside=beside), one.number, True
+                    yield StepCase(happens | _answers(one, DROPPED), beside=beside), one.number, True
+            yield StepCase(happens, until=BEGAN), one.number, True
+            yield StepCase(happens, frames=3), one.number, True
+            yield StepCase(happens, counted=0), one.number, True
             for bits in (DROPPED, RESET, DROPPED | RESET, ELSEWHERE) if one.handlers else ():
                 script = happens | _answers(one, bits)
-                yield Case(script), one.number, True
+                yield StepCase(script), one.number, True
                 if bits == DROPPED:
-                    yield Case(script, frames=3), one.number, True
-                    yield Case(script, told=1 << event), one.number, True
-        yield Case(happens), None, False
+                    yield StepCase(script, frames=3), one.number, True
+                    yield StepCase(script, told=1 << event), one.number, True
+        yield StepCase(happens), None, False
         if topic.drops[event]:
             for number in (None, *topic.properties):
-                yield Case({function: HAPPENED | DROPPED}), number, False
-            yield Case({function: HAPPENED | DROPPED}, frames=3), None, False
-            yield Case({function: HAPPENED | DROPPED}, told=1 << event), None, False
+                yield StepCase({function: HAPPENED | DROPPED}), number, False
+            yield StepCase({function: HAPPENED | DROPPED}, frames=3), None, False
+            yield StepCase({function: HAPPENED | DROPPED}, told=1 << event), None, False
     for place in dict.fromkeys(topic.specifications):
-        yield Case(dict.fromkeys(topic.functions, HAPPENED), enabled=~(1 << place)), None, False
+        yield StepCase(dict.fromkeys(topic.functions, HAPPENED), enabled=~(1 << place)), None, False
 
 
-def _pairs(topic: Topic) -> Iterator[tuple[Case, int | None, bool]]:
-    """The same of two events on one message: both happen, and what comes second drops it, if it may."""
+def _pairs(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
+    """Yield the cases of two events on one message: both happen, and the second drops it if it may."""
     for first, second in combinations(range(len(topic.functions)), 2):
         one, other = topic.functions[first], topic.functions[second]
         numbers = dict.fromkeys(each.number for event in (first, second) for each in topic.steps[event])
         happen = {one: HAPPENED, other: HAPPENED}
         for number in numbers or (None,):
-            yield Case(happen), number, True
+            yield StepCase(happen), number, True
             if topic.drops[second]:
-                yield Case(happen | {other: HAPPENED | DROPPED}), number, True
+                yield StepCase(happen | {other: HAPPENED | DROPPED}), number, True
             if topic.drops[first]:
-                yield Case(happen | {one: HAPPENED | DROPPED}), number, True
+                yield StepCase(happen | {one: HAPPENED | DROPPED}), number, True
             answers: dict[int, int] = {}
             for each in topic.steps[second]:
                 answers |= _answers(each, DROPPED)
             if any(answers.values()):
-                yield Case(happen | answers), number, True
+                yield StepCase(happen | answers), number, True
 
 
-def _handling(one: Stepped) -> tuple[int, int] | None:
-    """The property, and a state from which its event leads to a handler; None if there is none."""
+def _handling(one: PropertyStep) -> tuple[int, int] | None:
+    """Return the property, and a state from which its event leads to a handler; None if no state does."""
     if one.number is None or not isinstance(one.compiled, FiniteProperty):
         return None
     handled, automaton = {each.category for each in one.handlers}, one.compiled.automaton
@@ -149,8 +152,8 @@ def _handling(one: Stepped) -> tuple[int, int] | None:
     return None
 
 
-def _answers(one: Stepped, bits: int) -> dict[int, int]:
-    """What the handlers of a property return: they drop only if they may, and other bits mean nothing."""
+def _answers(one: PropertyStep, bits: int) -> dict[int, int]:
+    """Return the results of a property's handlers; a handler that may not drop has no drop."""
     bits |= HAPPENED | CHANGED
     return {
         each.function: bits if each.drops else bits & ~DROPPED
@@ -159,7 +162,7 @@ def _answers(one: Stepped, bits: int) -> dict[int, int]:
     }
 
 
-def _times(one: Stepped) -> Sequence[int]:
+def _times(one: PropertyStep) -> Sequence[int]:
     if isinstance(one.compiled, FiniteProperty):
         return (BEGAN,)
     within = one.compiled.within  # type: ignore[attr-defined]  # it has a clock
@@ -167,10 +170,10 @@ def _times(one: Stepped) -> Sequence[int]:
 
 
 class _Bench:
-    """A topic's walk in the module with replaced functions."""
+    """A topic's walk in the module with stubs."""
 
     def __init__(
-        self, machine: Machine, module: WrittenModule, cells: Cells, topic: Topic, name: str
+        self, machine: WasmInstance, module: WasmModule, cells: Cells, topic: ExpectedTopic, name: str
     ) -> None:
         feed = module.feeds[name]
         self._memory, self._cells, self._feed, self._topic = machine.memory, cells, feed, topic
@@ -189,15 +192,15 @@ class _Bench:
             at = self._frames + 20 * frame
             self._memory[at : at + 20] = struct.pack("<I", len(_FRAME)) + _FRAME
 
-    def run(self, case: Case, number: int | None, *, everywhere: bool) -> int:
-        """Run a case and compare; how many states were tried. Raises `StepDiffersError`."""
+    def run(self, case: StepCase, number: int | None, *, everywhere: bool) -> int:
+        """Run a case and compare; return how many states were tried. Raises `StepDiffersError`."""
         one = None if number is None else self._topic.properties[number]
         states = 1 if one is None else one.states if everywhere else min(one.states, _FEW)
         for first in range(0, states, self._most):
             self._sweep(case, one, first, min(first + self._most, states))
         return states
 
-    def _sweep(self, case: Case, one: Stepped | None, first: int, behind: int) -> None:
+    def _sweep(self, case: StepCase, one: PropertyStep | None, first: int, behind: int) -> None:
         begun = self._topic.begun()
         if case.beside is not None:
             begun[case.beside[0]] = case.beside[1]
@@ -212,7 +215,7 @@ class _Bench:
         end = self._frames + 20 * case.frames
         try:
             self._try(first, behind, cell, self._out, end, case.now)
-        except MachineTrap as trap:
+        except WasmTrap as trap:
             self._differs(case, one, first, f"it is stopped: {trap}")
         expected = []
         at = notes
@@ -224,7 +227,7 @@ class _Bench:
             at = self._compare(case, one, state, answer, expected[-1])
         self._count(case, one, expected)
 
-    def _waits_no_more(self, number: int, state: Any, case: Case) -> bool:
+    def _waits_no_more(self, number: int, state: Any, case: StepCase) -> bool:
         """Whether the deadline of a property would have passed before the message."""
         tables = self._topic.properties[number].compiled
         if not isinstance(tables, ClockedProperty) or tables.waits[state[0]] is None:
@@ -233,7 +236,7 @@ class _Bench:
         run.state, run.since, run.now = state
         return case.now > (run.deadline or 0)
 
-    def _put_down(self, case: Case, states: States, notes: int) -> None:
+    def _put_down(self, case: StepCase, states: States, notes: int) -> None:
         memory, cells, feed = self._memory, self._cells, self._feed
         for number in range(cells.properties):
             state = states.get(number, 0)
@@ -254,9 +257,14 @@ class _Bench:
         memory[feed.counters : feed.counters + 8 * counters] = bytes(8 * counters)
 
     def _compare(
-        self, case: Case, one: Stepped | None, state: int, given: tuple[int, ...], expected: Result
+        self,
+        case: StepCase,
+        one: PropertyStep | None,
+        state: int,
+        given: tuple[int, ...],
+        expected: ExpectedResult,
     ) -> int:
-        """Compare what came of one try; where the notes of the next begin."""
+        """Compare the results of one try; return where the notes of the next begin."""
         answer, who, what, cell, end, at = given
         notes = list(NOTE.iter_unpack(self._memory[at:end]))
         begins = [self._frames + 20 * frame for frame in range(4)]
@@ -276,11 +284,11 @@ class _Bench:
                 self._differs(case, one, state, f"{what_of}: {found}, not {right}")
         return int(end)
 
-    def _clock(self, one: Stepped) -> tuple[int, ...]:
+    def _clock(self, one: PropertyStep) -> tuple[int, ...]:
         address = self._cells.clocks.get(one.number or 0)
         return () if address is None else struct.unpack_from("<2q", self._memory, address)
 
-    def _count(self, case: Case, one: Stepped | None, expected: Sequence[Result]) -> None:
+    def _count(self, case: StepCase, one: PropertyStep | None, expected: Sequence[ExpectedResult]) -> None:
         """Compare how often events have happened, dropped, and come to verdicts."""
         rows = [
             [0] * len(self._feed.functions),
@@ -296,6 +304,6 @@ class _Bench:
         if found != wanted:
             self._differs(case, one, 0, f"what it counts: {found}, not {wanted}")
 
-    def _differs(self, case: Case, one: Stepped | None, state: int, text: str) -> None:
+    def _differs(self, case: StepCase, one: PropertyStep | None, state: int, text: str) -> None:
         formula = "" if one is None else f", `{one.compiled.logic}: {one.compiled.formula}` in state {state}"
         raise StepDiffersError(f"{self._name}{formula}: {text} ({case})")

@@ -1,12 +1,12 @@
-"""Extended regular expressions, by their derivatives: what may follow an event, as an expression again.
+"""Extended regular expressions by their derivatives (the expression after an event).
 
-Each expression has a number; those of unions and intersections are sets of numbers, so that what is written in another
-order, or twice, is the same. Then there are finitely many derivatives (Brzozowski, 1964).
+Each expression has a number. Unions and intersections are sets of numbers, so that order and repetition do not matter.
+Then there are finitely many derivatives (Brzozowski, 1964).
 """
 
 from collections.abc import Iterable
 
-from rosmop.certify.formula_reader import Node, TooMuchError, UnreadError
+from rosmop.certify.formula_reader import Node, UnsupportedFormulaError, WorkLimitError
 
 LONGEST = 5_000
 """Symbols of an expression whose powers are written out."""
@@ -14,8 +14,8 @@ LONGEST = 5_000
 Parts = tuple[object, ...] | frozenset[int]
 
 
-class Words:
-    """Follows an expression; a state is the number of one. `work` is how many parts all of them may have."""
+class ExpressionDerivatives:
+    """The derivatives of an expression; a state is an expression's number. `work` is the most parts of all together."""
 
     def __init__(self, expression: Node, work: int) -> None:
         self._work = work
@@ -33,7 +33,7 @@ class Words:
         return self._matching[state]
 
     def step(self, state: int, event: str) -> int:
-        """What may follow the event."""
+        """Return the derivative by an event."""
         known = self._derived.get((state, event))
         if known is None:
             known = self._derived[state, event] = self._derive(state, event)
@@ -59,7 +59,7 @@ class Words:
     def _number(self, kind: str, parts: Parts, *, matches: bool) -> int:
         self._work -= 1 + len(parts)
         if self._work < 0:
-            raise TooMuchError
+            raise WorkLimitError
         number = self._numbers.setdefault((kind, parts), len(self._all))
         if number == len(self._all):
             self._all.append((kind, parts))
@@ -73,7 +73,7 @@ class Words:
         return self._number("not", (inner,), matches=not self._matching[inner])
 
     def _sequence(self, first: int, rest: int) -> int:
-        """To the right: what a sequence begins with is none."""
+        """Return a sequence that nests to the right: its first part is not a sequence."""
         if self._none in (first, rest):
             return self._none
         if first == self._nothing:
@@ -87,7 +87,7 @@ class Words:
         return self._number("sequence", (first, rest), matches=self._matching[first] and self._matching[rest])
 
     def _several(self, kind: str, operands: Iterable[int]) -> int:
-        """A union or an intersection."""
+        """Return a union or an intersection."""
         neutral, decisive = (self._none, self._any) if kind == "union" else (self._any, self._none)
         flat: set[int] = set()
         for operand in operands:
@@ -102,7 +102,7 @@ class Words:
         return self._number(kind, frozenset(flat), matches=quantor(self._matching[part] for part in flat))
 
     def _read(self, node: Node) -> tuple[int, int]:
-        """The number of an expression, and how many symbols it has when its powers are written out."""
+        """Return the number of an expression, and how many symbols it has when its powers are written out."""
         kind = str(node[0])
         if kind == "event":
             return self._number("event", (node[1],), matches=False), 1
@@ -114,7 +114,7 @@ class Words:
             case "power":
                 count = int(str(node[2]))
                 if count * size > LONGEST:
-                    raise UnreadError("its powers are too large")
+                    raise UnsupportedFormulaError("its powers are too large")
                 power = self._nothing
                 for _ in range(count):
                     power = self._sequence(numbers[0], power)

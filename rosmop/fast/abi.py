@@ -1,5 +1,4 @@
-"""What a module and what runs it have agreed on: where things stand in its memory, what its calls answer, and the data
-that tell of it.
+"""The interface between a module and its runner: addresses in its memory, results of its calls, and data about it.
 
 A variable of the set is 8 bytes at its address: a number, or the address and length of a string
 (`strings_codegen.py`).
@@ -8,24 +7,26 @@ A variable of the set is 8 bytes at its address: a number, or the address and le
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from rosmop.fast.deferred_output import Line
+from rosmop.fast.deferred_output import OutputLine
 from rosmop.form.compiled import Compiled
 from rosmop.types import value_types
+from rosmop.types.messages import MessageTypes
 from rosmop.types.value_types import Type
+from roswire.definitions import Definitions
 
 POSITION, UNDO, SAID, NOW, SURE, REST, FIRST = 0, 8, 12, 16, 24, 32, 40
-"""Where it stands which frame is looked at, where the log and the lines end, the time, where the lines end of the
-messages before, and how many bytes the message has behind those that are shown (i64); and what is given out begins.
+"""Addresses of: the current frame, the ends of the log and of the lines, the time, the end of the lines of earlier
+messages, the bytes of the message beyond those that are shown (i64). Memory is allocated from `FIRST` on.
 """
 
 MOST_KEPT = 1024
-"""Bytes of a string that a variable keeps."""
+"""Most bytes of a string that a variable of the module keeps."""
 
 BEYOND = 0xFFFFFFFF
-"""In the place of the length of a longer one."""
+"""Replaces the length of a longer string."""
 
 AREA = 512 << 10
-"""Bytes of frames that are fed together: as many as one read takes."""
+"""Bytes of frames in one batch, as many as one read takes."""
 
 LEFT = 1 << 62
 SOONER = 1 << 61
@@ -35,45 +36,46 @@ LOUD = 1 << 63
 
 @dataclass
 class Cells:
-    """Where the state of specifications that share topics or variables stands: 8 bytes for each property's state, then
-    for each variable that is used. Those that are `noted` only are not undone.
+    """Addresses of the state of specifications that share topics or variables: 8 bytes for each property's state, then
+    for each variable that is used. Variables that are only `noted` are not undone.
     """
 
     base: int
     properties: int
     source: int = 0
-    """Where the sender of what is looked at stands (`Sender.source` from bit 32 on), what is told, and which are
-    enabled: three i64 (see `feed.py`).
+    """Address of three i64: the sender (`MessageSender.source` from bit 32 on), the events whose effects are recorded,
+    and the enabled specifications (see `batch_codegen.py`).
     """
     noted: Sequence[str] = ()
     exits: dict[int, int] = field(default_factory=dict)
-    """Where it is kept how the states of a property were left (`why.Exits`, `why.ClockedSteps`), by its number."""
+    """Addresses of the history of each property (`Exits`, `ClockedSteps`), by its number."""
     clocks: dict[int, int] = field(default_factory=dict)
-    """Where it stands when the clock of a property began, and its time (`ClockedRun`), by its number."""
+    """Addresses of the start and the time of a property's clock (`ClockedRun`), by its number."""
     until: int = 0
-    """Where it stands (i64) when the next is due that Python knows of: an earlier deadline is told."""
+    """Address (i64) of the time when Python's next timer is due; the module reports earlier deadlines."""
     variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
-    """Where each stands, and its type; in the order of the places."""
+    """Address and type of each variable, in the order of addresses."""
     texts: dict[int, int] = field(default_factory=dict)
-    """Where strings may be put when there is 0 (i32) at `generation`, by where that is noted."""
+    """Addresses for strings while the number (i32) at `generation` is 0, by the address of the variable."""
     generation: int = 0
     settle: int = 0
-    """The number of the function that puts them there."""
+    """The number of the function that copies strings there."""
 
     @property
     def kept(self) -> Sequence[int]:
-        """Where the addresses and lengths of strings are noted."""
-        return [at for at, kind in self.variables.values() if isinstance(kind, value_types.String)]
+        """Return the addresses of the variables that are strings."""
+        return [at for at, kind in self.variables.values() if isinstance(kind, value_types.StringType)]
 
 
 @dataclass(frozen=True)
-class Feed:
-    """The walk for one topic: the name of its export, whether it may drop or change messages, where events are counted.
+class TopicCode:
+    """The code for one topic: its export, whether it may drop or change messages, the address of the counters of
+    events.
 
-    `verdicts` have the place of an event, of its step of a property, and of the handler. `log` is where the log of
-    patches begins, `undo` the addresses of variables and of what they held before the message that is left. `brief`:
-    it has no loops. `functions` are the numbers of those of the events in the module. `says`: it may put out
-    lines; all before the address at `SURE` are.
+    `verdicts` are the indices of an event, of its step of a property, and of the handler. `log` is the address of the
+    log of patches; `undo` has the addresses of variables and of their values before the current message. `brief`: it
+    has no loops. `functions` are the numbers of the functions of events in the module. `says`: it may print lines;
+    those before the address at `SURE` are final.
     """
 
     name: str
@@ -87,32 +89,38 @@ class Feed:
     functions: Sequence[int]
     says: bool
     settle: str
-    """The export that is called when what was done to the message that is left is taken back; none if it is empty."""
+    """The export to call after undoing the message that was left; empty if there is none."""
 
 
 @dataclass(frozen=True)
-class FeedModule:
-    """A module: its machine code (`machine.translated`), how much memory it has, where frames are put and effects
-    stand, the topics that it takes, and where each component keeps its state.
+class CompiledModule:
+    """A module: its machine code (`translated`), the size of its memory, the addresses of frames and effects, its
+    topics, and the state of each component.
 
-    `throttles`: where it must stand (i64, ns) when output at a site was last due, by the context and the site.
+    `throttles`: addresses of the time (i64, ns) when output at a site was last due, by context and site.
     """
 
     code: bytes
     memory: int
     frames: int
     effects: int
-    feeds: Mapping[str, Feed]
+    feeds: Mapping[str, TopicCode]
     cells: Sequence[Cells]
     throttles: Mapping[tuple[str, int], int]
-    lines: Sequence[Line]
+    lines: Sequence[OutputLine]
     said: int
-    """Where lines of output are noted, by their places among the `lines`."""
+    """Address of the lines of output, which are noted by their index in `lines`."""
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class SetPart:
     """The specifications of a set that one process runs, and the module of those that are not in shadow mode."""
 
     compiled: Compiled
-    module: FeedModule
+    module: CompiledModule
+
+    @classmethod
+    def empty(cls) -> "SetPart":
+        """Return the part without specifications."""
+        nothing = Compiled((), (), {}, (), {}, MessageTypes(Definitions({})), ())
+        return cls(nothing, CompiledModule(b"", 0, 0, 0, {}, (), {}, (), 0))

@@ -1,10 +1,10 @@
-"""Numbers, truths and times: what is calculated with them, as instructions."""
+"""Code that calculates with numbers, booleans and times."""
 
 from math import inf
 
 from rosmop.fast.abi import NOW
-from rosmop.fast.function_parts import Parts
-from rosmop.fast.memory_layout import NotScalarError, is_signed, machine_type
+from rosmop.fast.function_parts import FunctionBuilder
+from rosmop.fast.memory_layout import NotCompiledError, is_signed, machine_type
 from rosmop.fast.wasm import (
     ELSE,
     END,
@@ -82,14 +82,14 @@ _CONVERT = {
 }  # fmt: skip
 
 
-class Arithmetic(Parts):
-    """Writes what has numbers, truths and times as its operands."""
+class ArithmeticCodegen(FunctionBuilder):
+    """Writes operations on numbers, booleans and times."""
 
     # Numbers
 
     def _literal(self, node: nodes.Literal) -> bytes:
         if not isinstance(node.value, int | float):
-            raise NotScalarError(repr(node.value))
+            raise NotCompiledError(f"uses the constant {node.value!r}")
         return constant(machine_type(node.type), node.value)
 
     def _zero(self, node: nodes.Zero) -> bytes:
@@ -101,12 +101,12 @@ class Arithmetic(Parts):
     def _convert(self, node: nodes.Convert) -> bytes:
         code, source, target = self._value(node.value), node.value.type, node.type
         one, other = machine_type(source), machine_type(target)
-        if isinstance(target, value_types.Bool):
+        if isinstance(target, value_types.BoolType):
             return code + constant(one, 0) + compare(one, "!=")
-        if isinstance(target, value_types.Floating):
+        if isinstance(target, value_types.FloatingType):
             return code + to_floating(one, other, signed=is_signed(source))
-        assert isinstance(target, value_types.Integer)  # noqa: S101  numbers are one of the three
-        if isinstance(source, value_types.Floating):
+        assert isinstance(target, value_types.IntegerType)  # noqa: S101  numbers are one of the three
+        if isinstance(source, value_types.FloatingType):
             return self._truncated(code + (F64_PROMOTE_F32 if one == F32 else b""), target)
         if one == other:
             return code + _narrowed(target)
@@ -114,8 +114,8 @@ class Arithmetic(Parts):
             return code + (I64_EXTEND_I32_S if is_signed(source) else I64_EXTEND_I32_U)
         return code + I32_WRAP_I64 + _narrowed(target)
 
-    def _truncated(self, code: bytes, target: value_types.Integer) -> bytes:
-        """A double toward zero, at most the limits."""
+    def _truncated(self, code: bytes, target: value_types.IntegerType) -> bytes:
+        """Truncate a double toward zero, within the limits of the type."""
         if target.bits >= 32:
             return code + _TRUNCATE[64 if target.bits == 64 else 32, target.signed]
         code += I32_TRUNC_SAT_F64_S + self._set("cut")
@@ -189,16 +189,16 @@ class Arithmetic(Parts):
         return self._value(node.test) + if_result(kind) + yes + ELSE + no + END
 
     def _question(self, argument: nodes.Expression, operator: str) -> bytes:
-        """Compare the size of a number with infinity."""
+        """Compare the absolute value of a number with infinity."""
         machine = machine_type(argument.type)
         if machine not in (F32, F64):
-            raise NotScalarError(str(argument.type))
+            raise NotCompiledError.of(argument.type)
         size = self._value(argument) + _ABS[machine]
         compared = size + constant(machine, inf) + compare(machine, operator.strip("!"))
         return compared + (I32_EQZ if operator.startswith("!") else b"")
 
     def _least(self, node: nodes.Call) -> bytes:
-        """`std::min` and `std::max`: the second if it is less, or greater; `fmin` and `fmax`: or the first is NaN."""
+        """Choose as `std::min` and `std::max` do; for `fmin` and `fmax`, the second also if the first is NaN."""
         machine = machine_type(node.type)
         one, other = (f"{side} {machine} {len(self._locals)}" for side in ("first", "second"))
         code = b"".join(
@@ -225,7 +225,7 @@ class Arithmetic(Parts):
         )
 
     def _of_parts(self, seconds: bytes, nanoseconds: bytes) -> bytes:
-        """Nanoseconds of two numbers in 64 bits; elsewhere if they are so large that this would not be exact."""
+        """Combine seconds and nanoseconds (64 bits); leave the message if the sum would not be exact."""
         code, names = b"", [f"{part} {len(self._locals)}" for part in ("seconds", "nanoseconds")]
         for name, value, most in zip(names, (seconds, nanoseconds), (1 << 32, 1 << 61), strict=True):
             code += value + self._set(name, I64)
@@ -235,7 +235,7 @@ class Arithmetic(Parts):
         return code + self._get(names[1], I64) + I64_ADD
 
     def _limited(self, kind: Type, code: bytes) -> bytes:
-        """A time or duration, elsewhere if it is none."""
+        """Leave the message if a time or duration is out of range."""
         least, most = (
             (0, times.MAX_TIME) if kind == value_types.TIME else (times.MIN_DURATION, times.MAX_DURATION)
         )
@@ -246,7 +246,7 @@ class Arithmetic(Parts):
         return code + self._get(name, I64)
 
     def _with_part(self, node: nodes.Call) -> bytes:
-        """A time with other seconds, or other nanoseconds."""
+        """Replace the seconds, or the nanoseconds, of a time."""
         moment, part, new = node.arguments
         assert isinstance(part, nodes.Literal)  # noqa: S101  the name of a part
         value = self._value(new)
@@ -258,7 +258,7 @@ class Arithmetic(Parts):
         return self._limited(node.type, self._of_parts(old + self._seconds(), value))
 
     def _nanoseconds(self) -> bytes:
-        """The part of a moment: not less than nothing."""
+        """Push the nanoseconds of a time, which are never negative."""
         code, value = self._set("moment", I64), self._get("moment", I64)
         whole = self._get("whole", I64)
         code += value + constant(I64, BILLION) + I64_REM_S + self._set("whole", I64)
@@ -271,8 +271,8 @@ class Arithmetic(Parts):
         return rest + whole + constant(I64, BILLION) + I64_DIV_S
 
     def _in_seconds(self) -> bytes:
-        """A moment as a double, rounded once: what has more than 53 bits is divided by 5^9 with 40 bits behind the
-        point, the last of which says whether something is left, and then by 2^9.
+        """Convert a time to seconds as a double, rounded once: more than 53 bits are divided by 5^9 with 40 bits after
+        the point, of which the last is set if there is a remainder, and then by 2^9.
         """
         code, value = self._set("moment", I64), self._get("moment", I64)
         size = self._get("whole", I64)
@@ -292,21 +292,21 @@ class Arithmetic(Parts):
         return code + result + F64_NEG + result + negative + SELECT
 
     def _parts_of(self, kind: Type, moment: bytes) -> tuple[bytes, bytes]:
-        """What divides nanoseconds into seconds and the rest; the two as they stand."""
+        """Return code that splits a time, and the 64 bits of seconds and nanoseconds as in a message."""
         code = self._limited(kind, moment) + self._seconds() + self._set("whole", I64)
         low = self._get("whole", I64) + constant(I64, 0xFFFFFFFF) + I64_AND
         return code, low + self._get("rest", I64) + constant(I64, 32) + I64_SHL + I64_OR
 
 
 def to_floating(source: int, target: int, *, signed: bool) -> bytes:
-    """A number as a floating-point number."""
+    """Return the instruction that converts a number to floating point."""
     if source in (F32, F64):
         return b"" if source == target else F32_DEMOTE_F64 if target == F32 else F64_PROMOTE_F32
     return _CONVERT[target, source, signed]
 
 
-def _narrowed(target: value_types.Integer) -> bytes:
-    """Wrap what stands in 32 bits into fewer."""
+def _narrowed(target: value_types.IntegerType) -> bytes:
+    """Wrap a number in 32 bits to the type's fewer bits."""
     if target.bits >= 32:
         return b""
     if target.signed:

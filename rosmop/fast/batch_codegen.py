@@ -1,23 +1,21 @@
-"""The walk over a read, as WebAssembly: frame by frame, the events of every message in order, patches in place.
+"""Writes the module of a set as WebAssembly: a loop over the frames of a read that runs the events of every message.
 
-`written` writes one module for a set: for each topic an export `feed(at, end, now)` that takes the frames
-(4 bytes of length, little-endian, and the message) from `at` to before `end` in the memory, and answers where the first
-one begins that is left (i64: the low 32 bits), how many effects there are (the next 24), and `LEFT` if that one is for
-Python.
+For each topic the module exports `feed(at, end, now)`. It takes the frames (4 bytes of length, little-endian, and the
+message) from `at` to before `end` in the memory. It returns the address of the first frame that it leaves (i64: the low
+32 bits), the number of effects (the next 24), and `LEFT` if that frame is for the interpreter.
 
-- What a dropped message did to the states of properties that suppress it (`form.Advance.suppresses`) is taken back.
-- A message is either done, with all that follows from it, or left, and then `Feed.undo` says how to take back what was
-  begun. After a trap the message that is left begins at the number that stands at `POSITION`; if that is 0, nothing has
-  begun.
-- What holds for all messages stands at `Cells.source`: their sender; of which events (bit N for the topic's event N)
-  a drop is left, and with `LOUD` a change is (*told*); bits of the topic's specifications (*enabled*), and of which
-  verdicts (bit N for `Feed.verdicts[N]`) are only counted (*counted*): what comes to another is left.
-- An effect is 16 bytes: a set of events (i64) that changed so many (i64) messages on end, or -1 and from where to
-  where (i32, i32) frames were dropped.
-- Where a message brings a property with a clock to a deadline before the time at `Cells.until`, the walk ends behind it
+- A message is either processed, with all consequences, or left; `TopicCode.undo` lists what to restore then. After a
+  trap the message that is left begins at the address stored at `POSITION`; if that is 0, no message had begun.
+- A dropped message does not change the states of properties that suppress it (`nodes.Advance.suppresses`).
+- The options for all messages are at `Cells.source`: their sender; the events (bit N for the topic's event N) whose
+  drops are left, and with `LOUD` all changes (*told*); bits of the topic's enabled specifications (*enabled*); and the
+  verdicts (bit N for `TopicCode.verdicts[N]`) that are only counted (*counted*). Other verdicts leave the message.
+- An effect is 16 bytes: a set of events (i64) and the number of consecutive messages that it changed (i64), or -1 and
+  the start and end (i32, i32) of frames that were dropped.
+- Where a message gives a property with a clock a deadline before the time at `Cells.until`, the loop ends behind it
   with `SOONER`.
-- An event that happened is counted at `Feed.counters`, its drops behind those of all, and behind these the verdicts;
-  with `TOLD` there were some.
+- Events that happened are counted at `TopicCode.counters`, followed by the drops of each event and the verdicts; with
+  `TOLD` there were verdicts.
 """
 
 import struct
@@ -34,17 +32,21 @@ from rosmop.fast.abi import (
     TOLD,
     UNDO,
     Cells,
-    Feed,
-    FeedModule,
+    CompiledModule,
+    TopicCode,
 )
-from rosmop.fast.codegen import CHANGED, DROPPED, HAPPENED, RESET, Writer, Written
+from rosmop.fast.codegen import CHANGED, DROPPED, HAPPENED, RESET, ModuleCodegen, WasmFunction
 from rosmop.fast.function_parts import ELSEWHERE
-from rosmop.fast.memory_layout import NotScalarError
+from rosmop.fast.memory_layout import NotCompiledError, reason_of
 from rosmop.fast.wasm import (
+    ACTIVE,
     BLOCK,
     DROP,
     ELSE,
     END,
+    EXPORTED_FUNCTION,
+    EXPORTED_MEMORY,
+    HEADER,
     I32,
     I32_ADD,
     I32_AND,
@@ -78,6 +80,7 @@ from rosmop.fast.wasm import (
     I64_SUB,
     I64_XOR,
     IF,
+    LIMITED,
     LOOP,
     NOTHING,
     RETURN,
@@ -87,6 +90,7 @@ from rosmop.fast.wasm import (
     call,
     constant,
     function,
+    function_type,
     i32_load,
     i32_load16_s,
     i32_store,
@@ -95,52 +99,64 @@ from rosmop.fast.wasm import (
     load,
     local_get,
     local_set,
+    row,
+    section,
     store,
+    text,
+    unsigned,
 )
-from rosmop.fast.wasm_assembler import PAGE, assembled
 from rosmop.form import nodes
-from rosmop.run.causes import NO_NUMBER, SEQ
+from rosmop.form.compiled import Compiled
+from rosmop.form.specification_groups import groups
 from rosmop.run.explain import CLOCKED_ROOM, ENTRY, KEPT, RING, RUNS
+from rosmop.run.outcomes import NO_NUMBER, SEQ
 from rosmop.runtime.action_context import BUDGET
-from rosmop.runtime.values import Values
+from rosmop.runtime.values import ValueCodec
 
 EFFECT = 4
-"""Where the address of the last effect stands."""
+"""Address of the address of the last effect."""
 
 MAX_EVENTS = 63
 MAX_VERDICTS = 63
 MAX_EFFECTS = 4096
 MAX_TABLES = 8 << 20
-"""Bytes that the tables of all properties of a set may take."""
+"""Most bytes for the tables of all properties of a set."""
+
+PAGE = 1 << 16
+"""Bytes of a page of memory."""
 
 _SLACK = 16  # bytes behind the frames that may be looked at
 
 
 @dataclass(frozen=True)
-class WrittenModule(FeedModule):
-    """A module whose `code` is WebAssembly, and what else there is to know of it."""
+class WasmModule(CompiledModule):
+    """A module whose `code` is WebAssembly, with data for its proof and certificate."""
 
     budgets: Mapping[str, int]
-    """Where the budget of each specification stands, by its context."""
+    """Addresses of budgets, by context."""
     strings: Mapping[bytes, int]
-    """Where constant strings stand."""
+    """Addresses of constant strings."""
     references: Sequence[range]
-    """Where functions leave the values of their references."""
+    """Addresses of the values of references that functions return."""
     handlers: Mapping[str, Sequence[int]]
-    """The numbers of the functions of each topic's verdicts (`Feed.verdicts`)."""
+    """Numbers of the handlers of each topic's verdicts (`TopicCode.verdicts`)."""
     functions: int
-    """How many functions there are besides those that are exported for topics."""
+    """Number of functions other than those exported for topics."""
+    refused: Mapping[str, NotCompiledError]
+    """Topics that are not in the module, with the reason."""
+    left: Mapping[str, Sequence[NotCompiledError]]
+    """Places at which a function leaves a message to the interpreter, by function."""
 
 
 def written(
     functions: Mapping[str, nodes.Function],
     components: Sequence[nodes.Component],
-    values: Values,
+    values: ValueCodec,
     stamped: Container[str] = (),
-) -> WrittenModule:
-    """The module of all topics that can have a walk. The messages of the `stamped` begin with a `std_msgs/Header`."""
+) -> WasmModule:
+    """Write the module of all topics that can be compiled. Messages of `stamped` begin with a `std_msgs/Header`."""
     shared: dict[str, Cells] = {}
-    writer = Writer(functions, shared, values)
+    writer = ModuleCodegen(functions, shared, values)
     cells = []
     for component in components:
         variables = (*component.variables, *component.noted)
@@ -149,21 +165,23 @@ def written(
         cells.append(Cells(base, component.properties, source, component.noted, until=until))
         shared |= dict.fromkeys(variables, cells[-1])
     effects = writer.take(16 * (MAX_EFFECTS + 2))
-    feeds: dict[str, Feed] = {}
-    walks: dict[str, WalkWriter] = {}
+    feeds: dict[str, TopicCode] = {}
+    refused: dict[str, NotCompiledError] = {}
+    walks: dict[str, TopicCodegen] = {}
     tables = _Tables(writer)
     for component, own in zip(components, cells, strict=True):
         for topic, events in component.topics:
             try:
-                walks[topic] = WalkWriter(writer, own, tables, effects, events, stamped=topic in stamped)
-            except (NotScalarError, RecursionError):
-                continue
+                walks[topic] = TopicCodegen(writer, own, tables, effects, events, stamped=topic in stamped)
+            except (NotCompiledError, RecursionError) as error:
+                refused[topic] = reason_of(error)
     settled = [writer.settling(own) for own in cells if own.kept]
     codes: list[bytes] = []
     for topic, walk in walks.items():
         try:
             codes.append(walk.code())
-        except (NotScalarError, RecursionError):
+        except (NotCompiledError, RecursionError) as error:
+            refused[topic] = reason_of(error)
             continue
         feeds[topic] = walk.feed(f"feed {len(feeds)}")
     frames = -(-writer.take(0) // PAGE) * PAGE  # the kernel copies faster from and to what is aligned
@@ -172,8 +190,8 @@ def written(
     exports = {f"settle {number}": number for number in settled}
     exports |= {feed.name: len(wholes) + place for place, feed in enumerate(feeds.values())}
     wholes += [(_PARAMETERS, I64, code) for code in codes]
-    code = assembled(wholes, exports, writer.constants, memory)
-    return WrittenModule(
+    code = _assembled(wholes, exports, writer.constants, memory)
+    return WasmModule(
         code,
         memory,
         frames,
@@ -188,13 +206,47 @@ def written(
         writer.references,
         {topic: [one.number for one in walks[topic].handlers()] for topic in feeds},
         len(writer.written),
+        refused,
+        writer.left,
     )
 
 
-class _Tables:
-    """The tables of properties: 2 bytes for each state; of times 8."""
+def written_of(compiled: Compiled) -> WasmModule:
+    """Return the module of a set of specifications."""
+    components = [group.component for group in groups(compiled.specifications)]
+    return written(compiled.functions, components, ValueCodec(compiled.messages), compiled.stamped)
 
-    def __init__(self, writer: Writer) -> None:
+
+def _assembled(
+    functions: Sequence[tuple[Sequence[int], int, bytes]],
+    exports: Mapping[str, int],
+    constants: Mapping[bytes, int],
+    memory: int,
+) -> bytes:
+    """Return the module of functions (parameter types, result type, code), with exports by name, constant bytes by
+    address, and the size of its memory.
+    """
+    types = [function_type(given, result) for given, result, _ in functions]
+    exported = [text(name) + EXPORTED_FUNCTION + unsigned(number) for name, number in exports.items()]
+    pages = unsigned(memory // PAGE)
+    data = [
+        ACTIVE + constant(I32, address) + END + unsigned(len(raw)) + raw for raw, address in constants.items()
+    ]
+    sections = (
+        (1, row(types)),
+        (3, row([unsigned(index) for index in range(len(types))])),
+        (5, row([LIMITED + pages + pages])),
+        (7, row([*exported, text("memory") + EXPORTED_MEMORY])),
+        (10, row([code for _, _, code in functions])),
+        (11, row(data)),
+    )
+    return HEADER + b"".join(section(number, part) for number, part in sections)
+
+
+class _Tables:
+    """Places the tables of properties: 2 bytes for each state; 8 for times."""
+
+    def __init__(self, writer: ModuleCodegen) -> None:
         self._writer = writer
         self._size = 0
 
@@ -202,11 +254,11 @@ class _Tables:
         try:
             raw = struct.pack(f"<{len(table)}{code}", *table)
         except struct.error:
-            raise NotScalarError("a table of a property") from None
+            raise NotCompiledError("has a property with too many states") from None
         if raw not in self._writer.constants:
             self._size += len(raw)
             if self._size > MAX_TABLES:
-                raise NotScalarError("tables of properties")
+                raise NotCompiledError(f"has properties with tables of more than {MAX_TABLES >> 20} MiB")
         return self._writer.constant(raw)
 
 
@@ -219,12 +271,12 @@ def _set(local: int, value: bytes) -> bytes:
     return value + local_set(local)
 
 
-class WalkWriter:
-    """Writes the walk for one topic. Raises `NotScalarError` if no message would come through."""
+class TopicCodegen:
+    """Writes the code for one topic. Raises `NotCompiledError` if it would leave every message."""
 
     def __init__(
         self,
-        writer: Writer,
+        writer: ModuleCodegen,
         cells: Cells,
         tables: _Tables,
         effects: int,
@@ -233,14 +285,14 @@ class WalkWriter:
         stamped: bool,
     ) -> None:
         if len(events) > MAX_EVENTS:
-            raise NotScalarError("many events")
+            raise NotCompiledError(f"has more than {MAX_EVENTS} events on one topic")
         self._cells = cells
         self._events = events
         self._effects = effects
         self._writer = writer
         self._written = [writer.event(event.function) for event in events]
         self._known_tables = tables
-        self._handlers: dict[tuple[int | None, int], tuple[int, Written | None]] = {}
+        self._handlers: dict[tuple[int | None, int], tuple[int, WasmFunction | None]] = {}
         self.verdicts: list[tuple[int, int, int]] = []
         self._tables = [
             [self._table(number, place) for place in range(len(event.advances))]
@@ -249,7 +301,7 @@ class WalkWriter:
         functions = [*self._written, *self.handlers()]
         self._says = any(written.says for written in functions)
         if self._says and stamped and any(written.early for written in functions):
-            raise NotScalarError("output about a message whose header is changed")
+            raise NotCompiledError("prints a line about a message whose header it changes")
         self._budgets = sorted({writer.budget(writer.functions[event.function].context) for event in events})
         self._counters = writer.take(16 * len(events) + 8 * len(self.verdicts))
         assigned = sorted(
@@ -279,13 +331,13 @@ class WalkWriter:
         self._sooner = self._following + 2
         clocked = sorted(properties.intersection(cells.clocks))
         self._clocks = {number: self._following + 3 + 3 * place for place, number in enumerate(clocked)}
-        """The locals of each property with a clock for what stands at `Cells.clocks`, and its number of steps."""
+        """The local variables of each property with a clock: its start, its time, and its number of steps."""
         self._telling = self._following + 3 + 3 * len(clocked)
-        """The first of the locals of handlers."""
+        """The first of the local variables of handlers."""
 
-    def feed(self, name: str) -> Feed:
-        """What is said about it."""
-        return Feed(
+    def feed(self, name: str) -> TopicCode:
+        """Return the data about this code."""
+        return TopicCode(
             name,
             any(map(self._drops, range(len(self._events)))),
             any(written.writes for written in self._written),
@@ -299,8 +351,8 @@ class WalkWriter:
             f"settle {self._cells.settle}" if self._settles else "",
         )
 
-    def handlers(self) -> list[Written]:
-        """The handlers that run here, by their verdicts."""
+    def handlers(self) -> list[WasmFunction]:
+        """Return the handlers that are compiled, in the order of verdicts."""
         return [written for _, written in self._handlers.values() if written is not None]
 
     def _drops(self, number: int) -> bool:
@@ -308,30 +360,31 @@ class WalkWriter:
         return any(written.drops for written in (self._written[number], *run))
 
     def _table(self, number: int, place: int) -> int | None:
-        """Where the table of a step stands (-1: that handler does not run here), None where it does nothing."""
+        """Return the address of the table of a step (-1: a handler that is not compiled); None if it does nothing."""
         advance = self._events[number].advances[place]
         left: set[int] = set()
         for index, handled in enumerate(advance.handlers):
             key = advance.property, index
             if key not in self._handlers and not handled.states.isdisjoint(advance.table):
+                written = None
                 try:
+                    if len(self.verdicts) == MAX_VERDICTS:
+                        raise NotCompiledError(f"more than {MAX_VERDICTS} verdicts of one topic")
                     written = self._writer.event(handled.function)
-                except (NotScalarError, RecursionError):
-                    written = None
-                if len(self.verdicts) == MAX_VERDICTS:
-                    written = None
+                except (NotCompiledError, RecursionError) as error:
+                    self._writer.leave(handled.function, reason_of(error))
                 self._handlers[key] = len(self.verdicts), written
                 self.verdicts += [(number, place, index)] if written is not None else []
             if key in self._handlers and self._handlers[key][1] is None:
                 left |= handled.states
         table = tuple(-1 if state in left else state for state in advance.table)
         if not self._written[number].passes and max(table) < 0:
-            raise NotScalarError("a verdict with each message")
+            raise NotCompiledError("comes to a verdict with each message")
         idle = advance.clock is None and not self._handled(advance) and table == tuple(range(len(table)))
         return None if idle else self._known_tables.address(table)
 
-    def _handled(self, advance: nodes.Advance) -> dict[tuple[int, Written], frozenset[int]]:
-        """The verdicts that a step may come to here, with what their handlers do, and the states of each."""
+    def _handled(self, advance: nodes.Advance) -> dict[tuple[int, WasmFunction], frozenset[int]]:
+        """Return the verdicts of a step with their compiled handlers, and the states of each."""
         found = {}
         for index, handled in enumerate(advance.handlers):
             verdict, written = self._handlers.get((advance.property, index), (0, None))
@@ -340,7 +393,7 @@ class WalkWriter:
         return found
 
     def code(self) -> bytes:
-        """The function."""
+        """Return the function."""
         here = local_get(_AT) + I64_EXTEND_I32_U + load(I32, EFFECT) + constant(I32, self._effects) + I32_SUB
         here += constant(I32, 4) + I32_SHR_U + I64_EXTEND_I32_U + constant(I64, 32) + I64_SHL + I64_OR
         if self.verdicts:
@@ -379,20 +432,20 @@ class WalkWriter:
         return self._cells.base + 8 * number
 
     def _clock_cells(self) -> Iterator[tuple[int, int, int]]:
-        """The properties with clocks, their locals, and where they stand: when it began, its time, and the steps."""
+        """Yield the properties with clocks, with local variable and address of start, time and number of steps."""
         for number, local in self._clocks.items():
             clock = self._cells.clocks[number]
             for place, at in enumerate((clock, clock + 8, self._cells.exits[number])):
                 yield number, local + place, at
 
     def _begin(self) -> bytes:
-        """Nothing has happened to the frame at hand: the runtime stops, if it does, at calls and where loops begin."""
+        """Mark the current frame as untouched: the runtime stops only at calls and at the start of loops."""
         code = store(I32, POSITION, local_get(_AT)) + store(I32, UNDO, constant(I32, self._log))
         code += store(I32, SURE, load(I32, SAID)) if self._says else b""
         return code + b"".join(store(I64, kept, load(I64, address)) for address, kept in self._undo)
 
     def _frame(self) -> bytes:
-        """Leave unless the whole frame is there, and a place for an effect."""
+        """Leave unless the whole frame is there, and room for an effect."""
         room = local_get(_END) + local_get(_AT) + I32_SUB
         stop = br_if(1)
         code = room + constant(I32, 4) + I32_LT_U + stop
@@ -435,7 +488,7 @@ class WalkWriter:
         return code + END
 
     def _drop(self, number: int, condition: bytes) -> bytes:
-        """The way of the message ends where a condition is not 0 (dropped: 1, left: 5)."""
+        """Stop processing the message if a condition is not 0 (dropped: 1, left: 5)."""
         dropped = condition + constant(I32, 0) + I32_NE
         hidden = local_get(_TOLD) + constant(I64, 1 << number) + I64_AND + I64_EQZ
         code = dropped + hidden + I32_EQZ + I32_AND + br_if(5)
@@ -466,7 +519,7 @@ class WalkWriter:
         return code + self._handle(advance, state) if self._handled(advance) else code
 
     def _handle(self, advance: nodes.Advance, state: int) -> bytes:
-        """Run the handlers of the state that was entered, in their order; then the property may begin anew.
+        """Run the handlers of the state that was entered, in their order; then the property may restart.
 
         Blocks from here: the `if` of the event's steps and of the event, ..., left (6).
         """
@@ -494,8 +547,8 @@ class WalkWriter:
         again = local_get(anew) + IF + NOTHING + _set(state, constant(I32, advance.initial)) + END
         return code + again + END
 
-    def _advance_clock(self, number: int, clock: nodes.Clock, event: int, table: int) -> bytes:
-        """The same of a property with a clock, as `ClockedRun` and `ClockedSteps` do it."""
+    def _advance_clock(self, number: int, clock: nodes.PropertyClock, event: int, table: int) -> bytes:
+        """Step a property with a clock, as `ClockedRun` and `ClockedSteps` do."""
         state, (since, now, count) = (
             self._states[number],
             range(self._clocks[number], self._clocks[number] + 3),
@@ -540,8 +593,9 @@ class WalkWriter:
         return store(I64, address, load(I64, address) + more + I64_EXTEND_I32_U + I64_ADD)
 
     def _changed(self) -> bytes:
-        """Note which events changed it. What several have changed may be as it was: that is left unless the first place
-        that was written has other bytes. (Blocks: dropped, done, the loop, out, left.)
+        """Note the events that changed the message. After several changes its bytes may be the original ones, so the
+        message is left to the engine unless the first changed word differs. (Blocks: dropped, done, the loop, out,
+        left.)
         """
         entry = self._log
         size = constant(I64, 64) + load(I64, entry) + constant(I64, 32) + I64_SHR_U
@@ -561,7 +615,7 @@ class WalkWriter:
         return more + store(I32, EFFECT, local_get(_LAST))
 
     def _dropped(self) -> bytes:
-        """Note which bytes do not go on, and take back the steps of what suppresses: the cells have what was before."""
+        """Note the dropped bytes, and restore the states of properties that suppress."""
         last = local_get(_LAST)
         same = last + i64_load(0) + constant(I64, -1) + I64_EQ
         same += last + i32_load(12) + local_get(_AT) + I32_EQ + I32_AND
@@ -580,7 +634,7 @@ class WalkWriter:
         return code + last + local_get(_NEXT) + i32_store(12)
 
     def _done(self) -> bytes:
-        """What came of the message stays."""
+        """Store the effects of the message."""
         code = b"".join(
             self._count(number, self._is(_FIRST + number, HAPPENED)) for number in range(len(self._events))
         )

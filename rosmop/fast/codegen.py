@@ -1,22 +1,20 @@
-"""A part of the form as WebAssembly: numbers, conditions, loops, reading the message, writing its numbers, drops.
+"""Writes functions of the form as WebAssembly: numbers, conditions, loops, message fields, drops.
 
-Strings, vectors and messages in the message at hand are read in place, if everything in them has a fixed size
-(`codegen_access.py`); strings are kept (`strings_codegen.py`).
+Strings, vectors and messages within the current message are read in place if everything in them has a fixed size
+(`codegen_access.py`); strings can be kept (`strings_codegen.py`). `ModuleCodegen` writes the functions of events and
+handlers and what they call; `batch_codegen.py` writes the loop over the frames of a read.
 
-`Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
-
-- An event, and the handler of a verdict, takes where the message is in the memory and its size (i32, i32), and returns
-  bits (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`, `RESET`.
-- What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
-  it is taken back. Within what it calls it is a trap. Beyond are strings that are made or changed; vectors and
-  messages that are made, kept, compared or changed, `MESSAGE` and whatever is published; messages by reference; output
-  that is the first of its kind in a second; recursion; `sin` and its like. An event of which no message can come past
-  such a place has no module: `NotScalarError` names what is beyond.
-- A line of output is noted behind those before, where `SAID` points, and the message at hand is at `POSITION`
+- The function of an event or handler takes the address of the message and its size (i32, i32), and returns bits (i32):
+  `HAPPENED`, `DROPPED`, `CHANGED` (bytes differ), `ELSEWHERE`, `RESET`.
+- `ELSEWHERE` leaves the message to the interpreter, and its effects are undone: at each fault, and where the form has
+  something that is not compiled. Functions that are called trap instead. An event is not compiled at all if every
+  message would reach such a place; `NotCompiledError` has the reason. The rows `STATEMENTS` and `EXPRESSIONS` list what
+  is not compiled.
+- A line of output is stored after those before, at the address in `SAID`; the current message is at `POSITION`
   (`deferred_output.py`).
-- Before a field is written, what stood there is noted in the log (address, size, bytes; 16 bytes each) that `UNDO`
-  points behind.
-- What the form charges is taken from the budget of its specification, as everywhere.
+- Before a field is written, the old bytes are appended to the log that `UNDO` points into (address, size, bytes; 16
+  bytes each).
+- The charges of the form are taken from the budget of its specification, as in the interpreter.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,9 +26,9 @@ from typing import Any
 from rosmop.fast.abi import NOW, POSITION, SAID, UNDO, Cells
 from rosmop.fast.arithmetic import to_floating
 from rosmop.fast.codegen_access import loaded, root_of
-from rosmop.fast.deferred_output import BYTES, HEAD, Line, is_text
-from rosmop.fast.memory_layout import LINES, Layout, NotScalarError, is_signed, machine_type
-from rosmop.fast.strings_codegen import Texts, settling
+from rosmop.fast.deferred_output import BYTES, HEAD, OutputLine, is_text
+from rosmop.fast.memory_layout import LINES, MemoryLayout, NotCompiledError, is_signed, machine_type
+from rosmop.fast.strings_codegen import StringCodegen, settling
 from rosmop.fast.wasm import (
     DROP,
     F32,
@@ -98,7 +96,7 @@ from rosmop.fast.wasm import (
     store,
 )
 from rosmop.form import nodes
-from rosmop.runtime.values import Values, struct_code, struct_size
+from rosmop.runtime.values import ValueCodec, struct_code, struct_size
 from rosmop.runtime.wire import FEW
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
@@ -106,21 +104,21 @@ from rosmop.types.value_types import Type
 _MOVES = {
     8: (i64_load, i64_store), 4: (i32_load, i32_store), 2: (i32_load16_u, i32_store16), 1: (i32_load8_u, i32_store8),
 }  # fmt: skip
-"""Instructions that load and store so many bytes as they are."""
+"""Instructions that load and store a number of bytes unchanged."""
 
 HAPPENED, DROPPED, CHANGED, RESET = 1, 2, 4, 16
 
 EARLY = 16
-"""Bytes of a message: what is written into a header begins in them."""
+"""Bytes of a message in which a header's fields begin."""
 
 
 @dataclass(frozen=True)
-class Written:
-    """A function that is written: its types and code; what it assigns, how many fields it writes, and whether it drops.
+class WasmFunction:
+    """A function of the module: types and code, the variables that it assigns, its writes to fields, whether it drops.
 
-    `brief`: without loops. `passes`: some message comes to its end. `says`: it may put out lines. `early`: it may write
-    into the first bytes of the message, where a header is. `references`: where the values of its references stand when
-    it has returned.
+    `brief`: it has no loops. `passes`: some message reaches its end. `says`: it may print lines. `early`: it may write
+    to the first bytes of the message, where a header is. `references`: addresses of the values of its references after
+    the return.
     """
 
     number: int
@@ -137,18 +135,24 @@ class Written:
     references: tuple[tuple[str, int], ...] = ()
 
 
-class Writer(Layout):
-    """The functions that are needed, in the order of their numbers, and what stands where in the memory."""
+class ModuleCodegen(MemoryLayout):
+    """Writes the functions of a module, in the order of their numbers, and lays out its memory."""
 
     def __init__(
-        self, functions: Mapping[str, nodes.Function], shared: Mapping[str, Cells], values: Values
+        self, functions: Mapping[str, nodes.Function], shared: Mapping[str, Cells], values: ValueCodec
     ) -> None:
         super().__init__(functions, shared, values)
-        self.written: list[Written] = []
-        self._numbers: dict[tuple[object, ...], Written] = {}
+        self.written: list[WasmFunction] = []
+        self._numbers: dict[tuple[object, ...], WasmFunction] = {}
+        self.left: dict[str, list[NotCompiledError]] = {}
+        """By function: the places at which it leaves the message to the interpreter."""
 
-    def event(self, name: str) -> Written:
-        """The function of an event, or of a handler. Raises `NotScalarError`."""
+    def leave(self, function: str, error: NotCompiledError) -> None:
+        """Note a place at which a function leaves the message."""
+        self.left.setdefault(function, []).append(error)
+
+    def event(self, name: str) -> WasmFunction:
+        """Return the function of an event, or of a handler. Raises `NotCompiledError`."""
         function = self.functions[name]
         return self.function(function, {"at": I32, "size": I32}, I32, function.context)
 
@@ -158,29 +162,29 @@ class Writer(Layout):
         parameters: Mapping[str, int],
         result: int,
         context: str,
-    ) -> Written:
-        """A function, written when it is first asked for; `context` is whose budget it takes from."""
+    ) -> WasmFunction:
+        """Return a function, written on first use; `context` names the budget that it is charged to."""
         key = (function.name, tuple(parameters), result, context)
         if key not in self._numbers:
-            written = _Body(self, function, parameters, result, context).written()
+            written = _FunctionCodegen(self, function, parameters, result, context).written()
             self._numbers[key] = written
             self.written.append(written)
         return self._numbers[key]
 
     def routine(self, key: tuple[object, ...], parameters: int, write: Callable[[], bytes]) -> int:
-        """The number of a function of so many addresses, which is written once."""
+        """Return the number of a function with this number of addresses, which is written once."""
         if key not in self._numbers:
             self._numbers[key] = self._added((I32,) * parameters, write())
         return self._numbers[key].number
 
     def settling(self, cells: Cells) -> int:
-        """The number of the function that copies the strings of variables, which must all be known."""
+        """Return the number of the function that copies the strings of variables, which must all be known."""
         cells.settle = self._added((), settling(self, cells)).number
         return cells.settle
 
-    def _added(self, parameters: tuple[int, ...], code: bytes) -> Written:
-        """A function that no form has; what it returns is in 32 bits."""
-        written = Written(
+    def _added(self, parameters: tuple[int, ...], code: bytes) -> WasmFunction:
+        """Add a function that is not in the form; its result has 32 bits."""
+        written = WasmFunction(
             len(self.written), parameters, I32, code, frozenset(), 0,
             drops=False, brief=True, passes=True, says=False, early=False,
         )  # fmt: skip
@@ -188,12 +192,12 @@ class Writer(Layout):
         return written
 
 
-class _Body(Texts):
+class _FunctionCodegen(StringCodegen):
     """Writes one function."""
 
     def __init__(
         self,
-        writer: Writer,
+        writer: ModuleCodegen,
         function: nodes.Function | nodes.Skipper,
         parameters: Mapping[str, int],
         result: int,
@@ -204,31 +208,31 @@ class _Body(Texts):
         self._writer = writer
         self._function = function
         self._references: dict[str, int] = {}
-        """Where the values of references stand when it has returned."""
+        """Addresses of the values of references after the return."""
         self._result = result
         self._is_handler = answers and function.happens is None  # type: ignore[union-attr]  # has looked
         self._types = tuple(parameters.values())
-        self._depends = False  # whether messages may have left before
+        self._depends = False  # whether messages may have left before this place
         self._writes = 0
         self._drops = False
         self._says = False
         self._early = False
         self._bits: tuple[tuple[str, int], ...] = ()
-        """What is answered besides whether it happened: the local variables, and how far each is shifted."""
+        """The bits of the result besides `HAPPENED`: local variables, and the shift of each."""
         if answers:
             self._bits = (("dropped", 1), ("changed", 2), *([("reset", 4)] if self._is_handler else ()))
         for name, _ in self._bits:
             self._local(name, I32)
 
-    def written(self) -> Written:
-        """The function. Raises `NotScalarError`."""
+    def written(self) -> WasmFunction:
+        """Return the function. Raises `NotCompiledError`."""
         body = self._block(self._function.body)
         if isinstance(self._function, nodes.Skipper):
             body += self._position(self._function.end) + RETURN
         if self._is_handler:
             body += self._leave(nodes.Leave(-1, None))
         made = sorted(self._locals.values())[len(self._types) :]
-        return Written(
+        return WasmFunction(
             len(self._writer.written),
             self._types,
             self._result,
@@ -255,13 +259,15 @@ class _Body(Texts):
     def _statement(self, node: nodes.Statement) -> bytes:
         depth, loops = self._depth, len(self._loops)
         try:
-            method = _STATEMENTS.get(type(node))
-            if method is None:
-                raise NotScalarError(type(node).__name__)
-            return method(self, node)
-        except NotScalarError:
+            row = STATEMENTS[type(node)]
+            if isinstance(row, nodes.Left):
+                raise NotCompiledError(row.reason)
+            return row(self, node)
+        except NotCompiledError as error:
+            error.place(node.site)
             if not depth and not self._depends:
                 raise
+            self._writer.leave(self._function.name, error)
             self._depth = depth
             del self._loops[loops:]
             return self._elsewhere()
@@ -294,11 +300,11 @@ class _Body(Texts):
         first, place, count = self._elements(node.values)
         self._brief = False
         at, left = (f"{what} {len(self._locals)}" for what in ("element", "left"))
-        if isinstance(kind, value_types.String):
+        if isinstance(kind, value_types.StringType):
             each, begin, length = self._text_at(self._get(at))
             each += begin + self._set(f"place of {node.name}") + length
             each += self._set(f"count of {node.name}", I64)
-        elif isinstance(kind, value_types.Record):
+        elif isinstance(kind, value_types.RecordType):
             each = self._get(at) + self._set(f"place of {node.name}")
         else:
             each = loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
@@ -334,14 +340,14 @@ class _Body(Texts):
         return self._spend(constant(I64, node.instructions))
 
     def _allocate(self, node: nodes.Allocate) -> bytes:
-        """Nothing is made here, but it costs the same."""
+        """Charge as the interpreter does, although nothing is allocated here."""
         if node.size is not None:
             return self._allocated(constant(I64, node.size))
         many = self._length() + constant(I64, nodes.CHARGED) + I64_GT_U
         return self._when(many, lambda: self._allocated(self._length()))
 
     def _pending(self, _node: nodes.Pending) -> bytes:
-        """Only `Whole` asks for it, which is beyond."""
+        """Do nothing: only `Whole` uses it, which is not compiled."""
         return b""
 
     def _drop(self, _node: nodes.Drop) -> bytes:
@@ -384,19 +390,21 @@ class _Body(Texts):
         code = self._when(self._get("dropped"), lambda: self._leave(nodes.Leave(node.site, True)))
         for write in sorted(node.writes, key=lambda write: write.end is not None):
             self._early = self._early or (write.at.base is None and write.at.offset < EARLY)
-            code += self._when(self._get(write.flag), partial(self._put_field, write))
+            code += self._when(self._get(write.flag), partial(self._put_field, write, node.site))
         return code
 
-    def _put_field(self, write: nodes.Write) -> bytes:
-        """Put a number where it differs, bit by bit. Python puts NaNs, strings and arrays."""
+    def _put_field(self, write: nodes.Write, site: int) -> bytes:
+        """Write a number if its bits differ. Python writes NaNs, strings and arrays."""
         try:
             return self._put_number(write)
-        except NotScalarError:
+        except NotCompiledError as error:
+            error.place(site)
+            self._writer.leave(self._function.name, error)
             return self._elsewhere()
 
     def _put_number(self, write: nodes.Write) -> bytes:
         if write.end is not None:
-            raise NotScalarError(str(write.value.type))
+            raise NotCompiledError.of(write.value.type)
         codes = struct_code(write.value.type) or ""
         machine, size = machine_type(write.value.type), struct_size(codes)
         value = self._value(write.value)
@@ -415,7 +423,7 @@ class _Body(Texts):
         return code + self._put_bits(self._get("at") + base, write.at.offset, size, value)
 
     def _put_bits(self, place: bytes, offset: int, size: int, bits: bytes) -> bytes:
-        """Put so many bytes there if others stand there, which are noted."""
+        """Write bytes if they differ, and log the old ones."""
         whole = I64 if size == 8 else I32
         get, overwrite = (instruction(offset) for instruction in _MOVES[size])
         new, mask = f"new {whole}", constant(I32, (1 << 8 * size) - 1) + I32_AND if size < 4 else b""
@@ -436,10 +444,10 @@ class _Body(Texts):
     # Expressions
 
     def _value(self, node: nodes.Expression) -> bytes:
-        method = _EXPRESSIONS.get(type(node))
-        if method is None:
-            raise NotScalarError(type(node).__name__)
-        return method(self, node)
+        row = EXPRESSIONS[type(node)]
+        if isinstance(row, nodes.Left):
+            raise NotCompiledError(row.reason)
+        return row(self, node)
 
     def _read(self, node: nodes.Read) -> bytes:
         machine = machine_type(node.type)
@@ -449,9 +457,9 @@ class _Body(Texts):
         return load(machine, self._writer.variable(node.name, node.type))
 
     def _assigned_to(self, node: nodes.Assign) -> bytes:
-        if isinstance(node.type, value_types.String):
+        if isinstance(node.type, value_types.StringType):
             return self._assigned_text(node)
-        if isinstance(node.type, value_types.Vector | value_types.Record):
+        if isinstance(node.type, value_types.VectorType | value_types.RecordType):
             return self._named_in_place(node)
         if node.type == value_types.VOID:
             return self._handed(node.name, node.value)
@@ -463,12 +471,12 @@ class _Body(Texts):
         return store(machine, self._writer.variable(node.name, node.type), value)
 
     def _named_in_place(self, node: nodes.Assign) -> bytes:
-        """Give a local variable a vector or message that is in the message at hand: it stays there."""
+        """Let a local variable name a vector or message within the current message; nothing is copied."""
         source, shared = root_of(node.value), self._writer.shared
         if not source or source in shared or node.name in shared:
-            raise NotScalarError(str(node.type))
+            raise NotCompiledError.of(node.type)
         self._assigned.add(node.name)
-        if isinstance(node.type, value_types.Record):
+        if isinstance(node.type, value_types.RecordType):
             return b"".join(self._place(node.value)) + self._set(f"place of {node.name}")
         code, place, count = self._elements(node.value)
         code += place + self._set(f"place of {node.name}")
@@ -478,8 +486,8 @@ class _Body(Texts):
         return self._assigned_to(node) + self._read(nodes.Read(node.type, node.name))
 
     def _log(self, node: nodes.Log) -> bytes:
-        """Note the values of a line, and what line it is."""
-        line, number = Line(self._context, node), len(self._locals)
+        """Store the number and the values of a line of output."""
+        line, number = OutputLine(self._context, node), len(self._locals)
         code, cost, stores = b"", constant(I64, line.cost), b""
         for place, value in enumerate(line.values):
             first, slot, size = self._slot(value, f"value {place} {number}", HEAD.size + 8 * place)
@@ -487,8 +495,8 @@ class _Body(Texts):
         self._says = True
         return code + self._noted_line(line, cost) + stores + constant(I32, 0)
 
-    def _noted_line(self, line: Line, cost: bytes) -> bytes:
-        """Pay for a line of output, and begin it, where the local variable `line` says then."""
+    def _noted_line(self, line: OutputLine, cost: bytes) -> bytes:
+        """Charge for a line of output, and store its head; the local variable `line` is its address."""
         known = self._layout.lines
         code = load(I32, SAID) + self._set("line")
         end = self._get("line") + constant(I32, line.size) + I32_ADD
@@ -500,7 +508,7 @@ class _Body(Texts):
         return code
 
     def _slot(self, node: nodes.Expression, name: str, at: int) -> tuple[bytes, bytes, bytes]:
-        """What comes first; what puts a value into the line (of a string: its place and length); its cost."""
+        """Return code to run first, code that stores a value in the line (a string: address, length), and its cost."""
         line = self._get("line")
         if is_text(node):
             first, place, count = self._elements(node)
@@ -518,7 +526,7 @@ class _Body(Texts):
         return first, line + value + wide + i64_store(at), b""
 
     def _throttle(self, node: nodes.Throttle) -> bytes:
-        """Output that is not due yet; Python puts out what is, and notes when."""
+        """Skip output that is not due yet; for output that is due, leave the message to Python."""
         seconds = self._value(node.seconds) + to_floating(
             machine_type(node.seconds.type), F64, signed=is_signed(node.seconds.type)
         )
@@ -567,16 +575,16 @@ class _Body(Texts):
         if node.function in _QUESTIONS:
             return self._question(argument, _QUESTIONS[node.function])
         if (
-            isinstance(node.type, value_types.Index)
+            isinstance(node.type, value_types.IteratorType)
             and isinstance(argument, nodes.Call)
             and argument.function != "l_len"
         ):
-            raise NotScalarError("a sum of more than two that must not wrap")
+            raise NotCompiledError("adds more than two numbers that must not wrap")
         opcode = _OPCODES.get((node.function, machine_type(argument.type)))
         if opcode is not None:
             return b"".join(map(self._value, node.arguments)) + opcode
         if node.function not in _OF_MOMENTS:
-            raise NotScalarError(node.function)
+            raise NotCompiledError(f"calls {node.function.partition('_')[2]}")
         code = self._value(argument) + _OF_MOMENTS[node.function](self)
         return code + I32_WRAP_I64 if machine_type(node.type) == I32 else code
 
@@ -590,22 +598,22 @@ class _Body(Texts):
     def _after(self, node: nodes.Sequence) -> tuple[bytes, bytes, bytes]:
         *before, last = node.items
         if node.chosen not in (-1, len(before)):
-            raise NotScalarError(str(node.type))
+            raise NotCompiledError.of(node.type)
         code = b"".join(self._evaluate(nodes.Evaluate(-1, item)) for item in before)
         first, place, count = self._elements(last)
         return code + first, place, count
 
-    # What functions are given, and hand back
+    # Arguments and results of functions
 
     def _invoke(self, node: nodes.Invoke) -> bytes:
         return self._called(node)[0]
 
     def _called(self, node: nodes.Invoke) -> tuple[bytes, tuple[tuple[str, int], ...]]:
-        """A call, and where the values of its references stand behind it. A string or vector that it returns is where
-        it is (32 bits) and how long.
+        """Return the code of a call, and the addresses of the values of its references. A returned string or vector is
+        its address (32 bits) and length.
         """
         if node.depth is not None:
-            raise NotScalarError("recursion")
+            raise NotCompiledError("calls a recursive function")
         result = (
             I32
             if node.type == value_types.VOID
@@ -621,7 +629,7 @@ class _Body(Texts):
                 if _has_place(argument.type):
                     parameters |= {f"place of {name}": I32, f"count of {name}": I64}
                     code += b"".join(self._elements(argument))
-                elif isinstance(argument.type, value_types.Record):
+                elif isinstance(argument.type, value_types.RecordType):
                     parameters[f"place of {name}"] = I32
                     code += b"".join(self._place(argument))
                 else:
@@ -653,15 +661,13 @@ class _Body(Texts):
                 machine = self._locals[name][1]
                 code += store(machine, at, self._get(name, machine))
             else:
-                raise NotScalarError("a message by reference")
+                raise NotCompiledError("passes a message by reference")
         return code + answer + RETURN
 
     def _handed(self, name: str, node: nodes.Expression) -> bytes:
-        """Call a function with references; what it hands back is in local variables that are numbered, from its value
-        on.
-        """
+        """Call a function with references; its value and those of the references are in numbered local variables."""
         if not isinstance(node, nodes.Invoke):
-            raise NotScalarError(str(node.type))
+            raise NotCompiledError.of(node.type)
         code, references = self._called(node)
         if _has_place(node.type):
             code += self._put_span(f"{name} 0")
@@ -678,7 +684,7 @@ class _Body(Texts):
         return code
 
     def _put_span(self, name: str) -> bytes:
-        """An address and length (32 bits each, from the stack) in local variables."""
+        """Pop an address and length (32 bits each) into local variables."""
         code = self._set("span", I64) + self._get("span", I64) + I32_WRAP_I64 + self._set(f"place of {name}")
         return (
             code + self._get("span", I64) + constant(I64, 32) + I64_SHR_U + self._set(f"count of {name}", I64)
@@ -705,12 +711,12 @@ class _Body(Texts):
 
 
 def _has_place(kind: Type) -> bool:
-    """Whether a value is where it is and how long it is."""
-    return isinstance(kind, value_types.String | value_types.Vector)
+    """Return whether values of a type are represented by address and length."""
+    return isinstance(kind, value_types.StringType | value_types.VectorType)
 
 
 def _part_of(node: nodes.Item) -> nodes.Read:
-    """The local variable that has a part of what a function has handed back."""
+    """Return the local variable for a part of a function's result."""
     assert isinstance(node.base, nodes.Read)  # noqa: S101  as the form has it
     return nodes.Read(node.type, f"{node.base.name} {node.number}")
 
@@ -728,18 +734,89 @@ _OPCODES = {
     ("k_after", I64): I64_ADD,
     ("k_before", I64): I64_SUB,
 }
-_SPECIAL: Mapping[str, Callable[[_Body, nodes.Call], bytes]] = MappingProxyType(
+_SPECIAL: Mapping[str, Callable[[_FunctionCodegen, nodes.Call], bytes]] = MappingProxyType(
     {
-        **dict.fromkeys(("h_min", "h_max", "h_fmin", "h_fmax", "h_fminf", "h_fmaxf"), _Body._least),
-        "a_part": _Body._with_part,
-        "l_element": _Body._element_at,
+        **dict.fromkeys(
+            ("h_min", "h_max", "h_fmin", "h_fmax", "h_fminf", "h_fmaxf"), _FunctionCodegen._least
+        ),
+        "a_part": _FunctionCodegen._with_part,
+        "l_element": _FunctionCodegen._element_at,
     }
 )
 _OF_COUNTS = {"l_len": b"", "l_empty": I64_EQZ, "l_last": constant(I64, 1) + I64_SUB}
 _QUESTIONS = {"h_isinf": "==", "h_isfinite": "<", "h_isnan": "!<="}
-_OF_MOMENTS: Mapping[str, Callable[[_Body], bytes]] = MappingProxyType(
-    {"m_nsec": _Body._nanoseconds, "m_sec": _Body._seconds, "m_seconds": _Body._in_seconds}
+_OF_MOMENTS: Mapping[str, Callable[[_FunctionCodegen], bytes]] = MappingProxyType(
+    {
+        "m_nsec": _FunctionCodegen._nanoseconds,
+        "m_sec": _FunctionCodegen._seconds,
+        "m_seconds": _FunctionCodegen._in_seconds,
+    }
 )
 
-_STATEMENTS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = nodes.methods_of(_Body, nodes.Statement)
-_EXPRESSIONS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = nodes.methods_of(_Body, nodes.Expression)
+STATEMENTS: Mapping[type[nodes.FormNode], Callable[[_FunctionCodegen, Any], bytes] | nodes.Left] = (
+    MappingProxyType(
+        {
+            nodes.Evaluate: _FunctionCodegen._evaluate,
+            nodes.If: _FunctionCodegen._if,
+            nodes.Loop: _FunctionCodegen._loop,
+            nodes.ForEach: _FunctionCodegen._for_each,
+            nodes.Break: _FunctionCodegen._break,
+            nodes.Continue: _FunctionCodegen._continue,
+            nodes.Select: _FunctionCodegen._select,
+            nodes.Return: _FunctionCodegen._return,
+            nodes.Leave: _FunctionCodegen._leave,
+            nodes.Charge: _FunctionCodegen._charge,
+            nodes.Allocate: _FunctionCodegen._allocate,
+            nodes.LimitDepth: nodes.Left("calls a recursive function"),
+            nodes.Drop: _FunctionCodegen._drop,
+            nodes.Reset: _FunctionCodegen._reset,
+            nodes.Publish: nodes.Left("publishes a message"),
+            nodes.AfterText: _FunctionCodegen._after_text,
+            nodes.Count: _FunctionCodegen._count,
+            nodes.AfterElements: _FunctionCodegen._after_elements,
+            nodes.Skip: _FunctionCodegen._skip,
+            nodes.NotPast: _FunctionCodegen._not_past,
+            nodes.ReadNumbers: _FunctionCodegen._read_numbers,
+            nodes.ReadValue: _FunctionCodegen._read_value,
+            nodes.Require: _FunctionCodegen._require,
+            nodes.Pending: _FunctionCodegen._pending,
+            nodes.WriteBack: _FunctionCodegen._write_back,
+        }
+    )
+)
+EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[_FunctionCodegen, Any], bytes] | nodes.Left] = (
+    MappingProxyType(
+        {
+            nodes.Literal: _FunctionCodegen._literal,
+            nodes.Read: _FunctionCodegen._read,
+            nodes.Assign: _FunctionCodegen._assign,
+            nodes.Convert: _FunctionCodegen._convert,
+            nodes.Arithmetic: _FunctionCodegen._arithmetic,
+            nodes.Unary: _FunctionCodegen._unary,
+            nodes.Moment: _FunctionCodegen._moment,
+            nodes.MomentOf: _FunctionCodegen._moment_of,
+            nodes.Compare: _FunctionCodegen._compare,
+            nodes.CompareTexts: _FunctionCodegen._compare_texts,
+            nodes.Logical: _FunctionCodegen._logical,
+            nodes.Not: _FunctionCodegen._not,
+            nodes.Conditional: _FunctionCodegen._conditional,
+            nodes.Sequence: _FunctionCodegen._sequence,
+            nodes.Discard: nodes.Left("discards a value within an expression"),
+            nodes.Item: _FunctionCodegen._item,
+            nodes.Vector: nodes.Left("builds an array"),
+            nodes.Zero: _FunctionCodegen._zero,
+            nodes.Copy: nodes.Left("copies an array or a message"),
+            nodes.Recast: nodes.Left("converts an array of bytes"),
+            nodes.OfType: nodes.Left("handles values of any type"),
+            nodes.Call: _FunctionCodegen._call,
+            nodes.Accumulate: _FunctionCodegen._accumulate,
+            nodes.Invoke: _FunctionCodegen._invoke,
+            nodes.Format: nodes.Left("formats text"),
+            nodes.Join: nodes.Left("joins strings"),
+            nodes.Log: _FunctionCodegen._log,
+            nodes.Throttle: _FunctionCodegen._throttle,
+            nodes.Now: _FunctionCodegen._now,
+            nodes.Whole: nodes.Left("uses MESSAGE"),
+        }
+    )
+)

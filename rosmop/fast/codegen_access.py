@@ -1,15 +1,15 @@
-"""What stands in a message: positions, numbers, and strings, arrays and messages where they stand.
+"""Code that reads a message: positions, numbers, and strings, arrays and messages in place.
 
-In a local variable is the address, and how many elements there are. Of an array of strings it is the address of a table
-that says where each begins.
+A local variable has the address and the number of elements. For an array of strings it has the address of a table with
+the address of each.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rosmop.fast.abi import REST
-from rosmop.fast.arithmetic import Arithmetic
-from rosmop.fast.memory_layout import NotScalarError, machine_type
+from rosmop.fast.arithmetic import ArithmeticCodegen
+from rosmop.fast.memory_layout import NotCompiledError, machine_type
 from rosmop.fast.wasm import (
     I32,
     I32_ADD,
@@ -45,7 +45,7 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 MOST_TEXTS = 256
-"""Strings of an array that is read; one of more is left."""
+"""Most strings of an array; a message with more is left to the interpreter."""
 
 _LOADS = {
     "?": i32_load8_u, "b": i32_load8_s, "B": i32_load8_u, "h": i32_load16_s, "H": i32_load16_u,
@@ -53,20 +53,20 @@ _LOADS = {
 }  # fmt: skip
 
 
-class Places(Arithmetic):
-    """Writes what looks at the message."""
+class MessageAccess(ArithmeticCodegen):
+    """Writes code that reads the message."""
 
     def _position(self, at: nodes.Spot) -> bytes:
-        """A position, in 64 bits: the lengths in a message are not to be trusted."""
+        """Push a position in 64 bits, because lengths in a message are untrusted."""
         offset = constant(I64, at.offset)
         return offset if at.base is None else self._get(at.base, I64) + offset + I64_ADD
 
     def _length(self) -> bytes:
-        """The bytes of all of the message, in 64 bits."""
+        """Push the size of the whole message, in 64 bits."""
         return self._get("size") + I64_EXTEND_I32_U + load(I64, REST) + I64_ADD
 
     def _within(self, at: nodes.Spot, size: int) -> bytes:
-        """A fault unless so many bytes of the message stand there."""
+        """Leave the message unless it has this many bytes at the position."""
         short = self._get("size") + I64_EXTEND_I32_U + self._position(at.plus(size)) + I64_LT_U
         return self._when(short, self._elsewhere)
 
@@ -82,7 +82,7 @@ class Places(Arithmetic):
         return self._within(node.at, 4) + end + self._set(node.name, I64)
 
     def _count(self, node: nodes.Count) -> bytes:
-        """The number of elements, in 64 bits; a fault if so many are not there."""
+        """Store the number of elements, in 64 bits; leave the message if it has fewer."""
         code = self._within(node.at, 4) + self._length_at(node.at)
         number = self._get(node.name, I64)
         room = self._get("size") + I64_EXTEND_I32_U + self._position(node.at.plus(4)) + I64_SUB
@@ -107,15 +107,15 @@ class Places(Arithmetic):
 
     def _read_value(self, node: nodes.ReadValue) -> bytes:
         place, count, start = f"place of {node.name}", f"count of {node.name}", node.at
-        if isinstance(node.type, value_types.Record):
+        if isinstance(node.type, value_types.RecordType):
             size = self._layout.size(node.type)
             code = self._within(start, size) + self._get("at") + self._position(start)
             code += I32_WRAP_I64 + I32_ADD + self._set(place)
             return code + self._position(start.plus(size)) + self._set(node.end, I64)
         element, size = self._layout.element(node.type)
-        if isinstance(element, value_types.String):
+        if isinstance(element, value_types.StringType):
             return self._read_texts(node)
-        if isinstance(node.type, value_types.Vector) and node.type.length is not None:
+        if isinstance(node.type, value_types.VectorType) and node.type.length is not None:
             code = self._within(start, node.type.length * size)
             code += constant(I64, node.type.length) + self._set(count, I64)
         else:
@@ -124,9 +124,9 @@ class Places(Arithmetic):
         return code + self._after_elements(nodes.AfterElements(node.site, node.end, start, count, size))
 
     def _read_texts(self, node: nodes.ReadValue) -> bytes:
-        """Note where each string of an array begins."""
-        if isinstance(node.type, value_types.Vector) and node.type.length is not None:
-            raise NotScalarError(str(node.type))
+        """Store the address of each string of an array."""
+        if isinstance(node.type, value_types.VectorType) and node.type.length is not None:
+            raise NotCompiledError.of(node.type)
         count, left, entry = (
             f"count of {node.name}",
             f"left {len(self._locals)}",
@@ -146,38 +146,38 @@ class Places(Arithmetic):
         return code + self._times(left, each) + table + self._set(f"place of {node.name}")
 
     def _text_at(self, entry: bytes) -> tuple[bytes, bytes, bytes]:
-        """The string that begins where an entry of a table says, as `_elements`."""
+        """Like `_elements`, for the string whose address is in an entry of a table."""
         name = f"text {len(self._locals)}"
         first = entry + i32_load(0) + self._set(name)
         length = self._get(name) + i32_load(0) + I64_EXTEND_I32_U
         return first, self._get(name) + constant(I32, 4) + I32_ADD, length
 
     def _elements(self, node: nodes.Expression) -> tuple[bytes, bytes, bytes]:
-        """What comes first; the address of the first element of a string or vector, and how many there are (i64)."""
+        """Return code to run first, the address of the first element of a string or vector, and their number (i64)."""
         if isinstance(node, nodes.Copy):
             first, place, count = self._elements(node.value)
             element, size = self._layout.element(node.type)
             machine_type(element)
             return first + self._allocated(count + constant(I64, size) + I64_MUL), place, count
         if (
-            isinstance(node.type, value_types.String)
+            isinstance(node.type, value_types.StringType)
             and isinstance(node, nodes.Call)
             and node.function == "l_element"
         ):
             return self._text_at(self._address_of(node))
         if (
             isinstance(node, nodes.Item)
-            and isinstance(node.type, value_types.Vector)
+            and isinstance(node.type, value_types.VectorType)
             and node.type.length is not None
         ):
             first, place = self._place(node)
             return first, place, constant(I64, node.type.length)
         if not isinstance(node, nodes.Read) or f"place of {node.name}" not in self._locals:
-            raise NotScalarError(str(node.type))
+            raise NotCompiledError.of(node.type)
         return b"", self._get(f"place of {node.name}"), self._get(f"count of {node.name}", I64)
 
     def _place(self, node: nodes.Expression) -> tuple[bytes, bytes]:
-        """What comes first; the address of a message within this one, or of an array of fixed length."""
+        """Return code to run first, and the address of a nested message, or of an array of fixed length."""
         if isinstance(node, nodes.Copy):
             self._layout.copied(node.type)
             return self._place(node.value)
@@ -188,27 +188,27 @@ class Places(Arithmetic):
             name, code = f"element {len(self._locals)}", self._address_of(node)
             return code + self._set(name), self._get(name)
         if not isinstance(node, nodes.Read) or f"place of {node.name}" not in self._locals:
-            raise NotScalarError(str(node.type))
+            raise NotCompiledError.of(node.type)
         return b"", self._get(f"place of {node.name}")
 
     @contextmanager
     def _apart(self, *looked_at: nodes.Expression) -> Iterator[None]:
-        """What is written here does not change what is looked at; raises `NotScalarError` if it does."""
+        """Raise `NotCompiledError` if the code written within changes the values that are read."""
         names = {
             root_of(node)
             for node in looked_at
-            if isinstance(node.type, value_types.Vector | value_types.Record)
+            if isinstance(node.type, value_types.VectorType | value_types.RecordType)
         }
         before, self._assigned = self._assigned, set()
         try:
             yield
             if not names.isdisjoint(self._assigned):
-                raise NotScalarError("a vector or message that changes while it is looked at")
+                raise NotCompiledError("changes an array or a message while reading it")
         finally:
             self._assigned |= before
 
     def _address_of(self, node: nodes.Call) -> bytes:
-        """The address of an element."""
+        """Push the address of an element."""
         values, index = node.arguments
         _, size = self._layout.element(values.type)
         first, place, count = self._elements(values)
@@ -229,7 +229,7 @@ class Places(Arithmetic):
 
 
 def loaded(place: bytes, offset: int, kind: Type) -> bytes:
-    """A number or time so many bytes behind a place."""
+    """Load a number or time at an offset from an address."""
     codes = struct_code(kind) or ""
     if len(codes) == 2:
         extend = I64_EXTEND_I32_U if codes[0] == "I" else I64_EXTEND_I32_S
@@ -240,7 +240,7 @@ def loaded(place: bytes, offset: int, kind: Type) -> bytes:
 
 
 def root_of(node: nodes.Expression) -> str:
-    """The variable that a value is, is in, or is copied from; none where that is not plain."""
+    """Return the variable that a value is, belongs to, or was copied from; empty if unknown."""
     while not isinstance(node, nodes.Read | nodes.Assign):
         if isinstance(node, nodes.Copy):
             node = node.value
@@ -250,4 +250,4 @@ def root_of(node: nodes.Expression) -> str:
             node = node.arguments[0]
         else:
             return ""
-    return node.name if node.type != value_types.VOID else ""  # that holds what a function has handed back
+    return node.name if node.type != value_types.VOID else ""  # the variable with a function's result

@@ -1,8 +1,8 @@
-"""Lines of output of which a module keeps the values, so that they are made of them later.
+"""Lines of output: the module stores their values, and Python formats them later.
 
-A line stands in the module's memory as its number among those of the module, the address of the frame (i32 each), and 8
-bytes for each value: an integer, a double, or a string's address (the low 32 bits) and length. It costs the most that
-it can: text is not made before it is paid for.
+A line is stored in the module's memory as its number among those of the module, the address of the frame (i32 each),
+and 8 bytes for each value: an integer, a double, or a string's address (the low 32 bits) and length. Its highest
+possible cost is charged, because text is not made before it is paid for.
 """
 
 import struct
@@ -18,10 +18,10 @@ from rosmop.runtime.formatting import MAX_PRECISION
 from rosmop.types import value_types
 
 HEAD = struct.Struct("<II")
-"""The number of a line and where its frame is."""
+"""The number of a line and the address of its frame."""
 
 BYTES = BYTES_PER_INSTRUCTION // 4
-"""Of a string, for an instruction more."""
+"""Bytes of a string that cost one instruction."""
 
 _ADDRESS = 0xFFFFFFFF
 _PIECE = 512  # bytes that a number may take
@@ -29,10 +29,8 @@ _SHORT = 1024  # bytes of a text whose size is not charged
 _Make = Callable[[Sequence[object]], object]
 
 
-class Line(msgspec.Struct, tag=True, array_like=True, dict=True):
-    """A line, which can be sent: the `values` that it is made of, and how many bytes it may have besides those of its
-    strings.
-    """
+class OutputLine(msgspec.Struct, tag=True, array_like=True, dict=True):
+    """A line that can be serialized: its `values`, and the most bytes that it has besides those of strings."""
 
     context: str
     node: nodes.Log
@@ -47,11 +45,11 @@ class Line(msgspec.Struct, tag=True, array_like=True, dict=True):
 
     @property
     def cost(self) -> int:
-        """Instructions: with one for each `BYTES` of its strings at least what is taken for it."""
+        """Return the cost in instructions; with one for each `BYTES` of its strings, at least what the form charges."""
         return OUTPUT_COST + 3 * (self.longest // BYTES_PER_INSTRUCTION + 1)  # formatted, joined and put out
 
     def put_out(self, memory: memoryview, at: int, monitor: str) -> LogLine:
-        """The line that stands there."""
+        """Return the line that is stored at an address."""
         values: list[Any] = [*self._slots.unpack_from(memory, at + HEAD.size)]
         for place in self._texts:
             where, length = values[place] & _ADDRESS, values[place] >> 32
@@ -61,7 +59,7 @@ class Line(msgspec.Struct, tag=True, array_like=True, dict=True):
         return line_of(self.node.level, text, monitor)
 
     def _made(self, node: nodes.Expression) -> _Make:
-        """How a part of the text is made of the values."""
+        """Return a function that formats a part of the text from the values."""
         if isinstance(node, nodes.Literal):
             constant = node.value
             self.longest += len(constant) if isinstance(constant, bytes) else 0
@@ -84,12 +82,12 @@ class Line(msgspec.Struct, tag=True, array_like=True, dict=True):
 
 
 def is_text(node: nodes.Expression) -> bool:
-    """Whether a value is a string."""
-    return isinstance(node.type, value_types.String)
+    """Return whether a value is a string."""
+    return isinstance(node.type, value_types.StringType)
 
 
 def _goes_on(node: nodes.Call) -> bool:
-    """Whether it does not fault: of those that can the precision is a constant that is not too large."""
+    """Return whether formatting cannot fault: the precision is a constant within bounds."""
     if node.function not in FAULTING:
         return True
     digits = node.arguments[1]
@@ -101,8 +99,10 @@ def _goes_on(node: nodes.Call) -> bool:
 
 
 def _code(node: nodes.Expression) -> str:
-    if isinstance(node.type, value_types.Floating):
+    if isinstance(node.type, value_types.FloatingType):
         return "d"
     return (
-        "Q" if is_text(node) or (isinstance(node.type, value_types.Integer) and not node.type.signed) else "q"
+        "Q"
+        if is_text(node) or (isinstance(node.type, value_types.IntegerType) and not node.type.signed)
+        else "q"
     )

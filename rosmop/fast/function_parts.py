@@ -1,10 +1,10 @@
-"""What every function of a module is made of: local variables, branches, loops, what is charged, what is left."""
+"""The parts of each function of a module: local variables, branches, loops, charges."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from rosmop.fast.memory_layout import Layout, NotScalarError
+from rosmop.fast.memory_layout import MemoryLayout, NotCompiledError
 from rosmop.fast.wasm import (
     BLOCK,
     ELSE,
@@ -33,13 +33,15 @@ from rosmop.form import nodes
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, UNMEASURED
 
 ELSEWHERE = 8
-"""The answer of an event or handler whose message is left."""
+"""The result of an event or handler that leaves its message to the interpreter."""
 
 
-class Parts(ABC):
-    """Writes one function. `context` is whose budget it takes from; `answers`: it is that of an event or handler."""
+class FunctionBuilder(ABC):
+    """Writes one function. `context` names the budget that it is charged to; `answers`: it is an event or handler."""
 
-    def __init__(self, layout: Layout, parameters: Mapping[str, int], context: str, *, answers: bool) -> None:
+    def __init__(
+        self, layout: MemoryLayout, parameters: Mapping[str, int], context: str, *, answers: bool
+    ) -> None:
         self._layout = layout
         self._context = context
         self._answers = answers
@@ -51,20 +53,20 @@ class Parts(ABC):
 
     @abstractmethod
     def _block(self, statements: Sequence[nodes.Statement]) -> bytes:
-        """What statements do."""
+        """Return the code of statements."""
 
     @abstractmethod
     def _value(self, node: nodes.Expression) -> bytes:
-        """What puts the value of an expression of numbers on the stack. Raises `NotScalarError` for another."""
+        """Push the value of an expression of numbers. Raises `NotCompiledError` for another."""
 
     @abstractmethod
     def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
-        """A call of a function of so many addresses (i32), which `write` writes of what it is given."""
+        """Call a function with this number of addresses (i32), which `write` writes from the arguments `given`."""
 
     def _local(self, name: str, machine: int) -> int:
         number, known = self._locals.setdefault(name, (len(self._locals), machine))
         if known != machine:
-            raise NotScalarError(name)
+            raise NotCompiledError("gives a variable values of two types")
         return number
 
     def _get(self, name: str, machine: int = I32) -> bytes:
@@ -88,19 +90,19 @@ class Parts(ABC):
         return left + self._when(load(I64, budget) + constant(I64, 0) + I64_LT_S, self._elsewhere)
 
     def _allocated(self, size: bytes) -> bytes:
-        """Charge for so many bytes (i64) that would be made; elsewhere if what the specification holds is measured."""
+        """Charge for the bytes (i64) of a new value; leave the message if the specification's memory is measured."""
         many = size + constant(I64, UNMEASURED) + I64_GT_U
         spent = size + constant(I64, BYTES_PER_INSTRUCTION) + I64_DIV_U
         return self._when(many, self._elsewhere) + self._spend(spent)
 
     def _times(self, left: str, each: bytes, body: Sequence[nodes.Statement] = ()) -> bytes:
-        """A loop that is run as often as a local variable says, which counts down."""
+        """Write a loop that counts a local variable down to zero."""
         over = self._get(left, I64) + I64_EQZ + br_if(1)
         less = self._get(left, I64) + constant(I64, 1) + I64_SUB + self._set(left, I64)
         return self._repeated(over + less + each, body)
 
     def _repeated(self, before: bytes, body: Sequence[nodes.Statement]) -> bytes:
-        """A loop without end; `before` may leave the outer of the two blocks."""
+        """Write an endless loop; `before` may leave the outer of the two blocks."""
         self._depth += 2
         self._loops.append(self._depth)
         code = before + self._block(body)

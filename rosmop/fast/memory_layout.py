@@ -1,12 +1,12 @@
-"""What stands where in the memory of a module, and how large the values of a type are there. See `abi.py`."""
+"""The layout of a module's memory, and the sizes of the values of each type there. See `abi.py`."""
 
 from collections.abc import Mapping
 
 from rosmop.fast.abi import FIRST, Cells
-from rosmop.fast.deferred_output import Line
+from rosmop.fast.deferred_output import OutputLine
 from rosmop.fast.wasm import F32, F64, I32, I64
 from rosmop.form import nodes
-from rosmop.runtime.values import Values, struct_code, struct_size
+from rosmop.runtime.values import ValueCodec, struct_code, struct_size
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
@@ -14,120 +14,149 @@ LINES = 64 << 10
 """Bytes for lines of output; a message whose line has no room is left."""
 
 
-class NotScalarError(Exception):
-    """A function has something that this part of the form does not have."""
+class NotCompiledError(Exception):
+    """A function, or a place in it, cannot be compiled: the reason, and the site (-1: of the whole function)."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.site = -1
+
+    @classmethod
+    def of(cls, kind: Type) -> "NotCompiledError":
+        """Return the error for a value of a type that is made, kept, compared or changed."""
+        return cls(f"makes, keeps, compares or changes a value of type {kind}")
+
+    def place(self, site: int) -> None:
+        """Set the site unless it is known."""
+        if self.site < 0:
+            self.site = site
+
+
+def reason_of(error: NotCompiledError | RecursionError) -> NotCompiledError:
+    """Return the error with the reason why something cannot be compiled."""
+    return (
+        error if isinstance(error, NotCompiledError) else NotCompiledError("has expressions nested too deep")
+    )
 
 
 def machine_type(kind: Type) -> int:
-    """The type of the machine for one of the language. Raises `NotScalarError`."""
-    if isinstance(kind, value_types.Bool) or (isinstance(kind, value_types.Integer) and kind.bits <= 32):
+    """Return the type of the machine for one of the language. Raises `NotCompiledError`."""
+    if isinstance(kind, value_types.BoolType) or (
+        isinstance(kind, value_types.IntegerType) and kind.bits <= 32
+    ):
         return I32
-    if isinstance(kind, value_types.Integer | value_types.Time | value_types.Duration | value_types.Index):
+    if isinstance(
+        kind,
+        value_types.IntegerType | value_types.TimeType | value_types.DurationType | value_types.IteratorType,
+    ):
         return I64
-    if isinstance(kind, value_types.Floating):
+    if isinstance(kind, value_types.FloatingType):
         return F32 if kind.bits == 32 else F64
-    raise NotScalarError(str(kind))
+    raise NotCompiledError.of(kind)
 
 
 def is_signed(kind: Type) -> bool:
     """Whether numbers of the type may be negative."""
-    return not isinstance(kind, value_types.Integer) or kind.signed
+    return not isinstance(kind, value_types.IntegerType) or kind.signed
 
 
-class Layout:
-    """Gives out the memory of a module."""
+class MemoryLayout:
+    """Allocates the memory of a module."""
 
     def __init__(
-        self, functions: Mapping[str, nodes.Function], shared: Mapping[str, Cells], values: Values
+        self, functions: Mapping[str, nodes.Function], shared: Mapping[str, Cells], values: ValueCodec
     ) -> None:
         self._values = values
         self.functions = functions
         self.shared = shared
         self.budgets: dict[str, int] = {}
         self.throttles: dict[tuple[str, int], int] = {}
-        """Where it stands when output at a site of a specification was last due."""
+        """Addresses of the time when output at a site of a specification was last due."""
         self.constants: dict[bytes, int] = {}
-        """Where bytes stand from the beginning."""
+        """Addresses of constant bytes."""
         self.strings: set[bytes] = set()
-        """Those of them that are strings."""
+        """The constants that are strings."""
         self.references: list[range] = []
-        """Where functions leave the values of their references."""
-        self.lines: list[Line] = []
+        """Addresses of the values of references that functions return."""
+        self.lines: list[OutputLine] = []
         self._used = FIRST
         self.said = self.take(LINES)
-        """Where lines stand."""
+        """The address of lines of output."""
 
     def variable(self, name: str, kind: Type) -> int:
-        """Where a variable of the set stands."""
+        """Return the address of a variable of the set."""
         cells = self.shared[name]
-        if not isinstance(kind, value_types.String):
+        if not isinstance(kind, value_types.StringType):
             machine_type(kind)
         place = cells.base + 8 * (cells.properties + len(cells.variables))
         return cells.variables.setdefault(name, (place, kind))[0]
 
     def size(self, kind: Type) -> int:
-        """The bytes of every value of a type in a message. Raises `NotScalarError` where they differ."""
+        """Return the size of each value of a type in a message. Raises `NotCompiledError` if sizes differ."""
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
-        if isinstance(kind, value_types.Record):
+        if isinstance(kind, value_types.RecordType):
             return sum(map(self.size, self._values.fields(kind)))
-        if isinstance(kind, value_types.Vector) and kind.length is not None:
+        if isinstance(kind, value_types.VectorType) and kind.length is not None:
             return kind.length * self.size(kind.element)
-        raise NotScalarError(str(kind))
+        raise NotCompiledError.of(kind)
 
     def offset(self, kind: Type, number: int) -> int:
-        """Where a field of a message begins in it. Raises `NotScalarError` where that differs."""
-        if not isinstance(kind, value_types.Record):
-            raise NotScalarError(str(kind))
+        """Return the offset of a field in a message. Raises `NotCompiledError` if offsets differ."""
+        if not isinstance(kind, value_types.RecordType):
+            raise NotCompiledError.of(kind)
         return sum(map(self.size, self._values.fields(kind)[:number]))
 
     def element(self, kind: Type) -> tuple[Type, int]:
-        """The type of the elements of a string or vector, and the bytes from one to the next (strings: in the table).
+        """Return the type of the elements of a string or vector, and their distance (of strings: in the table).
 
-        Raises `NotScalarError`.
+        Raises `NotCompiledError`.
         """
-        if isinstance(kind, value_types.String):
+        if isinstance(kind, value_types.StringType):
             return value_types.UINT8, 1
-        if not isinstance(kind, value_types.Vector):
-            raise NotScalarError(str(kind))
-        return kind.element, 4 if isinstance(kind.element, value_types.String) else self.size(kind.element)
+        if not isinstance(kind, value_types.VectorType):
+            raise NotCompiledError.of(kind)
+        return kind.element, 4 if isinstance(kind.element, value_types.StringType) else self.size(
+            kind.element
+        )
 
     def copied(self, kind: Type) -> Type:
-        """A message whose copy costs nothing. Raises `NotScalarError` of another."""
-        if isinstance(kind, value_types.Record):
+        """Return the type of a message whose copy is free. Raises `NotCompiledError` for other messages."""
+        if isinstance(kind, value_types.RecordType):
             for field in self._values.fields(kind):
                 self.copied(field)
         elif struct_code(kind) is None:
-            raise NotScalarError(str(kind))
+            raise NotCompiledError.of(kind)
         return kind
 
     def take(self, size: int) -> int:
-        """The address of so many bytes of memory."""
+        """Allocate memory and return its address."""
         at = self._used
         self._used += -(-size // 8) * 8
         return at
 
     def reference(self) -> int:
-        """The address of memory for the value of a reference."""
+        """Return the address of memory for the value of a reference."""
         at = self.take(8)
         self.references.append(range(at, at + 8))
         return at
 
     def constant(self, raw: bytes) -> int:
-        """Where these bytes stand from the beginning."""
+        """Return the address of constant bytes."""
         if raw not in self.constants:
             self.constants[raw] = self.take(len(raw))
         return self.constants[raw]
 
     def budget(self, context: str) -> int:
-        """Where the budget of a specification stands."""
+        """Return the address of the budget of a specification."""
         if context not in self.budgets:
             self.budgets[context] = self.take(8)
         return self.budgets[context]
 
     def throttle(self, context: str, site: int) -> int:
-        """Where it stands when output at a site was last due."""
+        """Return the address of the time when output at a site was last due."""
         if (context, site) not in self.throttles:
             self.throttles[context, site] = self.take(8)
         return self.throttles[context, site]

@@ -1,7 +1,6 @@
-"""A compiled set as bytes: what one process has compiled, and another runs.
+"""Serializes a compiled set: one process compiles it, and another runs it.
 
-It is read strictly: what is in it is what a set can be made of, or it is not read. Of the definitions of messages it
-has those that its specifications use.
+Reading is strict: only valid sets are accepted. Only message definitions in use are included.
 """
 
 import inspect
@@ -9,31 +8,31 @@ from typing import Any, get_type_hints
 
 import msgspec
 
-from rosmop.fast.abi import FeedModule, Part
+from rosmop.fast.abi import CompiledModule, SetPart
 from rosmop.form.compiled import Compiled
 from rosmop.logics.bounded import BoundedProperty
 from rosmop.logics.cfg import GrammarProperty
 from rosmop.logics.interface import CompiledProperty, FiniteProperty
-from rosmop.logics.past_monitors import ClockedPast, PastProperty
+from rosmop.logics.past_monitors import ClockedPastProperty, PastProperty
 from rosmop.logics.pattern import TimedPattern
 from rosmop.logics.ptcaret import CaretProperty
 from rosmop.logics.srs import RewritingProperty
-from rosmop.logics.tfsm import TimedMachine
-from rosmop.types.messages import Messages
+from rosmop.logics.tfsm import TimedStateMachine
+from rosmop.types.messages import MessageTypes
 from roswire.definitions import Definitions
 from roswire.message_text import MessageDefinition, ServiceDefinition
 
 _PROPERTIES = {
     kind.__name__: kind
     for kind in (
-        FiniteProperty, TimedMachine, TimedPattern, ClockedPast, PastProperty, BoundedProperty, GrammarProperty,
-        RewritingProperty, CaretProperty,
+        FiniteProperty, TimedStateMachine, TimedPattern, ClockedPastProperty, PastProperty, BoundedProperty,
+        GrammarProperty, RewritingProperty, CaretProperty,
     )
 }  # fmt: skip
 
 
 def _parts(kind: type) -> Any:
-    """The types of what a property is made of, in order."""
+    """Return the types of a property's constructor arguments, in order."""
     hints = get_type_hints(vars(kind)["__init__"])
     return tuple[tuple(hints[name] for name in list(inspect.signature(kind).parameters))]  # type: ignore[misc]  # made here
 
@@ -42,7 +41,7 @@ _MADE_OF = {name: _parts(kind) for name, kind in _PROPERTIES.items()}
 
 
 class _Used(msgspec.Struct):
-    """The definitions that a set uses."""
+    """Collects the definitions that a set uses."""
 
     messages: dict[str, MessageDefinition]
     services: dict[str, ServiceDefinition]
@@ -60,18 +59,18 @@ def _made(kind: type, value: Any) -> Any:
         if name not in _PROPERTIES:
             raise ValueError(f"there is no property {name[:40]!a}")
         return _PROPERTIES[name](*msgspec.convert(parts, _MADE_OF[name]))
-    if kind is Messages:
+    if kind is MessageTypes:
         used = msgspec.convert(value, _Used)
-        return Messages(Definitions(used.messages, used.services))
+        return MessageTypes(Definitions(used.messages, used.services))
     raise NotImplementedError(kind.__name__)
 
 
-_PARTS = msgspec.msgpack.Decoder(tuple[msgspec.Raw, FeedModule])
+_PARTS = msgspec.msgpack.Decoder(tuple[msgspec.Raw, CompiledModule])
 _DECODER = msgspec.msgpack.Decoder(Compiled, dec_hook=_made)
 
 
 def encoded(compiled: Compiled) -> bytes:
-    """The set as bytes: of the same set always the same."""
+    """Serialize a set; equal sets give equal bytes."""
     definitions = compiled.messages.definitions
     reached = {name for one in compiled.specifications for name in one.reached}
     reached |= {one.type for one in compiled.publications}
@@ -90,16 +89,16 @@ def encoded(compiled: Compiled) -> bytes:
 
 
 def decoded(data: bytes) -> Compiled:
-    """The set again. Raises `msgspec.ValidationError`."""
+    """Deserialize a set. Raises `msgspec.ValidationError`."""
     return _DECODER.decode(data)
 
 
-def encoded_part(part: Part) -> bytes:
-    """What one process runs as bytes: of the same always the same."""
+def encoded_part(part: SetPart) -> bytes:
+    """Serialize what one process runs; equal parts give equal bytes."""
     return msgspec.msgpack.encode((msgspec.Raw(encoded(part.compiled)), part.module))
 
 
-def decoded_part(data: bytes) -> Part:
-    """What one process runs. Raises `msgspec.ValidationError`."""
+def decoded_part(data: bytes) -> SetPart:
+    """Deserialize what one process runs. Raises `msgspec.ValidationError`."""
     compiled, module = _PARTS.decode(data)
-    return Part(_DECODER.decode(compiled), module)
+    return SetPart(_DECODER.decode(compiled), module)

@@ -1,17 +1,17 @@
 """Strings: constants, those of the message, and those that variables of the set keep.
 
-A variable is 8 bytes: where the string begins and how long it is (4 bytes each). While messages are looked at that may
-be in a message, in a constant, or where any variable's string stood before, so that to assign one copies nothing.
-When a walk ends all are copied together (`settling`) to where the strings of the walk before the last one stood: what
-lines of output show stays as it was until they are made.
+A variable is 8 bytes: the address of the string and its length (4 bytes each). While a batch is processed, the string
+may be in a message, in a constant, or in the former place of another variable, so that assignments copy nothing. At the
+end of a batch all strings are copied together (`settling`), to the places used by the batch before the last one,
+because lines of output may still show the last ones.
 
-A string longer than `MOST_KEPT` is not kept here: the message that brings it is left, and of a variable that holds one
-only that is known (`BEYOND`); the message that looks at it is left.
+Strings longer than `MOST_KEPT` are not kept: the message that brings one is left to the interpreter, the variable is
+marked `BEYOND`, and messages that read it are left.
 """
 
 from rosmop.fast.abi import MOST_KEPT, Cells
-from rosmop.fast.codegen_access import Places
-from rosmop.fast.memory_layout import Layout, NotScalarError
+from rosmop.fast.codegen_access import MessageAccess
+from rosmop.fast.memory_layout import MemoryLayout, NotCompiledError
 from rosmop.fast.wasm import (
     BLOCK,
     ELSE,
@@ -61,14 +61,14 @@ from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION
 from rosmop.types import value_types
 
 _LOADS = {1: (I32, i32_load8_u), 2: (I32, i32_load16_u), 4: (I32, i32_load), 8: (I64, i64_load)}
-"""The type and the load instruction for a number of bytes."""
+"""Type and load instruction for a number of bytes."""
 
 
-class Texts(Places):
-    """Writes what looks at strings."""
+class StringCodegen(MessageAccess):
+    """Writes code that reads and keeps strings."""
 
     def _elements(self, node: nodes.Expression) -> tuple[bytes, bytes, bytes]:
-        if not isinstance(node.type, value_types.String):
+        if not isinstance(node.type, value_types.StringType):
             return super()._elements(node)
         if isinstance(node, nodes.Literal | nodes.Zero):
             raw = node.value if isinstance(node, nodes.Literal) else b""
@@ -88,7 +88,7 @@ class Texts(Places):
         return super()._elements(node)
 
     def _noted(self, span: bytes, most: int | None = None) -> tuple[bytes, bytes, bytes]:
-        """Address and length from the stack in local variables; left if it is longer than `most`."""
+        """Pop address and length into local variables; leave the message if the length exceeds `most`."""
         place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
         code = span + self._set(count, I64) + self._set(place)
         if most is not None:
@@ -96,7 +96,7 @@ class Texts(Places):
         return code, self._get(place), self._get(count, I64)
 
     def _chosen(self, node: nodes.Conditional) -> tuple[bytes, bytes, bytes]:
-        """One of two, of which only that is looked at."""
+        """Choose one of two strings; the other is not evaluated."""
         test = self._value(node.test)
         place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
         self._local(place, I32)
@@ -110,7 +110,7 @@ class Texts(Places):
         return code, self._get(place), self._get(count, I64)
 
     def _assigned_text(self, node: nodes.Assign) -> bytes:
-        """Give a string to a variable."""
+        """Assign a string to a variable."""
         first, place, count = self._elements(node.value)
         cells = self._layout.shared.get(node.name)
         if cells is None:
@@ -158,11 +158,11 @@ class Texts(Places):
         )
 
     def _is_constant(self, given: nodes.Expression, known: nodes.Literal) -> bytes:
-        """Whether a string is a short constant: as long, and the same bytes."""
+        """Compare a string with a short constant: length and bytes."""
         assert isinstance(known.value, bytes)  # noqa: S101  a constant of strings
         first, place, count = self._elements(given)
         if len(known.value) > nodes.SHORT:
-            raise NotScalarError("std::string")
+            raise NotCompiledError.of(given.type)
         same, at = constant(I32, 1), 0
         while at < len(known.value):
             size = max(size for size in (1, 2, 4, 8) if size <= len(known.value) - at)
@@ -176,12 +176,12 @@ class Texts(Places):
 
 
 def turns(leave: bytes, *turn: bytes) -> bytes:
-    """A loop that ends when `leave` is true, or a turn leaves its block."""
+    """Write a loop that ends when `leave` is true, or when an iteration leaves its block."""
     return BLOCK + LOOP + leave + br_if(1) + b"".join(turn) + br(0) + END + END
 
 
 def mismatch() -> bytes:
-    """A function of two addresses and a length (i32): where the first byte is that differs, or the length."""
+    """Write a function of two addresses and a length (i32) that returns the offset of the first difference."""
     one, other, size, at = (local_get(local) for local in range(4))
 
     def compared(read: bytes, differs: bytes) -> bytes:
@@ -196,12 +196,11 @@ def mismatch() -> bytes:
     return function([(1, I32)], long + short + at)
 
 
-def settling(layout: Layout, cells: Cells) -> bytes:
-    """A function that copies the strings of all variables to where they stay until the next time but one: each has two
-    places.
+def settling(layout: MemoryLayout, cells: Cells) -> bytes:
+    """Write a function that copies the strings of all variables to one of their two places, in turn.
 
-    That there is another place now is said last: one that is stopped is begun again when what the message at hand
-    has done is taken back. It returns 0 (i32).
+    The switch of places is stored last: if the function is stopped, it runs again after the current message is undone.
+    It returns 0 (i32).
     """
     cells.generation = layout.take(8)
     cells.texts = {at: layout.take(2 * MOST_KEPT) for at in cells.kept}

@@ -1,17 +1,16 @@
-"""One WebAssembly module that runs: its memory to write into, its functions to call, bounds on both.
+"""Runs one WebAssembly module: access to its memory and functions, with bounds on both.
 
 Theory of operation:
 
-- Work is bounded by *fuel*, which is used up by what the module does (about one for an instruction or a byte that is
-  copied), the same on every machine. Memory is bounded by a limit. What goes beyond is a `MachineTrap`.
-- The addresses of the whole limit are reserved at the start and the memory grows in place: a view of it is never
-  wrong, an older one is only shorter. A view keeps the memory when the machine is closed.
-- A module becomes code of this machine (`translated`) in one process, and runs (`Machine`) in others, which compile
-  nothing.
-- The library of the package `wasmtime` is called by its C functions (0.4 µs a call, 20 by its Python) under Python's
-  lock: no other thread is ever within a machine. Its Python could not be loaded in the relay: it has functions that
-  C calls, for which libffi wants memory that is writable and executable at once. So a module has no imports, either.
-- Traps come without signals: a handler of SIGSEGV (`faulthandler`) is not in the way.
+- Work is bounded by *fuel*: about one unit for an instruction or a copied byte, the same on every machine. Memory is
+  bounded by a limit. Exceeding either raises `WasmTrap`.
+- The addresses of the whole limit are reserved at the start and the memory grows in place, so an older view of it is
+  only shorter. A view keeps the memory alive after the instance is closed.
+- One process translates a module into machine code (`translated`). Others run it (`WasmInstance`) and compile nothing.
+- The library of the package `wasmtime` is called by its C functions (0.4 µs a call; 20 µs by its Python) under Python's
+  lock, so no other thread runs in an instance. The relay cannot load its Python: it has functions that C calls, for
+  which libffi needs memory that is writable and executable. For the same reason a module has no imports.
+- Traps come without signals, so a handler of SIGSEGV (`faulthandler`) does not interfere.
 """
 
 import ctypes
@@ -26,10 +25,10 @@ from pathlib import Path
 from typing import Any
 
 PAGE = 1 << 16
-"""Memory grows by so many bytes."""
+"""Memory grows in steps of this size."""
 
 VERSION = "50."
-"""How the versions of wasmtime begin whose functions and layouts these are."""
+"""Start of the versions of wasmtime with these functions and layouts."""
 
 _FUEL_AT_START = 1_000_000
 _TABLE_ELEMENTS = 10_000
@@ -42,15 +41,15 @@ _OFF = ("component_model", "custom_page_sizes", "exceptions", "function_referenc
         "relaxed_simd", "simd", "stack_switching", "tail_call", "threads", "wide_arithmetic")  # fmt: skip
 
 Call = Callable[..., int | None]
-"""A function of integers, which takes them in order and goes on with the fuel that there is (`Machine.refuel`)."""
+"""A function of integers; it uses the remaining fuel (`WasmInstance.refuel`)."""
 
 
-class MachineError(Exception):
-    """There is no such machine or function; the text says why."""
+class WasmError(Exception):
+    """An instance or function cannot be made; the text says why."""
 
 
-class MachineTrap(Exception):  # noqa: N818  its name in WebAssembly
-    """A call was stopped; what it had written stays.
+class WasmTrap(Exception):  # noqa: N818  its name in WebAssembly
+    """A call was stopped; its writes to memory stay.
 
     `reason` says why ("integer division by zero", "out of fuel").
     """
@@ -60,12 +59,11 @@ class MachineTrap(Exception):  # noqa: N818  its name in WebAssembly
         self.reason = reason
 
 
-class Machine:
+class WasmInstance:
     """A module, which has no imports, and the memory that it exports as `memory`.
 
-    `code` is what `translated` has made, with the same `limit`; nothing else may be given, for it is run as it is.
-    `limit` is how large the memory may become, in bytes. Raises `MachineError`, and `MachineTrap` for what the module
-    does at its start.
+    `code` must be the result of `translated` with the same `limit`, because it is run unchecked. `limit` is the largest
+    size of the memory, in bytes. Raises `WasmError`, and `WasmTrap` if the module's start traps.
     """
 
     def __init__(self, code: bytes, limit: int) -> None:
@@ -98,21 +96,21 @@ class Machine:
             elif export.kind == _MEMORY and text == "memory":
                 self._memory = _Export.from_buffer_copy(export)
         if self._memory is None:
-            raise MachineError("the module exports no memory")
+            raise WasmError("the module exports no memory")
 
     @property
     def memory(self) -> memoryview:
-        """All of the memory, to read and write; ask again when it has grown. Raises `MachineError` when closed."""
+        """Return the whole memory, writable; get it again after it has grown. Raises `WasmError` when closed."""
         asked = self._asked()
         size = load().wasmtime_memory_data_size(*asked)
         if size != len(self._view):
             found = (ctypes.c_ubyte * size).from_address(load().wasmtime_memory_data(*asked))
-            found.keeps = self._store  # as long as there is a view
+            found.keeps = self._store  # while there is a view
             self._view = memoryview(found).cast("B")
         return self._view
 
     def reserve(self, size: int) -> None:
-        """Let the memory grow to `size` bytes or more. Raises `MachineError` beyond the limit."""
+        """Let the memory grow to `size` bytes or more. Raises `WasmError` beyond the limit."""
         missing = size - len(self.memory)
         _check(
             load().wasmtime_memory_grow(
@@ -121,36 +119,36 @@ class Machine:
         )
 
     def call(self, name: str | int, *arguments: int, fuel: int) -> int | None:
-        """The result of an exported function of integers (signed), by its name or its number among them.
+        """Call an exported function of integers (signed) by its name or number, and return the result.
 
-        Each argument fits 64 bits with a sign; of one that the function takes in 32 bits these are given. Raises
-        `MachineTrap`; `MachineError` where there is no such function or the machine is closed; `struct.error` where
-        the arguments are not as many as it takes or too large.
+        Each argument is a signed 64-bit integer; if the function takes 32 bits, the low ones are given. Raises
+        `WasmTrap`; `WasmError` where there is no such function or the machine is closed; `struct.error` where the
+        arguments are not as many as it takes or too large.
         """
         function = self.function(name)
         self.refuel(fuel)
         return function(*arguments)
 
     def function(self, name: str | int) -> Call:
-        """An exported function of integers, to be called often; see `call`."""
+        """Return an exported function of integers, for frequent calls; see `call`."""
         try:
             return self._functions[name]
         except KeyError:
             self._asked()
-            raise MachineError(f"the module has no function {name!r} of integers") from None
+            raise WasmError(f"the module has no function {name!r} of integers") from None
 
     def refuel(self, fuel: int) -> None:
-        """Say how much fuel there is from now on. Raises `MachineError` when closed."""
+        """Set the remaining fuel. Raises `WasmError` when closed."""
         _check(load().wasmtime_context_set_fuel(self._asked()[0], fuel))
 
     def close(self) -> None:
-        """Give the module back, and the memory when the last view of it is gone."""
+        """Free the module; its memory is freed with the last view of it."""
         self._functions, self._view, self._store = {}, memoryview(b""), None
 
     def _asked(self) -> tuple[int, Any]:
-        """How the memory is named to C."""
+        """Return the C name of the memory."""
         if self._store is None or self._memory is None:
-            raise MachineError("the machine is closed")
+            raise WasmError("the machine is closed")
         return self._store.context, ctypes.byref(self._memory, _Export.of.offset)
 
 
@@ -163,7 +161,7 @@ class _Vector(ctypes.Structure):
 
 
 class _Store:
-    """What a machine has of wasmtime; freed when nobody has it any more."""
+    """Owns wasmtime's objects of an instance and frees them with the last reference."""
 
     def __init__(self, engine: int, limit: int) -> None:
         self._library = load()
@@ -176,7 +174,7 @@ class _Store:
 
 
 _P, _SIZE = ctypes.c_void_p, ctypes.c_size_t
-_C: dict[str, tuple[Any, ...]] = {  # what each function gives, and what it takes
+_C: dict[str, tuple[Any, ...]] = {  # the result and the parameters of each function
     "wasm_byte_vec_delete": (None, _P),
     "wasm_config_new": (_P,),
     "wasm_engine_new_with_config": (_P, _P),
@@ -207,9 +205,9 @@ _C: dict[str, tuple[Any, ...]] = {  # what each function gives, and what it take
 
 
 def translated(code: bytes, limit: int) -> bytes:
-    """A module of WebAssembly as code of this machine, for a `Machine` with this limit; the same gives the same.
+    """Translate a module into machine code for a `WasmInstance` with this limit; deterministic.
 
-    Raises `MachineError` where it is no module.
+    Raises `WasmError` if the code is not a module.
     """
     c, module, native = load(), ctypes.c_void_p(), _Vector()
     _check(c.wasmtime_module_new(_engine(_bits(limit)), code, len(code), ctypes.byref(module)))
@@ -225,14 +223,14 @@ def translated(code: bytes, limit: int) -> bytes:
 
 @cache
 def load() -> ctypes.PyDLL:
-    """wasmtime's functions of C. Raises `MachineError` where it is another version."""
+    """Load the C functions of wasmtime. Raises `WasmError` for another version."""
     package, found = find_spec("wasmtime"), version("wasmtime")
     if package is None or package.origin is None or not found.startswith(VERSION):
-        raise MachineError(f"wasmtime {VERSION}x is needed, and {found} is here")
+        raise WasmError(f"wasmtime {VERSION}x is needed, and {found} is here")
     folder = f"linux-{os.uname().machine}"
     file = str(Path(package.origin).with_name(folder) / "_libwasmtime.so")
     library = ctypes.PyDLL(file)
-    # The one that takes seconds of a large set: what else the process does goes on, and it answers its supervisor.
+    # Takes seconds for a large set: without Python's lock, the process still answers its supervisor.
     library.__dict__["wasmtime_module_new"] = ctypes.CDLL(file).wasmtime_module_new
     for name, (result, *given) in _C.items():
         function = getattr(library, name)
@@ -246,7 +244,7 @@ def _bits(limit: int) -> int:
 
 @cache
 def _engine(bits: int) -> int:
-    """What compiles the modules of all machines with a limit of up to 2**bits bytes."""
+    """Return the engine for all instances with a limit of up to 2**bits bytes."""
     settings = {
         **dict.fromkeys((f"wasm_{feature}" for feature in _OFF), 0),
         "shared_memory": 0,
@@ -266,9 +264,9 @@ def _engine(bits: int) -> int:
 
 
 def _bound(store: _Store, export: _Export) -> Call | None:
-    """A function as it is called from Python; None if it has others than integers.
+    """Wrap a function for Python; None if it has arguments or results other than integers.
 
-    Arguments and result stand in slots of 16 bytes; a trap or error that comes back is ours to free.
+    Arguments and result are in slots of 16 bytes; a trap or error that comes back is ours to free.
     """
     c = load()
     native = _Export.from_buffer_copy(export)
@@ -278,11 +276,11 @@ def _bound(store: _Store, export: _Export) -> Call | None:
     c.wasm_functype_delete(kind)
     if len(gives) > 1 or None in (*takes, *gives):
         return None
-    # Without the types of their arguments, which would be looked at in each call.
+    # Without argument types, which would be checked at each call.
     invoke = c["wasmtime_func_call_unchecked"]
     invoke.restype = ctypes.c_void_p
     slots = (ctypes.c_uint64 * (2 * max(len(takes), 1)))()
-    slots.keeps = store, native  # type: ignore[attr-defined]  # until the call is over, whoever closes the machine
+    slots.keeps = store, native  # type: ignore[attr-defined]  # until the call is over, even if the instance is closed
     room = memoryview(slots).cast("B")
     fill = struct.Struct("<" + "q8x" * len(takes)).pack_into
     read = room.cast(gives[0]) if gives else (None,)
@@ -308,7 +306,7 @@ def _bound(store: _Store, export: _Export) -> Call | None:
 
 
 def _kinds(vector: Any) -> list[Any]:
-    """The kinds of values; None for one that is no integer."""
+    """Return the kinds of values; None for a kind that is not an integer."""
     found = vector.contents
     return [_KINDS.get(load().wasm_valtype_kind(found.data[number])) for number in range(found.size)]
 
@@ -320,13 +318,13 @@ def _check(error: int | None) -> None:
         message = ctypes.string_at(text.data, text.size).decode()
         c.wasm_byte_vec_delete(ctypes.byref(text))
         c.wasmtime_error_delete(error)
-        raise MachineError(message)
+        raise WasmError(message)
 
 
-def _trapped(trap: ctypes.c_void_p) -> MachineTrap:
-    """What a trap says; it is freed."""
+def _trapped(trap: ctypes.c_void_p) -> WasmTrap:
+    """Return the message of a trap, and free it."""
     c, code = load(), ctypes.c_uint8()
     c.wasmtime_trap_code(trap, ctypes.byref(code))
     c.wasm_trap_delete(trap)
     trap.value = None
-    return MachineTrap(_REASONS[code.value])
+    return WasmTrap(_REASONS[code.value])

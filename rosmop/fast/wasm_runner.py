@@ -1,13 +1,14 @@
-"""Runs the module of a set (`ir/feed.py`): when a walk of a topic, or part of a service, may be used, and what it does.
+"""Runs the module of a set: decides when a lane of a topic, or part of a service, may be used, and processes batches.
 
 Invariants:
-- A walk ends before the first message that it leaves to the engine; of that message nothing has happened yet.
-- What a walk has done to the messages before is what `MonitorSet.process` does to them, one after the other, at the
-  time of the walk: bytes, variables, states of properties, which events happened.
-- The state of specifications that share topics or variables is in one place: in the module's memory from a walk on
-  (`Home.enter`), in Python until then, and again before Python looks at it (`Home.leave`).
-- Frames that were received into the module's memory (`Lanes.area`) are looked at and changed where they stand. Of
-  one that stands elsewhere the beginning is copied, and back if it was changed: what looks further leaves the message.
+
+- A batch ends before the first message that the module leaves to the engine; nothing of that message has happened.
+- The effect on the messages before is that of `MonitorSet.process` on each of them, at the time of the batch: bytes,
+  variables, states of properties, events.
+- The state of specifications that share topics or variables is in one place: in the module's memory from the first
+  batch on (`ModuleState.prepare`), in Python before that, and again before Python reads it (`ModuleState.leave`).
+- Frames that were received into the module's memory (`Lanes.area`) are read and changed in place. For other frames the
+  beginning is copied, and back if it was changed; code that reads further leaves the message to the engine.
 """
 
 import struct
@@ -29,17 +30,17 @@ from rosmop.fast.abi import (
     TOLD,
     UNDO,
     Cells,
-    Feed,
-    FeedModule,
+    CompiledModule,
+    TopicCode,
 )
 from rosmop.fast.deferred_output import HEAD
-from rosmop.fast.wasm_instance import Machine, MachineTrap
+from rosmop.fast.wasm_instance import WasmInstance, WasmTrap
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
 from rosmop.run.explain import ClockedSteps, Exits
-from rosmop.run.fast_path import MESSAGE_FUEL, Due, Lanes, Prepared, Walked
+from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, BatchResult, Lanes, NextDue
 from rosmop.run.interpreter import Interpreter
-from rosmop.run.monitor import CellNames, Monitor, RunningProperty
+from rosmop.run.monitor import CellNames, MonitorInstance, RunningProperty
 from rosmop.run.outcomes import Outcome, Verdict
 from rosmop.runtime.action_context import FUEL_PER_SECOND, Context, LogLine
 from rosmop.runtime.values import struct_code
@@ -48,14 +49,14 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 FUEL = FUEL_PER_SECOND // 1000
-"""Instructions of one call at most: about a millisecond. What a call leaves is for the next ones: setting it costs a
-quarter of a call. Where it ends, the walk pauses before the message at hand.
+"""Most instructions of one call: about a millisecond. The fuel that a call leaves is for the next ones, because setting
+it costs a quarter of a call. When it is used up, the batch pauses before the current message.
 """
 
 BEGINNING = 8192
-"""Bytes that are looked at of a frame that was not received into the module's memory."""
+"""Bytes that are copied of a frame that was not received into the module's memory."""
 
-_FIRST = 512  # that are shown if they suffice: caches are cold when a large frame has gone through them
+_FIRST = 512  # shown if they suffice: a large frame leaves cold caches
 
 _NO_FUEL = "out of fuel"
 _ADDRESS = 0xFFFFFFFF
@@ -69,23 +70,23 @@ _CLOCK = struct.Struct("<qq")
 _NEVER = (1 << 63) - 1  # comes after every time, so that output is due
 
 
-class Home:
-    """Where the state of specifications is that share topics or variables."""
+class ModuleState:
+    """Holds the state of specifications that share topics or variables, in the module's memory or in Python."""
 
     def __init__(
         self,
-        machine: Machine,
+        machine: WasmInstance,
         cells: Cells,
         interpreter: Interpreter,
         running: Sequence[RunningProperty],
         throttles: Sequence[tuple[Context, int, int]],
         *,
-        due: Due,
+        due: NextDue,
         properties: Sequence[tuple[str, int]] = (),
         known: Mapping[str, tuple[str, str]] = MappingProxyType({}),
     ) -> None:
-        """`throttles`: specification, site, and address of when output there was last due. `properties` are those of
-        `running` by monitor and number, `known` the variables by monitor and name.
+        """`throttles`: specification, site, and address of the time when output there was last due. `properties` are
+        those of `running` by monitor and number, `known` the variables by monitor and name.
         """
         self.machine = machine
         self._memory = machine.memory
@@ -101,7 +102,7 @@ class Home:
         self._strings = [
             (place, cells.texts[address])
             for place, (address, kind) in enumerate(variables.values())
-            if isinstance(kind, value_types.String)
+            if isinstance(kind, value_types.StringType)
         ]
         codes = "".join(_cell(kind) for _, kind in variables.values())
         self.names = CellNames([*properties], [*map(known.get, variables)], codes, [*cells.clocks])
@@ -114,11 +115,11 @@ class Home:
         self._clocks = [(running[number], address) for number, address in cells.clocks.items()]
         self._due = due
         self._inside = False
-        self.prepared: Prepared | None = None
-        """For whom the module was prepared last, with the state in its memory; None where that is with Python."""
+        self.prepared: BatchOptions | None = None
+        """The options that the module was prepared with last; None while the state is in Python."""
 
-    def prepare(self, prepared: Prepared) -> None:
-        """Take the state into the module, and name the sender of what comes now."""
+    def prepare(self, prepared: BatchOptions) -> None:
+        """Move the state into the module, and set the options of the next batch."""
         if not self._inside:
             self._enter()
         self.prepared = prepared
@@ -143,8 +144,8 @@ class Home:
         self._inside = True
 
     def cells(self) -> bytes | None:
-        """The state as it is in the module's memory, if it is only numbers; empty if Python has it, and had it when it
-        was last kept. None: it is to be kept as Python has it.
+        """Return the state in the module's memory if it is only numbers; empty if Python has had it since it was last
+        saved; None if the state must be saved as Python has it.
         """
         if not self._inside and not self.left:
             return b""
@@ -157,22 +158,22 @@ class Home:
         return cells
 
     def hasten(self) -> None:
-        """A deadline is earlier than what was due."""
+        """Compute the next timer again, because there is an earlier deadline."""
         self.leave()
         self._due(anew=True)
 
     def named(self, context: str) -> str:
-        """The monitor whose context has this name."""
+        """Return the monitor whose context has this name."""
         return self._contexts[context].monitor
 
     def leave(self) -> None:
-        """Give it back to Python."""
+        """Move the state back to Python."""
         if self._inside:
             self.show()
             self._inside, self.prepared, self.left = False, None, True
 
     def show(self) -> None:
-        """Give Python a copy of what is in the module's memory."""
+        """Copy the state from the module's memory to Python."""
         if not self._inside:
             return
         values = self._cells.unpack_from(self._memory, self._base)
@@ -189,7 +190,7 @@ class Home:
 
 
 def _entered(memory: memoryview, value: bytes, buffer: int) -> int:
-    """Put a string there; where it is now, and how long it is (from bit 32 on)."""
+    """Write a string to memory; return its address, with the length from bit 32 on."""
     if len(value) > MOST_KEPT:
         return BEYOND << 32
     memory[buffer : buffer + len(value)] = value
@@ -197,32 +198,32 @@ def _entered(memory: memoryview, value: bytes, buffer: int) -> int:
 
 
 def _left(memory: memoryview, word: int, before: bytes) -> bytes:
-    """The string that such a number says; one that is not there is as it was before."""
+    """Read the string of such a number; `before` if the module does not keep it."""
     at, count = word & _ADDRESS, word >> 32
     return before if count == BEYOND else bytes(memory[at : at + count])
 
 
 def _cell(kind: Type) -> str:
-    """The `struct` code of a variable in the module's memory, 8 bytes."""
-    if isinstance(kind, value_types.String):
+    """Return the `struct` code of a variable in the module's memory, 8 bytes."""
+    if isinstance(kind, value_types.StringType):
         return "Q"
-    if isinstance(kind, value_types.Bool):
+    if isinstance(kind, value_types.BoolType):
         return "?7x"
-    if isinstance(kind, value_types.Integer) and kind.bits <= 32:
+    if isinstance(kind, value_types.IntegerType) and kind.bits <= 32:
         return "i4x" if kind.signed else "I4x"
     code = struct_code(kind) or ""
     return "q" if len(code) == 2 else "f4x" if code == "f" else code
 
 
-class Walker:
+class WasmLane:
     """Runs the module for one topic, or part of a service; implements `FastLane`."""
 
     def __init__(
         self,
-        home: Home,
-        module: FeedModule,
-        feed: Feed,
-        monitors: Sequence[Monitor],
+        home: ModuleState,
+        module: CompiledModule,
+        feed: TopicCode,
+        monitors: Sequence[MonitorInstance],
         events: Sequence[str],
     ) -> None:
         self.events = tuple((name,) for name in events)
@@ -275,19 +276,25 @@ class Walker:
         counted: Sequence[bool] = (),
         source: int = 0,
         changed: dict[int, int] | None = None,
-    ) -> Prepared:
+    ) -> BatchOptions:
         """See `FastLane`."""
         bits = sum(1 << number for number, silent in enumerate(told) if silent) - (LOUD if loud else 0)
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
         only = sum(1 << number for number, silent in enumerate(counted) if silent)
-        return Prepared(source, bits, enabled, only, {} if changed is None else changed)
+        return BatchOptions(source, bits, enabled, only, {} if changed is None else changed)
 
-    def walk(  # noqa: PLR0912, PLR0917  called for every batch: calls and keywords would cost a tenth of it
-        self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
-    ) -> Walked | None:
+    def process_batch(  # noqa: PLR0912, PLR0917  called for every batch: calls and keywords would cost a tenth of it
+        self,
+        view: memoryview,
+        position: int,
+        run: int,
+        pieces: list[Any],
+        time_ns: int,
+        prepared: BatchOptions,
+    ) -> BatchResult | None:
         """See `FastLane`."""
         if view.obj is not self._owner:
-            return self._walk_elsewhere(view, position, run, pieces, time_ns, prepared)
+            return self._process_elsewhere(view, position, run, pieces, time_ns, prepared)
         if self._home.prepared is not prepared:
             self._home.prepare(prepared)
         frames = self._frames
@@ -298,7 +305,7 @@ class Walker:
         while True:
             try:
                 answer = self._call(frames + position, end, time_ns) or 0
-            except MachineTrap as trap:
+            except WasmTrap as trap:
                 paused = trap.reason == _NO_FUEL
                 answer = self._stopped(frames + position, end, time_ns)
             said |= answer
@@ -324,29 +331,29 @@ class Walker:
                 if sooner:
                     self._home.hasten()
                 dropped, told = self._counted() if run != begun or said & TOLD else ((), ())
-                return Walked(position, run, dropped, told, sooner, output, paused and answer >= LEFT)
+                return BatchResult(position, run, dropped, told, sooner, output, paused and answer >= LEFT)
 
-    def walk_one(  # noqa: PLR0917  as `walk`
+    def process_one(  # noqa: PLR0917  as `process_batch`
         self,
         view: memoryview,
         position: int,
         run: int,
         pieces: list[Any],
         time_ns: int,
-        prepared: Prepared,
+        prepared: BatchOptions,
         fuel: int = MESSAGE_FUEL,
-    ) -> Walked:
+    ) -> BatchResult:
         """See `FastLane`."""
         following = position + 4 + _LENGTH.unpack_from(view, position)[0]
         if self._home.prepared is not prepared:
             self._home.prepare(prepared)
         self._machine.refuel(fuel)
-        walked = self.walk(view[:following], position, run, pieces, time_ns, prepared)
+        walked = self.process_batch(view[:following], position, run, pieces, time_ns, prepared)
         self._machine.refuel(FUEL)
-        return Walked(following, run, ()) if walked is None else walked
+        return BatchResult(following, run, ()) if walked is None else walked
 
-    def take(
-        self, message: Buffer, time_ns: int, prepared: Prepared, fuel: int = MESSAGE_FUEL
+    def process_message(
+        self, message: Buffer, time_ns: int, prepared: BatchOptions, fuel: int = MESSAGE_FUEL
     ) -> Outcome | None:
         """See `FastLane`."""
         end = self._frames + 4 + len(message)
@@ -356,7 +363,7 @@ class Walker:
         _LENGTH.pack_into(frame, 0, len(message))
         frame[4:] = message
         prepared.changed.clear()
-        walked = self.walk_one(frame, 0, 0, [], time_ns, prepared, fuel)
+        walked = self.process_one(frame, 0, 0, [], time_ns, prepared, fuel)
         if walked is not None and not walked.position:
             return None
         outcome = Outcome(message, time_ns)
@@ -374,9 +381,15 @@ class Walker:
             outcome.verdicts = tuple(verdict for verdict, count in counts for _ in range(count))
         return outcome
 
-    def _walk_elsewhere(  # noqa: PLR0917  as `walk`
-        self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
-    ) -> Walked:
+    def _process_elsewhere(  # noqa: PLR0917  as `process_batch`
+        self,
+        view: memoryview,
+        position: int,
+        run: int,
+        pieces: list[Any],
+        time_ns: int,
+        prepared: BatchOptions,
+    ) -> BatchResult:
         dropped: Sequence[int] = ()
         told: Sequence[int] = ()
         output: list[tuple[int, LogLine]] = []
@@ -384,13 +397,13 @@ class Walker:
         while position < len(view) and not sooner:
             following = position + 4 + _LENGTH.unpack_from(view, position)[0]
             frame = view[position:following]
-            walked = self._walk_beginning(frame, self._shown, time_ns, prepared)
+            walked = self._process_beginning(frame, self._shown, time_ns, prepared)
             if (
                 walked is not None
                 and not (walked.position or walked.paused)
                 and self._shown < min(len(frame), BEGINNING)
             ):
-                walked = self._walk_beginning(frame, BEGINNING, time_ns, prepared)
+                walked = self._process_beginning(frame, BEGINNING, time_ns, prepared)
                 if walked is None or walked.position:
                     self._shown = BEGINNING
             if walked is not None:
@@ -406,19 +419,19 @@ class Walker:
                     run = following
                     dropped = _sums(dropped, walked.dropped)
             position = following
-        return Walked(position, run, dropped, told, sooner, output, paused)
+        return BatchResult(position, run, dropped, told, sooner, output, paused)
 
-    def _walk_beginning(
-        self, frame: memoryview, shown: int, time_ns: int, prepared: Prepared
-    ) -> Walked | None:
-        """The walk over one frame of which so many bytes are shown."""
+    def _process_beginning(
+        self, frame: memoryview, shown: int, time_ns: int, prepared: BatchOptions
+    ) -> BatchResult | None:
+        """Process one frame of which the module gets the first `shown` bytes."""
         size, before = min(len(frame), shown), prepared.changed.copy()
         area = self._memory[self._frames : self._frames + size]
         area[4:] = frame[4:size]
         _LENGTH.pack_into(area, 0, size - 4)
         _TIME.pack_into(self._memory, REST, len(frame) - size)
         try:
-            walked = self.walk(area, 0, 0, [], time_ns, prepared)
+            walked = self.process_batch(area, 0, 0, [], time_ns, prepared)
         finally:
             _TIME.pack_into(self._memory, REST, 0)
         if prepared.changed != before:
@@ -426,7 +439,7 @@ class Walker:
         return walked
 
     def _put_out(self, output: list[tuple[int, LogLine]]) -> None:
-        """Append what is put out, each with where its frame begins."""
+        """Append the lines of output, each with the offset of its frame."""
         at, end = self._said, _LENGTH.unpack_from(self._memory, SURE)[0]
         while at < end:
             number, frame = HEAD.unpack_from(self._memory, at)
@@ -435,9 +448,9 @@ class Walker:
             at += line.size
 
     def _stopped(self, *call: int) -> int:
-        """What the module would have answered where it was stopped: the message that it looked at is left.
+        """Return what the module would have returned where it was stopped: the current message is left.
 
-        If none had begun it is called again: the calls before have used up the fuel.
+        If no message had begun, it is called again: earlier calls have used up the fuel.
         """
         self._home.machine.refuel(FUEL)
         at, effect = _POSITION.unpack_from(self._memory, POSITION)
@@ -447,11 +460,11 @@ class Walker:
             return int(at | effects << 32 | LEFT | TOLD | SOONER)  # there may be an earlier deadline
         try:
             return self._call(*call) or 0
-        except MachineTrap:
+        except WasmTrap:
             return self._stopped(*call)
 
     def _undo(self) -> None:
-        """Take back what was done to the message that is left."""
+        """Undo the effects of the message that is left."""
         memory = self._memory
         for address, kept in self._feed.undo:
             memory[address : address + 8] = memory[kept : kept + 8]
@@ -463,7 +476,7 @@ class Walker:
             self._settle()
 
     def _counted(self) -> tuple[Sequence[int], Sequence[int]]:
-        """How many messages each event has dropped, and how often there was each verdict, since this was last asked."""
+        """Return the messages dropped by each event, and the number of each verdict, since the last call."""
         counts = self._later.unpack_from(self._memory, self._feed.counters + self._counts.size)
         before, self._before = self._before, counts
         more = [now - then for now, then in zip(counts, before, strict=True)]
@@ -474,7 +487,7 @@ def _sums(one: Sequence[int], other: Sequence[int]) -> Sequence[int]:
     return [sum(counts) for counts in zip_longest(one, other, fillvalue=0)]
 
 
-def _verdict(monitor: Monitor, place: int, handler: int) -> Verdict:
+def _verdict(monitor: MonitorInstance, place: int, handler: int) -> Verdict:
     code = monitor.properties[place].code
     source = code.property.source
     return Verdict(monitor.name, monitor.properties[place].index, source.logic, code.order[handler], source)
@@ -483,19 +496,19 @@ def _verdict(monitor: Monitor, place: int, handler: int) -> Verdict:
 class WasmFastPath:
     """Runs the module of a set; implements `FastPath`."""
 
-    def __init__(self, module: FeedModule) -> None:
+    def __init__(self, module: CompiledModule) -> None:
         self._module = module
 
     def lanes(
-        self, compiled: Compiled, interpreter: Interpreter, monitors: Sequence[Monitor], due: Due
+        self, compiled: Compiled, interpreter: Interpreter, monitors: Sequence[MonitorInstance], due: NextDue
     ) -> Lanes:
         """Instantiate the module and return a lane for each topic that it takes; set `home` of its monitors."""
         module = self._module
         if not module.feeds:
             return Lanes()
         found = list(groups(compiled.specifications))
-        machine = Machine(module.code, module.memory)
-        walks: dict[str, Walker] = {}
+        machine = WasmInstance(module.code, module.memory)
+        walks: dict[str, WasmLane] = {}
         for group, cells in zip(found, module.cells, strict=True):
             running = [monitors[number].properties[index] for number, index in group.properties]
             for number, address in cells.exits.items():
@@ -509,7 +522,7 @@ class WasmFastPath:
                 if context in contexts
             ]
             specifications = [compiled.specifications[number] for number in group.specifications]
-            home = Home(
+            home = ModuleState(
                 machine,
                 cells,
                 interpreter,
@@ -530,5 +543,5 @@ class WasmFastPath:
                         f"{monitors[number].name}.{monitors[number].code.events[index].name}"
                         for number, index in events
                     ]
-                    walks[topic] = Walker(home, module, module.feeds[topic], own, names)
+                    walks[topic] = WasmLane(home, module, module.feeds[topic], own, names)
         return Lanes(walks, machine.memory[module.frames : module.frames + AREA])

@@ -1,4 +1,4 @@
-"""The bytes of a module as functions: their types, local variables, and instructions in a tree.
+"""Decodes a module into functions: types, local variables, and instructions in a tree.
 
 Only the instructions are known that modules of events are written with; any other is an `UnknownInstructionError`.
 """
@@ -10,17 +10,17 @@ from types import MappingProxyType
 
 
 class UnknownInstructionError(Exception):
-    """The module has something that is not known here."""
+    """The module has something unknown."""
 
 
 @dataclass(frozen=True, slots=True)
-class Instruction:
+class WasmInstruction:
     """`operands` are its constants; blocks have their `body`, and `if` what is done `otherwise`."""
 
     name: str
     operands: tuple[int | float, ...] = ()
-    body: "tuple[Instruction, ...]" = ()
-    otherwise: "tuple[Instruction, ...]" = ()
+    body: "tuple[WasmInstruction, ...]" = ()
+    otherwise: "tuple[WasmInstruction, ...]" = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Code:
     parameters: tuple[str, ...]
     result: str
     made: tuple[str, ...]
-    body: tuple[Instruction, ...]
+    body: tuple[WasmInstruction, ...]
 
 
 TYPES = {0x7F: "i32", 0x7E: "i64", 0x7D: "f32", 0x7C: "f64"}
@@ -51,7 +51,7 @@ _TRUNCATED = """i32.trunc_sat_f32_s i32.trunc_sat_f32_u i32.trunc_sat_f64_s i32.
 
 
 def _plain() -> dict[int, str]:
-    """The codes of what has no operands, as the standard lists them (WebAssembly 1.0, section 5.4)."""
+    """Return the opcodes of instructions without operands (WebAssembly 1.0, section 5.4)."""
     found = {
         0x00: "unreachable",
         0x0F: "return",
@@ -120,46 +120,46 @@ class Reader:
         """Read a list of types."""
         return tuple(TYPES[self.byte()] for _ in range(self.unsigned()))
 
-    def block(self) -> tuple[tuple[Instruction, ...], int]:
-        """Instructions up to an `else` or `end`, and which of the two it is."""
-        found: list[Instruction] = []
+    def block(self) -> tuple[tuple[WasmInstruction, ...], int]:
+        """Read instructions up to an `else` or `end`; return them and which of the two it is."""
+        found: list[WasmInstruction] = []
         while True:
             code = self.byte()
             if code in (_ELSE, _END):
                 return tuple(found), code
             found.append(self.instruction(code))
 
-    def instruction(self, code: int) -> Instruction:
+    def instruction(self, code: int) -> WasmInstruction:
         """Read the rest of an instruction that begins with this byte."""
         if code in PLAIN:
-            return Instruction(PLAIN[code])
+            return WasmInstruction(PLAIN[code])
         if code in MEMORY:
             self.unsigned()  # what the address is a multiple of: a hint
-            return Instruction(MEMORY[code], (self.unsigned(),))
+            return WasmInstruction(MEMORY[code], (self.unsigned(),))
         if code in _NUMBERED:
-            return Instruction(_NUMBERED[code], (self.unsigned(),))
+            return WasmInstruction(_NUMBERED[code], (self.unsigned(),))
         if code in _BLOCKS:
             self.byte()  # the type of its value
             body, end = self.block()
             otherwise = self.block()[0] if end == _ELSE else ()
-            return Instruction(_BLOCKS[code], (), body, otherwise)
+            return WasmInstruction(_BLOCKS[code], (), body, otherwise)
         if code in (0x41, 0x42):
-            return Instruction("i32.const" if code == 0x41 else "i64.const", (self.signed(),))
+            return WasmInstruction("i32.const" if code == 0x41 else "i64.const", (self.signed(),))
         if code in _FLOATS:
             name, layout = _FLOATS[code]
-            return Instruction(name, layout.unpack(self.take(layout.size)))
+            return WasmInstruction(name, layout.unpack(self.take(layout.size)))
         number = self.unsigned() if code == 0xFC else -1
         if number in _TRUNCATING:
-            return Instruction(_TRUNCATING[number])
+            return WasmInstruction(_TRUNCATING[number])
         if number == _COPY:
-            return Instruction("memory.copy", tuple(self.take(2)))
+            return WasmInstruction("memory.copy", tuple(self.take(2)))
         if number == _FILL:
-            return Instruction("memory.fill", tuple(self.take(1)))
+            return WasmInstruction("memory.fill", tuple(self.take(1)))
         raise UnknownInstructionError(f"the instruction {code:#04x}")
 
 
 def functions_of(module: bytes) -> list[Code]:
-    """The functions of a module without imports.
+    """Return the functions of a module without imports.
 
     Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` where the module ends too early.
     """

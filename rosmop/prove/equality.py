@@ -1,15 +1,15 @@
-"""Whether events and the module that was written of them can differ: the question for z3, and its answer.
+"""Asks z3 whether an event and its code in the module can differ.
 
 An event and its function in the module are equal if, for every message of up to `AREA` bytes and every state, the
-function leaves the message to Python (which then judges it anew), or
+function leaves the message to Python (which then processes it from the start), or
 
 - the form does not fault,
-- both say the same of whether the event happened, dropped the message, changed it,
-- the bytes of the message, the variables and what is left of the budget are the same,
-- and so is what is put out, in its order. (An event that looks at a string that is kept, or keeps one, is not proved.)
+- both agree on whether the event happened, dropped the message, changed it,
+- the bytes of the message, the variables and the rest of the budget are the same,
+- and so are the lines of output, in order. (An event that reads or keeps a string in a variable is not proved.)
 
-Where it leaves the message, the walk takes back what it has done: each variable that it has written stands among those
-that are taken back, and each byte in the log (`module_terms.py`).
+If it leaves the message, its effects are undone: each variable that it has written must be among those that are
+restored, and each byte in the log (`module_terms.py`).
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,21 +19,21 @@ from typing import Any
 import z3
 
 from rosmop.fast.abi import AREA
-from rosmop.fast.batch_codegen import WrittenModule, written
+from rosmop.fast.batch_codegen import WasmModule, written
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
 from rosmop.prove.decoding import functions_of
-from rosmop.prove.form_terms import Meaning, wrapped
-from rosmop.prove.module_terms import Done, Execution
+from rosmop.prove.form_terms import FormTerms, wrapped
+from rosmop.prove.module_terms import ModuleExecution, ModuleResult
 from rosmop.prove.terms import (
     DOUBLE,
     SINGLE,
-    Beginning,
     DiffersError,
-    Noted,
+    FormResult,
+    LineTerm,
     NotProvedError,
-    Result,
+    StartTerms,
     Term,
     abstracted,
     as_bits,
@@ -45,23 +45,23 @@ from rosmop.prove.terms import (
 )
 from rosmop.runtime.action_context import BUDGET
 from rosmop.runtime.times import MAX_TIME
-from rosmop.runtime.values import Values
+from rosmop.runtime.values import ValueCodec
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 EQUAL = "equal"
 IN_PYTHON = "no module: messages of this topic are judged in Python"
-PATIENCE = 1.0
-"""Seconds for each event."""
+PATIENCE = 5.0
+"""Default number of seconds for each event."""
 
-_NOW, _REST = 16, 32  # where the time stands in the module, and how much of the message is not shown
+_NOW, _REST = 16, 32  # addresses of the time and of the number of bytes that are not shown
 _HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE = 1, 2, 4, 8
 _LATEST = 1 << 62
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What is known of an event on a topic, or part of a service.
+class ProofFinding:
+    """The result for an event on a topic, or part of a service.
 
     `answer` is `EQUAL`, or says why it is not known to be, or what differs.
 
@@ -76,10 +76,10 @@ class Finding:
 
 def findings_of(
     compiled: Compiled, clock: Callable[[], float], patience: float = PATIENCE
-) -> Iterator[Finding]:
-    """What is known of every event of a set but timers, in their order; `patience` in seconds of the clock for each."""
+) -> Iterator[ProofFinding]:
+    """Yield the result for each event of a set except timers, in order; `patience` is in seconds for each."""
     found = list(groups(compiled.specifications))
-    values = Values(compiled.messages)
+    values = ValueCodec(compiled.messages)
     module = written(compiled.functions, [group.component for group in found], values)
     validation = Validation(compiled.functions, values, module, clock, patience)
     for group in found:
@@ -92,17 +92,17 @@ def findings_of(
     for number, specification in enumerate(compiled.specifications):
         for index, event in enumerate(specification.events):
             if event.way is not None and (number, index) not in in_module:
-                yield Finding(event.way, f"{specification.name}.{event.name}", IN_PYTHON)
+                yield ProofFinding(event.way, f"{specification.name}.{event.name}", IN_PYTHON)
 
 
 class Validation:
-    """The module of a set beside the form. Raises `UnknownInstructionError` for a module that cannot be read."""
+    """Compares the module of a set with the form. Raises `UnknownInstructionError` for a module that cannot be read."""
 
     def __init__(
         self,
         functions: Mapping[str, nodes.Function],
-        values: Values,
-        module: WrittenModule,
+        values: ValueCodec,
+        module: WasmModule,
         clock: Callable[[], float],
         patience: float = PATIENCE,
     ) -> None:
@@ -116,23 +116,23 @@ class Validation:
         self._strings += [range(at, at + len(raw)) for raw, at in module.strings.items()]
         self._strings += module.references
 
-    def finding(self, topic: str, event: str, function: str, place: int) -> Finding:
-        """What is known of the event that is at this place among those of a topic."""
+    def finding(self, topic: str, event: str, function: str, place: int) -> ProofFinding:
+        """Return the result for the event with this index on a topic."""
         feed = self._module.feeds.get(topic)
         if feed is None:
-            return Finding(topic, event, IN_PYTHON)
+            return ProofFinding(topic, event, IN_PYTHON)
         try:
-            return Finding(topic, event, self._compared(function, feed.functions[place], topic))
+            return ProofFinding(topic, event, self._compared(function, feed.functions[place], topic))
         except DiffersError as error:
-            return Finding(topic, event, f"not equal: {error}", differs=True)
+            return ProofFinding(topic, event, f"not equal: {error}", differs=True)
         except NotProvedError as error:
-            return Finding(topic, event, str(error))
+            return ProofFinding(topic, event, str(error))
 
     def _compared(self, name: str, number: int, topic: str) -> str:
         begin, cells, known = self._beginning()
         module = self._module
-        meant = Meaning(self._forms, self._values, begin, name, module.lines).result()
-        done = Execution(self.codes, number, begin.message, begin.size, cells, self._strings).done()
+        meant = FormTerms(self._forms, self._values, begin, name, module.lines).result()
+        done = ModuleExecution(self.codes, number, begin.message, begin.size, cells, self._strings).done()
         self._check_undone(done, topic)
         left = either(done.trapped, done.bits == _ELSEWHERE)
         unknown = either(*meant.unknown.values())
@@ -168,7 +168,7 @@ class Validation:
         return EQUAL
 
     def _first(self, known: Sequence[Term], wrong: Mapping[str, Term]) -> str | None:
-        """Why they are not known to be equal; None if they are. Raises `DiffersError`."""
+        """Return why they are not known to be equal; None if they are. Raises `DiffersError`."""
         begun = self._clock()
         undecided = False
         for text, condition in wrong.items():
@@ -186,7 +186,9 @@ class Validation:
         return "not decided in time" if undecided else None
 
     def _asked(self, conditions: Sequence[Term], begun: float) -> tuple[Any, Any]:
-        """Whether they can hold together, and how; `begun` is when the first question about the event was asked."""
+        """Return whether the conditions are satisfiable, and a model; `begun` is the time of the event's first
+        question.
+        """
         rest = int(1000 * (begun + self._patience - self._clock()))
         if rest <= 0:
             return z3.unknown, None
@@ -196,18 +198,18 @@ class Validation:
         answer = solver.check()
         return answer, solver.model() if answer == z3.sat else None
 
-    def _beginning(self) -> tuple[Beginning, dict[int, Term], list[Term]]:
-        """What every event may begin with; the same as the module's cells; and what is known of it."""
+    def _beginning(self) -> tuple[StartTerms, dict[int, Term], list[Term]]:
+        """Return the initial state of every event, the same as cells of the module, and its constraints."""
         now, size = z3.BitVec("now", 64), z3.BitVec("size", 32)
         known = [now >= 0, now < _LATEST, z3.ULE(size, AREA)]
         cells: dict[int, Term] = {_NOW: now, _REST: integer(0, 64)}
         variables: dict[str, Any] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
-                if isinstance(kind, value_types.String):
+                if isinstance(kind, value_types.StringType):
                     continue
                 variables[name] = cells[address] = _variable(name, kind)
-                if isinstance(kind, value_types.Time | value_types.Duration):
+                if isinstance(kind, value_types.TimeType | value_types.DurationType):
                     most = MAX_TIME + (1 << 32)
                     known += [variables[name] >= -most, variables[name] <= most]
         budgets = {context: z3.BitVec(f"budget of {context}", 64) for context in self._module.budgets}
@@ -219,10 +221,10 @@ class Validation:
             known.append(throttles[key] >= 0)
             cells[address] = throttles[key]
         message = z3.Array("message", z3.BitVecSort(32), z3.BitVecSort(8))
-        return Beginning(message, size, now, variables, budgets, throttles), cells, known
+        return StartTerms(message, size, now, variables, budgets, throttles), cells, known
 
-    def _ends(self, meant: Result) -> Iterator[tuple[int, Term]]:
-        """What each cell must hold at the end."""
+    def _ends(self, meant: FormResult) -> Iterator[tuple[int, Term]]:
+        """Yield the required final value of each cell."""
         for component in self._module.cells:
             for name, (address, _) in component.variables.items():
                 if name in meant.variables:
@@ -230,14 +232,14 @@ class Validation:
         for context, address in self._module.budgets.items():
             yield address, meant.budgets[context]
 
-    def _check_undone(self, done: Done, topic: str) -> None:
+    def _check_undone(self, done: ModuleResult, topic: str) -> None:
         taken_back = {address for address, _ in self._module.feeds[topic].undo}
         for address in sorted(done.stored - set(self._module.budgets.values()) - taken_back):
             raise DiffersError(f"what it writes at {address} is not taken back")
 
 
 def _holds(conditions: Sequence[Term], guess: Any) -> bool:
-    """Whether a message and a state are an example, too, with what costly operations are in truth."""
+    """Return whether a message and a state are an example with the true results of costly operations."""
     values = [
         (declaration(), guess[declaration]) for declaration in guess.decls() if declaration.arity() == 0
     ]
@@ -250,19 +252,19 @@ def _holds(conditions: Sequence[Term], guess: Any) -> bool:
 
 
 def _example(model: Any) -> str:
-    """A message and a state, as short as they are."""
+    """Format a message and a state."""
     return ", ".join(
         f"{declaration} = {model[declaration]}" for declaration in model.decls() if declaration.arity() == 0
     )
 
 
 def _same(held: Term, value: Term) -> Term:
-    """Whether a cell holds a value; a truth may be one by its bits."""
+    """Return whether a cell holds a value; a boolean may be a number."""
     return held == (as_bits(value) if z3.is_bool(value) and not z3.is_bool(held) else value)
 
 
-def _among(noted: Noted, lines: Term) -> Term:
-    """Whether one of what may stand there does."""
+def _among(noted: LineTerm, lines: Term) -> Term:
+    """Return whether the line has one of its allowed values."""
     held = number_at(lines, noted.offset, noted.allowed[0].size() // 8) if noted.allowed else None
     return either(*(held == one for one in noted.allowed))
 
@@ -272,11 +274,11 @@ def _bit(bits: Term, which: int) -> Term:
 
 
 def _variable(name: str, kind: Type) -> Term:
-    """A variable of the set, with any value of its type."""
-    if isinstance(kind, value_types.Bool):
+    """Return a variable of the set, with any value of its type."""
+    if isinstance(kind, value_types.BoolType):
         return z3.Bool(name)
-    if isinstance(kind, value_types.Floating):
+    if isinstance(kind, value_types.FloatingType):
         return z3.FP(name, DOUBLE if kind.bits == 64 else SINGLE)
-    if isinstance(kind, value_types.Integer) and kind.bits <= 32:
+    if isinstance(kind, value_types.IntegerType) and kind.bits <= 32:
         return wrapped(z3.BitVec(name, 32), kind)
     return z3.BitVec(name, 64)

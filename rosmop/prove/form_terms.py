@@ -1,10 +1,10 @@
-"""What the form of an event means, as terms: line by line `ir/interpreter.py`, for every message at once.
+"""Translates the form of an event to terms of z3: `run/interpreter.py` line by line, for all messages at once.
 
-- Positions and counts are 64 bits here and any number there: a function without loops adds up a few products of a
-  count below 2**32 and a size, and never comes to more. Times are 64 bits, too, and sums of two of them fit.
-- Of numbers of 32 bits the interpreter rounds the double that comes of `+ - * /`. That is the float that the operation
-  has itself: a double has more than twice as many digits, so that rounding twice is rounding once.
-- What it measures of the values that a specification holds, once in a megabyte that it says it will make, is left out.
+- Positions and counts have 64 bits here and are unbounded there: a function without loops adds a few products of a
+  count below 2**32 and a size, which never exceed 64 bits. Times also have 64 bits, and sums of two of them fit.
+- For floats of 32 bits the interpreter rounds the double result of `+ - * /`. That is the result of the operation on
+  floats: a double has more than twice as many digits, so that rounding twice is rounding once.
+- Measuring the values of a specification, once for each megabyte that it allocates, is left out.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,7 @@ from typing import Any
 
 import z3
 
-from rosmop.fast.deferred_output import BYTES, HEAD, Line
+from rosmop.fast.deferred_output import BYTES, HEAD, OutputLine
 from rosmop.form import nodes
 from rosmop.prove.terms import (
     AT,
@@ -23,10 +23,10 @@ from rosmop.prove.terms import (
     MIXED,
     NEAREST,
     SINGLE,
-    Beginning,
-    Noted,
+    FormResult,
+    LineTerm,
     NotProvedError,
-    Result,
+    StartTerms,
     State,
     Term,
     as_bits,
@@ -42,7 +42,7 @@ from rosmop.prove.terms import (
 )
 from rosmop.runtime import times
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, UNMEASURED
-from rosmop.runtime.values import Values, struct_code, struct_size
+from rosmop.runtime.values import ValueCodec, struct_code, struct_size
 from rosmop.runtime.wire import MAX_EMPTY
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
@@ -52,7 +52,7 @@ _MESSAGE, _DROPPED, _CHANGED, _BUDGET, _SAID = "message", "dropped", "changed", 
 
 @dataclass(frozen=True)
 class _View:
-    """A string, vector or message as it stood in the bytes: from where, and how many elements."""
+    """A string, vector or message in the bytes: its start and number of elements."""
 
     message: Term
     start: Term
@@ -60,54 +60,54 @@ class _View:
 
 
 class UnknownError(Exception):
-    """What is not said here."""
+    """The form has something that is not translated."""
 
 
 def is_signed(kind: Type) -> bool:
-    """Whether numbers of the type may be negative."""
-    return not isinstance(kind, value_types.Integer) or kind.signed
+    """Return whether numbers of the type may be negative."""
+    return not isinstance(kind, value_types.IntegerType) or kind.signed
 
 
 def width(kind: Type) -> int:
-    """The bits of the vector that holds a number of this type."""
-    return 32 if isinstance(kind, value_types.Integer) and kind.bits <= 32 else 64
+    """Return the width of the bit vector for a number of this type."""
+    return 32 if isinstance(kind, value_types.IntegerType) and kind.bits <= 32 else 64
 
 
-def wrapped(value: Term, kind: value_types.Integer) -> Term:
-    """Only the bits of this type, as the vector holds them."""
+def wrapped(value: Term, kind: value_types.IntegerType) -> Term:
+    """Wrap a number to the bits of its type, extended to the bit vector."""
     if kind.bits >= 32:
         return value
     return (z3.SignExt if kind.signed else z3.ZeroExt)(32 - kind.bits, z3.Extract(kind.bits - 1, 0, value))
 
 
 def _text(view: _View) -> Term:
-    """Where a string of the message stands, and how long it is."""
+    """Return the address and length of a string of the message."""
     return z3.Concat(z3.Extract(31, 0, view.count), AT + z3.Extract(31, 0, view.start))
 
 
 def _word(value: Term, kind: Type) -> Term:
-    """A number as it stands in a line."""
-    if isinstance(kind, value_types.Floating):
+    """Return a number as it is stored in a line of output."""
+    if isinstance(kind, value_types.FloatingType):
         return z3.fpToIEEEBV(value if kind.bits == 64 else z3.fpFPToFP(NEAREST, value, DOUBLE))
     bits = as_bits(value) if z3.is_bool(value) else value
     return bits if bits.size() == 64 else (z3.SignExt if is_signed(kind) else z3.ZeroExt)(32, bits)
 
 
-class Meaning:
-    """One event. `functions` are those of its set, `values` the types of its messages; `lines` are what the module puts
-    out, by number.
+class FormTerms:
+    """Translates one event. `functions` are those of its set, `values` the types of its messages; `lines` are the
+    module's lines of output, by number.
     """
 
     def __init__(
         self,
         functions: Mapping[str, nodes.Function],
-        values: Values,
-        beginning: Beginning,
+        values: ValueCodec,
+        beginning: StartTerms,
         name: str,
-        lines: Sequence[Line] = (),
+        lines: Sequence[OutputLine] = (),
     ) -> None:
         self._lines = lines
-        self._noted: list[Noted] = []
+        self._noted: list[LineTerm] = []
         self._context = functions[name].context
         self._functions = functions
         self._values = values
@@ -121,8 +121,8 @@ class Meaning:
         self._frame = 0
         self._shared: Sequence[str] = self._function.shared
 
-    def result(self) -> Result:
-        """What it comes to. Raises `NotProvedError` for a loop."""
+    def result(self) -> FormResult:
+        """Return the result. Raises `NotProvedError` for a loop."""
         begin, no = self._beginning, z3.BoolVal(False)
         budget = begin.budgets[self._function.context]
         slots: dict[Any, Any] = {_MESSAGE: begin.message, _DROPPED: no, _CHANGED: no, _BUDGET: budget}
@@ -130,14 +130,14 @@ class Meaning:
         slots |= {("shared", name): value for name, value in begin.variables.items()}
         state = State(z3.BoolVal(True), slots)
         self._block(self._function.body, state)
-        self._left.append(state.alive)  # nothing comes to the end without leaving
+        self._left.append(state.alive)  # no message reaches the end without leaving
         happened, end = no, slots
         for left, value in self._exits:
             happened = choice(left.alive, value, happened)
             end = merged(left.alive, left, State(opposite(left.alive), end))
         unknown = {name: either(*conditions) for name, conditions in self._unknown.items()}
         variables = {name: end["shared", name] for name in begin.variables}
-        return Result(
+        return FormResult(
             either(*self._left), unknown, happened, end[_DROPPED], end[_CHANGED], end[_MESSAGE], variables,
             {**begin.budgets, self._function.context: end[_BUDGET]}, end[_SAID], self._noted,
         )  # fmt: skip
@@ -145,7 +145,7 @@ class Meaning:
     # Ends
 
     def _leave_to_python(self, state: State, condition: Term) -> None:
-        """A fault, or what no module does: the message is judged anew, by others."""
+        """Leave the message to Python: a fault, or something that is not compiled."""
         self._left.append(both(state.alive, condition))
         state.require(opposite(condition))
 
@@ -163,11 +163,11 @@ class Meaning:
         for statement in statements:
             if z3.is_false(state.alive):
                 return
-            method = _STATEMENTS.get(type(statement))
+            row = STATEMENTS[type(statement)]
             try:
-                if method is None:
-                    raise UnknownError(type(statement).__name__)
-                method(self, statement, state)
+                if isinstance(row, nodes.Left):
+                    raise UnknownError(row.reason)
+                row(self, statement, state)
             except UnknownError as error:
                 self._ignore(state, str(error))
 
@@ -183,8 +183,6 @@ class Meaning:
 
     def _repeat(self, _node: nodes.Statement | nodes.Expression, _state: State) -> None:
         raise NotProvedError("not loop-free")
-
-    _loop = _for_each = _skip = _accumulate = _repeat
 
     def _select(self, node: nodes.Select, state: State) -> None:
         value = self._value(node.value, state)
@@ -228,8 +226,8 @@ class Meaning:
         state.slots[_DROPPED] = z3.BoolVal(True)
 
     def _log(self, node: nodes.Log, state: State) -> None:
-        """A line costs the most that it can."""
-        line = Line("", node)
+        """Charge the highest possible cost of a line."""
+        line = OutputLine("", node)
         cost, words = integer(line.cost, 64), []
         for expression in line.values:
             value = self._value(expression, state)
@@ -241,7 +239,7 @@ class Meaning:
         self._put_out(node, words, cost, state)
 
     def _put_out(self, node: nodes.Log, parts: Sequence[Term], cost: Term, state: State) -> None:
-        """Note a line: its number among those of the module, the frame, and its parts."""
+        """Store a line: its number in the module, the frame, and its parts."""
         numbers = [
             integer(number, 32)
             for number, line in enumerate(self._lines)
@@ -249,15 +247,15 @@ class Meaning:
         ]
         self._spend(cost, state)
         begin = state.slots[_SAID]
-        self._noted += (Noted(state.alive, begin, numbers), Noted(state.alive, begin + 4, [FRAME]))
+        self._noted += (LineTerm(state.alive, begin, numbers), LineTerm(state.alive, begin + 4, [FRAME]))
         offset = HEAD.size
         for part in parts:
-            self._noted.append(Noted(state.alive, begin + offset, [part]))
+            self._noted.append(LineTerm(state.alive, begin + offset, [part]))
             offset += part.size() // 8
         state.slots[_SAID] = begin + (offset + 7 & ~7)
 
     def _pending(self, node: nodes.Pending, state: State) -> None:
-        """Only `Whole` asks for it, of which no module is written."""
+        """Do nothing: only `Whole` uses it, which is not compiled."""
 
     def _require(self, node: nodes.Require, state: State) -> None:
         test = self._value(node.test, state)
@@ -274,7 +272,7 @@ class Meaning:
         return offset if at.base is None else state.slots[self._frame, at.base] + offset
 
     def _place(self, at: nodes.Spot, state: State) -> Term:
-        """The same where it is known to be within the message."""
+        """Return the address of a position that is within the message."""
         offset = integer(at.offset, 32)
         return offset if at.base is None else z3.Extract(31, 0, state.slots[self._frame, at.base]) + offset
 
@@ -316,46 +314,46 @@ class Meaning:
         return self._decoded(number_at(message, place, self._size(kind)), kind)
 
     def _decoded(self, bits: Term, kind: Type) -> Term:
-        """The number that these bytes are."""
-        if isinstance(kind, value_types.Time | value_types.Duration):
+        """Decode a number."""
+        if isinstance(kind, value_types.TimeType | value_types.DurationType):
             extend = z3.ZeroExt if kind == value_types.TIME else z3.SignExt
             seconds, rest = (extend(32, z3.Extract(more + 31, more, bits)) for more in (0, 32))
             return seconds * integer(times.BILLION, 64) + rest
-        if isinstance(kind, value_types.Bool):
+        if isinstance(kind, value_types.BoolType):
             return bits != 0
-        if isinstance(kind, value_types.Floating):
+        if isinstance(kind, value_types.FloatingType):
             return z3.fpBVToFP(bits, DOUBLE if kind.bits == 64 else SINGLE)
-        if not isinstance(kind, value_types.Integer):
+        if not isinstance(kind, value_types.IntegerType):
             raise UnknownError(f"a value of type {kind}")
         missing = width(kind) - bits.size()
         return bits if not missing else (z3.SignExt if kind.signed else z3.ZeroExt)(missing, bits)
 
     def _size(self, kind: Type) -> int:
-        """The bytes of every value of a type in a message."""
+        """Return the size of each value of a type in a message."""
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
-        if isinstance(kind, value_types.Record):
+        if isinstance(kind, value_types.RecordType):
             return sum(map(self._size, self._values.fields(kind)))
-        if isinstance(kind, value_types.Vector) and kind.length is not None:
+        if isinstance(kind, value_types.VectorType) and kind.length is not None:
             return kind.length * self._size(kind.element)
         raise UnknownError(f"a value of type {kind} in a vector or message")
 
     def _read_value(self, node: nodes.ReadValue, state: State) -> None:
         kind, start = node.type, self._position(node.at, state)
         count, size = integer(1, 64), 1
-        if isinstance(kind, value_types.String):
+        if isinstance(kind, value_types.StringType):
             count = self._length(node.at, state)
             start = self._position(node.at.plus(4), state)
             self._leave_to_python(state, z3.UGT(start + count, z3.ZeroExt(32, self._beginning.size)))
-        elif isinstance(kind, value_types.Vector) and kind.length is None:
+        elif isinstance(kind, value_types.VectorType) and kind.length is None:
             size = self._size(kind.element)
             count = self._counted(node.at, size, state)
             start = self._position(node.at.plus(4), state)
         else:
             size = self._size(kind)
             self._within(node.at, size, state)
-            if isinstance(kind, value_types.Vector):
+            if isinstance(kind, value_types.VectorType):
                 count, size = integer(kind.length or 0, 64), self._size(kind.element)
         state.slots[self._frame, node.name] = _View(state.slots[_MESSAGE], start, count)
         state.slots[self._frame, node.end] = start + count * size
@@ -382,13 +380,13 @@ class Meaning:
             state.slots[_CHANGED] = either(state.slots[_CHANGED], differs)
 
     def _packed(self, value: Term, kind: Type, state: State) -> Term:
-        """The bytes of a number. Which bits a NaN has is for Python to say."""
-        if isinstance(kind, value_types.Floating):
+        """Encode a number. The bits of a NaN are left to Python."""
+        if isinstance(kind, value_types.FloatingType):
             self._leave_to_python(state, z3.fpIsNaN(value))
             return z3.fpToIEEEBV(value)
-        if isinstance(kind, value_types.Bool):
+        if isinstance(kind, value_types.BoolType):
             return as_bits(value, 8)
-        if isinstance(kind, value_types.Integer):
+        if isinstance(kind, value_types.IntegerType):
             return z3.Extract(kind.bits - 1, 0, value)
         seconds, rest = self._parts(value)
         least, most = (0, 1 << 32) if kind == value_types.TIME else (-(1 << 31), 1 << 31)
@@ -396,7 +394,7 @@ class Meaning:
         return z3.Concat(z3.Extract(31, 0, rest), z3.Extract(31, 0, seconds))
 
     def _parts(self, value: Term) -> tuple[Term, Term]:
-        """`divmod(value, 10**9)`: the rest has the sign of the divisor."""
+        """Return `divmod(value, 10**9)`: the rest has the sign of the divisor."""
         billion = integer(times.BILLION, 64)
         rest = z3.SRem(value, billion)
         rest = z3.If(rest < 0, rest + billion, rest)
@@ -405,28 +403,31 @@ class Meaning:
     # Expressions
 
     def _value(self, node: nodes.Expression, state: State) -> Any:
-        method = _EXPRESSIONS.get(type(node))
-        if method is None:
-            raise UnknownError(type(node).__name__)
-        return method(self, node, state)
+        row = EXPRESSIONS[type(node)]
+        if isinstance(row, nodes.Left):
+            raise UnknownError(row.reason)
+        return row(self, node, state)
 
     def _literal(self, node: nodes.Literal, _state: State) -> Any:
         if node.value is None:
             return None
         if isinstance(node.value, bytes | str):
             raise UnknownError("a constant string")
-        if isinstance(node.type, value_types.Floating):
+        if isinstance(node.type, value_types.FloatingType):
             return floating(node.value, node.type.bits)
         return self._whole_number(int(node.value), node.type)
 
     def _whole_number(self, value: int, kind: Type) -> Term:
-        return z3.BoolVal(bool(value)) if isinstance(kind, value_types.Bool) else integer(value, width(kind))
+        return (
+            z3.BoolVal(bool(value)) if isinstance(kind, value_types.BoolType) else integer(value, width(kind))
+        )
 
     def _zero(self, node: nodes.Zero, state: State) -> Any:
-        if isinstance(node.type, value_types.Floating):
+        if isinstance(node.type, value_types.FloatingType):
             return self._literal(nodes.Literal(node.type, 0.0), state)
         if not isinstance(
-            node.type, value_types.Bool | value_types.Integer | value_types.Time | value_types.Duration
+            node.type,
+            value_types.BoolType | value_types.IntegerType | value_types.TimeType | value_types.DurationType,
         ):
             raise UnknownError(f"a zero of type {node.type}")
         return self._whole_number(0, node.type)
@@ -450,27 +451,27 @@ class Meaning:
         return self._converted(self._value(node.value, state), node.value.type, node.type)
 
     def _converted(self, value: Term, source: Type, target: Type) -> Term:
-        if isinstance(target, value_types.Bool):
-            if isinstance(source, value_types.Floating):
+        if isinstance(target, value_types.BoolType):
+            if isinstance(source, value_types.FloatingType):
                 return opposite(z3.fpIsZero(value))
-            return value if isinstance(source, value_types.Bool) else value != 0
-        if isinstance(source, value_types.Bool):
+            return value if isinstance(source, value_types.BoolType) else value != 0
+        if isinstance(source, value_types.BoolType):
             source, value = value_types.INT, as_bits(value)
-        if isinstance(target, value_types.Floating):
+        if isinstance(target, value_types.FloatingType):
             sort = DOUBLE if target.bits == 64 else SINGLE
-            if isinstance(source, value_types.Floating):
+            if isinstance(source, value_types.FloatingType):
                 return value if source.bits == target.bits else z3.fpFPToFP(NEAREST, value, sort)
             return (z3.fpSignedToFP if is_signed(source) else z3.fpUnsignedToFP)(NEAREST, value, sort)
-        if not isinstance(target, value_types.Integer):
+        if not isinstance(target, value_types.IntegerType):
             raise UnknownError(f"a conversion to {target}")
-        if isinstance(source, value_types.Floating):
-            return self._truncated(self._converted(value, source, value_types.Floating(64)), target)
+        if isinstance(source, value_types.FloatingType):
+            return self._truncated(self._converted(value, source, value_types.FloatingType(64)), target)
         if width(target) > value.size():
             value = (z3.SignExt if is_signed(source) else z3.ZeroExt)(32, value)
         return wrapped(value if width(target) == value.size() else z3.Extract(31, 0, value), target)
 
-    def _truncated(self, value: Term, target: value_types.Integer) -> Term:
-        """Toward zero, at most the limits; of what is narrower than 32 bits within those of `int` first."""
+    def _truncated(self, value: Term, target: value_types.IntegerType) -> Term:
+        """Truncate toward zero, within the limits; types narrower than 32 bits first within those of `int`."""
         whole = target if target.bits >= 32 else value_types.INT
         bits = whole.bits
         least, most = floating(whole.least, 64), floating(whole.most, 64)
@@ -486,9 +487,9 @@ class Meaning:
     def _arithmetic(self, node: nodes.Arithmetic, state: State) -> Any:
         left, right = self._value(node.left, state), self._value(node.right, state)
         kind, operator = node.type, node.operator
-        if isinstance(kind, value_types.Floating):
+        if isinstance(kind, value_types.FloatingType):
             return _OF_FLOATS[operator](NEAREST, left, right)
-        assert isinstance(kind, value_types.Integer)  # noqa: S101  numbers that are calculated with are one of the two
+        assert isinstance(kind, value_types.IntegerType)  # noqa: S101  numbers that are calculated with are one of the two
         if operator in "/%":
             self._leave_to_python(state, right == 0)
             if operator == "/":
@@ -512,7 +513,7 @@ class Meaning:
 
     def _unary(self, node: nodes.Unary, state: State) -> Any:
         value = self._value(node.value, state)
-        if isinstance(node.type, value_types.Floating):
+        if isinstance(node.type, value_types.FloatingType):
             return z3.fpAbs(value) if node.operator == "abs" else z3.fpNeg(value)
         if node.operator == "~":
             result = ~value
@@ -520,7 +521,7 @@ class Meaning:
             result = -value
         else:
             result = z3.If(value < 0, -value, value) if is_signed(node.type) else value
-        return wrapped(result, node.type) if isinstance(node.type, value_types.Integer) else result
+        return wrapped(result, node.type) if isinstance(node.type, value_types.IntegerType) else result
 
     def _moment(self, node: nodes.Moment, state: State) -> Any:
         left, right = self._value(node.left, state), self._value(node.right, state)
@@ -531,8 +532,8 @@ class Meaning:
         return self._of_parts(node.type, seconds, rest, state)
 
     def _of_parts(self, kind: Type, seconds: Term, rest: Term, state: State) -> Term:
-        """Exact: seconds beyond 2**33 are out of range with whatever nanoseconds, of which there are few enough, and
-        within 64 bits what overflows is told from what does not by the sum in 72.
+        """Return the exact time. Seconds beyond 2**33 are out of range for all allowed nanoseconds. Below that, the
+        sum in 72 bits shows whether the sum in 64 overflows.
         """
         far = either(seconds >= 1 << 33, seconds <= -(1 << 33), rest >= 1 << 62, rest <= -(1 << 62))
         known = state.where(far)
@@ -550,7 +551,7 @@ class Meaning:
 
     def _compare(self, node: nodes.Compare, state: State) -> Any:
         kind = node.left.type
-        if isinstance(kind, value_types.Vector | value_types.Record):
+        if isinstance(kind, value_types.VectorType | value_types.RecordType):
             raise UnknownError(f"a comparison of values of type {kind}")
         left, right = self._value(node.left, state), self._value(node.right, state)
         return _compared(node.operator, left, right, kind)
@@ -598,12 +599,12 @@ class Meaning:
         return self._beginning.now
 
     def _throttle(self, node: nodes.Throttle, state: State) -> Any:
-        """Output that is due is noted, and so for Python; of what is not due nothing comes."""
+        """Leave output that is due to Python; ignore output that is not due."""
         last = self._beginning.throttles.get((self._function.context, node.site))
         if last is None:
             raise UnknownError("output at most so often")
         seconds = self._converted(
-            self._value(node.seconds, state), node.seconds.type, value_types.Floating(64)
+            self._value(node.seconds, state), node.seconds.type, value_types.FloatingType(64)
         )
         more = z3.fpMul(NEAREST, seconds, floating(1e9, 64))
         until = z3.fpAdd(NEAREST, z3.fpSignedToFP(NEAREST, last, DOUBLE), more)
@@ -617,25 +618,25 @@ class Meaning:
 
     def _item(self, node: nodes.Item, state: State) -> Any:
         view = self._value(node.base, state)
-        if not isinstance(view, _View) or not isinstance(node.base.type, value_types.Record):
+        if not isinstance(view, _View) or not isinstance(node.base.type, value_types.RecordType):
             raise UnknownError("a part of a value")
         before = self._values.fields(node.base.type)[: node.number]
         return self._part(view, sum(map(self._size, before)), node.type)
 
     def _part(self, view: _View, offset: Term | int, kind: Type) -> Any:
-        """What stands so many bytes behind the beginning of a value."""
+        """Return the part at an offset in a value."""
         start = view.start + offset
-        if isinstance(kind, value_types.Record):
+        if isinstance(kind, value_types.RecordType):
             return _View(view.message, start, integer(1, 64))
-        if isinstance(kind, value_types.Vector) and kind.length is not None:
+        if isinstance(kind, value_types.VectorType) and kind.length is not None:
             return _View(view.message, start, integer(kind.length, 64))
         return self._number(view.message, z3.Extract(31, 0, start), kind)
 
     def _copy(self, node: nodes.Copy, state: State) -> Any:
         view, kind = self._value(node.value, state), node.type
-        if isinstance(kind, value_types.Vector) and struct_code(kind.element) is not None:
+        if isinstance(kind, value_types.VectorType) and struct_code(kind.element) is not None:
             self._make(view.count * self._values.width(kind.element), state)
-        elif not isinstance(kind, value_types.Record) or any(
+        elif not isinstance(kind, value_types.RecordType) or any(
             not struct_code(field) for field in self._values.fields(kind)
         ):
             raise UnknownError(f"a copy of type {kind}")
@@ -649,29 +650,29 @@ class Meaning:
         kind = arguments[0].type if arguments else value_types.VOID
         if name in _OF_VIEWS and isinstance(values[0], _View):
             return _OF_VIEWS[name](values[0].count)
-        if name == "l_element" and isinstance(values[0], _View) and isinstance(kind, value_types.Vector):
+        if name == "l_element" and isinstance(values[0], _View) and isinstance(kind, value_types.VectorType):
             index = values[1]
             self._leave_to_python(state, z3.UGE(index, values[0].count))
             return self._part(values[0], index * self._size(kind.element), node.type)
-        rounded = name.removesuffix("f") if kind == value_types.Floating(32) else name
+        rounded = name.removesuffix("f") if kind == value_types.FloatingType(32) else name
         if (
-            isinstance(kind, value_types.Floating)
+            isinstance(kind, value_types.FloatingType)
             and rounded in _ROUNDED
             and (rounded != name) == (kind.bits == 32)
         ):
             return _ROUNDED[rounded](values[0])
-        if isinstance(kind, value_types.Floating) and name in _QUESTIONS:
+        if isinstance(kind, value_types.FloatingType) and name in _QUESTIONS:
             return _QUESTIONS[name](values[0])
         if name in ("h_min", "h_max"):
             return self._chosen(
                 _compared("<" if name == "h_min" else ">", values[1], values[0], kind), values
             )
-        if name in ("h_fmin", "h_fmax") and kind == value_types.Floating(64):
+        if name in ("h_fmin", "h_fmax") and kind == value_types.FloatingType(64):
             less = (z3.fpLT if name == "h_fmin" else z3.fpGT)(values[1], values[0])
             return self._chosen(either(z3.fpIsNaN(values[0]), less), values)
         if name in _OF_MOMENTS:
             value = _OF_MOMENTS[name](self, values[0])
-            if isinstance(node.type, value_types.Integer) and width(node.type) == 32:
+            if isinstance(node.type, value_types.IntegerType) and width(node.type) == 32:
                 return z3.Extract(31, 0, value)
             return value
         if name in ("k_after", "k_before"):
@@ -685,7 +686,7 @@ class Meaning:
         moment, part, new = node.arguments
         assert isinstance(part, nodes.Literal)  # noqa: S101  the name of a part
         old = self._value(moment, state)
-        value = self._converted(self._value(new, state), new.type, value_types.Integer(64, True, "long"))
+        value = self._converted(self._value(new, state), new.type, value_types.IntegerType(64, True, "long"))
         seconds, rest = self._parts(old)
         one, other = (value, rest) if part.value == b"sec" else (seconds, value)
         return self._of_parts(node.type, one, other, state)
@@ -721,10 +722,10 @@ class Meaning:
 
 
 def _compared(operator: str, left: Term, right: Term, kind: Type) -> Term:
-    """A comparison of numbers, truths or times."""
-    if isinstance(kind, value_types.Bool) and operator not in ("==", "!="):
+    """Compare numbers, booleans or times."""
+    if isinstance(kind, value_types.BoolType) and operator not in ("==", "!="):
         left, right = map(as_bits, (left, right))
-    if isinstance(kind, value_types.Floating):
+    if isinstance(kind, value_types.FloatingType):
         result: Term = _COMPARED_FLOATS[operator](left, right)
         return opposite(result) if operator == "!=" else result
     return (_COMPARED if is_signed(kind) else _COMPARED_UNSIGNED)[operator](left, right)
@@ -778,7 +779,7 @@ _QUESTIONS: Mapping[str, Callable[[Term], Term]] = MappingProxyType(
         "h_isfinite": lambda value: opposite(either(z3.fpIsNaN(value), z3.fpIsInf(value))),
     }
 )
-_OF_MOMENTS: Mapping[str, Callable[[Meaning, Term], Term]] = MappingProxyType(
+_OF_MOMENTS: Mapping[str, Callable[[FormTerms, Term], Term]] = MappingProxyType(
     {
         "m_is_zero": lambda _, value: value == 0,
         "m_whole": lambda _, value: value,
@@ -787,9 +788,70 @@ _OF_MOMENTS: Mapping[str, Callable[[Meaning, Term], Term]] = MappingProxyType(
     }
 )
 
-_STATEMENTS: Mapping[type[Any], Callable[[Meaning, Any, State], None]] = nodes.methods_of(
-    Meaning, nodes.Statement
+STATEMENTS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], None] | nodes.Left] = (
+    MappingProxyType(
+        {
+            nodes.Evaluate: FormTerms._evaluate,
+            nodes.If: FormTerms._if,
+            nodes.Loop: FormTerms._repeat,
+            nodes.ForEach: FormTerms._repeat,
+            nodes.Break: nodes.Left("a loop"),
+            nodes.Continue: nodes.Left("a loop"),
+            nodes.Select: FormTerms._select,
+            nodes.Return: FormTerms._return,
+            nodes.Leave: FormTerms._leave,
+            nodes.Charge: FormTerms._charge,
+            nodes.Allocate: FormTerms._allocate,
+            nodes.LimitDepth: nodes.Left("recursion"),
+            nodes.Drop: FormTerms._drop,
+            nodes.Reset: nodes.Left("a reset"),
+            nodes.Publish: nodes.Left("a message to publish"),
+            nodes.AfterText: FormTerms._after_text,
+            nodes.Count: FormTerms._count,
+            nodes.AfterElements: FormTerms._after_elements,
+            nodes.Skip: FormTerms._repeat,
+            nodes.NotPast: FormTerms._not_past,
+            nodes.ReadNumbers: FormTerms._read_numbers,
+            nodes.ReadValue: FormTerms._read_value,
+            nodes.Require: FormTerms._require,
+            nodes.Pending: FormTerms._pending,
+            nodes.WriteBack: FormTerms._write_back,
+        }
+    )
 )
-_EXPRESSIONS: Mapping[type[Any], Callable[[Meaning, Any, State], Any]] = nodes.methods_of(
-    Meaning, nodes.Expression
+EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], Any] | nodes.Left] = (
+    MappingProxyType(
+        {
+            nodes.Literal: FormTerms._literal,
+            nodes.Read: FormTerms._read,
+            nodes.Assign: FormTerms._assign,
+            nodes.Convert: FormTerms._convert,
+            nodes.Arithmetic: FormTerms._arithmetic,
+            nodes.Unary: FormTerms._unary,
+            nodes.Moment: FormTerms._moment,
+            nodes.MomentOf: FormTerms._moment_of,
+            nodes.Compare: FormTerms._compare,
+            nodes.CompareTexts: FormTerms._compare_texts,
+            nodes.Logical: FormTerms._logical,
+            nodes.Not: FormTerms._not,
+            nodes.Conditional: FormTerms._conditional,
+            nodes.Sequence: FormTerms._sequence,
+            nodes.Discard: FormTerms._discard,
+            nodes.Item: FormTerms._item,
+            nodes.Vector: nodes.Left("an array that is built"),
+            nodes.Zero: FormTerms._zero,
+            nodes.Copy: FormTerms._copy,
+            nodes.Recast: nodes.Left("a converted array of bytes"),
+            nodes.OfType: nodes.Left("a function for values of any type"),
+            nodes.Call: FormTerms._call,
+            nodes.Accumulate: FormTerms._repeat,
+            nodes.Invoke: FormTerms._invoke,
+            nodes.Format: nodes.Left("formatted text"),
+            nodes.Join: nodes.Left("joined strings"),
+            nodes.Log: FormTerms._log,
+            nodes.Throttle: FormTerms._throttle,
+            nodes.Now: FormTerms._now,
+            nodes.Whole: nodes.Left("MESSAGE"),
+        }
+    )
 )

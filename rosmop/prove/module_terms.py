@@ -1,17 +1,15 @@
-"""What a function of a module does, as terms: its instructions, as the standard of WebAssembly defines them.
+"""Translates a function of a module to terms of z3, by the standard of WebAssembly.
 
-Three kinds of places are known, and an address that is none of them is a difference:
+Memory has these parts, and any other address is a difference:
 
-- cells, 8 bytes each at constant addresses: variables, budgets, times, and where the log ends (`UNDO`);
-- the message, from the address that the function is handed: everything that is read or written is within its size;
-- what is put out, in order;
-- the log, by which a message that is left is put back: whatever is written into the message was noted there before,
-  address, size and the bytes that stood there, and a note is never written again.
+- cells, 8 bytes each at constant addresses: variables, budgets, times, and the end of the log (`UNDO`);
+- the message, from the address that the function gets: all reads and writes are within its size;
+- lines of output, in order;
+- the log, by which a message that is left is restored: each write to the message is preceded by an entry with address,
+  size and old bytes, and entries are never overwritten.
 
-Of strings that variables keep, and of constant ones, nothing is known but where they are: who looks at them is not
-proved.
-
-What the function has left (`ELSEWHERE`) and a trap are the same: the walk takes back what was begun.
+For strings in variables, and for constant strings, only the addresses are known: code that reads them is not proved.
+Leaving the message (`ELSEWHERE`) and a trap are the same: the effects are undone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +20,7 @@ from typing import Any
 
 import z3
 
-from rosmop.prove.decoding import Code, Instruction
+from rosmop.prove.decoding import Code, WasmInstruction
 from rosmop.prove.terms import (
     AT,
     DOUBLE,
@@ -47,9 +45,9 @@ from rosmop.prove.terms import (
 )
 
 POSITION, UNDO, SAID = 0, 8, 12
-"""Where the frame, the end of the log and that of the lines stand."""
+"""Addresses of the frame, the end of the log and the end of the lines."""
 
-_ENTRY = 16  # bytes of a note: address, size (4 bytes each), what stood there
+_ENTRY = 16  # bytes of an entry: address, size (4 bytes each), old bytes
 _MESSAGE, _NOTE, _LINES = "message", "note", "lines"
 _SORTS: Mapping[str, Any] = MappingProxyType(
     {"i32": z3.BitVecSort(32), "i64": z3.BitVecSort(64), "f32": SINGLE, "f64": DOUBLE}
@@ -58,7 +56,7 @@ _SORTS: Mapping[str, Any] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Pointer:
-    """An address: so many bytes behind the beginning of the message, or of what is added to the log."""
+    """An address: an offset from the start of the message, or of the next entry of the log."""
 
     place: str
     offset: Term
@@ -66,7 +64,7 @@ class Pointer:
 
 @dataclass(frozen=True)
 class _Note:
-    """The last note of the log, and where it was made."""
+    """The last entry of the log, and its address."""
 
     alive: Term
     position: Term
@@ -75,9 +73,9 @@ class _Note:
 
 
 @dataclass(frozen=True)
-class Done:
-    """What a function of an event has done. `bits` are those that it returns, where it has not `trapped`; `outside`:
-    it looks at what is not the message's.
+class ModuleResult:
+    """The result of a function of an event. `bits` are its return value, unless it has `trapped`; `outside`: it reads
+    beyond the message.
     """
 
     trapped: Term
@@ -90,10 +88,10 @@ class Done:
     said: Term
 
 
-class Execution:
-    """One event's function, by its number, begun with these cells (truths are numbers, too).
+class ModuleExecution:
+    """Executes the function of one event, by its number, on these cells (booleans are also numbers).
 
-    `strings` are the addresses of strings, and of the cells that say where they are.
+    `strings` are the addresses of strings, and of the cells that refer to them.
     """
 
     def __init__(  # noqa: PLR0917  as `done` names them
@@ -127,8 +125,8 @@ class Execution:
         self._state = State(z3.BoolVal(True), slots)
         self._number = number
 
-    def done(self) -> Done:
-        """What it does. Raises `DiffersError` and `NotProvedError`."""
+    def done(self) -> ModuleResult:
+        """Return the result of the function. Raises `DiffersError` and `NotProvedError`."""
         state = self._state
         bits = _bits(self._call(self._number, [Pointer("message", integer(0, 32)), self._size], state))
         cells = {
@@ -136,13 +134,13 @@ class Execution:
             for key, value in state.slots.items()
             if isinstance(key, tuple) and key[0] == "cell" and key[1] not in (POSITION, UNDO, SAID)
         }
-        return Done(
+        return ModuleResult(
             either(*self._trapped), either(*self._outside), bits, state.slots[_MESSAGE], cells,
             frozenset(self._stored), state.slots[_LINES], state.slots["cell", SAID].offset,
         )  # fmt: skip
 
     def _call(self, number: int, arguments: Sequence[Any], state: State) -> Any:
-        """The value of a function; the state goes on behind it."""
+        """Return the value of a function; `state` becomes the one after the call."""
         code = self._functions[number]
         self._frames += 1
         outer = self._frame, self._returned
@@ -165,7 +163,7 @@ class Execution:
         state.alive, state.slots = end.alive, end.slots
         return result
 
-    def _run(self, instructions: Sequence[Instruction], state: State, stack: list[Any]) -> None:
+    def _run(self, instructions: Sequence[WasmInstruction], state: State, stack: list[Any]) -> None:
         for instruction in instructions:
             if z3.is_false(state.alive):
                 return
@@ -186,7 +184,7 @@ class Execution:
                 stack.append(_calculated(family, rest, instruction.operands, stack))
 
     def _divides(self, name: str, state: State, stack: Sequence[Any]) -> None:
-        """A division traps by zero, and where the quotient is too large."""
+        """Trap for a division by zero, or if the quotient overflows."""
         left, right = _bits(stack[-2]), _bits(stack[-1])
         traps = right == 0
         if name == "div_s":
@@ -196,7 +194,7 @@ class Execution:
 
     # Control
 
-    def _if(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+    def _if(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
         test = _truth(stack.pop())
         yes, no = state.where(test), state.where(opposite(test))
         one: list[Any] = []
@@ -209,35 +207,35 @@ class Execution:
         if any(value is not None for value in values):
             stack.append(choice(test, *values))
 
-    def _unreachable(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+    def _unreachable(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
         self._trapped.append(state.alive)
         state.alive = z3.BoolVal(False)
 
-    def _return(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+    def _return(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
         self._returned.append((state.where(z3.BoolVal(True)), stack[-1]))
         state.alive = z3.BoolVal(False)
 
-    def _called(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+    def _called(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
         number = int(instruction.operands[0])
         count = len(self._functions[number].parameters)
         arguments = stack[len(stack) - count :]
         del stack[len(stack) - count :]
         stack.append(self._call(number, arguments, state))
 
-    def _drop(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+    def _drop(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
         stack.pop()
 
-    def _select(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+    def _select(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
         test, no, yes = _truth(stack.pop()), stack.pop(), stack.pop()
         stack.append(choice(test, yes, no))
 
-    def _get(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+    def _get(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
         value = state.slots[self._frame, instruction.operands[0]]
         if value is MIXED:
             raise NotProvedError("uses a variable for an address and a number")
         stack.append(value)
 
-    def _set(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+    def _set(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
         state.slots[self._frame, instruction.operands[0]] = stack.pop()
 
     # Memory
@@ -289,7 +287,7 @@ class Execution:
             self._stored.add(place)
 
     def _cell(self, address: Any, offset: int) -> int:
-        """A constant address of what is no string."""
+        """Return a constant address that is not in a string."""
         number = z3.simplify(_bits(address))
         known = z3.is_bv_value(number)
         place = int(number.as_long()) + offset if known else -1
@@ -319,7 +317,7 @@ class Execution:
         state.slots[_MESSAGE] = with_number(message, position, z3.Extract(8 * size - 1, 0, _bits(value)))
 
     def _note(self, pointer: Pointer, offset: int, size: int, value: Any, state: State) -> None:
-        """A part of the note that is added next."""
+        """Write a part of the next entry of the log."""
         begin = state.slots["cell", UNDO].offset
         part = z3.simplify(pointer.offset + offset - begin)
         if not z3.is_bv_value(part) or (part.as_long(), size) not in ((0, 4), (4, 4), (8, 8)):
@@ -346,7 +344,7 @@ class Execution:
 
 
 def _loaded(value: Term, family: str, how: str) -> Term:
-    """So many bytes as a number of the machine."""
+    """Return bytes as a number of the machine."""
     if family in ("f32", "f64"):
         return z3.fpBVToFP(value, _SORTS[family])
     missing = int(family[1:]) - value.size()
@@ -354,7 +352,7 @@ def _loaded(value: Term, family: str, how: str) -> Term:
 
 
 def _stored(value: Any, size: int) -> Term:
-    """A number of the machine, or an address in the message, as so many bytes."""
+    """Return a number of the machine, or an address in the message, as bytes."""
     if isinstance(value, Pointer):
         if value.place != "message":
             raise DiffersError("it notes an address that is nowhere in the message")
@@ -365,25 +363,25 @@ def _stored(value: Any, size: int) -> Term:
 
 
 def each_name(family: str, how: str) -> str:
-    """What is read or written."""
+    """Return a name for the bits that are read or written."""
     return f"{how.strip('_us') or family[1:]} bits"
 
 
 def _same(one: Term, other: Term) -> bool:
-    """Whether they are plainly the same number; of two simplified terms one may be simpler."""
+    """Return whether two terms are plainly the same number."""
     rest = z3.simplify(one - other)
     return bool(z3.is_bv_value(rest) and rest.as_long() == 0)
 
 
 def _fits(value: Any, family: str) -> bool:
-    """Whether a cell holds values of this type."""
+    """Return whether a cell holds values of this type."""
     return (
         family == "i32" if isinstance(value, Pointer) or z3.is_bool(value) else value.sort() == _SORTS[family]
     )
 
 
 def _bits(value: Any) -> Term:
-    """A value as a number."""
+    """Return a value as a number."""
     if isinstance(value, Pointer):
         raise DiffersError("it calculates with an address")
     return as_bits(value) if z3.is_bool(value) else value
@@ -416,7 +414,7 @@ def _calculated(family: str, name: str, operands: Sequence[float], stack: list[A
 
 
 def _cut(value: Term, bits: int, *, signed: bool) -> Term:
-    """`trunc_sat`: toward zero; what does not fit is the nearest that does, NaN is 0."""
+    """Return `trunc_sat`: toward zero, saturated, 0 for NaN."""
     least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
     whole = (z3.fpToSBV if signed else z3.fpToUBV)(z3.RTZ(), value, z3.BitVecSort(bits))
     # Between a limit and the next whole number nothing is cut but to the limit.
@@ -433,17 +431,19 @@ def _shifted(operation: Callable[[Term, Term], Term]) -> Callable[[Term, Term], 
     return lambda value, amount: operation(value, amount & (amount.size() - 1))
 
 
-_CONTROL: Mapping[str, Callable[[Execution, Instruction, State, list[Any]], None]] = MappingProxyType(
-    {
-        "if": Execution._if,
-        "unreachable": Execution._unreachable,
-        "return": Execution._return,
-        "call": Execution._called,
-        "drop": Execution._drop,
-        "select": Execution._select,
-        "local.get": Execution._get,
-        "local.set": Execution._set,
-    }
+_CONTROL: Mapping[str, Callable[[ModuleExecution, WasmInstruction, State, list[Any]], None]] = (
+    MappingProxyType(
+        {
+            "if": ModuleExecution._if,
+            "unreachable": ModuleExecution._unreachable,
+            "return": ModuleExecution._return,
+            "call": ModuleExecution._called,
+            "drop": ModuleExecution._drop,
+            "select": ModuleExecution._select,
+            "local.get": ModuleExecution._get,
+            "local.set": ModuleExecution._set,
+        }
+    )
 )
 
 _FLOATS_ALONE = frozenset({"abs", "neg", "ceil", "floor", "trunc", "nearest", "sqrt"})

@@ -1,8 +1,8 @@
-"""What both sides begin with and are compared by: terms of z3, and states that branches are merged in.
+"""Terms of z3 for both sides, their initial state, and states that merge branches.
 
 - A message is an array of bytes, addressed in 32 bits, with a `size` that no frame exceeds.
 - A number of the language is a bit vector of 32 bits (narrower ones extended by their sign, or zeros) or of 64, a
-  truth, or an IEEE number; of NaN there is one, with bits that nobody may ask for.
+  truth, or an IEEE number; there is one NaN, and its bits cannot be read.
 """
 
 import struct
@@ -13,44 +13,44 @@ from typing import Any
 import z3
 
 Term = Any
-"""A term of z3, which has no types of its own for Python."""
+"""A term of z3, which has no Python types."""
 
 DOUBLE, SINGLE = z3.Float64(), z3.Float32()
 NEAREST = z3.RNE()
 AT = z3.BitVec("at", 32)
-"""Where the message stands in the memory."""
+"""Address of the message in the memory."""
 FRAME = z3.BitVec("position", 32)
-"""Where its frame does."""
+"""Address of its frame."""
 
 
 class NotProvedError(Exception):
-    """Why nothing can be said about an event."""
+    """Nothing is known about an event, for this reason."""
 
 
 class _Mixed:
-    """What a place holds that had different kinds of things in two branches: nobody may look at it."""
+    """The content of a slot with different kinds of values in two branches; it may not be read."""
 
 
 MIXED = _Mixed()
 
 
 class DiffersError(Exception):
-    """What a module does that no form means."""
+    """The module does something that the form does not."""
 
 
 def integer(value: int, bits: int) -> Term:
-    """A constant."""
+    """Return a constant."""
     return z3.BitVecVal(value, bits)
 
 
 def floating(value: float, bits: int) -> Term:
-    """A constant, to the last bit."""
+    """Return a floating-point constant, to the last bit."""
     number = int.from_bytes(struct.pack("<d" if bits == 64 else "<f", value), "little")
     return z3.simplify(z3.fpBVToFP(integer(number, bits), DOUBLE if bits == 64 else SINGLE))
 
 
 def both(*conditions: Term) -> Term:
-    """All of them, shorter where that is known."""
+    """Return the conjunction, simplified."""
     rest = [condition for condition in conditions if not z3.is_true(condition)]
     if any(z3.is_false(condition) for condition in rest):
         return z3.BoolVal(False)
@@ -58,7 +58,7 @@ def both(*conditions: Term) -> Term:
 
 
 def either(*conditions: Term) -> Term:
-    """Any of them, shorter where that is known."""
+    """Return the disjunction, simplified."""
     rest = [condition for condition in conditions if not z3.is_false(condition)]
     if any(z3.is_true(condition) for condition in rest):
         return z3.BoolVal(True)
@@ -66,7 +66,7 @@ def either(*conditions: Term) -> Term:
 
 
 def opposite(condition: Term) -> Term:
-    """Its negation."""
+    """Return the negation."""
     if z3.is_not(condition):
         return condition.arg(0)
     known = z3.is_true(condition) or z3.is_false(condition)
@@ -74,7 +74,7 @@ def opposite(condition: Term) -> Term:
 
 
 def choice(test: Term, yes: Term, no: Term) -> Term:
-    """`test ? yes : no`, of terms and of what is made of them; what only one has is that."""
+    """Return `test ? yes : no` of terms and of structures of them; a part that only one has is taken from it."""
     if z3.is_true(test) or no is None or yes is no:
         return yes
     if z3.is_false(test) or yes is None:
@@ -98,18 +98,18 @@ def choice(test: Term, yes: Term, no: Term) -> Term:
 
 
 def as_bits(truth: Term, bits: int = 32) -> Term:
-    """A truth as a number."""
+    """Return a boolean as a number."""
     return z3.If(truth, integer(1, bits), integer(0, bits))
 
 
 def number_at(message: Term, position: Term, size: int) -> Term:
-    """The number in so many bytes from a position on, little-endian."""
+    """Return the little-endian number in `size` bytes from a position on."""
     every = [z3.Select(message, position + integer(more, 32) if more else position) for more in range(size)]
     return every[0] if size == 1 else z3.Concat(*reversed(every))
 
 
 def with_number(message: Term, position: Term, value: Term) -> Term:
-    """The message with these bytes."""
+    """Return the message with these bytes."""
     for more in range(value.size() // 8):
         place = position + integer(more, 32) if more else position
         message = z3.Store(message, place, z3.Extract(8 * more + 7, 8 * more, value))
@@ -118,28 +118,28 @@ def with_number(message: Term, position: Term, value: Term) -> Term:
 
 @dataclass
 class State:
-    """What holds at a place of a function: when it is reached (`alive`), and what has which value (`slots`)."""
+    """The state at a point of a function: the condition under which it is reached (`alive`), and values (`slots`)."""
 
     alive: Term
     slots: dict[Any, Any]
 
     def where(self, condition: Term) -> "State":
-        """A branch of it."""
+        """Return a branch of the state."""
         return State(both(self.alive, condition), dict(self.slots))
 
     def require(self, condition: Term) -> None:
-        """Go on only so."""
+        """Require a condition from here on."""
         self.alive = both(self.alive, condition)
 
     def join(self, test: Term, yes: "State", no: "State") -> None:
-        """Go on behind two branches."""
+        """Continue after two branches."""
         whole = yes.alive.eq(both(self.alive, test)) and no.alive.eq(both(self.alive, opposite(test)))
         self.alive = self.alive if whole else either(yes.alive, no.alive)
         self.slots = merged(test, yes, no)
 
 
 def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
-    """The values behind two branches; a branch that has ended has none."""
+    """Return the values after two branches; a branch that has ended has none."""
     if z3.is_false(no.alive):
         return yes.slots
     if z3.is_false(yes.alive):
@@ -148,9 +148,9 @@ def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
 
 
 @dataclass(frozen=True)
-class Beginning:
-    """What an event begins with: the message and its size, the time, and variables by name, budgets by context and
-    times of output by context and site.
+class StartTerms:
+    """The initial state of an event: message and size, time, variables by name, budgets by context, and times of output
+    by context and site.
     """
 
     message: Term
@@ -162,8 +162,8 @@ class Beginning:
 
 
 @dataclass(frozen=True)
-class Noted:
-    """What stands among what is put out, where it comes to that (`alive`): one of these from an offset on."""
+class LineTerm:
+    """A part of a line of output, under a condition (`alive`): one of these values, at an offset."""
 
     alive: Term
     offset: Term
@@ -171,9 +171,9 @@ class Noted:
 
 
 @dataclass(frozen=True)
-class Result:
-    """What an event has come to: `left` it is not decided here (a fault), and why nobody knows (`unknown`, by name);
-    the rest counts where it is neither. What it puts out is `noted`, in so many bytes (`said`, see `ir/output.py`).
+class FormResult:
+    """The result of an event: `left` (a fault), and reasons why it is unknown (`unknown`, by name); the rest holds if
+    it is neither. Its lines of output are `noted`, in `said` bytes.
     """
 
     left: Term
@@ -185,7 +185,7 @@ class Result:
     variables: Mapping[str, Any]
     budgets: Mapping[str, Term]
     said: Term
-    noted: Sequence[Noted]
+    noted: Sequence[LineTerm]
 
 
 _SMALL = 1 << 10
@@ -200,9 +200,9 @@ _COSTLY = frozenset(
 
 
 def abstracted(terms: Sequence[Term]) -> list[Term]:
-    """The same with the results of costly operations as anything, the same for the same operands.
+    """Replace the results of costly operations by variables, the same for equal operands.
 
-    What cannot hold then cannot hold at all.
+    If a formula over these variables cannot hold, neither can the original.
     """
     known: dict[int, Term] = {}
     kept: list[Term] = []  # as long as their numbers are used
@@ -233,7 +233,7 @@ def abstracted(terms: Sequence[Term]) -> list[Term]:
 
 
 def _is_cheap(kind: int, operands: Sequence[Term]) -> bool:
-    """Whether it is an operation on constants, or a product with a small one."""
+    """Return whether it is an operation on constants, or a product with a small constant."""
     small = any(z3.is_bv_value(operand) and operand.as_long() < _SMALL for operand in operands)
     return (kind == z3.Z3_OP_BMUL and small) or all(map(_is_number, operands))
 

@@ -1,0 +1,105 @@
+"""Lists the messages that the module of a set leaves to the interpreter, and why (`rosmop check --why-slow`)."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from rosmop.fast.batch_codegen import written_of
+from rosmop.fast.memory_layout import NotCompiledError
+from rosmop.form import nodes
+from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
+from rosmop.form.positions import Position
+from rosmop.logics.interface import ClockedProperty, FiniteProperty
+
+
+@dataclass(frozen=True)
+class SlowPath:
+    """Messages that the interpreter processes.
+
+    `topic` is a topic, or a service with `request` or `response`. `code` is the event or handler that leaves them, and
+    is empty if no message of the topic is compiled. `position` is the place in the text that cannot be compiled.
+    """
+
+    topic: str
+    code: str
+    position: Position
+    reason: str
+
+
+def slow_paths(compiled: Compiled) -> list[SlowPath]:
+    """Return the messages that a set leaves to the interpreter, by topic. Faults and due output always are."""
+    module = written_of(compiled)
+    found: dict[SlowPath, None] = {}
+    ways = dict.fromkeys(
+        event.way for one in compiled.specifications for event in one.events if event.way is not None
+    )
+    for way in ways:
+        specifications = [
+            one for one in compiled.specifications if any(event.way == way for event in one.events)
+        ]
+        error = module.refused.get(way)
+        if error is not None:
+            found[SlowPath(way, "", _position(compiled, way, error), error.reason)] = None
+            continue
+        sliced = [one for one in specifications if one.slicing is not None]
+        for one in sliced:
+            found[SlowPath(way, "", one.position, "has a parametric specification")] = None
+        for one in specifications if not sliced else ():
+            found |= dict.fromkeys(_partly(compiled, module.left, way, one))
+    return list(found)
+
+
+def _partly(
+    compiled: Compiled,
+    left: Mapping[str, Sequence[NotCompiledError]],
+    way: str,
+    specification: SpecificationCode,
+) -> Iterator[SlowPath]:
+    """Yield the messages of a compiled topic that one specification leaves."""
+    codes = [
+        (f"event {specification.name}.{event.name}", event.function)
+        for event in specification.events
+        if event.way == way
+    ]
+    codes += [
+        (f"handler @{category} of {specification.name}", code.handlers[category])
+        for code in specification.properties
+        for category in code.order
+        if isinstance(code.property, FiniteProperty)
+    ]
+    for code, function in codes:
+        for name in _called(compiled, function):
+            for error in left.get(name, ()):
+                yield SlowPath(way, code, _position(compiled, way, error), error.reason)
+    for declared in specification.properties:
+        reason = _of_property(declared)
+        if reason:
+            source = declared.property.source
+            yield SlowPath(way, f"{source.logic} property of {specification.name}", source.origin, reason)
+
+
+def _of_property(code: PropertyCode) -> str:
+    if isinstance(code.property, FiniteProperty):
+        return ""
+    if isinstance(code.property, ClockedProperty):
+        return "runs a handler of a property with time bounds" if code.order else ""
+    return "steps a property without a finite automaton"
+
+
+def _called(compiled: Compiled, function: str) -> list[str]:
+    """Return the names of a function, the functions that it calls, and those that skip elements for it."""
+    names = [function]
+    for name in names:
+        body = compiled.functions[name].body if name in compiled.functions else ()
+        for node in nodes.walk(body):
+            called = node.function if isinstance(node, nodes.Invoke) else ""
+            if isinstance(node, nodes.Skipper):
+                called = node.name
+            if called and called not in names:
+                names.append(called)
+    return names
+
+
+def _position(compiled: Compiled, way: str, error: NotCompiledError) -> Position:
+    if error.site >= 0:
+        return compiled.sites[error.site].position
+    return next(event.position for one in compiled.specifications for event in one.events if event.way == way)
