@@ -1,1 +1,1 @@
-"""Monitors out of recordings of a robot that behaves: what is regular in them, written as specifications."""
+"""Learn monitors from recordings of normal operation: regular behaviour, written as specifications."""

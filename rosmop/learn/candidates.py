@@ -1,8 +1,8 @@
-"""What may be said of a topic's messages and of their order, each with the bound that the recordings support.
+"""Propose conditions on a topic's messages and on their order, each with a bound that the recordings support.
 
-A bound is the level that `extremes` expects to be passed once in `QUIET_HOURS` by all bounds of the file together.
-What says little is left out: a rate that would let any value follow any other, a standstill as long as the drive.
-Of each topic only so many are kept (`MOST`); those that most messages exercised come first.
+A bound is the level that `extremes` expects all bounds of the file together to exceed once in `QUIET_HOURS`. Conditions
+without content are left out: a rate that allows any change, a standstill as long as the recording. Each topic keeps at
+most `MOST` conditions of a kind; those that most messages exercised come first.
 """
 
 import math
@@ -13,23 +13,23 @@ from dataclasses import dataclass, field, replace
 from rosmop.learn import extremes
 from rosmop.learn.recordings import Windows
 from rosmop.learn.rv_text import identifier, literal, number, rounded_down, rounded_up, short_names
-from rosmop.learn.series import Highs, Series, Values
-from rosmop.learn.topic_orders import Orders, Pair
-from rosmop.learn.topics import Content, Rhythm
+from rosmop.learn.series import HighestValues, Series, ValueSeries
+from rosmop.learn.topic_orders import TopicOrders, TopicPair
+from rosmop.learn.topics import TopicContent, TopicRhythm
 
 QUIET_HOURS = 10.0
 MOST = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
-"""Of each kind for one topic; of the others there are as many as there are fields, or one."""
+"""The limit for one topic and kind; of the other kinds there is one for each field, or one in all."""
 
-_FEWEST = 20  # messages that something said of all of them stands on
+_FEWEST = 20  # least number of messages for a statement about all of them
 _FEWEST_SET = 10
 _ALWAYS_CHANGING = 0.5  # of the messages brought another value
-_REGULAR = 8.0  # usual gaps: a topic that pauses for longer is not one that comes regularly
+_REGULAR = 8.0  # usual gaps: a topic with longer pauses is not regular
 
 
 @dataclass(frozen=True)
-class Support:
-    """What a candidate stands on."""
+class CandidateSupport:
+    """The evidence for a candidate."""
 
     messages: int
     seconds: float
@@ -38,7 +38,7 @@ class Support:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One thing that held in all recordings.
+    """One condition that held in all recordings.
 
     `says` begins the warning, as no other's does; `condition` is that of the alarm in the language, with `{v}` for the
     field's value, `{n}` for a name made of its path and `{t}` for a prefix of the topic's own. It needs the
@@ -50,7 +50,7 @@ class Candidate:
     path: str
     says: str
     seen: str
-    support: Support
+    support: CandidateSupport
     element: int | None = None
     folded: bool = False
     length: int | None = None
@@ -61,48 +61,48 @@ class Candidate:
     then: tuple[str, ...] = ()
     formula: str = ""
     events: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    """Of an order: its events' topics and patterns."""
+    """For an order: the topics and patterns of its events."""
     alarms: int = 0
     """On the recordings that were held out."""
     widened: str = ""
 
     @property
     def key(self) -> tuple[str, str, str, int | None]:
-        """What it is about, whatever its bound."""
+        """Return the subject of the candidate, without its bound."""
         return self.topic, self.kind, self.path, self.element
 
     @property
     def topics(self) -> set[str]:
-        """The topics it listens to."""
+        """Return the topics it listens to."""
         return {topic for topic, _ in self.events.values()} | {self.topic}
 
     @property
     def place(self) -> str:
-        """The field as people write it."""
+        """Return the field as people write it."""
         return self.path if self.element is None else f"{self.path}[{self.element}]"
 
 
 @dataclass
-class Knowledge:
-    """What was seen of all topics."""
+class LearntFacts:
+    """The observations of all topics."""
 
     types: Mapping[str, str]
-    rhythms: Mapping[str, Rhythm]
-    contents: Mapping[str, Content]
-    orders: Orders
+    rhythms: Mapping[str, TopicRhythm]
+    contents: Mapping[str, TopicContent]
+    orders: TopicOrders
     windows: Windows
     trimmed: Counter[str] = field(default_factory=Counter)
     """How many conditions of each topic `candidates` left out because there are more than `MOST`."""
 
     @property
     def short(self) -> Mapping[str, str]:
-        """A name for each topic: its last words, as far as they are its own."""
+        """Return a name for each topic: its last words, as far as they are its own."""
         paths = {topic: identifier(topic).replace("_", ".") for topic in self.contents}
         names = short_names(paths.values())
         return {topic: names[path] for topic, path in paths.items()}
 
     def candidates(self) -> Iterator[Candidate]:
-        """All that is worth saying, topic by topic."""
+        """Yield all candidates, topic by topic."""
         bounds = sum(3 * len(content.types) for content in self.contents.values()) + len(self.orders.pairs)
         proposer = _Proposer(self, QUIET_HOURS * 3600 / self.windows.mean * max(bounds, 1))
         self.trimmed.clear()
@@ -122,7 +122,7 @@ _Place = tuple[str, int | None, int | None, Series]
 
 
 class _Proposer:
-    def __init__(self, known: Knowledge, windows: float) -> None:
+    def __init__(self, known: LearntFacts, windows: float) -> None:
         self._known = known
         self._windows = windows
 
@@ -146,13 +146,15 @@ class _Proposer:
         for place in sorted(self._numbers(content), key=lambda found: -found[3].changed):
             yield from self._number(topic, content, rhythm, place)
 
-    def _support(self, rhythm: Rhythm) -> Support:
-        return Support(rhythm.count, round(self._known.windows.seconds, 1), len(rhythm.recordings))
+    def _support(self, rhythm: TopicRhythm) -> CandidateSupport:
+        return CandidateSupport(rhythm.count, round(self._known.windows.seconds, 1), len(rhythm.recordings))
 
-    def _upper(self, highs: Highs, *, stops: bool = False) -> float | None:
+    def _upper(self, highs: HighestValues, *, stops: bool = False) -> float | None:
         return extremes.upper(highs.of.values(), self._windows, stops=stops)
 
-    def _rhythm(self, topic: str, rhythm: Rhythm, content: Content, support: Support) -> Iterator[Candidate]:
+    def _rhythm(
+        self, topic: str, rhythm: TopicRhythm, content: TopicContent, support: CandidateSupport
+    ) -> Iterator[Candidate]:
         most = self._upper(content.counts)
         if most is not None and rhythm.count >= _FEWEST:
             span, limit = rhythm.interval, math.ceil(most)
@@ -168,7 +170,7 @@ class _Proposer:
         longest = self._upper(rhythm.gaps)
         if longest is None or rhythm.count < _FEWEST or longest > _REGULAR * rhythm.period:
             return
-        # A message that is less than half a period late is not one that is missing.
+        # A message that is less than half a period late is not missing.
         milliseconds = math.ceil(max(longest, 1.5 * rhythm.period) * 1000)
         yield Candidate(
             topic, "late", "", f"is silent for {milliseconds} ms",
@@ -176,7 +178,7 @@ class _Proposer:
             formula=f"pattern: globally: message causes message within {milliseconds}ms",
         )  # fmt: skip
 
-    def _stamps(self, topic: str, content: Content, support: Support) -> Iterator[Candidate]:
+    def _stamps(self, topic: str, content: TopicContent, support: CandidateSupport) -> Iterator[Candidate]:
         age, lead = self._upper(content.ages), self._upper(content.leads)
         if not content.ages.of:
             return
@@ -187,7 +189,7 @@ class _Proposer:
                 state=("double {t}stamped = 0.0;",), then=("{t}stamped = {v}.toSec();",),
             )  # fmt: skip
         if age is not None and lead is not None:
-            width = max(content.ages.top + content.leads.top, 1e-4)  # a tenth of a millisecond is no delay
+            width = max(content.ages.top + content.leads.top, 1e-4)  # a tenth of a millisecond is not a delay
             low, high = rounded_down(-lead - 1e-4, width), rounded_up(age + 1e-4, width)
             yield Candidate(
                 topic, "age", "header.stamp", "header.stamp is too old or too new",
@@ -196,7 +198,7 @@ class _Proposer:
                 shown="now - {v}.toSec()",
             )  # fmt: skip
 
-    def _sets(self, topic: str, content: Content, support: Support) -> Iterator[Candidate]:
+    def _sets(self, topic: str, content: TopicContent, support: CandidateSupport) -> Iterator[Candidate]:
         for path, values in content.sets.items():
             if content.types[path] != "string[]":
                 yield from self._set(topic, content, path, values, support)
@@ -217,7 +219,7 @@ class _Proposer:
                 yield from self._set(topic, content, path, series.values, support)
 
     def _set(
-        self, topic: str, content: Content, path: str, values: Values, support: Support
+        self, topic: str, content: TopicContent, path: str, values: ValueSeries, support: CandidateSupport
     ) -> Iterator[Candidate]:
         texts = [literal(value) for value in values.windows]
         if not values.closed or None in texts:
@@ -234,9 +236,9 @@ class _Proposer:
         yield from self._moves(topic, content, path, values, support)
 
     def _moves(
-        self, topic: str, content: Content, path: str, values: Values, support: Support
+        self, topic: str, content: TopicContent, path: str, values: ValueSeries, support: CandidateSupport
     ) -> Iterator[Candidate]:
-        """The automaton of a field's values, if some value never followed some other and all moves are well known."""
+        """Yield the automaton of a field's values, if some value never followed another, and moves are frequent."""
         moves = content.moves.get(path, {})
         ordered = list(values.windows)
         count = len(ordered)
@@ -253,14 +255,14 @@ class _Proposer:
             for value in ordered
         )
         begin = ", ".join(go.values())
-        told = "; ".join(f"{literal(a)} to {literal(b)}" for a, b in moves)
+        listed = "; ".join(f"{literal(a)} to {literal(b)}" for a, b in moves)
         yield Candidate(
-            topic, "moves", path, f"{path} makes a move that was never seen", told, support,
+            topic, "moves", path, f"{path} makes a move that was never seen", listed, support,
             formula=f"fsm: start [ {begin} ] {states}",
             events={names[value]: (topic, f"{path}:{literal(value)}") for value in ordered},
         )  # fmt: skip
 
-    def _numbers(self, content: Content) -> Iterator[_Place]:
+    def _numbers(self, content: TopicContent) -> Iterator[_Place]:
         for path, series in content.numbers.items():
             row = content.elements.get(path)
             if row:
@@ -272,7 +274,9 @@ class _Proposer:
             ):
                 yield path, None, None, series
 
-    def _number(self, topic: str, content: Content, rhythm: Rhythm, place_of: _Place) -> Iterator[Candidate]:
+    def _number(
+        self, topic: str, content: TopicContent, rhythm: TopicRhythm, place_of: _Place
+    ) -> Iterator[Candidate]:
         path, element, length, series = place_of
         support = self._support(rhythm)
         integer = not content.types[path].startswith("float")
@@ -333,14 +337,14 @@ class _Proposer:
             )  # fmt: skip
 
     def of_orders(self) -> Iterator[Candidate]:
-        """Orders of topics, the strongest first."""
+        """Yield the orders of topics, the strongest first."""
         orders = self._known.orders
         found: list[tuple[float, Candidate]] = []
         done: set[frozenset[str]] = set()
         for (a, b), pair in orders.pairs.items():
             if pair.turns and orders.pairs[b, a].turns and frozenset((a, b)) not in done:
                 if not pair.requires:
-                    continue  # told of (b, a), which begins
+                    continue  # reported for (b, a), which begins
                 done.add(frozenset((a, b)))
                 formula = "fsm: first [ a -> second ] second [ b -> first ]"
                 found.append((0.0, self._order((a, b), "turns", formula, "one after the other, always")))
@@ -349,14 +353,16 @@ class _Proposer:
             found += [
                 row for row in self._timed(a, b, pair, orders) if row[1].kind == "causes" or not taking_turns
             ]
-        told: dict[str, int] = {}
+        counts: dict[str, int] = {}
         for _, candidate in sorted(found, key=lambda ranked: ranked[0]):
             names = [topic for topic, _ in candidate.events.values()]
-            if all(told.get(name, 0) < MOST["order"] for name in names):
-                told.update({name: told.get(name, 0) + 1 for name in names})
+            if all(counts.get(name, 0) < MOST["order"] for name in names):
+                counts.update({name: counts.get(name, 0) + 1 for name in names})
                 yield candidate
 
-    def _timed(self, a: str, b: str, pair: Pair, orders: Orders) -> Iterator[tuple[float, Candidate]]:
+    def _timed(
+        self, a: str, b: str, pair: TopicPair, orders: TopicOrders
+    ) -> Iterator[tuple[float, Candidate]]:
         rhythms = self._known.rhythms
         seconds = max(self._known.windows.seconds, 1e-3)
         back = self._upper(pair.back)

@@ -1,8 +1,8 @@
-"""What of specifications recordings exercised: events, branches, handlers, functions, states and transitions.
+"""Measure how often recordings exercise events, branches, handlers, functions, states and transitions.
 
-The specifications are compiled once more with a counter of their own in front of each action, branch and handler, put
-into the tree and not into the text, so lines stay what they are; the runs of state machines are watched from outside.
-What the monitors do is otherwise the same, and nobody's messages are kept.
+The specifications are compiled with a counter before each action, branch and handler. Counters are added to the syntax
+tree, not to the text, so line numbers stay. The runs of state machines are observed from outside. Otherwise the
+monitors behave as usual, and no messages are kept.
 """
 
 import re
@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 from rosmop.check.sources import compiled_from
 from rosmop.check.specification import compile_files
 from rosmop.form.positions import Position
-from rosmop.learn.recordings import Recording
-from rosmop.logics.fsm import FAIL, TIMEOUT, StateText, read_machine
+from rosmop.learn.recordings import RecordingSource
+from rosmop.logics.catalogue import LOGICS
+from rosmop.logics.fsm import FAIL, TIMEOUT, StateText, read_state_machine
 from rosmop.logics.interface import Categories, CompiledProperty, Run, Source
 from rosmop.run.engine import MonitorSet
 from rosmop.run.explain import history_of
@@ -23,11 +24,9 @@ from rosmop.text import tree
 from rosmop.text.parser import parse
 from roswire.definitions import Definitions
 
-_MACHINES = frozenset({"fsm", "tfsm"})
-
 
 @dataclass(frozen=True)
-class Item:
+class CoverageItem:
     """Something that a recording may exercise: its kind (`event`, `branch`, `state`, …), what it is, and where."""
 
     specification: str
@@ -37,18 +36,18 @@ class Item:
 
 
 def covered(
-    texts: Mapping[str, str], definitions: Definitions, recordings: Iterable[Recording]
-) -> dict[Item, int]:
-    """How often the recordings exercised each item, in the order of the text.
+    texts: Mapping[str, str], definitions: Definitions, recordings: Iterable[RecordingSource]
+) -> dict[CoverageItem, int]:
+    """Return how often the recordings exercised each item, in the order of the text.
 
     A state counts how often it was entered or stayed in by an event. Raises `SpecificationError`.
     """
     compiled_from(texts, definitions)  # errors are those of the text as it is
     marked = _Marked([parse(text, name) for name, text in texts.items()])
-    counts: Counter[Item] = Counter()
+    counts: Counter[CoverageItem] = Counter()
     for recording in recordings:
         monitors = MonitorSet(compile_files(marked.files, definitions), "drop", lambda: lambda: False)
-        # who explains tries runs, which are no part of the recording
+        # explaining a verdict tries runs, which are not part of the recording
         monitors.explain_when(lambda *_: False, lambda *_: False)
         watches = _watch(monitors)
         monitors.start(recording.began, frozenset(recording.topics))
@@ -70,8 +69,8 @@ def covered(
 class _Marked:
     """Files with a counter in front of each thing; `items` by the names of the counters."""
 
-    def __init__(self, files: Sequence[tree.File]) -> None:
-        self.items: dict[str, Item] = {}
+    def __init__(self, files: Sequence[tree.SpecificationFile]) -> None:
+        self.items: dict[str, CoverageItem] = {}
         self._declared: list[tree.Declaration] = []
         self._specification = ""
         self.files = [
@@ -115,12 +114,12 @@ class _Marked:
         )  # fmt: skip
 
     def _block(self, kind: str, what: str, position: Position, body: tree.Statement) -> tree.Block:
-        mark = self._mark(Item(self._specification, kind, what, position))
+        mark = self._mark(CoverageItem(self._specification, kind, what, position))
         inside = self._inside(body)
         statements = inside.statements if isinstance(inside, tree.Block) else (inside,)
         return tree.Block(body.position, (mark, *statements))
 
-    def _mark(self, item: Item) -> tree.Statement:
+    def _mark(self, item: CoverageItem) -> tree.Statement:
         name = f"covered_{len(self.items)}_"
         self.items[name] = item
         text = f"m() {{ static long {name} = 0; init() {{ {name} = {name} + 1; }} }}"
@@ -131,20 +130,20 @@ class _Marked:
     def _inside(self, node: tree.Statement) -> tree.Statement:
         if isinstance(node, tree.Block):
             return replace(node, statements=tuple(self._inside(statement) for statement in node.statements))
-        if isinstance(node, tree.If):
+        if isinstance(node, tree.IfStatement):
             yes = self._block("branch", "if", node.position, node.yes)
             no = node.no or tree.Block(node.position, ())
-            if isinstance(no, tree.If):  # its own branches are marked
+            if isinstance(no, tree.IfStatement):  # its own branches are marked
                 return replace(node, yes=yes, no=self._inside(no))
             return replace(node, yes=yes, no=self._block("branch", "else", no.position, no))
-        if isinstance(node, tree.While | tree.For | tree.RangeFor):
+        if isinstance(node, tree.WhileStatement | tree.ForStatement | tree.RangeForStatement):
             return replace(node, body=self._block("branch", "loop", node.position, node.body))
-        if isinstance(node, tree.Switch):
+        if isinstance(node, tree.SwitchStatement):
             cases = tuple(
                 replace(
                     case,
                     statements=(
-                        self._mark(Item(self._specification, "branch", "case", case.position)),
+                        self._mark(CoverageItem(self._specification, "branch", "case", case.position)),
                         *(self._inside(statement) for statement in case.statements),
                     ),
                 )
@@ -162,7 +161,7 @@ def _watch(monitors: MonitorSet) -> list["_Watch"]:
     watches = []
     for monitor in monitors.monitors:
         for running in monitor.properties:
-            if running.code.property.logic in _MACHINES:
+            if LOGICS[running.code.property.logic].has_states:
                 watch = _Watch(monitor.name, running.code.property)
                 running.code = replace(running.code, property=watch)
                 running.history = history_of(watch, 0)
@@ -182,14 +181,14 @@ class _Watch(CompiledProperty):
         self.timed = machine.timed
 
     def start(self, time_ns: int) -> Run:
-        """A run of the machine that is watched."""
-        states = read_machine(self.source, timed=self._machine.timed).states
+        """Return a run of the machine that is watched."""
+        states = read_state_machine(self.source, timed=self._machine.timed).states
         return _Run(self, self._machine.start(time_ns), next(iter(states)))
 
-    def seen(self) -> dict[Item, int]:
-        """How often each state and transition was exercised."""
-        counts: Counter[Item] = Counter()
-        states = read_machine(self.source, timed=self.timed).states
+    def seen(self) -> dict[CoverageItem, int]:
+        """Return how often each state and transition was exercised."""
+        counts: Counter[CoverageItem] = Counter()
+        states = read_state_machine(self.source, timed=self.timed).states
         for (state, event), count in self.taken.items():
             if state in states:
                 target = _target(states[state], event)
@@ -200,7 +199,7 @@ class _Watch(CompiledProperty):
 
 
 class _Run:
-    """A run that says which state it was in."""
+    """A run that reports its earlier state."""
 
     keeps = ()
 
@@ -214,7 +213,7 @@ class _Run:
 
     @property
     def deadline(self) -> int | None:
-        """The machine's."""
+        """Return the machine's deadline."""
         return self._run.deadline
 
     @property
@@ -244,30 +243,30 @@ def _target(state: StateText, event: str) -> str:
     return move.text if move is not None else FAIL
 
 
-def _state(specification: str, source: Source, name: str) -> Item:
+def _state(specification: str, source: Source, name: str) -> CoverageItem:
     found = re.search(rf"\b{name}\s*\[", source.text)
-    return Item(
+    return CoverageItem(
         specification, "state", name, source.origin.within(source.text, found.start() if found else 0)
     )
 
 
-def _transition(specification: str, source: Source, state: str, event: str, text: StateText) -> Item:
+def _transition(specification: str, source: Source, state: str, event: str, text: StateText) -> CoverageItem:
     written = event if event in text.moves or event == TIMEOUT else "default"
     target = _target(text, event)
     token = text.timeout[1] if event == TIMEOUT and text.timeout else text.moves.get(event, text.default)
     position = source.origin.within(source.text, token.offset) if token is not None else source.origin
     what = f"{state}: {written} -> {target}" if token is not None else f"{state}: any other event -> {FAIL}"
-    return Item(specification, "transition", what, position)
+    return CoverageItem(specification, "transition", what, position)
 
 
-def _machine_items(file: tree.File) -> Iterator[Item]:
+def _machine_items(file: tree.SpecificationFile) -> Iterator[CoverageItem]:
     for node in file.specifications:
         names = tuple(event.name for event in node.events)
         for declared in node.properties:
-            if declared.logic.lower() in _MACHINES:
-                logic = declared.logic.lower()
+            logic = declared.logic.lower()
+            if LOGICS[logic].has_states:
                 source = Source(logic, declared.formula, names, declared.formula_position)
-                for name, state in read_machine(source, timed=logic == "tfsm").states.items():
+                for name, state in read_state_machine(source, timed=logic == "tfsm").states.items():
                     yield _state(node.name, source, name)
                     for event in state.moves:
                         yield _transition(node.name, source, name, event, state)

@@ -1,8 +1,8 @@
-"""The values of a message's fields by their paths, as far as something can be learnt from them.
+"""Read the values of a message's fields by path, as far as they are useful for learning.
 
-Numbers, strings and times come as they are, arrays of numbers as numpy arrays, arrays of strings as lists; of arrays of
-messages only how many there are. Bytes (images, points, maps) mean nothing one by one and are left out, as is the
-`seq` of headers, which every publisher counts on by itself.
+Numbers, strings and times are scalars, arrays of numbers are numpy arrays, arrays of strings are lists; of an array of
+messages only the length is read. Bytes (images, points, maps) are left out, because single bytes mean nothing. So is
+the `seq` of headers, which every publisher counts automatically.
 """
 
 import struct
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from roswire.message_layout import ArrayPart, FixedPart, Layout, Leaf, StringPart
+from roswire.message_layout import ArrayPart, FixedField, FixedPart, MessageLayout, StringPart
 from roswire.message_text import PRIMITIVES
 
 MOST_ELEMENTS = 20_000
@@ -26,19 +26,19 @@ _Part = Callable[[bytes, int, dict[str, Value]], int]
 
 
 class MessageError(Exception):
-    """The bytes are no message of this type."""
+    """The bytes are not a message of this type."""
 
 
 class Fields:
     """Reads the messages of one type."""
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: MessageLayout) -> None:
         self._parts = [_reader(part) for part in layout.parts]
         self.types = dict(_types(layout))
         """The primitive types of the fields that are read; with `[]` those of arrays, `length` where only that is."""
 
     def read(self, data: bytes) -> dict[str, Value]:
-        """The values by path. Raises `MessageError`."""
+        """Return the values by path. Raises `MessageError`."""
         values: dict[str, Value] = {}
         position = 0
         try:
@@ -53,12 +53,12 @@ def _wanted(path: str) -> bool:
     return path != "header.seq" and not path.endswith(".header.seq")
 
 
-def _types(layout: Layout) -> Iterator[tuple[str, str]]:
+def _types(layout: MessageLayout) -> Iterator[tuple[str, str]]:
     for part in layout.parts:
         for item in part.leaves if isinstance(part, FixedPart) else (part,):
             if isinstance(item, StringPart):
                 yield item.path, "string"
-            elif isinstance(item, Leaf) and item.count is None:
+            elif isinstance(item, FixedField) and item.count is None:
                 if _wanted(item.path):
                     yield item.path, item.type
             elif _elements_read(item):
@@ -67,7 +67,7 @@ def _types(layout: Layout) -> Iterator[tuple[str, str]]:
                 yield item.path, "length"
 
 
-def _elements_read(item: Leaf | ArrayPart) -> bool:
+def _elements_read(item: FixedField | ArrayPart) -> bool:
     return item.layout is None and item.type not in _BYTES | _NO_NUMBERS
 
 

@@ -1,11 +1,11 @@
-"""Learning: two passes over the recordings that are learnt from, one over those held out, and what comes of it.
+"""Learn in two passes over the training recordings, and one over the held-out part.
 
-1. Times only: the rhythm of each topic, and its order with the others.
-2. The fields of each message. Then the candidates are written down as specifications.
-3. The specifications run on the recordings that were held out. A bound that was passed there is learnt anew from all
-   recordings (and so is untested); anything else that gave an alarm is left out.
+1. Times only: the rhythm of each topic, and its order relative to the others.
+2. The fields of each message. Then the candidates are written as specifications.
+3. The specifications run on the held-out recordings. A bound that was exceeded there is learnt again from all
+   recordings (and so is untested); any other candidate with an alarm is left out.
 
-Messages are never kept, so memory is bounded by the number of topics and fields.
+Messages are never kept, so the number of topics and fields bounds the memory.
 """
 
 from collections import Counter
@@ -13,28 +13,28 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rosmop.check.sources import compiled_from
-from rosmop.learn.candidates import Candidate, Knowledge
+from rosmop.learn.candidates import Candidate, LearntFacts
 from rosmop.learn.field_values import Fields, MessageError
-from rosmop.learn.recordings import Part, Received, Recording, Windows, split
+from rosmop.learn.recordings import Received, RecordingPart, RecordingSource, Windows, split
 from rosmop.learn.rv_writer import on, specifications
-from rosmop.learn.topic_orders import Orders
-from rosmop.learn.topics import Content, Rhythm
+from rosmop.learn.topic_orders import TopicOrders
+from rosmop.learn.topics import TopicContent, TopicRhythm
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 
 _WIDENS = frozenset({"range", "rate", "unchanged", "often", "late", "age", "requires", "causes"})
-Told = Callable[[int], None]
+Progress = Callable[[int], None]
 
 
 class LearningError(Exception):
-    """Nothing can be learnt from these recordings; the text says which, and why."""
+    """Nothing can be learnt from these recordings; the text names them and the reason."""
 
 
 @dataclass(frozen=True)
-class Learnt:
-    """What came of it. `alarms` are those of the text on the held-out recordings, as they stand in the comments."""
+class LearningResult:
+    """The result. `alarms` are those of the text on the held-out recordings, as in the comments."""
 
     text: str
     candidates: tuple[Candidate, ...]
@@ -43,26 +43,32 @@ class Learnt:
     """The specification of each candidate, by its key."""
     types: Mapping[str, str]
     """The message types of the topics."""
-    trained: tuple[Part, ...]
-    held_out: tuple[Part, ...]
+    trained: tuple[RecordingPart, ...]
+    held_out: tuple[RecordingPart, ...]
     skipped: tuple[str, ...]
     """Topics whose type cannot be read, with the reason."""
 
 
-def learn(recordings: Sequence[Recording], definitions: Definitions, held_out: float, told: Told) -> Learnt:
-    """Learn from recordings, with this share of them held out; `told` gets the number of messages so far.
+def learn(
+    recordings: Sequence[RecordingSource], definitions: Definitions, held_out: float, progress: Progress
+) -> LearningResult:
+    """Learn from recordings, holding out the fraction `held_out`; `progress` gets the number of messages so far.
 
     Raises `LearningError`.
     """
-    return _Learner(recordings, definitions, held_out, told).learnt()
+    return _Learner(recordings, definitions, held_out, progress).learnt()
 
 
 class _Learner:
     def __init__(
-        self, recordings: Sequence[Recording], definitions: Definitions, held_out: float, told: Told
+        self,
+        recordings: Sequence[RecordingSource],
+        definitions: Definitions,
+        held_out: float,
+        progress: Progress,
     ) -> None:
         self._definitions = definitions
-        self._told, self._seen = told, 0
+        self._progress, self._seen = progress, 0
         self._trained, self._held_out = split(recordings, held_out)
         self._types = _types_of(recordings)
         self._fields: dict[str, Fields] = {}
@@ -74,8 +80,8 @@ class _Learner:
             except DefinitionError as error:
                 self._skipped.append(f"{topic} ({kind}): {error}")
 
-    def learnt(self) -> Learnt:
-        rhythms = {topic: Rhythm() for topic in self._fields}
+    def learnt(self) -> LearningResult:
+        rhythms = {topic: TopicRhythm() for topic in self._fields}
         self._times(self._trained, rhythms)
         if not any(rhythm.count for rhythm in rhythms.values()):
             raise LearningError("no message on any of these topics is in the recordings that are learnt from")
@@ -104,7 +110,7 @@ class _Learner:
         names = {candidate.key: name for name, _, group in rows for candidate in group}
         text = "\n".join([self._head(known, kept, left_out), *(row[1] for row in rows)])
         compiled_from({"learnt.rv": text}, self._definitions)
-        return Learnt(
+        return LearningResult(
             text,
             tuple(kept),
             tuple(left_out),
@@ -115,33 +121,33 @@ class _Learner:
             tuple(self._skipped),
         )
 
-    def _times(self, parts: Sequence[Part], rhythms: Mapping[str, Rhythm]) -> None:
+    def _times(self, parts: Sequence[RecordingPart], rhythms: Mapping[str, TopicRhythm]) -> None:
         for part in parts:
             self._beats.enter(part)
             for rhythm in rhythms.values():
                 rhythm.begin()
             for topic, time, _ in self._messages(part):
-                rhythms[topic].see(time, self._beats.at(time), part.name)
+                rhythms[topic].add(time, self._beats.at(time), part.name)
 
-    def _contents(self, rhythms: dict[str, Rhythm]) -> Knowledge:
+    def _contents(self, rhythms: dict[str, TopicRhythm]) -> LearntFacts:
         contents = {
-            topic: Content(fields, rhythms[topic])
+            topic: TopicContent(fields, rhythms[topic])
             for topic, fields in self._fields.items()
             if rhythms[topic].count
         }
-        orders = Orders({topic: rhythms[topic].count for topic in contents})
-        known = Knowledge(self._types, rhythms, contents, orders, Windows(len(self._trained)))
+        orders = TopicOrders({topic: rhythms[topic].count for topic in contents})
+        known = LearntFacts(self._types, rhythms, contents, orders, Windows(len(self._trained)))
         for part in self._trained:
-            self._see(known, part)
+            self._observe(known, part)
         return known
 
-    def _continue(self, known: Knowledge) -> None:
-        """Learn from the held-out recordings, too, once they have been the test."""
+    def _continue(self, known: LearntFacts) -> None:
+        """Learn from the held-out recordings also, after the test."""
         self._times(self._held_out, known.rhythms)
         for part in self._held_out:
-            self._see(known, part)
+            self._observe(known, part)
 
-    def _see(self, known: Knowledge, part: Part) -> None:
+    def _observe(self, known: LearntFacts, part: RecordingPart) -> None:
         known.windows.enter(part)
         known.orders.begin()
         for content in known.contents.values():
@@ -151,23 +157,23 @@ class _Learner:
                 continue
             window = known.windows.at(time)
             try:
-                known.contents[topic].see(data, time, window)
+                known.contents[topic].add(data, time, window)
             except MessageError as error:
                 kind = self._types[topic]
                 raise LearningError(f"{part.name}: a message on {topic} is no {kind}: {error}") from error
-            known.orders.see(topic, time, window)
+            known.orders.add(topic, time, window)
 
-    def _messages(self, part: Part) -> Iterator[Received]:
+    def _messages(self, part: RecordingPart) -> Iterator[Received]:
         for topic, time, data in part.messages():
             self._seen += 1
-            self._told(self._seen)
+            self._progress(self._seen)
             if topic in self._fields:
                 yield topic, time, data
 
     def _alarms(
         self, rows: Sequence[tuple[str, str, list[Candidate]]]
     ) -> Counter[tuple[str, str, str, int | None]]:
-        """How often each candidate warned on the held-out recordings."""
+        """Return how often each candidate warned on the held-out recordings."""
         found: Counter[tuple[str, str, str, int | None]] = Counter()
         groups = {name: group for name, _, group in rows}
         text = "\n".join(row[1] for row in rows)
@@ -176,15 +182,15 @@ class _Learner:
             monitors.start(part.began, frozenset(part.topics))
             for topic, time, data in self._messages(part):
                 outcome = monitors.process(topic, data, time)
-                for told in (*outcome.before, outcome):
-                    found.update(_warned(told, groups))
+                for each in (*outcome.before, outcome):
+                    found.update(_warned(each, groups))
         return found
 
-    def _head(self, known: Knowledge, kept: Sequence[Candidate], left_out: Sequence[Candidate]) -> str:
+    def _head(self, known: LearntFacts, kept: Sequence[Candidate], left_out: Sequence[Candidate]) -> str:
         seconds = sum(part.seconds for part in self._trained)
         held = sum(part.seconds for part in self._held_out)
         lines = [
-            "Learnt from recordings; edit it: what is said here held in them, and nobody knows yet whether it must.",
+            "Learnt from recordings; edit it: its conditions held in them, but may not be required.",
             "It warns and drops nothing: write DROP; or return; where a message shall not pass.",
             f"Learnt from {seconds:.0f} s: {_names(self._trained)}.",
             f"Tested on {held:.0f} s that were held out: {_names(self._held_out)}."
@@ -212,13 +218,13 @@ class _Learner:
         return "".join(f"// {' '.join(line.split())}\n" for line in lines)
 
 
-def _names(parts: Sequence[Part]) -> str:
+def _names(parts: Sequence[RecordingPart]) -> str:
     most = 6
     names = [part.name for part in parts]
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def _types_of(recordings: Sequence[Recording]) -> dict[str, str]:
+def _types_of(recordings: Sequence[RecordingSource]) -> dict[str, str]:
     types: dict[str, str] = {}
     for recording in recordings:
         for topic, kind in recording.topics.items():

@@ -1,4 +1,4 @@
-"""Recordings as the learner takes them, their split into what is learnt from and what is held out, and windows."""
+"""Recordings as input of the learner, their split into training and held-out parts, and windows."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,66 +7,68 @@ from typing import Protocol
 
 Received = tuple[str, int, bytes]  # topic, nanoseconds, the bytes of the fields
 
-_WINDOWS = 24  # at least so many, of all recordings together
+_WINDOWS = 24  # at least this number for all recordings together
 
 
-class Recording(Protocol):
-    """What was received on some topics from `began` to `ended`, in nanoseconds."""
+class RecordingSource(Protocol):
+    """The messages on some topics from `began` to `ended`, in nanoseconds."""
 
     @property
     def name(self) -> str:
-        """How people call it."""
+        """Return the name for messages."""
 
     @property
     def began(self) -> int:
-        """The time of its first message."""
+        """Return the time of its first message."""
 
     @property
     def ended(self) -> int:
-        """The time of its last message."""
+        """Return the time of its last message."""
 
     @property
     def topics(self) -> Mapping[str, str]:
-        """The message types of its topics."""
+        """Return the message types of its topics."""
 
     def messages(self) -> Iterator[Received]:
-        """All messages, in the order of their times; each call begins anew."""
+        """Yield all messages in order of time; each call starts again."""
 
 
 @dataclass(frozen=True)
-class Part:
+class RecordingPart:
     """A recording, or the part of it between two times (both included)."""
 
-    whole: Recording
+    whole: RecordingSource
     began: int
     ended: int
 
     @property
     def name(self) -> str:
-        """The recording's."""
+        """Return the recording's."""
         return self.whole.name
 
     @property
     def topics(self) -> Mapping[str, str]:
-        """The recording's."""
+        """Return the recording's."""
         return self.whole.topics
 
     @property
     def seconds(self) -> float:
-        """How long it is."""
+        """Return the length in seconds."""
         return (self.ended - self.began) / 10**9
 
     def messages(self) -> Iterator[Received]:
-        """The messages of these times."""
+        """Return the messages of these times."""
         return (message for message in self.whole.messages() if self.began <= message[1] <= self.ended)
 
 
-def split(recordings: Sequence[Recording], held_out: float) -> tuple[list[Part], list[Part]]:
-    """Return what is learnt from, and about this share to test it: whole recordings, spread evenly; of one its end.
+def split(
+    recordings: Sequence[RecordingSource], held_out: float
+) -> tuple[list[RecordingPart], list[RecordingPart]]:
+    """Return the training part and the held-out part: whole recordings, spread evenly, or the end of a single one.
 
     Nothing is held out of one recording that is too short to have an end.
     """
-    parts = [Part(recording, recording.began, recording.ended) for recording in recordings]
+    parts = [RecordingPart(recording, recording.began, recording.ended) for recording in recordings]
     if held_out <= 0:
         return parts, []
     if len(parts) == 1:
@@ -74,7 +76,7 @@ def split(recordings: Sequence[Recording], held_out: float) -> tuple[list[Part],
         cut = only.ended - int((only.ended - only.began) * held_out)
         if cut == only.ended:
             return parts, []
-        return [Part(only.whole, only.began, cut)], [Part(only.whole, cut + 1, only.ended)]
+        return [RecordingPart(only.whole, only.began, cut)], [RecordingPart(only.whole, cut + 1, only.ended)]
     count = min(max(round(len(parts) * held_out), 1), len(parts) - 1)
     chosen = {int((number + 0.5) * len(parts) / count) for number in range(count)}
     return (
@@ -84,28 +86,28 @@ def split(recordings: Sequence[Recording], held_out: float) -> tuple[list[Part],
 
 
 class Windows:
-    """Numbers the windows that recordings are divided into: each into as many of equal length as give enough."""
+    """Number the windows that recordings are divided into: equally long, and enough of them in each recording."""
 
     def __init__(self, recordings: int) -> None:
         self._each = math.ceil(_WINDOWS / recordings)
         self._first = -self._each
-        self._part: Part | None = None
+        self._part: RecordingPart | None = None
         self.seconds = 0.0
-        """Of all windows so far together."""
+        """The length of all windows so far."""
 
     @property
     def mean(self) -> float:
         """Seconds of a window."""
         return max(self.seconds / (self._first + self._each), 1e-3)
 
-    def enter(self, part: Part) -> None:
-        """The times that follow are of this recording."""
+    def enter(self, part: RecordingPart) -> None:
+        """Continue with the times of this recording."""
         self._part = part
         self._first += self._each
         self.seconds += part.seconds
 
     def at(self, time: int) -> int:
-        """The window of a time."""
+        """Return the window of a time."""
         assert self._part is not None  # noqa: S101  `enter` comes first
         length = self._part.ended - self._part.began + 1
         return self._first + (time - self._part.began) * self._each // length

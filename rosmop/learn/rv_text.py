@@ -17,7 +17,7 @@ CPP = {
 
 
 def rounded_up(value: float, width: float) -> str:
-    """A number not below the value, with no more digits than a hundredth of the width needs."""
+    """Return a number not below the value, with no more digits than a hundredth of the width needs."""
     if not width > 0:
         return number(value)
     quantum = Decimal(1).scaleb(math.floor(math.log10(width / 100)))
@@ -25,18 +25,18 @@ def rounded_up(value: float, width: float) -> str:
 
 
 def rounded_down(value: float, width: float) -> str:
-    """A number not above the value."""
+    """Return a number not above the value."""
     return number(-float(rounded_up(-value, width)))
 
 
 def number(value: float) -> str:
-    """A number as the language reads it; an integer stays one."""
+    """Return a number as the language reads it; an integer stays one."""
     text = repr(value)
     return "0.0" if text == "-0.0" else text
 
 
 def literal(value: object) -> str | None:
-    """A bool, number or string; None where the language cannot write it."""
+    """Return a bool, number or string; None where the language cannot write it."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -45,23 +45,23 @@ def literal(value: object) -> str | None:
 
 
 def quoted(text: str) -> str:
-    """What stands between the quotes of a string."""
+    """Return the text between the quotes of a string literal."""
     return "".join(_ESCAPES.get(letter, letter) for letter in text)
 
 
 def formatted(text: str) -> str:
-    """Text for a format of printf."""
+    """Return text for a format of printf."""
     return quoted(text).replace("%", "%%")
 
 
 def identifier(text: str) -> str:
-    """A name made of any text."""
+    """Return a name made of any text."""
     name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_") or "root"
     return f"n{name}" if name[0].isdigit() else name
 
 
 def short_names(paths: Iterable[str]) -> dict[str, str]:
-    """For each path the shortest end of it that no other has, as a name that the language has not taken."""
+    """Return for each path its shortest unique end, as a name that is free in the language."""
     paths = list(paths)
     names: dict[str, str] = {}
     for path in paths:

@@ -4,7 +4,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import count, groupby
 
-from rosmop.learn.candidates import Candidate, Knowledge, Support
+from rosmop.learn.candidates import Candidate, CandidateSupport, LearntFacts
 from rosmop.learn.rv_text import CPP, formatted, identifier, number, short_names
 
 _TOLD_EVERY = "1.0"  # seconds
@@ -12,9 +12,9 @@ _WIDTH = 104  # columns of a statement
 
 
 def specifications(
-    candidates: Sequence[Candidate], known: Knowledge
+    candidates: Sequence[Candidate], known: LearntFacts
 ) -> Iterator[tuple[str, str, list[Candidate]]]:
-    """Name, text and candidates of each specification."""
+    """Yield name, text and candidates of each specification."""
     taken: set[str] = set()
     own = [candidate for candidate in candidates if not candidate.events]
     for topic, group in groupby(own, key=lambda candidate: candidate.topic):
@@ -27,21 +27,21 @@ def specifications(
 
 
 def _new_name(text: str, taken: set[str]) -> str:
-    """A name made of the text, with a number if there is such a name already."""
+    """Return a name made of the text, with a number if there is such a name already."""
     name = identifier(text)
     free = name if name not in taken else next(f"{name}_{n}" for n in count(2) if f"{name}_{n}" not in taken)
     taken.add(free)
     return free
 
 
-def on(support: Support) -> str:
-    """What something stands on, in words."""
+def on(support: CandidateSupport) -> str:
+    """Return the evidence in words."""
     return f"{support.messages} messages, {support.seconds:g} s, {support.recordings} recording" + "s" * (
         support.recordings != 1
     )
 
 
-def _topic(name: str, rows: list[Candidate], known: Knowledge) -> str:
+def _topic(name: str, rows: list[Candidate], known: LearntFacts) -> str:
     checks = [row for row in rows if not row.formula]
     names = short_names(dict.fromkeys(row.path for row in checks if row.path))
     topic = rows[0].topic
@@ -98,7 +98,7 @@ def _check(row: Candidate, names: Mapping[str, str]) -> list[str]:
     elif row.length is not None:
         condition = f"{size} == {row.length} && ({condition})"
     lines = _alarm(condition, [_warning(row, names)])
-    # A constant's condition says it all.
+    # A constant's condition suffices.
     return lines if row.kind == "constant" and not row.widened else [_comment(row), *lines]
 
 
@@ -145,7 +145,7 @@ def _once(pieces: Iterable[str]) -> list[str]:
 
 
 def _filled(row: Candidate, texts: Iterable[str], names: Mapping[str, str]) -> list[str]:
-    """The texts with the field's expression and name; statements of an element only where it is there."""
+    """Return the texts with the field's expression and name; statements of an element only where it is there."""
     value = _short(row, names)
     name = value
     if row.element is not None:

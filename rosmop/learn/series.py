@@ -1,4 +1,4 @@
-"""What is kept of one field over all recordings: extremes by window, few values, how it changes, how long it stays.
+"""Statistics of one field over all recordings: extremes by window, few values, rates of change, standstills.
 
 Memory is bounded: a number for each window, and as many values as a set may have.
 """
@@ -7,36 +7,36 @@ import math
 from typing import Any
 
 MOST_VALUES = 8
-"""A field with more values is no enumeration."""
+"""A field with more values is not an enumeration."""
 
 
-class Highs:
+class HighestValues:
     """The highest number of each window."""
 
     def __init__(self) -> None:
         self.of: dict[int, float] = {}
 
-    def see(self, value: float, window: int) -> None:
-        """Take a number that is one."""
+    def add(self, value: float, window: int) -> None:
+        """Add a number that is not NaN."""
         if value > self.of.get(window, -math.inf):
             self.of[window] = value
 
     @property
     def top(self) -> float:
-        """The highest of all; minus infinity without any."""
+        """Return the highest of all; minus infinity without any."""
         return max(self.of.values(), default=-math.inf)
 
 
-class Values:
-    """The different values of a field while they are few, with the number of windows that had each."""
+class ValueSeries:
+    """The distinct values of a field while they are few, and the number of windows with each."""
 
     def __init__(self) -> None:
         self.windows: dict[Any, int] = {}
         self._last: dict[Any, int] = {}
         self.many = False
 
-    def see(self, value: Any, window: int) -> None:
-        """Take a value."""
+    def add(self, value: Any, window: int) -> None:
+        """Add a value."""
         if self.many or self._last.get(value) == window:
             return
         self._last[value] = window
@@ -54,53 +54,53 @@ class Values:
 class Series:
     """A field that is a number (or an array of them folded into one): what it was, and how it changed.
 
-    `period` is the usual time between two messages in seconds: two that come closer to each other are taken to be so
-    far apart, as a rate would otherwise be that of the network.
+    `period` is the usual time between two messages in seconds. Closer messages count as this far apart, because their
+    rate would otherwise be that of the network.
     """
 
     def __init__(self, period: float) -> None:
         self.count = self.changed = 0
         self.nan = self.infinite = False
-        self.highs, self.lows = Highs(), Highs()  # of lows the negative
-        self.values = Values()
-        self.rates, self.stays = Highs(), Highs()
+        self.highs, self.lows = HighestValues(), HighestValues()  # of lows the negative
+        self.values = ValueSeries()
+        self.rates, self.stays = HighestValues(), HighestValues()
         self._period = period
         self.begin()
 
     def begin(self) -> None:
-        """A recording begins: what comes has nothing to do with what was."""
+        """Begin a recording: its values are independent of earlier ones."""
         self._last: float | None = None
         self._time = self._since = 0.0
 
-    def see(self, value: float, seconds: float, window: int) -> None:
-        """Take a value and its time."""
+    def add(self, value: float, seconds: float, window: int) -> None:
+        """Add a value and its time."""
         self.count += 1
         if not self.values.many:
-            self.values.see(value, window)
+            self.values.add(value, window)
         last, self._last = self._last, value
         elapsed = max(seconds - self._time, self._period)
         self._time = seconds
         if last is None or value != last:
             self._since = seconds
         if math.isfinite(value):
-            self.highs.see(value, window)
-            self.lows.see(-value, window)
+            self.highs.add(value, window)
+            self.lows.add(-value, window)
             if last is not None:
-                self.stays.see(seconds - self._since, window)
+                self.stays.add(seconds - self._since, window)
                 if value != last:
                     self.changed += 1
                 if math.isfinite(last):
-                    self.rates.see(abs(value - last) / elapsed, window)
+                    self.rates.add(abs(value - last) / elapsed, window)
         elif math.isnan(value):
             self.nan = True
         else:
             self.infinite = True
 
-    def see_array(self, low: float, high: float, nan: bool, infinite: bool, window: int) -> None:
-        """Take the extremes of an array's finite elements, and whether it has others."""
+    def add_array(self, low: float, high: float, nan: bool, infinite: bool, window: int) -> None:
+        """Add the extremes of an array's finite elements, and whether it has others."""
         self.count += 1
         self.nan |= nan
         self.infinite |= infinite
         if low <= high:
-            self.highs.see(high, window)
-            self.lows.see(-low, window)
+            self.highs.add(high, window)
+            self.lows.add(-low, window)

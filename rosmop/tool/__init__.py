@@ -1,1 +1,1 @@
-"""The command `rosmop`, and what `rosrv monitor` shares with it. Only this part of the language reads and writes."""
+"""The command `rosmop`, shared with `rosrv monitor`: the only part of the language that reads and writes files."""

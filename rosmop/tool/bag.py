@@ -1,6 +1,6 @@
-"""Recordings: a bag goes through the monitors, and what subscribers would have received into another bag.
+"""Run monitors on a bag, and write the messages that subscribers would have received into another bag.
 
-A topic whose messages have another definition than the specifications mean is refused: its messages are dropped.
+Messages of a topic with a different definition than the specifications expect are dropped.
 """
 
 import struct
@@ -15,17 +15,16 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag1 import ReaderError, Writer
 from rosbags.rosbag1.writer import WriterError
 
-from rosmop.run.causes import Sender
 from rosmop.run.engine import MonitorSet
-from rosmop.run.outcomes import Outcome, Verdict, bound
+from rosmop.run.outcomes import MessageSender, Outcome, Verdict, bound
 from rosmop.tool.bounded_bag import BoundedReader
-from rosmop.tool.program import Program
+from rosmop.tool.command_context import CommandContext
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_text import MessageDefinition
 
-_OWN = "/rosrv"  # the appliance: what monitors publish is not given to monitors
-# What `rosbags` and what unpacks for it raise for a damaged bag, beside an error of their own.
+_OWN = "/rosrv"  # caller id of messages that monitors publish; monitors do not receive them
+# The exceptions of `rosbags` and of its decompressors for a damaged bag.
 _DAMAGE = (
     ReaderError, ValueError, LookupError, AssertionError, struct.error, MemoryError, OverflowError, OSError,
     EOFError, RuntimeError,
@@ -33,8 +32,8 @@ _DAMAGE = (
 
 
 @dataclass(frozen=True)
-class Replayed:
-    """What came of one message (or, without a topic, of a tick or deadline)."""
+class ReplayStep:
+    """The outcome of one message or, without a topic, of a tick or deadline."""
 
     outcome: Outcome
     index: int | None = None
@@ -42,42 +41,40 @@ class Replayed:
 
 
 def ros_type(name: str) -> str:
-    """`package/Type` of the name that the bag reader gives a type, `package/msg/Type`."""
+    """Return `package/Type` for the bag reader's `package/msg/Type`."""
     package, _, kind = name.partition("/")
     return f"{package}/{kind.rpartition('/')[2]}"
 
 
-def open_bag(program: Program, path: Path) -> BoundedReader:
-    """An open recording, or an end with the reason."""
+def open_bag(program: CommandContext, path: Path) -> BoundedReader:
+    """Open a recording. Raises a usage error for a file that is not a bag."""
     try:
         reader = BoundedReader(program, path)
         reader.open()
     except _DAMAGE as error:
-        mend = (
-            "; it takes a bag of ROS 1, and `rosbag reindex` mends one that was cut off"
-            if path.is_file()
-            else ""
+        advice = (
+            "; it must be a ROS 1 bag; `rosbag reindex` repairs a truncated bag" if path.is_file() else ""
         )
         raise program.usage_error(
-            f"cannot read the bag {path}: {_said_by(error).rstrip('.')}{mend}"
+            f"cannot read the bag {path}: {_text_of(error).rstrip('.')}{advice}"
         ) from error
     return reader
 
 
 def messages_of(reader: BoundedReader) -> Iterator[tuple[Connection, int, bytes]]:
-    """Connection, nanoseconds and bytes of every message, in the order of the bag, or an end with the reason."""
+    """Yield connection, nanoseconds and bytes of every message, in order. Raises a usage error for a damaged bag."""
     try:
         yield from reader.in_order()
     except _DAMAGE as error:
-        raise reader.program.usage_error(f"the bag {reader.path} is damaged: {_said_by(error)}") from error
+        raise reader.program.usage_error(f"the bag {reader.path} is damaged: {_text_of(error)}") from error
 
 
-def _said_by(error: Exception) -> str:
+def _text_of(error: Exception) -> str:
     return str(error) or type(error).__name__
 
 
 def definitions_of(reader: BoundedReader) -> Definitions:
-    """Return the definitions that the recorded publishers sent; those that cannot be read are left out."""
+    """Return the message definitions in the bag, without those that cannot be parsed."""
     found: dict[str, MessageDefinition] = {}
     sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data) for row in reader.connections)
     for name, text in sent:
@@ -89,14 +86,14 @@ def definitions_of(reader: BoundedReader) -> Definitions:
     return Definitions(found)
 
 
-class Recorded:
-    """A bag as the learner takes it: read anew for each pass, and only the topics that fit one of the patterns.
+class RecordedBag:
+    """The messages of a bag on topics that match a pattern, read again for each pass.
 
-    `definitions` are those that its publishers sent. Raises `typer.BadParameter` for a bag that cannot be read or has
-    two types on one topic.
+    `definitions` are those in the bag. Raises a usage error for a bag that cannot be read, has no messages, or has two
+    types on one topic.
     """
 
-    def __init__(self, program: Program, path: Path, patterns: Sequence[str]) -> None:
+    def __init__(self, program: CommandContext, path: Path, patterns: Sequence[str]) -> None:
         self._program = program
         self._path = path
         self.name = path.name
@@ -116,7 +113,7 @@ class Recorded:
                     raise program.usage_error(f"{path}: {connection.topic} carries both {other} and {kind}")
 
     def messages(self) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, nanoseconds and bytes of every message, in the order of the bag."""
+        """Yield topic, nanoseconds and bytes of every message, in order."""
         with closing(open_bag(self._program, self._path)) as reader:
             for connection, time_ns, data in messages_of(reader):
                 if connection.topic in self.topics:
@@ -127,10 +124,10 @@ class Recorded:
 _Header = tuple[str, str, str, str, str | None, int | None]
 
 
-class Recording:
-    """The bag that is written: what subscribers would have received."""
+class OutputBag:
+    """Write a bag of the messages that subscribers would have received."""
 
-    def __init__(self, program: Program, path: Path, definitions: Definitions) -> None:
+    def __init__(self, program: CommandContext, path: Path, definitions: Definitions) -> None:
         self._path = path
         self._definitions = definitions
         self._connections: dict[_Header, Connection] = {}
@@ -140,7 +137,7 @@ class Recording:
         except (WriterError, OSError) as error:
             raise program.usage_error(f"cannot write the bag {path}: {error}") from error
 
-    def __enter__(self) -> "Recording":
+    def __enter__(self) -> "OutputBag":
         return self
 
     def __exit__(
@@ -156,7 +153,7 @@ class Recording:
         self._write((*sent, caller, latching), time_ns, data)
 
     def publish(self, outcome: Outcome) -> None:
-        """Write what monitors published."""
+        """Write the messages that monitors published."""
         for message in outcome.published:
             package, _, kind = message.type.partition("/")
             text, digest = self._definitions.full_text(message.type), self._definitions.md5sum(message.type)
@@ -175,12 +172,13 @@ class Recording:
 def replay(
     monitors: MonitorSet,
     reader: BoundedReader,
-    output: Recording | None,
+    output: OutputBag | None,
     topics: Sequence[str] = ("*",),
     span: tuple[int, int] = (0, 1 << 63),
-) -> Iterator[Replayed]:
-    """Give the messages of a bag on these topics (patterns), from a moment to another (nanoseconds since the epoch), to
-    the monitors, in its order and with its clock.
+) -> Iterator[ReplayStep]:
+    """Run the monitors on the messages of a bag, in its order and by its clock.
+
+    `topics` are patterns; `span` is the first and last time in nanoseconds since the epoch.
     """
     started: Outcome | None = None
     refusals = {
@@ -192,54 +190,56 @@ def replay(
         connection.topic for connection in reader.connections if refusals.get(connection.id, "") is None
     )
     begun = False
-    asked = _Asked()
-    monitors.explain_when(asked, asked)
+    selection = _ExplainOnce()
+    monitors.explain_when(selection, selection)
     for index, (connection, time_ns, data) in enumerate(messages_of(reader)):
         if connection.id not in refusals or not span[0] <= time_ns <= span[1]:
             continue
         if not begun:
             started, begun = monitors.start(time_ns, expected), True
-        asked.now = time_ns
-        outcome = _outcome(monitors, connection, time_ns, data, refusals[connection.id], Sender(index + 1))
+        selection.now = time_ns
+        outcome = _outcome(
+            monitors, connection, time_ns, data, refusals[connection.id], MessageSender(index + 1)
+        )
         if started is not None:
             outcome = _after(started, outcome)
             started = None
         for earlier in outcome.before:
             if output is not None:
                 output.publish(earlier)
-            yield Replayed(earlier)
+            yield ReplayStep(earlier)
         if output is not None:
             if outcome.result != "dropped":
                 output.relay(connection, time_ns, bytes(outcome.buffer))
             output.publish(outcome)
-        yield Replayed(outcome, index, connection.topic)
+        yield ReplayStep(outcome, index, connection.topic)
 
 
-class _Asked:
-    """Of each category of a property, and each binding, the first verdict of a second is explained."""
+class _ExplainOnce:
+    """Select for explanation the first verdict each second of each category and binding of a property."""
 
     def __init__(self) -> None:
         self.now = 0
         self._second = 0
-        self._told: set[tuple[str, int, str, str]] = set()
+        self._explained: set[tuple[str, int, str, str]] = set()
 
     def __call__(self, verdict: Verdict, _source: int) -> bool:
         if self._second != self.now // 10**9:
             self._second = self.now // 10**9
-            self._told.clear()
+            self._explained.clear()
         key = verdict.monitor, verdict.property, verdict.category, bound(verdict)
-        told = key in self._told
-        self._told.add(key)
-        return not told
+        is_new = key not in self._explained
+        self._explained.add(key)
+        return is_new
 
 
-def _outcome(  # noqa: PLR0917  a message, and what is known of it
+def _outcome(  # noqa: PLR0917  a message and its facts
     monitors: MonitorSet,
     connection: Connection,
     time_ns: int,
     data: bytes,
     refusal: str | None,
-    sender: Sender,
+    sender: MessageSender,
 ) -> Outcome:
     if refusal is None:
         return monitors.judge(connection.topic, data, time_ns, sender)
@@ -249,7 +249,7 @@ def _outcome(  # noqa: PLR0917  a message, and what is known of it
 
 
 def _after(started: Outcome, outcome: Outcome) -> Outcome:
-    """The outcome of the first message, with what `init` put out in front."""
+    """Return the outcome of the first message, with the output of `init` in front."""
     outcome.log = [*started.log, *outcome.log]
     outcome.published = [*started.published, *outcome.published]
     outcome.faults = [*started.faults, *outcome.faults]
@@ -257,15 +257,15 @@ def _after(started: Outcome, outcome: Outcome) -> Outcome:
 
 
 def _refusal(monitors: MonitorSet, connection: Connection) -> str | None:
-    """Why the messages of a recorded publisher are refused, None if they are not."""
+    """Return why the monitors drop the messages of a connection, or None."""
     wanted = monitors.topics.get(connection.topic)
     if wanted is None:
         return None
     kind = ros_type(connection.msgtype)
     if kind != wanted:
-        return f"{connection.topic} carries {kind}, but the specifications mean {wanted}"
+        return f"{connection.topic} carries {kind}, but the specifications expect {wanted}"
     if connection.digest not in ("*", monitors.md5sum(wanted)):
-        return f"the publisher of {connection.topic} has another definition of {kind} than the specifications"
+        return f"the publisher of {connection.topic} has a different definition of {kind} than the specifications"
     return None
 
 
@@ -274,6 +274,6 @@ def _fits(connection: Connection, topics: Sequence[str]) -> bool:
 
 
 def refusals(monitors: MonitorSet, reader: BoundedReader, topics: Sequence[str] = ("*",)) -> list[str]:
-    """What to tell about topics that are refused, of those that fit one of the patterns."""
+    """Return the reasons why messages on topics that match a pattern are dropped."""
     found = [_refusal(monitors, connection) for connection in reader.connections if _fits(connection, topics)]
     return sorted({text for text in found if text is not None})

@@ -1,11 +1,11 @@
-"""Reads a bag of ROS 1 in a time that is linear in its size, whatever somebody wrote into it.
+"""Read a ROS 1 bag in time linear in its size, even if the bag is malicious.
 
-`rosbags` believes what a bag says of itself. Here
+`rosbags` trusts the headers of a bag. This reader adds limits:
 
-1. no more than `LARGEST_CHUNK` bytes are read at once, and a chunk unpacks to no more;
-2. what is unpacked and what is read of it, each as often as it is, has no more than `PER_BYTE` bytes for each byte of
-   the bag, and one chunk more: entries of the index can mean one message, and have two chunks unpacked in turn;
-3. the index has no more entries than the bag has room for: several chunks cannot share one.
+1. it reads at most `LARGEST_CHUNK` bytes at once, and unpacks a chunk to at most that size;
+2. it unpacks and reads at most `PER_BYTE` bytes for each byte of the bag, plus one chunk: index entries can name one
+   message many times, or unpack two chunks in turn;
+3. the index has at most as many entries as fit into the bag: chunks cannot share an index.
 """
 
 import bz2
@@ -19,7 +19,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import Header, IndexData, RecordType, decompressors, read_bytes, read_uint32
 
-from rosmop.tool.program import Program
+from rosmop.tool.command_context import CommandContext, open_regular
 
 LARGEST_CHUNK = 256 << 20
 PER_BYTE = 256
@@ -32,43 +32,37 @@ _UNPACKERS: dict[Callable[[bytes], bytes], Callable[[], Any]] = {
 
 
 class _BoundedFile(BufferedReader):
-    """A file of which only so much is read at once."""
+    """A file with a limit for each read."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Return so many bytes."""
+        """Read bytes, at most `LARGEST_CHUNK`."""
         if size is None or not 0 <= size <= LARGEST_CHUNK:
-            raise ReaderError(f"it has a part of more than {LARGEST_CHUNK} bytes.")
+            raise ReaderError(f"it has a record of more than {LARGEST_CHUNK} bytes.")
         return super().read(size)
 
     def readline(self, _size: int | None = -1, /) -> bytes:
-        """Return the line that names the format."""
+        """Read the line with the format, at most `_LONGEST_LINE` bytes."""
         return super().readline(_LONGEST_LINE)
 
 
 class _BagPath(PosixPath):
-    """The path of a bag, which the program opens."""
-
-    tool: Program
-
     def open(self, *_mode: object) -> BinaryIO:  # type: ignore[override] # rosbags asks for bytes
-        """Open it to be read."""
-        return _BoundedFile(self.tool.open(Path(self)).detach())
+        return _BoundedFile(open_regular(Path(self)).detach())
 
 
 class BoundedReader(Reader):
-    """The reader of `rosbags`; beyond a bound it raises `ReaderError`."""
+    """The reader of `rosbags`; raises `ReaderError` beyond a limit."""
 
-    def __init__(self, program: Program, path: Path) -> None:
-        bag = _BagPath(path)
-        bag.tool = self.program = program
-        super().__init__(bag)
+    def __init__(self, program: CommandContext, path: Path) -> None:
+        self.program = program
+        super().__init__(_BagPath(path))
         self._size = path.stat().st_size
         self._left = PER_BYTE * self._size + LARGEST_CHUNK
         self._entries = 0
 
     @property
     def message_count(self) -> int:
-        """The number of messages in the index."""
+        """Return the number of messages in the index."""
         return self._entries
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
@@ -81,7 +75,7 @@ class BoundedReader(Reader):
             raise ReaderError("its chunks share an index.")
 
     def in_order(self) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield connection, nanoseconds and bytes of every message: by time, then by its place in the file."""
+        """Yield connection, nanoseconds and bytes of every message: by time, then by position in the file."""
         connections = {connection.id: connection for connection in self.connections}
         everything = [entry for entries in self.indexes.values() for entry in entries]
         everything.sort(key=lambda entry: (entry.time, entry.chunk_pos, entry.offset))
@@ -99,7 +93,7 @@ class BoundedReader(Reader):
             yield connections[header.get_uint32("conn")], entry.time, data
 
     def _content(self, place: int) -> bytes:
-        """Return what a chunk unpacks to."""
+        """Return an unpacked chunk."""
         assert self.bio is not None  # noqa: S101  the reader is open
         chunk = self.chunks[place]
         self.bio.seek(chunk.datapos)
@@ -116,4 +110,4 @@ class BoundedReader(Reader):
     def _charge(self, count: int) -> None:
         self._left -= count
         if self._left < 0:
-            raise ReaderError(f"to read it takes more than {PER_BYTE} times its size.")
+            raise ReaderError(f"it unpacks to more than {PER_BYTE} times its size.")

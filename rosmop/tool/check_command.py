@@ -1,34 +1,38 @@
-"""Check specifications.
+"""Check specifications."""
 
-Exit status: 0 right (warnings or not), 1 a specification with errors, 2 usage.
-"""
-
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 
 from rosmop.certify.properties import certificates_of
-from rosmop.form.positions import Finding
+from rosmop.fast.slow_paths import slow_paths
+from rosmop.form.compiled import Compiled
+from rosmop.form.positions import Diagnostic
 from rosmop.logics.interface import CompiledProperty
 from rosmop.logics.picture import dot_of, svg_of
 from rosmop.run.engine import MonitorSet
 from rosmop.text.errors import SpecificationError
+from rosmop.tool.command_context import CommandContext
 from rosmop.tool.monitor_output import explained, say_finding
-from rosmop.tool.program import Program
 from rosmop.tool.specification_input import load
-from rosmop.tool.terminal import counted, say
+from rosmop.tool.terminal import counted, say, say_json
 
 
 def check(
-    program: Program,
+    program: CommandContext,
     files: list[Path],
     folders: list[Path],
     *,
     as_json: bool,
     prove: bool,
+    why_slow: bool,
     dot: Path | None,
     svg: Path | None,
 ) -> int:
-    """Report every error and warning with its place; return the exit status."""
+    """Report every error and warning with its position.
+
+    Return the exit status: 0 without errors, 1 with errors. A usage error ends with 2.
+    """
     if prove and find_spec("z3") is None:
         raise program.usage_error(
             f"--prove needs the package z3-solver: pip install '{program.package}[prove]'"
@@ -56,6 +60,8 @@ def check(
             running.code.property for monitor in monitors.monitors for running in monitor.properties
         ]
         _draw(program, properties, dot, svg)
+        if why_slow:
+            _say_slow(monitors.compiled, as_json=as_json)
         if prove:
             from rosmop.tool.proof_output import say_proofs  # noqa: PLC0415  its package may be missing
 
@@ -63,26 +69,43 @@ def check(
     return 1 if errors else 0
 
 
-def _summarise(findings: list[Finding], errors: int, monitors: MonitorSet | None) -> None:
+def _say_slow(compiled: Compiled, *, as_json: bool) -> None:
+    """Write which messages the interpreter processes, and why."""
+    found = slow_paths(compiled)
+    for path in found:
+        if as_json:
+            say_json(
+                {"topic": path.topic, "code": path.code, **asdict(path.position), "why_slow": path.reason}
+            )
+        elif path.code:
+            say(f"{path.position}: {path.topic}: {path.code}: interpreted here, because it {path.reason}")
+        else:
+            say(f"{path.position}: {path.topic}: each message is interpreted, because it {path.reason}")
+    if not found and not as_json:
+        say("compiled code processes every message")
+
+
+def _summarise(findings: list[Diagnostic], errors: int, monitors: MonitorSet | None) -> None:
     warnings = len(findings) - errors
     tail = f", {counted(warnings, 'warning')}" if warnings else ""
     if monitors is None:
-        say(f"{counted(errors, 'error')}: refused{tail}", "red")
+        say(f"{counted(errors, 'error')}: rejected{tail}", "red")
         return
     number = len(monitors.monitors)
-    say(f"{counted(number, 'specification')} right{tail}", "green")
+    say(f"{counted(number, 'specification')} OK{tail}", "green")
 
 
-def _draw(program: Program, properties: list[CompiledProperty], dot: Path | None, svg: Path | None) -> None:
+def _draw(
+    program: CommandContext, properties: list[CompiledProperty], dot: Path | None, svg: Path | None
+) -> None:
     for path, draw in ((dot, dot_of), (svg, svg_of)):
         if path is None:
             continue
         picture = draw(properties)
         if picture is None:
-            text = "no property's monitor is a finite automaton: there is nothing to draw"
-            program.warn(f"{text}, and {path} is not written")
+            program.warn(f"{path} is not written: no property has a finite automaton to draw")
             continue
         try:
-            path.write_text(picture, encoding="utf-8")
+            program.write(path, picture.encode())
         except OSError as error:
             raise program.usage_error(f"cannot write {path}: {error.strerror}") from error

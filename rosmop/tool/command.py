@@ -1,11 +1,15 @@
-"""The `rosmop` command."""
+"""The commands `check`, `run`, `learn` and `coverage`: of `rosmop`, and of `rosrv monitor`."""
 
+import inspect
+from collections.abc import Callable
 from pathlib import Path
 
 import typer
 
 from rosmop.tool import check_command, coverage_command, learn_command, run_command
+from rosmop.tool.command_context import CommandContext
 from rosmop.tool.options import (
+    SUMMARIES,
     Bag,
     Bags,
     Dot,
@@ -19,67 +23,70 @@ from rosmop.tool.options import (
     Prove,
     Svg,
     Topics,
+    WhySlow,
 )
-from rosmop.tool.program import Program
 
-_ROSMOP = Program("rosmop", "rosmop", Path.read_bytes, lambda path: path.open("rb"), Path.write_bytes)
+
+def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
+    """Return the commands of a program by name; the help of each goes on after its summary."""
+
+    def check(
+        files: Files,
+        *,
+        as_json: Json = False,
+        msg: Folders = None,
+        prove: Prove = False,
+        why_slow: WhySlow = False,
+        dot: Dot = None,
+        svg: Svg = None,
+    ) -> None:
+        """`--prove` needs the package z3-solver and takes up to a few seconds for each event. It prints what is proved
+        for each event. Exit status 1 if the code of an event differs from its meaning.
+        """
+        status = check_command.check(
+            program, files, msg or [], as_json=as_json, prove=prove, why_slow=why_slow, dot=dot, svg=svg
+        )
+        raise typer.Exit(status)
+
+    def run(
+        files: Files, *, bag: Bag, as_json: Json = False, output: Output = None, msg: Folders = None
+    ) -> None:
+        run_command.run(program, files, msg or [], bag, output=output, as_json=as_json)
+
+    def learn(
+        bags: Bags, topics: Topics = None, out: Out = None, hold_out: HoldOut = 0.3, as_json: Json = False
+    ) -> None:
+        learn_command.learn_monitors(program, bags, topics or [], out, hold_out=hold_out, as_json=as_json)
+
+    def coverage(
+        files: Files, *, bags: Bags, msg: Folders = None, fail_under: FailUnder = 0.0, as_json: Json = False
+    ) -> None:
+        status = coverage_command.coverage(
+            program, files, msg or [], bags, fail_under=fail_under, as_json=as_json
+        )
+        raise typer.Exit(status)
+
+    commands: dict[str, Callable[..., None]] = {}
+    for command, example in (
+        (check, "monitors/*.rv"),
+        (run, "monitors/safe_triggering.rv --bag drive.bag"),
+        (learn, "--bag monday.bag --bag tuesday.bag --out learnt.rv"),
+        (coverage, "monitors/*.rv --bag drive.bag --fail-under 80"),
+    ):
+        name = command.__name__
+        more = [inspect.cleandoc(command.__doc__)] if command.__doc__ else []
+        command.__doc__ = "\n\n".join([*more, f"Example: {program.name} {name} {example}"])
+        commands[name] = command
+    return commands
+
 
 app = typer.Typer(
     name="rosmop",
-    help="Runtime monitors for ROS 1: check specifications, and try them on recordings.",
+    help="Runtime monitors for ROS 1: check specifications and run them on recordings.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-
-@app.command()
-def check(
-    files: Files,
-    *,
-    as_json: Json = False,
-    msg: Folders = None,
-    prove: Prove = False,
-    dot: Dot = None,
-    svg: Svg = None,
-) -> None:
-    """Report every error and warning with its place; exit status 1 if there is an error.
-
-    Example: rosmop check monitors/*.rv
-    """
-    status = check_command.check(_ROSMOP, files, msg or [], as_json=as_json, prove=prove, dot=dot, svg=svg)
-    raise typer.Exit(status)
-
-
-@app.command()
-def run(files: Files, *, bag: Bag, as_json: Json = False, output: Output = None, msg: Folders = None) -> None:
-    """Give a recording to the monitors and report what came of every message, by the recording's clock.
-
-    Example: rosmop run monitors/safe_triggering.rv --bag drive.bag
-    """
-    run_command.run(_ROSMOP, files, msg or [], bag, output=output, as_json=as_json)
-
-
-@app.command("learn")
-def learn_monitors(
-    bags: Bags, topics: Topics = None, out: Out = None, hold_out: HoldOut = 0.3, as_json: Json = False
-) -> None:
-    """Propose specifications out of recordings of a robot that behaves, for a person to edit.
-
-    Example: rosmop learn --bag monday.bag --bag tuesday.bag --out learnt.rv
-    """
-    learn_command.learn_monitors(_ROSMOP, bags, topics or [], out, hold_out=hold_out, as_json=as_json)
-
-
-@app.command()
-def coverage(
-    files: Files, *, bags: Bags, msg: Folders = None, fail_under: FailUnder = 0.0, as_json: Json = False
-) -> None:
-    """Say which events, branches, handlers, states and transitions recordings exercised, and what never happened.
-
-    Example: rosmop coverage monitors/*.rv --bag drive.bag --fail-under 80
-    """
-    raise typer.Exit(
-        coverage_command.coverage(_ROSMOP, files, msg or [], bags, fail_under=fail_under, as_json=as_json)
-    )
+for _name, _command in commands_of(CommandContext("rosmop", "rosmop", Path.write_bytes)).items():
+    app.command(_name, help=f"{SUMMARIES[_name]}\n\n{_command.__doc__}")(_command)

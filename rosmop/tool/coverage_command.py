@@ -1,4 +1,4 @@
-"""Report what of specifications recordings exercised, and what never happened."""
+"""Report which parts of specifications recordings exercise."""
 
 from collections.abc import Iterable
 from contextlib import closing
@@ -8,11 +8,11 @@ from rich.console import Console
 from rich.table import Column
 
 from rosmop.check.sources import compiled_from
-from rosmop.learn.exercised import Item, covered
+from rosmop.learn.exercised import CoverageItem, covered
 from rosmop.run.engine import MonitorSet
 from rosmop.text.errors import SpecificationError
-from rosmop.tool.bag import Recorded, open_bag, refusals
-from rosmop.tool.program import Program
+from rosmop.tool.bag import RecordedBag, open_bag, refusals
+from rosmop.tool.command_context import CommandContext
 from rosmop.tool.specification_input import read_definitions, read_specifications
 from rosmop.tool.tables import table_of
 from rosmop.tool.terminal import refused, say, say_json
@@ -21,7 +21,7 @@ _KINDS = ("event", "branch", "function", "handler", "state", "transition")
 
 
 def coverage(
-    program: Program,
+    program: CommandContext,
     files: list[Path],
     folders: list[Path],
     bags: list[Path],
@@ -29,8 +29,8 @@ def coverage(
     fail_under: float,
     as_json: bool,
 ) -> int:
-    """Report what the recordings exercised, and what never happened; return the exit status."""
-    recordings = [Recorded(program, bag, ["*"]) for bag in bags]
+    """Report the exercised and the missing parts; return the exit status."""
+    recordings = [RecordedBag(program, bag, ["*"]) for bag in bags]
     try:
         definitions = read_definitions(program, files, folders)
         for recording in recordings:
@@ -58,12 +58,14 @@ def coverage(
     return 1 if percent < fail_under else 0
 
 
-def _show(counts: dict[Item, int]) -> None:
+def _show(counts: dict[CoverageItem, int]) -> None:
     columns = (Column(kind, justify="right") for kind in _KINDS)
     table = table_of("monitor", *columns)
     for name in dict.fromkeys(item.specification for item in counts):
         own = [(item, count) for item, count in counts.items() if item.specification == name]
-        table.add_row(name, *(_share(count for item, count in own if item.kind == kind) for kind in _KINDS))
+        table.add_row(
+            name, *(_fraction(count for item, count in own if item.kind == kind) for kind in _KINDS)
+        )
     Console(highlight=False).print(table)
     for item, count in counts.items():
         if not count:
@@ -71,6 +73,6 @@ def _show(counts: dict[Item, int]) -> None:
             say(f"{place}: never: {item.kind} {item.what} of {item.specification}", "yellow")
 
 
-def _share(counts: Iterable[int]) -> str:
+def _fraction(counts: Iterable[int]) -> str:
     found = list(counts)
     return f"{sum(count > 0 for count in found)}/{len(found)}" if found else "-"

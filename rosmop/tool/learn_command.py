@@ -1,13 +1,13 @@
-"""Learn specifications from recordings of a robot that behaves."""
+"""Learn specifications from recordings of normal operation."""
 
 import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from rosmop.learn.learner import LearningError, Learnt, learn
-from rosmop.tool.bag import Recorded
-from rosmop.tool.program import Program
+from rosmop.learn.learner import LearningError, LearningResult, learn
+from rosmop.tool.bag import RecordedBag
+from rosmop.tool.command_context import CommandContext
 from rosmop.tool.progress_bar import progress
 from rosmop.tool.specification_input import BESIDE
 from rosmop.tool.terminal import counted, say, say_json
@@ -18,7 +18,7 @@ from roswire.standard import standard_definitions
 
 
 def learn_monitors(
-    program: Program,
+    program: CommandContext,
     bags: list[Path],
     topics: list[str],
     out: Path | None,
@@ -26,12 +26,12 @@ def learn_monitors(
     hold_out: float,
     as_json: bool,
 ) -> None:
-    """Propose specifications from recordings of a robot that behaves."""
+    """Propose specifications from the recordings, and print or write them."""
     if out is not None and out.exists():
-        raise program.usage_error(f"{out} is there already")
+        raise program.usage_error(f"{out} already exists")
     if len({os.path.realpath(bag) for bag in bags}) < len(bags):
-        raise program.usage_error("a recording is given twice: it would be its own test")
-    recordings = [Recorded(program, bag, topics or ["*"]) for bag in bags]
+        raise program.usage_error("a recording is given twice: it would test itself")
+    recordings = [RecordedBag(program, bag, topics or ["*"]) for bag in bags]
     recorded = Definitions({})
     for recording in recordings:
         _check_same(program, recording, recorded)
@@ -39,8 +39,8 @@ def learn_monitors(
     definitions = standard_definitions().extended(recorded)
     total = sum(recording.message_count for recording in recordings)
     try:
-        with progress("learning", lambda: 2 * total, shares_screen=out is None) as told:
-            learnt = learn(recordings, definitions, hold_out, told)
+        with progress("learning", lambda: 2 * total, shares_screen=out is None) as advance:
+            learnt = learn(recordings, definitions, hold_out, advance)
     except LearningError as error:
         raise program.usage_error(str(error)) from error
     if out is not None:
@@ -54,19 +54,19 @@ def learn_monitors(
         say(f"{conditions} in {counted(len(names), 'specification')}: {out}")
         widened = sum(1 for candidate in learnt.candidates if candidate.widened)
         if learnt.held_out:
-            say(f"alarms on what was held out: {widened} widened, {len(learnt.left_out)} left out")
+            say(f"alarms on the held-out part: {widened} widened, {len(learnt.left_out)} left out")
 
 
-def _check_same(program: Program, recording: Recorded, others: Definitions) -> None:
-    """A type has one definition in all recordings, or their messages would be read wrongly."""
+def _check_same(program: CommandContext, recording: RecordedBag, others: Definitions) -> None:
+    """Reject recordings with different definitions of one type."""
     for kind in set(recording.topics.values()) & set(recording.definitions.message_types):
         if kind in others.message_types and others.md5sum(kind) != recording.definitions.md5sum(kind):
             raise program.usage_error(
-                f"{recording.name} has another definition of {kind} than the recordings before it"
+                f"{recording.name} has a different definition of {kind} than the recordings before it"
             )
 
 
-def _say_rows(learnt: Learnt) -> None:
+def _say_rows(learnt: LearningResult) -> None:
     for result, rows in (("kept", learnt.candidates), ("left out", learnt.left_out)):
         for candidate in rows:
             say_json({
@@ -77,14 +77,16 @@ def _say_rows(learnt: Learnt) -> None:
             })  # fmt: skip
 
 
-def _write(program: Program, out: Path, learnt: Learnt, recorded: Definitions) -> None:
-    """The text, and beside it the definitions that are not ROS's own."""
+def _write(program: CommandContext, out: Path, learnt: LearningResult, recorded: Definitions) -> None:
+    """Write the specification, and beside it the definitions that are not part of ROS."""
     files = {out: learnt.text}
     for name in _needed(learnt, recorded):
         path = out.parent / BESIDE / f"{name}.msg"
         text = recorded.message(name).text
         if path.exists() and program.read_text(path) != text:
-            raise program.usage_error(f"{path} is there already and is another than the recordings have")
+            raise program.usage_error(
+                f"{path} already exists and differs from the definition in the recordings"
+            )
         files[path] = text
     try:
         for path, text in files.items():
@@ -94,8 +96,8 @@ def _write(program: Program, out: Path, learnt: Learnt, recorded: Definitions) -
         raise program.usage_error(f"cannot write {out}: {error.strerror}") from error
 
 
-def _needed(learnt: Learnt, recorded: Definitions) -> list[str]:
-    """The types of the specifications, and those that they are made of, that `check` would not know."""
+def _needed(learnt: LearningResult, recorded: Definitions) -> list[str]:
+    """Return the types of the specifications, and of their fields, that `check` would not know."""
     own = standard_definitions()
     waiting = [learnt.types[topic] for candidate in learnt.candidates for topic in candidate.topics]
     found: set[str] = set()

@@ -1,12 +1,12 @@
-"""How the monitor verbs show things: findings, and what came of every message of a recording."""
+"""Print findings, and the outcome of every message of a recording."""
 
 from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-from rosmop.form.positions import Finding
+from rosmop.form.positions import Diagnostic
 from rosmop.run.explanations import why_of
-from rosmop.run.monitor import Monitor
+from rosmop.run.monitor import MonitorInstance
 from rosmop.run.outcomes import Fault, Outcome, Verdict, bound
 from rosmop.run.why_text import lines_of_why
 from rosmop.tool.terminal import say, say_json
@@ -14,7 +14,7 @@ from rosmop.tool.terminal import say, say_json
 BILLION = 1_000_000_000
 
 
-def say_finding(finding: Finding, *, as_json: bool) -> None:
+def say_finding(finding: Diagnostic, *, as_json: bool) -> None:
     """Write an error or a warning."""
     if not as_json:
         say(str(finding), "red" if finding.severity == "error" else "yellow")
@@ -23,7 +23,7 @@ def say_finding(finding: Finding, *, as_json: bool) -> None:
 
 
 def record(outcome: Outcome, index: int | None = None, topic: str | None = None) -> dict[str, object]:
-    """The record of a message, or of a tick or deadline."""
+    """Return the JSON record of a message, or of a tick or deadline."""
     head: dict[str, object] = (
         {"index": index, "topic": topic} if topic is not None else {"timer": outcome.timer}
     )
@@ -48,8 +48,8 @@ def record(outcome: Outcome, index: int | None = None, topic: str | None = None)
     }
 
 
-def explained(monitor: Monitor) -> Iterator[str]:
-    """What the parameters of a specification mean: nothing without any."""
+def explained(monitor: MonitorInstance) -> Iterator[str]:
+    """Yield the meaning of the parameters of a specification."""
     slices, slicing = monitor.slices, monitor.code.slicing
     if slices is None or slicing is None:
         return
@@ -62,7 +62,7 @@ def explained(monitor: Monitor) -> Iterator[str]:
 
 
 def because(verdict: Verdict) -> Iterator[str]:
-    """Which messages of the recording made a verdict so."""
+    """Yield the messages of the recording that caused a verdict."""
     return lines_of_why(why_of(verdict, _place).get("why", {}))
 
 
@@ -75,7 +75,7 @@ def _fault(fault: Fault) -> dict[str, object]:
 
 
 def lines(outcome: Outcome, index: int | None = None, topic: str | None = None) -> Iterator[str]:
-    """The same for people: nothing for a message that nobody had anything to say about."""
+    """Yield the lines for a person; none for a message without an outcome to report."""
     seconds = f"{outcome.time / BILLION:.3f}"
     head = f"{seconds} {outcome.timer}" if topic is None else f"{seconds} #{index} {topic}"
     if topic is not None and outcome.result != "passed":

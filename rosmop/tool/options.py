@@ -1,5 +1,6 @@
-"""The arguments and options that `rosmop` and `rosrv monitor` have in common."""
+"""The arguments, options and summaries of the commands of `rosmop`, which `rosrv monitor` shares."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -18,25 +19,38 @@ Bags = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 Prove = Annotated[
     bool,
-    typer.Option("--prove", help="Also prove that the relay's code of each event does what the event means"),
+    typer.Option("--prove", help="Also prove that the compiled code of each event matches its specification"),
 ]
-Dot = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata for Graphviz")]
-Svg = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata as a picture")]
+WhySlow = Annotated[
+    bool,
+    typer.Option(
+        "--why-slow", help="Also list the messages that the interpreter processes, with file, line and reason"
+    ),
+]
+Dot = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata for Graphviz (.dot)")]
+Svg = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata as a picture (.svg)")]
 Bag = Annotated[Path, typer.Option(metavar="FILE", help="The recording", show_default=False)]
 Output = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Write what subscribers would have received")
 ]
 Topics = Annotated[
     list[str] | None,
-    typer.Option("--topic", metavar="PATTERN", help="Only such topics, as /arm/* (repeatable)"),
+    typer.Option("--topic", metavar="PATTERN", help="Only these topics, such as /arm/* (repeatable)"),
 ]
 Out = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.rv", help="Write it here (must not exist), definitions into msg/ beside it"),
+    typer.Option(metavar="FILE.rv", help="Write a new file; message definitions go into msg/ beside it"),
 ]
 HoldOut = Annotated[
-    float, typer.Option(min=0.0, max=0.9, help="The share of the recordings that is its test")
+    float, typer.Option(min=0.0, max=0.9, help="The fraction of the recordings that tests the result")
 ]
 FailUnder = Annotated[
-    float, typer.Option(min=0.0, max=100.0, metavar="PERCENT", help="Exit status 1 below it")
+    float, typer.Option(min=0.0, max=100.0, metavar="PERCENT", help="Exit with 1 below this percentage")
 ]
+SUMMARIES: Mapping[str, str] = {
+    "check": "Report every error and warning with its place. Exit status 1 if there is an error.",
+    "run": "Run the monitors on a recording, by the recording's clock, and report the result for each message.",
+    "learn": "Propose specifications from recordings of a robot that behaves correctly, for you to edit.",
+    "coverage": "Show which events, branches, handlers, states and transitions the recordings covered, and which not.",
+}
+"""The first sentence of each command's help."""

@@ -1,4 +1,4 @@
-"""Shows how far long work is: a bar on a terminal's standard error, nothing elsewhere."""
+"""Show progress: a bar on standard error if that is a terminal, nothing otherwise."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -19,9 +19,9 @@ from rich.progress import (
 def progress(
     what: str, total: Callable[[], int], *, shares_screen: bool = False
 ) -> Iterator[Callable[[int], None]]:
-    """Gives the function that is told how much of `total()` is done.
+    """Yield a function that takes the finished part of `total()`.
 
-    `shares_screen`: the work itself writes on standard output; there is no bar where that is the terminal, too.
+    `shares_screen`: the work writes to standard output; without a bar if that is a terminal.
     """
     console = Console(stderr=True)
     if not console.is_terminal or (shares_screen and sys.stdout.isatty()):

@@ -1,4 +1,4 @@
-"""Give a recording to monitors."""
+"""Run monitors on a recording."""
 
 from contextlib import closing
 from importlib.util import find_spec
@@ -7,21 +7,27 @@ from pathlib import Path
 from rosmop.fast.wasm_build import fast_path_of
 from rosmop.run.engine import MonitorSet
 from rosmop.text.errors import SpecificationError
-from rosmop.tool.bag import Recording, definitions_of, open_bag, refusals, replay
+from rosmop.tool.bag import OutputBag, definitions_of, open_bag, refusals, replay
 from rosmop.tool.bounded_bag import BoundedReader
+from rosmop.tool.command_context import CommandContext
 from rosmop.tool.monitor_output import lines, record
-from rosmop.tool.program import Program
 from rosmop.tool.progress_bar import progress
 from rosmop.tool.specification_input import load
 from rosmop.tool.terminal import counted, refused, say, say_json
 
-_TOLD_EVERY = 1000
+_PROGRESS_EVERY = 1000
 
 
 def run(
-    program: Program, files: list[Path], folders: list[Path], bag: Path, *, output: Path | None, as_json: bool
+    program: CommandContext,
+    files: list[Path],
+    folders: list[Path],
+    bag: Path,
+    *,
+    output: Path | None,
+    as_json: bool,
 ) -> None:
-    """Report what comes of every message, by the recording's clock."""
+    """Report the outcome of every message, by the recording's clock."""
     with closing(open_bag(program, bag)) as reader:
         try:
             compiled = load(program, files, folders, definitions_of(reader))
@@ -34,16 +40,16 @@ def run(
         if output is None:
             _report(monitors, reader, None, as_json=as_json)
         else:
-            with Recording(program, output, monitors.definitions) as recording:
+            with OutputBag(program, output, monitors.definitions) as recording:
                 _report(monitors, reader, recording, as_json=as_json)
 
 
 def _report(
-    monitors: MonitorSet, reader: BoundedReader, recording: Recording | None, *, as_json: bool
+    monitors: MonitorSet, reader: BoundedReader, recording: OutputBag | None, *, as_json: bool
 ) -> None:
     counts = {"passed": 0, "changed": 0, "dropped": 0}
     verdicts = faults = 0
-    with progress("replaying", lambda: reader.message_count, shares_screen=True) as told:
+    with progress("replaying", lambda: reader.message_count, shares_screen=True) as advance:
         for number, replayed in enumerate(replay(monitors, reader, recording)):
             outcome = replayed.outcome
             if replayed.topic is not None:
@@ -55,8 +61,8 @@ def _report(
             else:
                 for line in lines(outcome, replayed.index, replayed.topic):
                     say(line)
-            if not number % _TOLD_EVERY:
-                told(sum(counts.values()))
+            if not number % _PROGRESS_EVERY:
+                advance(sum(counts.values()))
     if not as_json:
         total = ", ".join(f"{number} {word}" for word, number in counts.items())
         say(f"{counted(sum(counts.values()), 'message')}: {total}; "

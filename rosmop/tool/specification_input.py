@@ -1,27 +1,29 @@
 """Read specifications and folders of message definitions."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rosmop.check.sources import compiled_from
 from rosmop.form.compiled import Compiled
 from rosmop.form.positions import Position
+from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
-from rosmop.tool.program import Program
+from rosmop.text.parser import parse
+from rosmop.tool.command_context import CommandContext
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
 
 BESIDE = "msg"
-"""The folder of definitions that is looked into beside every specification."""
+"""The folder of message definitions beside a specification."""
 
 
 def load(
-    program: Program, files: list[Path], folders: list[Path], recorded: Definitions | None = None
+    program: CommandContext, files: list[Path], folders: list[Path], recorded: Definitions | None = None
 ) -> Compiled:
     """Compile specifications. Raises `SpecificationError`.
 
-    Definitions that were recorded apply to the types that no file defines.
+    `recorded` definitions apply to the types that no file defines.
     """
     definitions = read_definitions(program, files, folders)
     if recorded is not None:
@@ -29,9 +31,10 @@ def load(
     return compiled_from(read_specifications(program, files), definitions)
 
 
-def read_specifications(program: Program, files: Sequence[Path]) -> dict[str, str]:
-    """The texts of specifications by name, in the order of file names. Bytes that are no UTF-8 are half of a character
-    (`surrogateescape`), which no specification may have: it is refused with all else that is wrong.
+def read_specifications(program: CommandContext, files: Sequence[Path]) -> dict[str, str]:
+    """Return the texts of specifications by name, in the order of file names.
+
+    Bytes outside UTF-8 become surrogates, which the parser rejects with their position.
     """
     texts: dict[str, str] = {}
     for file in sorted(files, key=lambda path: (path.name, str(path))):
@@ -43,8 +46,20 @@ def read_specifications(program: Program, files: Sequence[Path]) -> dict[str, st
     return texts
 
 
-def read_definitions(program: Program, files: Sequence[Path], folders: Sequence[Path]) -> Definitions:
-    """ROS's own definitions, those in `msg/` beside the specifications, and those of the folders.
+def topics_of(texts: Mapping[str, str], chosen: str | None) -> dict[str, str]:
+    """Return the topics, with their types, of one specification or (None) of all. Raises `SpecificationError`."""
+    return {
+        event.trigger.topic: event.trigger.type
+        for name, text in texts.items()
+        for specification in parse(text, name).specifications
+        if chosen in (None, specification.name)
+        for event in specification.events
+        if isinstance(event.trigger, tree.MessageTrigger) and event.trigger.part is None
+    }
+
+
+def read_definitions(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> Definitions:
+    """Return the definitions of ROS, of `msg/` beside the specifications, and of the folders.
 
     Later ones win. Raises `SpecificationError` for a definition that cannot be read.
     """
@@ -59,17 +74,17 @@ def read_definitions(program: Program, files: Sequence[Path], folders: Sequence[
     return definitions
 
 
-def definition_folders(program: Program, files: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
-    """Return the folders of definitions beside the files, and those that are given."""
+def definition_folders(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
+    """Return the folders of definitions beside the files, and the given ones."""
     for folder in folders:
         if not folder.is_dir():
-            raise program.usage_error(f"--msg: {folder} is no folder")
+            raise program.usage_error(f"--msg: {folder} is not a folder")
     beside = dict.fromkeys(file.parent / BESIDE for file in files)
     return [*(path for path in beside if path.is_dir()), *folders]
 
 
-def definition_texts(program: Program, folder: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """The definitions below a folder by `package/File`, and where each stands, by that name and the type's."""
+def definition_texts(program: CommandContext, folder: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the definitions below a folder by `package/File`, and their paths by that name and by type."""
     texts: dict[str, str] = {}
     places: dict[str, str] = {}
     for path in sorted(path for path in folder.rglob("*") if path.suffix in (".msg", ".srv")):
@@ -77,7 +92,7 @@ def definition_texts(program: Program, folder: Path) -> tuple[dict[str, str], di
             continue
         package = path.parent.parent if path.parent.name in ("msg", "srv") else path.parent
         if package == folder.parent or path.parent == folder:
-            text = f"a definition belongs into the folder of its package: {folder}/package/{path.name}"
+            text = f"a definition belongs in the folder of its package: {folder}/package/{path.name}"
             raise SpecificationError.at(Position(str(path), 1, 1), text)
         name = f"{package.name}/{path.name}"
         places[name] = places[name.rsplit(".", 1)[0]] = str(path)
@@ -85,7 +100,7 @@ def definition_texts(program: Program, folder: Path) -> tuple[dict[str, str], di
     return texts, places
 
 
-def _text_of(program: Program, path: Path) -> str:
+def _text_of(program: CommandContext, path: Path) -> str:
     try:
         return program.read_text(path)
     except OSError as error:

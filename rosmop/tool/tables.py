@@ -1,15 +1,15 @@
-"""How verbs show tables."""
+"""Print tables."""
 
 import sys
 
 from rich.console import Console
 from rich.table import Column, Table
 
-_WIDE = 200  # columns, where nobody looks at them through a window
+_WIDE = 200  # columns, if the output is not a terminal
 
 
 def table_of(*heads: str | Column) -> Table:
-    """An empty table with these heads."""
+    """Return an empty table with these column heads."""
     return Table(*heads, box=None, padding=(0, 2, 0, 0), header_style="dim")
 
 

@@ -1,6 +1,6 @@
-"""Write lines: coloured on a terminal, plain otherwise, JSON when asked for.
+"""Write lines: coloured on a terminal, plain otherwise, or as JSON.
 
-Strings from files and messages never reach a terminal with control characters in them, and are never read as markup.
+Control characters of untrusted strings are escaped, and the strings are never read as markup.
 """
 
 import json
@@ -15,7 +15,7 @@ from rich.text import Text
 
 
 def printable(text: str) -> str:
-    """Return the text with everything that a terminal could act on escaped."""
+    """Return the text with its control characters escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
@@ -25,7 +25,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def refused(findings: Iterable[object]) -> typer.Exit:
-    """Write the errors of a text, one on each line; raise the result (exit status 1)."""
+    """Write errors, one on each line; the caller raises the result (exit status 1)."""
     for finding in findings:
         typer.echo(printable(str(finding)), err=True)
     return typer.Exit(1)
