@@ -8,7 +8,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from rosmop.check.sources import compiled_from
-from rosmop.form.positions import Finding
+from rosmop.form.positions import Diagnostic
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
 from rosmop.run.outcomes import Outcome
@@ -93,12 +93,17 @@ def load(
     return monitors
 
 
+def action(body: str, *, before: str = "") -> str:
+    """Return a specification with an action on `/t`, `std_msgs/Int32` bound to `x`; `before` are declarations."""
+    return f"s() {{ {before} event e(int x) /t std_msgs/Int32 '{{data:x}}' {{ {body} }} }}"
+
+
 def act(body: str, *, before: str = "", data: int = 0, most: int = BUDGET) -> Outcome:
-    """What comes of an action on `/t`, `std_msgs/Int32` bound to `x`; `before` are declarations and functions.
+    """Return the result of an action on `/t`, `std_msgs/Int32` bound to `x`; `before` are declarations and functions.
 
     `most` are the instructions that a message may take.
     """
-    text = f"s() {{ {before} event e(int x) /t std_msgs/Int32 '{{data:x}}' {{ {body} }} }}"
+    text = action(body, before=before)
     told = message("std_msgs/Int32", data=data)
     monitors = load(text)
     monitors.monitor("s").context.most = most
@@ -106,14 +111,14 @@ def act(body: str, *, before: str = "", data: int = 0, most: int = BUDGET) -> Ou
 
 
 def shown(expression: str, *, conversion: str = "%s", before: str = "", data: int = 0) -> str:
-    """What an expression prints; a fault's text if there is one."""
+    """Return the output of an expression; a fault's text if there is one."""
     outcome = act(f'ROS_INFO("{conversion}", {expression});', before=before, data=data)
     if outcome.faults:
         return f"fault: {outcome.faults[0].text}"
     return outcome.log[0].text
 
 
-def refused(text: str) -> list[Finding]:
+def refused(text: str) -> list[Diagnostic]:
     """The errors of a specification; fails if there is none."""
     try:
         MonitorSet.of(compiled_from({"x.rv": text}, definitions()))
@@ -122,7 +127,7 @@ def refused(text: str) -> list[Finding]:
     raise AssertionError("the specification was accepted")
 
 
-def refused_action(body: str, *, before: str = "") -> list[Finding]:
+def refused_action(body: str, *, before: str = "") -> list[Diagnostic]:
     """The errors of an action on `/t`, `std_msgs/Int32` bound to `x`; columns count from the action."""
     text = f"s() {{ {before}\nevent e(int x) /t std_msgs/Int32 '{{data:x}}' {{\n{body}\n}} }}"
     return refused(text)

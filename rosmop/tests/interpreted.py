@@ -1,4 +1,4 @@
-"""The same monitors once more, whose messages go nowhere but through the interpreter: what a module is held against."""
+"""The same monitors in the interpreter only, as a reference for modules."""
 
 from collections.abc import Mapping
 from dataclasses import replace

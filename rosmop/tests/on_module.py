@@ -8,6 +8,6 @@ from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
 
 
-def on_module(compiled: Compiled, on_fault: OnFault = "drop", trials: Collection[str] = ()) -> MonitorSet:
+def on_module(compiled: Compiled, on_fault: OnFault = "drop", shadows: Collection[str] = ()) -> MonitorSet:
     """Return the set of what was compiled, with a module of its own; not started."""
-    return MonitorSet.of(compiled, on_fault, fast=fast_path_of(compiled.without(trials)), trials=trials)
+    return MonitorSet.of(compiled, on_fault, fast=fast_path_of(compiled.without(shadows)), shadows=shadows)

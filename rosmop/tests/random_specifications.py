@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from random import Random
 
+from rosmop.tests import acting
 from roswire.definitions import Definitions
-from roswire.standard import standard_definitions
 
 _OF_PLAIN = (
     "uint8 kind\nint32 count\nfloat64 x\nfloat32 y\nbool on\ntime when\nint64[3] three\nuint8[] rest\n"
@@ -34,7 +34,7 @@ PLAIN = ("/plain", "/serve request")
 
 
 def ways(seed: int) -> tuple[str, ...]:
-    """What to draw a topic from, or a part of a service, which some seeds have."""
+    """Return the choices for a topic, or for a part of a service, which some seeds have."""
     served = ("/serve request", "/serve request", "/serve response", "/plain")
     return served if seed % 4 == 3 else ("/plain", "/plain", "/stamped")
 
@@ -43,6 +43,7 @@ _PLAIN = {"kind": "int", "count": "int", "x": "double", "y": "float", "on": "boo
           "three[1]": "long", "x ": "int", "three": "std::vector<long>", "rest": "uint8_t[]"}  # fmt: skip
 _STAMPED = {"frame": "std::string", "x": "double", "count": "int", "values[1]": "double", "kind": "int",
             "when.sec": "unsigned int", "values": "std::vector<double>", "names": "std::string[]"}  # fmt: skip
+_NUMBERS = ("int", "long", "unsigned int", "float", "double", "bool")
 _LOGICS = (
     "fsm: here [ e0 -> there, default here ] there [ e0 -> here, default there ]{here}{there}{fail}",
     "fsm: one [ e0 -> two, default one ] two [ e0 -> three ] three [ default three ]{three}{fail}",
@@ -65,8 +66,8 @@ _HANDLERS = (*[""] * 8, "@{} {{ }}", '@{} {{ ROS_WARN("{}"); }}', "@{} {{ DROP; 
 
 
 def definitions() -> Definitions:
-    """ROS's definitions and the two of these tests."""
-    return standard_definitions().extended(OWN)
+    """ROS's definitions, and those of these tests."""
+    return acting.definitions().extended(OWN)
 
 
 @dataclass(frozen=True)
@@ -87,10 +88,11 @@ class Traffic:
 
 
 class Specifications:
-    """Random texts of specifications."""
+    """Random texts of specifications. With `numbers`, they have what the module takes: numbers and conditions."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, *, numbers: bool = False) -> None:
         self._random = Random(seed)  # noqa: S311  draws examples, not keys
+        self._numbers = numbers
         self._ways = ways(seed)
 
     def texts(self) -> list[str]:
@@ -115,6 +117,8 @@ class Specifications:
         random = self._random
         topic = random.choice(self._ways)
         fields = _PLAIN if topic in PLAIN else _STAMPED
+        if self._numbers:
+            fields = {field: kind for field, kind in fields.items() if kind in _NUMBERS}
         chosen = random.sample(sorted(fields), random.randint(0, 3))
         arrays = {one for one in chosen if f"{one}[1]" in chosen}
         chosen = [one for one in chosen if one not in arrays]
@@ -176,9 +180,17 @@ class Specifications:
         value = self._expression(readable, 2)
         assigned = [name for name in names if name in readable] * 3
         texts = [name for name, (_, kind) in names.items() if kind == "std::string"]
-        choices = [
+        of_numbers = [
             f"total = {value};", f"level = {value};", "total++;", "seen = !seen;", f"total += {value};",
             *(f"{name} = {value};" for name in assigned),
+        ]  # fmt: skip
+        if self._numbers:
+            if depth:
+                inner, other = (self._statement(names, readable, depth - 1) for _ in range(2))
+                of_numbers += [f"if ({self._condition(readable)}) {{ {inner} }} else {{ {other} }}"] * 5
+            return random.choice([*of_numbers, "return;", "DROP;"])
+        choices = [
+            *of_numbers,
             *(f'if ({name} == "abc") {{ last = {name}; }}' for name in texts),
             *(f'ROS_INFO("%s %.3f %d", {name}.c_str(), {value}, total);' for name in texts),
             f'ROS_WARN("%g and %5d", (double) {value}, total);', f"std::cout << {value} << std::endl;",

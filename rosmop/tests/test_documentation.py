@@ -6,26 +6,26 @@ from pathlib import Path
 import pytest
 
 from rosmop.check.loops import MAX_NESTED
+from rosmop.check.members import TIME_METHODS
 from rosmop.check.standard_functions import LIBRARY
 from rosmop.check.string_members import TEXT_METHODS
-from rosmop.check.time_members import MOMENT_METHODS
 from rosmop.check.vector_members import VECTOR_METHODS
 from rosmop.runtime.action_context import BUDGET, MAX_BYTES, MAX_CALLS
 from rosmop.runtime.numbers import MATH
 from rosmop.tests.acting import load
 from rosmop.text.parser import MAX_CHARACTERS, MAX_DEPTH
 
-PAGE = (Path(__file__).parents[2] / "docs" / "rv-language.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "rv-language.md").read_text()
 CODE = re.findall(r"```cpp\n(.*?)```", PAGE, re.DOTALL)
 
 
 def test_the_example_loads() -> None:
-    """What the page shows as a file is one."""
+    """Each example file of the page is valid."""
     assert [monitor.name for monitor in load(CODE[0]).monitors] == ["safeTrigger"]
 
 
 def test_the_example_of_a_property_loads() -> None:
-    """What the page shows as a property is one."""
+    """Each example property of the page is valid."""
     events = "event go() /t std_msgs/Empty '{}' { } event stop() /u std_msgs/Empty '{}' { }"
     text = CODE[1]
     assert load(f"s() {{ {events} {text} }}").monitors[0].properties
@@ -42,11 +42,11 @@ def row(head: str) -> str:
         ("`<math.h>`", MATH),
         ("strings", TEXT_METHODS),
         ("vectors", VECTOR_METHODS),
-        ("`ros::Time`, `ros::Duration`", MOMENT_METHODS),
+        ("`ros::Time`, `ros::Duration`", TIME_METHODS),
     ],
 )
 def test_every_function_is_on_the_page(head: str, names: dict[str, object]) -> None:
-    """What can be called is written down."""
+    """Each function that can be called is documented."""
     words = set(re.findall(r"\w+", row(head)))
     assert set(names) - words - {"data", "nearbyint", "fromNSec"} == set()
 

@@ -1,4 +1,4 @@
-"""What the module takes is what the interpreter makes of it, of any specifications: bytes, records, faults, state."""
+"""For any specifications, module and interpreter agree on bytes, records, faults and state."""
 
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,17 @@ from rosmop.check.sources import compiled_from
 from rosmop.form import nodes
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
-from rosmop.runtime.values import Values
+from rosmop.run.margins import MarginReader
+from rosmop.runtime.values import ValueCodec
 from rosmop.tests.acting import message
+from rosmop.tests.both_ways import state_of
 from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
 from rosmop.tests.on_module import on_module
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
 from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
-from rosmop.types.messages import Messages as MessageTypes
+from rosmop.types.messages import MessageTypes
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
 
@@ -31,6 +33,8 @@ FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthChec
 def check(given: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> None:
     """Fail if the two ways differ anywhere on the way of these messages, or in the variables at the end."""
     other, monitors = beside(given), on_module(given.compiled, given.on_fault)
+    for either in (monitors, other):
+        MarginReader(either)
     check_same(monitors.start(0), other.start(0))
     for number, (topic, body) in enumerate(traffic):
         time = number * step_ns
@@ -38,7 +42,8 @@ def check(given: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> 
     for one in monitors.compiled.specifications:
         for variable in one.variables:
             known, found = (each.value(one.name, variable) for each in (monitors, other))
-            assert repr(known) == repr(found)  # a NaN is one, too
+            assert repr(known) == repr(found)  # a NaN is also one
+    assert state_of(monitors) == state_of(other)
 
 
 @FEW
@@ -46,14 +51,19 @@ def check(given: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> 
     seed=st.integers(0, 1 << 30),
     on_fault=st.sampled_from(["drop", "pass"]),
     step_ns=st.sampled_from([1, 700_000]),
+    wild=st.lists(st.binary(max_size=80), max_size=4),
 )
-def test_random_specifications_and_messages(seed: int, on_fault: OnFault, step_ns: int) -> None:
+def test_single_messages_have_the_outcomes_of_the_interpreter(
+    seed: int, on_fault: OnFault, step_ns: int, wild: list[bytes]
+) -> None:
     """Actions, conditions, helper functions, loops, timers and properties, on messages that are not always whole."""
     sources = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
     messages = Messages(seed)
-    together = [(one.topic, body) for one in (messages.traffic() for _ in range(4)) for body in one.bodies()]
+    together = [
+        (one.topic, body) for one in (messages.traffic() for _ in range(4)) for body in (*one.bodies(), *wild)
+    ]
     try:
-        monitors = MonitorSet.of(compiled_from(sources, definitions()), on_fault)
+        monitors = MonitorSet.of(compiled_from(sources, definitions(), margins=seed % 4 > 1), on_fault)
     except SpecificationError:
         return  # a draw that means nothing
     check(monitors, together, step_ns)
@@ -71,7 +81,7 @@ def test_random_specifications_and_messages(seed: int, on_fault: OnFault, step_n
     ],
     ids=["kind", "type", "missing", "missing in a type", "statement as a value", "no value of the language"],
 )
-def test_what_is_no_form_is_not_read(wrong: list[object]) -> None:
+def test_data_that_is_not_a_form_is_rejected(wrong: list[object]) -> None:
     """Whatever is sent in its place: what is read is what the form can be, throughout."""
     statement = msgspec.msgpack.Decoder(nodes.Statement)
     assert statement.decode(msgspec.msgpack.encode(["Break", 1])) == nodes.Break(1)
@@ -90,14 +100,14 @@ def shipped() -> MonitorSet:
     return MonitorSet.of(compiled_from(sources, standard_definitions().extended(own)))
 
 
-def a_value(values: Values, kind: value_types.Type) -> st.SearchStrategy[Any]:
+def a_value(values: ValueCodec, kind: value_types.Type) -> st.SearchStrategy[Any]:
     """Any value of a type."""
-    if isinstance(kind, value_types.Record):
+    if isinstance(kind, value_types.RecordType):
         return st.tuples(*(a_value(values, field) for field in values.fields(kind))).map(list)
-    if isinstance(kind, value_types.Vector):
+    if isinstance(kind, value_types.VectorType):
         most = 4 if kind.length is None else kind.length
         return st.lists(a_value(values, kind.element), min_size=kind.length or 0, max_size=most)
-    if isinstance(kind, value_types.Integer):
+    if isinstance(kind, value_types.IntegerType):
         return st.integers(kind.least, kind.most)
     known: dict[value_types.Type, st.SearchStrategy[Any]] = {
         value_types.BOOL: st.booleans(),
@@ -115,10 +125,10 @@ def a_value(values: Values, kind: value_types.Type) -> st.SearchStrategy[Any]:
 def test_shipped_specifications(data: st.DataObject) -> None:
     """Any messages on their topics, cut short now and then."""
     monitors = shipped()
-    values = Values(MessageTypes(monitors.definitions))
+    values = ValueCodec(MessageTypes(monitors.definitions))
     traffic = []
     for topic in data.draw(st.lists(st.sampled_from(sorted(monitors.topics)), min_size=1, max_size=12)):
-        kind = value_types.Record(monitors.topics[topic])
+        kind = value_types.RecordType(monitors.topics[topic])
         body = bytearray()
         values.encoder(kind)(data.draw(a_value(values, kind)), body)
         end = data.draw(st.just(len(body)) | st.integers(0, len(body)))
@@ -144,7 +154,7 @@ def test_shipped_specifications(data: st.DataObject) -> None:
         "swap(position[0], position[1]);",
     ],
 )
-def test_values_that_grow_and_fields_of_any_size(body: str) -> None:
+def test_growing_values_and_fields_of_any_size_do_the_same(body: str) -> None:
     """Vectors, strings, whole messages, references, recursion, the bounds of memory and work."""
     text = f"""s() {{ int n = 0; sensor_msgs::JointState v;
     void f(int &x) {{ x = x * 3; }}

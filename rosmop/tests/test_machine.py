@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosmop.fast import wasm_instance
-from rosmop.fast.wasm_instance import PAGE, Machine, MachineError, MachineTrap, translated
+from rosmop.fast.wasm_instance import PAGE, WasmError, WasmInstance, WasmTrap, translated
 from rosmop.tests.examples import examples
 
 LIMIT = 4 * PAGE
@@ -35,25 +35,25 @@ TRAPS = {
 }
 
 
-def run(code: bytes, limit: int = LIMIT) -> Machine:
+def run(code: bytes, limit: int = LIMIT) -> WasmInstance:
     """A machine of this module."""
-    return Machine(translated(code, limit), limit)
+    return WasmInstance(translated(code, limit), limit)
 
 
-def made(text: str, limit: int = LIMIT, pages: str = "1") -> Machine:
+def made(text: str, limit: int = LIMIT, pages: str = "1") -> WasmInstance:
     """A machine of these functions."""
     return run(bytes(wasmtime.wat2wasm(f'(module (memory (export "memory") {pages}) {text})')), limit)
 
 
-def trap_of(one: Machine, name: str | int, *arguments: int, fuel: int = FUEL) -> MachineTrap:
+def trap_of(one: WasmInstance, name: str | int, *arguments: int, fuel: int = FUEL) -> WasmTrap:
     """The trap that ends this call."""
-    with pytest.raises(MachineTrap) as caught:
+    with pytest.raises(WasmTrap) as caught:
         one.call(name, *arguments, fuel=fuel)
     return caught.value
 
 
 def test_arguments_and_results_by_name_and_number() -> None:
-    """Of 32 and 64 bits, with a sign, and no result; what has others than integers has no number."""
+    """Signed results of 32 and 64 bits, or none; functions with other types have no number."""
     one = made("""
         (func (export "first") (param f64))
         (func (export "mixed") (param i32 i64 i32) (result i64)
@@ -65,13 +65,13 @@ def test_arguments_and_results_by_name_and_number() -> None:
     assert one.call("narrow", -1, fuel=FUEL) == one.call(1, (1 << 32) - 1, fuel=FUEL) == -1
     assert one.call("none", fuel=FUEL) is one.call(2, fuel=FUEL) is None
     for name in ("first", "other", 3, "memory"):
-        with pytest.raises(MachineError, match="has no function"):
+        with pytest.raises(WasmError, match="has no function"):
             one.call(name, fuel=FUEL)
 
 
 @pytest.mark.parametrize("arguments", [(), (1, 2), (1 << 63,), (0.5,)])
 def test_other_arguments(arguments: tuple[int, ...]) -> None:
-    """Too few, too many, too large, no integers: refused before anything runs."""
+    """Missing, surplus, oversized or non-integer values are refused before anything runs."""
     one = made("""(func (export "mark") (param i64) (i32.store (i32.const 0) (i32.const 1)))""")
     with pytest.raises(struct.error):
         one.call("mark", *arguments, fuel=FUEL)
@@ -80,7 +80,7 @@ def test_other_arguments(arguments: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("reason", TRAPS)
 def test_every_trap_has_its_reason_and_the_machine_goes_on(reason: str) -> None:
-    """What was written before a trap stays."""
+    """Writes before a trap stay."""
     one = made(f"""(type $none (func)) (table 2 funcref) (elem (i32.const 1) $other)
         (func $other (param i32))
         (func $self (export "fail") (i32.store (i32.const 8) (i32.const 7)) {TRAPS[reason]})
@@ -99,7 +99,7 @@ def test_each_call_has_its_own_fuel() -> None:
     def is_enough(fuel: int) -> bool:
         try:
             one.call("turns", 1000, fuel=fuel)
-        except MachineTrap as trap:
+        except WasmTrap as trap:
             assert trap.reason == "out of fuel"
             return False
         return True
@@ -111,16 +111,16 @@ def test_each_call_has_its_own_fuel() -> None:
 
 
 def test_bytes_that_are_copied_use_fuel() -> None:
-    """One instruction is no way to work for long."""
+    """One instruction cannot run for long."""
     one = made("""(func (export "fill") (memory.fill (i32.const 0) (i32.const 1) (i32.const 65536)))""")
     assert trap_of(one, "fill", fuel=60_000).reason == "out of fuel"
     one.call("fill", fuel=70_000)
 
 
 def test_an_unknown_wasmtime_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What it lays out in another way would be read wrongly."""
+    """A different layout would be read wrongly."""
     monkeypatch.setattr(wasm_instance, "VERSION", "49.")
-    with pytest.raises(MachineError, match="wasmtime 49"):
+    with pytest.raises(WasmError, match="wasmtime 49"):
         wasm_instance.load.__wrapped__()
 
 
@@ -140,7 +140,7 @@ def test_the_memory_grows_in_place_and_views_stay_right() -> None:
     assert (one.memory[0], one.call("at", 0, fuel=FUEL), one.call("at", PAGE, fuel=FUEL)) == (2, 2, 9)
     one.reserve(10)
     assert one.call("grow", 2, fuel=FUEL) == -1
-    with pytest.raises(MachineError, match="failed to grow"):
+    with pytest.raises(WasmError, match="failed to grow"):
         one.reserve(LIMIT + 1)
     one.reserve(LIMIT)
     assert len(one.memory) == LIMIT
@@ -152,7 +152,7 @@ def test_the_limit_is_whole_pages_of_what_is_given(limit: int) -> None:
     """Whatever is reserved for it."""
     one = made("", limit)
     one.reserve(limit // PAGE * PAGE)
-    with pytest.raises(MachineError):
+    with pytest.raises(WasmError):
         one.reserve(limit // PAGE * PAGE + 1)
 
 
@@ -170,13 +170,13 @@ def test_the_limit_is_whole_pages_of_what_is_given(limit: int) -> None:
 )
 def test_what_is_no_machine(code: str | bytes, reason: str) -> None:
     """It is refused with the reason."""
-    with pytest.raises(MachineError, match=reason):
+    with pytest.raises(WasmError, match=reason):
         run(code if isinstance(code, bytes) else bytes(wasmtime.wat2wasm(code)))
 
 
 def test_what_a_module_does_at_its_start_is_bounded_too() -> None:
     """It has fuel, and its traps are traps."""
-    with pytest.raises(MachineTrap) as caught:
+    with pytest.raises(WasmTrap) as caught:
         made("(func $begin (loop (br 0))) (start $begin)")
     assert caught.value.reason == "out of fuel"
 
@@ -211,7 +211,7 @@ def test_a_view_outlives_its_machine() -> None:
     many = [made("", pages="4") for _ in range(50)]
     assert (view[0], len(many)) == (3, 50)
     for use in (lambda: one.memory, lambda: one.reserve(1), lambda: one.call("f", fuel=1)):
-        with pytest.raises(MachineError, match="closed"):
+        with pytest.raises(WasmError, match="closed"):
             use()
 
 
@@ -254,11 +254,11 @@ def test_damaged_modules(changes: list[tuple[int, int]], length: int, argument: 
     for at, value in changes:
         code[at] = value
     other = made("", PAGE)
-    with contextlib.suppress(MachineError, MachineTrap):
+    with contextlib.suppress(WasmError, WasmTrap):
         one = run(bytes(code[:length]))
         for number in range(8):
             for arguments in ((), (argument,), (argument, 3), (argument, 3, argument)):
-                with contextlib.suppress(MachineError, MachineTrap, struct.error):
+                with contextlib.suppress(WasmError, WasmTrap, struct.error):
                     one.call(number, *arguments, fuel=10_000)
         assert len(one.memory) <= LIMIT
         one.memory[:] = bytes(len(one.memory))
@@ -281,7 +281,7 @@ def test_calls_and_traps_leave_nothing_behind() -> None:
             one.call("fine", fuel=FUEL)
             try:
                 one.call("fail", 1, fuel=FUEL)
-            except MachineTrap:
+            except WasmTrap:
                 continue
         for _ in range(machines):
             made("", pages="4").memory[::4096] = bytes(LIMIT // 4096)
@@ -297,13 +297,13 @@ def test_many_machines_need_few_addresses() -> None:
     done = subprocess.run(
         [sys.executable, "-c", f"""
 import resource, wasmtime
-from rosmop.fast.wasm_instance import Machine, translated
+from rosmop.fast.wasm_instance import WasmInstance, translated
 code = bytes(wasmtime.wat2wasm('(module (memory (export "memory") 1) (func (export "f") unreachable))'))
 code = translated(code, 1 << 20)
-Machine(code, 1 << 20)
+WasmInstance(code, 1 << 20)
 had = int(open("/proc/self/statm").read().split()[0]) * {resource.getpagesize()}
 resource.setrlimit(resource.RLIMIT_AS, (had + (400 << 20), had + (400 << 20)))
-machines = [Machine(code, 1 << 20) for _ in range(250)]
+machines = [WasmInstance(code, 1 << 20) for _ in range(250)]
 for one in machines:
     one.reserve(1 << 20)
     one.memory[-1] = 1
@@ -320,14 +320,14 @@ def test_traps_come_without_signals() -> None:
     done = subprocess.run(
         [sys.executable, "-c", f"""
 import faulthandler, wasmtime
-from rosmop.fast.wasm_instance import Machine, MachineTrap, translated
+from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translated
 code = bytes(wasmtime.wat2wasm({f'(module (memory (export "memory") 1) {fails})'!r}))
-one = Machine(translated(code, 1 << 16), 1 << 16)
+one = WasmInstance(translated(code, 1 << 16), 1 << 16)
 faulthandler.enable()
 for number in range(5):
     try:
         one.call(number, fuel=1000)
-    except MachineTrap as trap:
+    except WasmTrap as trap:
         print(trap)
 """],
         capture_output=True, text=True, check=False, timeout=120,

@@ -1,4 +1,4 @@
-"""What one relay runs of a set: its specifications, and the machine code of their module."""
+"""The part of a set that one relay runs: its specifications, and the machine code of their module."""
 
 import hashlib
 import os
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rosmop.check.sources import compiled_from
 from rosmop.fast.serialization import decoded_part, encoded_part
 from rosmop.fast.wasm_build import part_of
-from rosmop.fast.wasm_instance import MachineError
+from rosmop.fast.wasm_instance import WasmError
 from rosmop.fast.wasm_runner import WasmFastPath
 from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
@@ -96,10 +96,10 @@ def test_it_is_the_same_whoever_makes_it() -> None:
 @FEW
 @given(seed=st.integers(0, 1 << 30))
 def test_it_does_what_its_specifications_do_in_the_set(seed: int) -> None:
-    """Of random ones; what is told of places in the text is the same, and so is the module that was sent."""
+    """Random specifications have the same reported places in the text and the same sent module."""
     texts = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
     try:
-        whole = compiled_from(texts, definitions(), margins=True)
+        whole = compiled_from(texts, definitions())
     except SpecificationError:
         return  # a draw that means nothing
     for names in whole.groups([one.name for one in whole.specifications]):
@@ -119,8 +119,8 @@ def test_it_does_what_its_specifications_do_in_the_set(seed: int) -> None:
         assert stories[0] == stories[1]
 
 
-def test_only_what_is_not_on_trial_has_a_module() -> None:
-    """The others are given copies; those that share variables with them are on trial with them."""
+def test_only_what_is_not_in_shadow_mode_has_a_module() -> None:
+    """The others are given copies; those that share variables with them are also in shadow mode."""
     part = part_of(compiled("a", "b"), ["a", "b"], ["b"])
     assert list(part.module.feeds) == ["/a"]
     assert {one.name for one in part.compiled.specifications} == {"a", "b"}
@@ -130,12 +130,12 @@ def test_only_what_is_not_on_trial_has_a_module() -> None:
 def test_what_is_no_machine_code_of_this_library(wrong: bytes) -> None:
     """It is refused, and nothing of it is run."""
     part = part_of(compiled("a"), ["a"], [])
-    with pytest.raises(MachineError):
+    with pytest.raises(WasmError):
         MonitorSet.of(part.compiled, fast=WasmFastPath(replace(part.module, code=wrong)))
 
 
 @pytest.mark.parametrize("length", [0, 1, 100])
 def test_a_part_that_is_cut(length: int) -> None:
-    """It is no part."""
+    """It is not a part."""
     with pytest.raises(msgspec.MsgspecError):
         decoded_part(encoded_part(part_of(compiled("a"), ["a"], []))[:length])

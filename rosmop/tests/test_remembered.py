@@ -1,4 +1,4 @@
-"""The state of a property outlives the process that had it (of whole monitors: `relay/monitors/test_keeper.py`)."""
+"""The state of a property outlives its process (of whole monitors: `relay/monitors/test_state_keeper.py`)."""
 
 from random import Random
 from typing import Any
@@ -76,7 +76,7 @@ def test_what_is_no_state_of_a_property_is_refused(name: str, data: object) -> N
 
 
 def test_a_deep_stack_is_too_large_to_keep() -> None:
-    """What is written with each message is bounded: a grammar nested thousands deep is not kept, and that is said."""
+    """The data written with each message is bounded: a deeply nested grammar is not kept, which is reported."""
     formula = compiled(FORMULAS["cfg"]).compiled.specifications[0].properties[0].property
     run = formula.start(0)
     for _ in range(2 * MOST_PARTS):

@@ -11,7 +11,7 @@ from rosmop.check.sources import compiled_from
 from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
 from rosmop.run.interpreter import Interpreter
-from rosmop.run.monitor import Monitor
+from rosmop.run.monitor import MonitorInstance
 from rosmop.run.outcomes import Outcome
 from rosmop.tests.acting import fields, message
 from rosmop.tests.on_module import on_module
@@ -85,7 +85,7 @@ def odometry(x: float, y: float = 0.0, speed: float = 0.0) -> bytes:
 
 
 def fix(latitude: float, longitude: float) -> bytes:
-    """What the GPS says."""
+    """Return a message of the GPS."""
     return message("sensor_msgs/NavSatFix", latitude=latitude, longitude=longitude)
 
 
@@ -122,7 +122,7 @@ def scan(distance: float, beams: int = 61) -> bytes:
 
 
 def commanded(monitors: MonitorSet, time: int, forward: float = 1.0) -> Outcome:
-    """What becomes of a velocity command."""
+    """Return the outcome of a velocity command."""
     return monitors.process("/landshark_control/base_velocity", drive(forward), time)
 
 
@@ -156,7 +156,7 @@ def test_an_obstacle_beside_the_robot_does_not_stop_it() -> None:
 
 
 def test_a_silent_laser_stops_the_robot() -> None:
-    """Half a second without a scan counts as an obstacle, until scans come again; before the first, too."""
+    """Half a second without a scan counts as an obstacle, until scans come again; also before the first one."""
     monitors = shipped("obstacle_avoidance")
     assert commanded(monitors, 1).result == "changed"
     monitors.process("/landshark/scan", scan(9.0), SECOND)
@@ -200,7 +200,7 @@ def goal(monitors: MonitorSet, part: str, name: str, time: float) -> Outcome:
 
 
 def test_each_goal_is_answered_within_its_cancel() -> None:
-    """Of two goals that are cancelled, the one without an answer within three seconds is named."""
+    """The cancelled goal without an answer within three seconds is named, the other is not."""
     monitors = shipped("goals")
     for number, name in enumerate(("a", "b", "c")):
         goal(monitors, "goal", name, number)
@@ -212,7 +212,7 @@ def test_each_goal_is_answered_within_its_cancel() -> None:
 
 
 def test_an_id_is_that_of_one_goal() -> None:
-    """The second goal of an id is told with it; after the answer nothing is kept but the id."""
+    """The second goal of an id is reported with it; after the answer nothing is kept but the id."""
     monitors = shipped("goals")
     goal(monitors, "goal", "a", 1)
     (verdict,) = goal(monitors, "goal", "a", 2).verdicts
@@ -235,7 +235,7 @@ def test_a_set_that_is_gone_leaves_nothing_to_the_garbage_collector() -> None:
         left = [
             part
             for part in gc.get_objects()
-            if id(part) in known and isinstance(part, (Monitor, Interpreter))
+            if id(part) in known and isinstance(part, (MonitorInstance, Interpreter))
         ]
     finally:
         gc.enable()

@@ -11,6 +11,7 @@ from rosmop.check.sources import compiled_from
 from rosmop.logics.interface import CompiledProperty, FormulaError, FormulaRun, RunFaultError
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import definitions, load, message
+from rosmop.tests.both_ways import BothWays, plain
 from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
 from rosmop.tests.logics.driving import ABC, compiled, seeded
@@ -18,7 +19,6 @@ from rosmop.tests.logics.temporal import Tree, draw
 from rosmop.tests.logics.test_bounded import ARITY, FUTURE, PAST, PRINTER, worth
 from rosmop.tests.logics.test_ltl import PRINTER as LTL_PRINTER
 from rosmop.tests.logics.test_pattern import Meaning
-from rosmop.tests.test_walks import Fed, plain
 
 SECOND = 10**9
 Timed = list[tuple[int, str]]
@@ -62,7 +62,7 @@ def violates(tree: Tree, before: Timed, event: tuple[int, str]) -> bool:
 
 
 def told(property_: CompiledProperty, trace: Timed) -> tuple[str, ...]:
-    """What a fresh run tells at the last event of a trace."""
+    """Return the verdict of a fresh run at the last event of a trace."""
     run = property_.start(0)
     categories: tuple[str, ...] = ()
     for time, event in trace:
@@ -127,7 +127,7 @@ def _bounded(random: Random, operators: Sequence[str]) -> tuple[Tree, str]:
 
 @pytest.mark.parametrize("operators", [PAST, (*PAST, *FUTURE)], ids=["past", "future"])
 def test_random_metric_formulas_by_definition(operators: Sequence[str]) -> None:
-    """What goes on is what the definition of the formula says of the trace that went on before."""
+    """Each passed message agrees with the formula's definition on the trace that passed before."""
     random, dropped = seeded(26), 0
     for _ in range(examples(600)):
         tree, text = _bounded(random, operators)
@@ -240,11 +240,11 @@ def test_a_reset_by_a_message_that_is_dropped_later_is_none() -> None:
     assert [verdict.category for verdict in monitors.process("/b", b"", 3).verdicts] == ["violation"]
 
 
-def test_on_trial_the_trace_is_the_one_that_there_would_be() -> None:
+def test_in_shadow_mode_the_trace_is_the_one_that_there_would_be() -> None:
     """A specification in shadow mode drops nothing, and goes on as if it had."""
     monitors = MonitorSet.of(
         compiled_from({"s.rv": guard("pattern: globally: a forbids b within 5s")}, definitions()),
-        trials=["s"],
+        shadows=["s"],
     )
     monitors.start(0)
     results = []
@@ -269,7 +269,7 @@ def test_a_dropped_request_has_not_happened() -> None:
 
 
 def test_explanations_name_no_event_that_was_dropped() -> None:
-    """What is named has given the verdict to the trace that subscribers saw."""
+    """The named events gave the verdict on the trace that subscribers saw."""
     for formula in (
         "pattern: globally: a forbids b within 5s",
         "ptltl: b => !(<*> a)",
@@ -314,7 +314,7 @@ def test_the_module_takes_back_what_the_interpreter_takes_back() -> None:
             ]
             random.shuffle(events)
             texts.append(f"{name}() {{ int n = 0; {' '.join(events)} {' '.join(_formulas(random))} }}")
-        fed, time = Fed(*texts), 1
+        fed, time = BothWays(*texts), 1
         for _ in range(6):
             bodies = [plain(random.randint(0, 10), random.random(), random.randint(0, 2)) for _ in range(12)]
             time += random.randint(0, 3)
@@ -326,7 +326,7 @@ def test_the_module_takes_back_what_the_interpreter_takes_back() -> None:
 
 @pytest.mark.parametrize("creation", ["", "creation "])
 def test_slices_take_back_theirs(creation: str) -> None:
-    """Of a parametric specification each binding is guarded alone, as by a specification without parameters."""
+    """Each binding of a parametric specification is guarded alone, as without parameters."""
     random, dropped = seeded(31), 0
 
     def text(formula: str, parameters: str) -> str:

@@ -1,4 +1,4 @@
-"""What explains a verdict is enough for it: the named events alone, given to a run that begins anew, give the verdict.
+"""The explanation of a verdict is sufficient: the named events alone, in a new run, give the verdict.
 
 For each logic, over random formulas and traces. None of them can be left out (`fewest`).
 """
@@ -14,9 +14,9 @@ from rosmop.logics import mtl, ptcaret, ptltl
 from rosmop.logics.formula import read_formula
 from rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError, Run
 from rosmop.run import explain
-from rosmop.run.causes import NOBODY, SEQ, Explanation, Happened, Sender
 from rosmop.run.engine import MonitorSet
 from rosmop.run.explain import ClockedSteps, Steps, history_of
+from rosmop.run.outcomes import NOBODY, SEQ, EventOccurrence, Explanation, MessageSender
 from rosmop.run.subformulas import Meaning, deciding
 from rosmop.tests.acting import definitions, message
 from rosmop.tests.logics.driving import compiled, seeded
@@ -144,8 +144,8 @@ MAKERS = {
 def gives(
     made: CompiledProperty,
     before: Run | None,
-    explanation: Sequence[Happened],
-    target: Happened,
+    explanation: Sequence[EventOccurrence],
+    target: EventOccurrence,
     category: str,
 ) -> bool:
     """Whether events give a category, as a reader would try it: with the last of them, or by the target's deadline."""
@@ -166,14 +166,14 @@ def gives(
 
 def explained(
     made: CompiledProperty, random: Random, length: int
-) -> list[tuple[Explanation | None, Happened, str, Run | None]]:
+) -> list[tuple[Explanation | None, EventOccurrence, str, Run | None]]:
     """A random trace and each explanation of a verdict on it: of what, and (where it is cut) the run before it."""
     run, history, now = made.start(0), history_of(made, 0), 0
     found = []
     copies: dict[int, Run] = {}
 
     def note(event: int, time: int, number: int, categories: Sequence[str]) -> None:
-        happened = Happened(event, time, Sender(7, number, SEQ) if event >= 0 else NOBODY)
+        happened = EventOccurrence(event, time, MessageSender(7, number, SEQ) if event >= 0 else NOBODY)
         for category in dict.fromkeys(categories):
             explanation = history.explain(category)
             since = explanation.since if explanation is not None else None
@@ -187,7 +187,7 @@ def explained(
         if isinstance(history, Steps):
             copies[now] = copy.copy(run)
         event = random.randrange(len(made.events))
-        note(event, now, number, history.step(run, event, now, Sender(7, number, SEQ)))
+        note(event, now, number, history.step(run, event, now, MessageSender(7, number, SEQ)))
     return found
 
 
@@ -208,7 +208,7 @@ def test_what_is_kept_of_a_clock_is_what_steps_keep(logic: str) -> None:
                 said = []
                 while (deadline := run.deadline) is not None and deadline < now:
                     said += [history.explain(one) for one in history.expire(run)]
-                categories = history.step(run, event, now, Sender(7, number, SEQ))
+                categories = history.step(run, event, now, MessageSender(7, number, SEQ))
                 if number % 7 == 0:
                     said += [history.explain(one) for one in categories]
                 told.append(said)
@@ -271,7 +271,7 @@ def test_what_is_cut_says_so(logic: str, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_long_way_is_told_whole() -> None:
-    """What came back to where it had been is no part of it; a way that is too long to be shortened says so."""
+    """Loops back to an earlier state are left out; a path too long to be shortened is marked."""
     states = 400
     text = " ".join(f"s{number} [ a -> s{number + 1}, b -> s{number} ]" for number in range(states))
     made = compiled("fsm", f"{text} s{states} [ ]")
@@ -287,11 +287,11 @@ def test_a_long_way_is_told_whole() -> None:
 
 
 def test_the_latest_of_equal_explanations() -> None:
-    """Who asks why wants what happened now, and not what was as bad an hour ago."""
+    """An explanation has the present events, not equally bad ones of an hour ago."""
     made = compiled("ere", "(a b)* c")
     run, history = made.start(0), history_of(made, 0)
     for number, event in enumerate((0, 1, 0, 1, 2)):
-        history.step(run, event, number + 1, Sender(1, number, SEQ))
+        history.step(run, event, number + 1, MessageSender(1, number, SEQ))
     explanation = history.explain("match")
     assert explanation is not None
     assert [one.sender.number for one in explanation.events] == [4]
@@ -302,7 +302,7 @@ def test_a_verdict_of_now_is_not_explained_by_one_of_before() -> None:
     made = compiled("ptltl", "!c and (a -> <*> b)")
     run, history = made.start(0), history_of(made, 0)
     for number, event in enumerate((2, 0)):
-        history.step(run, event, number + 1, Sender(1, number, SEQ))
+        history.step(run, event, number + 1, MessageSender(1, number, SEQ))
     explanation = history.explain("violation")
     assert explanation is not None
     assert [one.event for one in explanation.events] == [0]
@@ -340,7 +340,7 @@ def test_what_decides_a_formula() -> None:
 
 
 def test_what_was_long_ago_is_known_by_what_it_led_to() -> None:
-    """Where there are no tables the last events are kept; the one that decides is older, and that is said."""
+    """Where there are no tables the last events are kept; the deciding one is older, and the explanation says so."""
     made = compiled("mtl", "a -> !(once[0,10s] b)")
     run, history = made.start(0), history_of(made, 0)
     for number, event in enumerate((1, *[0] * 4 * explain.KEPT)):
@@ -387,7 +387,7 @@ def test_a_verdict_of_a_slice_is_explained_by_its_own_events() -> None:
     outcome = None
     for number, (topic, value) in enumerate((("/start", 1), ("/start", 2), ("/end", 2), ("/start", 1))):
         data = message("std_msgs/Int32", data=value)
-        outcome = monitors.process(topic, data, number, Sender(number + 1))
+        outcome = monitors.process(topic, data, number, MessageSender(number + 1))
     assert outcome is not None
     [verdict] = outcome.verdicts
     assert verdict.binding == {"id": 1}

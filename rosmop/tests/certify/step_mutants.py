@@ -4,7 +4,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import replace
 
-from rosmop.fast.batch_codegen import WrittenModule
+from rosmop.fast.batch_codegen import WasmModule
 from rosmop.fast.wasm import signed, unsigned
 from rosmop.prove import decoding
 
@@ -19,9 +19,9 @@ class _Reader(decoding.Reader):
 
     def __init__(self, data: bytes) -> None:
         super().__init__(data)
-        self.found: list[tuple[int, int, decoding.Instruction]] = []
+        self.found: list[tuple[int, int, decoding.WasmInstruction]] = []
 
-    def instruction(self, code: int) -> decoding.Instruction:
+    def instruction(self, code: int) -> decoding.WasmInstruction:
         """Read one, and note it."""
         begin = self.at - 1
         one = super().instruction(code)
@@ -30,14 +30,14 @@ class _Reader(decoding.Reader):
         return one
 
 
-def _others(one: decoding.Instruction, kinds: list[str]) -> Iterator[tuple[str, bytes]]:
+def _others(one: decoding.WasmInstruction, kinds: list[str]) -> Iterator[tuple[str, bytes]]:
     """An instruction made wrong: the kind of the fault, and the bytes."""
     yield from _calculations(one)
     yield from _places(one, kinds)
     yield from _ways(one)
 
 
-def _calculations(one: decoding.Instruction) -> Iterator[tuple[str, bytes]]:
+def _calculations(one: decoding.WasmInstruction) -> Iterator[tuple[str, bytes]]:
     family, _, name = one.name.partition(".")
     for left, right in _PAIRS:
         for here, other in ((left, right), (right, left)):
@@ -50,7 +50,7 @@ def _calculations(one: decoding.Instruction) -> Iterator[tuple[str, bytes]]:
             yield "constant", code + signed(value)
 
 
-def _places(one: decoding.Instruction, kinds: list[str]) -> Iterator[tuple[str, bytes]]:
+def _places(one: decoding.WasmInstruction, kinds: list[str]) -> Iterator[tuple[str, bytes]]:
     if one.name in ("local.get", "local.set"):
         code = b"\x20" if one.name == "local.get" else b"\x21"
         place = int(one.operands[0])
@@ -65,7 +65,7 @@ def _places(one: decoding.Instruction, kinds: list[str]) -> Iterator[tuple[str, 
             )
 
 
-def _ways(one: decoding.Instruction) -> Iterator[tuple[str, bytes]]:
+def _ways(one: decoding.WasmInstruction) -> Iterator[tuple[str, bytes]]:
     if one.name in ("br", "br_if"):
         for step in (1, -1):
             if int(one.operands[0]) + step >= 0:
@@ -79,7 +79,7 @@ def _ways(one: decoding.Instruction) -> Iterator[tuple[str, bytes]]:
         yield "call", b"\x10" + unsigned(int(one.operands[0]) ^ 1)
 
 
-def walks(module: WrittenModule) -> Iterator[tuple[str, str, WrittenModule]]:
+def walks(module: WasmModule) -> Iterator[tuple[str, str, WasmModule]]:
     """The kind of each fault in the code of the first walk, the instruction, and the module that has it."""
     code = module.code
     at = 8
@@ -116,7 +116,7 @@ def walks(module: WrittenModule) -> Iterator[tuple[str, str, WrittenModule]]:
             yield kind, f"{one.name} {one.operands} at {begin}", replace(module, code=made)
 
 
-def tables(module: WrittenModule) -> Iterator[tuple[str, str, WrittenModule]]:
+def tables(module: WasmModule) -> Iterator[tuple[str, str, WasmModule]]:
     """The same of each cell (2 bytes) of all data."""
     code = module.code
     reader = _Reader(code)

@@ -9,20 +9,18 @@ from random import Random
 import pytest
 
 import rosmop.certify
-from appliance.specifications.checking import check
-from appliance.specifications.specification_files import (
-    Sources,
-    SpecificationsRefusedError,
-)
-from rosmop.certify.check import MOST_STEPS, Tables, certify
-from rosmop.certify.properties import certificate_of
+from rosmop.certify.check import MOST_STEPS, AutomatonTables, certify
+from rosmop.certify.properties import DEFECT, certificate_of, certificates_of
+from rosmop.check.sources import compiled_from
 from rosmop.form.positions import Position
 from rosmop.logics import catalogue
 from rosmop.logics.automaton import Automaton
 from rosmop.logics.catalogue import compile_property
-from rosmop.logics.interface import CompiledProperty, FiniteProperty, FormulaError, Source
-from rosmop.logics.tfsm import TimedMachine
+from rosmop.logics.interface import CompiledProperty, FiniteProperty, FormulaError, Logic, Source
+from rosmop.logics.tfsm import TimedStateMachine
+from rosmop.run.engine import MonitorSet
 from rosmop.tests.examples import examples
+from roswire.standard import standard_definitions
 
 EVENTS = ["a", "b", "c", "d"]
 ORIGIN = Position("x.rv", 1, 1)
@@ -30,7 +28,7 @@ Draw = Callable[[Random, int, Sequence[str]], str]
 
 
 def drawn(unary: Sequence[str], binary: Sequence[str], leaves: Sequence[str]) -> Draw:
-    """What draws a formula over these operators."""
+    """Return a function that draws a formula over these operators."""
 
     def draw(random: Random, depth: int, events: Sequence[str]) -> str:
         if depth == 0 or random.random() < 0.15:
@@ -132,15 +130,15 @@ def test_what_the_compilers_make_is_proved(logic: str) -> None:
         assert certificate.proved, (compiled.formula, compiled.events, certificate.text)
 
 
-def tables_of(compiled: CompiledProperty) -> Tables:
-    """What was made of a formula."""
-    assert isinstance(compiled, FiniteProperty | TimedMachine)
+def tables_of(compiled: CompiledProperty) -> AutomatonTables:
+    """Return the automaton of a property."""
+    assert isinstance(compiled, FiniteProperty | TimedStateMachine)
     made = compiled.automaton
-    timeouts = compiled.timeouts if isinstance(compiled, TimedMachine) else ()
-    return Tables(made.initial, made.table, made.verdicts, timeouts)
+    timeouts = compiled.timeouts if isinstance(compiled, TimedStateMachine) else ()
+    return AutomatonTables(made.initial, made.table, made.verdicts, timeouts)
 
 
-def same_verdicts(one: Tables, other: Tables) -> bool:
+def same_verdicts(one: AutomatonTables, other: AutomatonTables) -> bool:
     """Whether two automata say the same after every trace, and after the same times."""
     seen = {(one.initial, other.initial)}
     waiting = list(seen)
@@ -160,7 +158,7 @@ def same_verdicts(one: Tables, other: Tables) -> bool:
     return True
 
 
-def broken(random: Random, tables: Tables) -> Tables:
+def broken(random: Random, tables: AutomatonTables) -> AutomatonTables:
     """With one fault of a compiler: a wrong way on, two states that became one, a verdict that is not right."""
     table, verdicts = [list(row) for row in tables.table], list(tables.verdicts)
     state, other = random.randrange(len(table)), random.randrange(len(table))
@@ -176,7 +174,7 @@ def broken(random: Random, tables: Tables) -> Tables:
             timeouts[state] = timeouts[other]
         case _:
             verdicts[state] = ()
-    return Tables(tables.initial, table, verdicts, timeouts)
+    return AutomatonTables(tables.initial, table, verdicts, timeouts)
 
 
 @pytest.mark.parametrize("logic", LOGICS)
@@ -220,7 +218,7 @@ def test_a_thousand_faults_of_compilers_are_refused(logic: str) -> None:
 
 def test_a_fault_is_shown_by_a_trace() -> None:
     """As short as there is one."""
-    wrong = Tables(0, [[0, 1], [1, 1]], [(), ("violation",)])
+    wrong = AutomatonTables(0, [[0, 1], [1, 1]], [(), ("violation",)])
     certificate = certify("ltl", "[](a => o (!b U a))", ["a", "b"], wrong)
     assert certificate.wrong
     assert certificate.text == "after b the automaton says violation, the definition nothing"
@@ -235,7 +233,7 @@ def test_a_fault_is_shown_by_a_trace() -> None:
         ("pattern", "after a until a: some b", "one event opens and closes the scope"),
     ],
 )
-def test_what_is_not_proved_is_said(logic: str, formula: str, why: str) -> None:
+def test_unproved_properties_have_a_reason(logic: str, formula: str, why: str) -> None:
     """With the reason, and never as if it were."""
     certificate = certificate_of(compile_property(logic, formula, ["a", "b"], ORIGIN))
     assert not certificate.proved
@@ -256,7 +254,9 @@ def test_what_is_too_large_is_not_proved() -> None:
 
 def test_an_expression_that_is_too_large_is_not_proved() -> None:
     """Its automaton has one state too few, at the very end: that is not reached."""
-    certificate = certify("ere", "(a|b)* a (a|b)^30 c", ["a", "b", "c"], Tables(0, [[0, 0, 0]], [()]))
+    certificate = certify(
+        "ere", "(a|b)* a (a|b)^30 c", ["a", "b", "c"], AutomatonTables(0, [[0, 0, 0]], [()])
+    )
     assert (certificate.proved, certificate.wrong) == (False, False)
     assert certificate.text == "there is too much to look at: tested, not proved"
 
@@ -273,32 +273,37 @@ guard() {
 """
 
 
-def test_the_load_says_what_was_proved() -> None:
-    """Of each property, in the order of the text."""
-    checked = check(Sources({"guard.rv": SPECIFICATION}), ())
-    proved, tested = checked.certificates["guard"]
+def certified() -> tuple[dict[str, list[str]], list[str]]:
+    """Return the certificates and the errors of `SPECIFICATION`."""
+    compiled = compiled_from({"guard.rv": SPECIFICATION}, standard_definitions())
+    lines, wrong = certificates_of(MonitorSet.of(compiled).monitors)
+    return lines, [str(finding) for finding in wrong]
+
+
+def test_each_property_has_a_certificate() -> None:
+    """The lines are in the order of the text."""
+    lines, wrong = certified()
+    proved, tested = lines["guard"]
     assert proved.startswith("ltl: proved: ")
     assert tested == "mtl: it has bounds of time: tested, not proved"
+    assert not wrong
 
 
-def test_a_compiler_that_is_wrong_loads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The finding has the place of the formula, a trace, and whose defect it is."""
+def test_a_wrong_compiler_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error has the position of the formula, a trace, and the owner of the defect."""
 
     def compile_wrong(source: Source) -> FiniteProperty:
         return FiniteProperty(source, ("violation", "validation"), Automaton(0, ((0, 0),), ((),)))
 
-    monkeypatch.setattr(catalogue, "LOGICS", {**catalogue.LOGICS, "ltl": compile_wrong})
-    with pytest.raises(SpecificationsRefusedError) as refused:
-        check(Sources({"guard.rv": SPECIFICATION}), ())
-    assert refused.value.findings == [
-        "guard.rv:5:10: error: the automaton of this property is not what is written: after a a the automaton says"
-        " nothing, the definition violation; this is a defect of the appliance: nothing is loaded with it; report it"
-        " with the specification"
+    monkeypatch.setattr(catalogue, "LOGICS", {**catalogue.LOGICS, "ltl": Logic(compile_wrong)})
+    assert certified()[1] == [
+        "guard.rv:5:10: error: the automaton of this property differs from its formula: after a a the automaton says"
+        f" nothing, the definition violation; {DEFECT}"
     ]
 
 
 def test_the_certifier_shares_no_code_with_the_compilers() -> None:
-    """Only the files that receive results know the compilers: `properties.py`, and those that run steps."""
+    """Only the files that receive results import the compilers, and none imports an encoder of the writer."""
     receiving = {"properties.py", "steps.py", "expected_steps.py", "scripted_module.py"}
     pure = 0
     folder = Path(rosmop.certify.__file__).parent
@@ -308,7 +313,8 @@ def test_the_certifier_shares_no_code_with_the_compilers() -> None:
             for node in ast.walk(ast.parse(file.read_text()))
             if isinstance(node, ast.ImportFrom)
         }
-        ours = {module for module in imported if module.startswith(("rosmop", "roswire", "appliance"))}
+        ours = {module for module in imported if module.startswith(("rosmop", "roswire"))}
+        assert "rosmop.fast.wasm" not in ours, file
         if file.name not in receiving:
             assert all(module.startswith("rosmop.certify") for module in ours), file
             pure += bool(ours)

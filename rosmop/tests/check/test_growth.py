@@ -1,4 +1,4 @@
-"""What a text costs to compile grows as its length does: a minute of the compiler is for megabytes of them."""
+"""The time to compile a text is linear in its length."""
 
 import sys
 from collections import Counter
@@ -25,7 +25,7 @@ SPECIFICATION = """m{0}(int key) {{
 
 
 def lines_run(number: int) -> Counter[str]:
-    """How many lines of the compiler are run for so many specifications, by its files."""
+    """Return the number of compiler lines that run for this number of specifications, by file."""
     counted: Counter[str] = Counter()
 
     def trace(frame: FrameType, event: str, _argument: Any) -> Callable[..., Any] | None:
@@ -38,7 +38,7 @@ def lines_run(number: int) -> Counter[str]:
     definitions, before = standard_definitions(), sys.gettrace()
     sys.settrace(trace)
     try:
-        MonitorSet.of(compiled_from(files, definitions, margins=True))
+        MonitorSet.of(compiled_from(files, definitions))
     finally:
         sys.settrace(before)
     return counted

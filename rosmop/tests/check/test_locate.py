@@ -9,7 +9,7 @@ import pytest
 
 from rosmop.tests.acting import definitions, load, message
 from rosmop.types import value_types
-from rosmop.types.messages import Messages
+from rosmop.types.messages import MessageTypes
 
 KINDS = (
     "nav_msgs/Odometry", "sensor_msgs/JointState", "sensor_msgs/LaserScan", "nav_msgs/Path", "sensor_msgs/PointCloud2",
@@ -22,21 +22,21 @@ KINDS = (
 
 def content(random: Random, kind: value_types.Type) -> object:
     """A random value of a type, for the other library's encoder."""
-    if isinstance(kind, value_types.Record):
-        slots = Messages(definitions()).slots(kind.name)
+    if isinstance(kind, value_types.RecordType):
+        slots = MessageTypes(definitions()).slots(kind.name)
         return {name: content(random, slot.type) for name, slot in slots.items()}
-    if isinstance(kind, value_types.Vector):
+    if isinstance(kind, value_types.VectorType):
         count = random.randrange(4) if kind.length is None else kind.length
         return [content(random, kind.element) for _ in range(count)]
-    if isinstance(kind, value_types.Integer):
+    if isinstance(kind, value_types.IntegerType):
         return random.randint(kind.least, kind.most)
-    if isinstance(kind, value_types.Time | value_types.Duration):
+    if isinstance(kind, value_types.TimeType | value_types.DurationType):
         return {"sec": random.randrange(2**31), "nanosec": random.randrange(10**9)}
-    if isinstance(kind, value_types.Bool):
+    if isinstance(kind, value_types.BoolType):
         return random.random() < 0.5
     return (
         "x" * random.randrange(6)
-        if isinstance(kind, value_types.String)
+        if isinstance(kind, value_types.StringType)
         else float(random.randrange(-99, 99)) / 4
     )
 
@@ -45,23 +45,23 @@ def paths(kind: value_types.Type, value: object, path: str = "") -> Iterator[tup
     """Every path to a value in a message, and the type there."""
     if path:
         yield path, kind
-    if isinstance(kind, value_types.Record) and isinstance(value, dict):
-        for name, slot in Messages(definitions()).slots(kind.name).items():
+    if isinstance(kind, value_types.RecordType) and isinstance(value, dict):
+        for name, slot in MessageTypes(definitions()).slots(kind.name).items():
             yield from paths(slot.type, value[name], f"{path}.{name}" if path else name)
-    if isinstance(kind, value_types.Vector) and isinstance(value, list):
+    if isinstance(kind, value_types.VectorType) and isinstance(value, list):
         for index in range(min(len(value), 3)):
             yield from paths(kind.element, value[index], f"{path}[{index}]")
 
 
 def change(kind: value_types.Type, name: str) -> str:
     """A statement that gives a variable of this type another value; nothing for whole messages and fixed arrays."""
-    if isinstance(kind, value_types.String):
+    if isinstance(kind, value_types.StringType):
         return f'{name} += "longer";'
-    if isinstance(kind, value_types.Bool):
+    if isinstance(kind, value_types.BoolType):
         return f"{name} = !{name};"
-    if isinstance(kind, value_types.Vector) and kind.length is None:
+    if isinstance(kind, value_types.VectorType) and kind.length is None:
         return f"{name}.resize(5);"
-    if isinstance(kind, value_types.Time | value_types.Duration):
+    if isinstance(kind, value_types.TimeType | value_types.DurationType):
         return f"{name}.nsec = 17;"
     return f"{name} = 7;" if value_types.is_number(kind) else ""
 
@@ -71,9 +71,9 @@ def change(kind: value_types.Type, name: str) -> str:
 def test_every_field_of_a_random_message(kind: str, seed: int) -> None:
     """Bound one by one, each field is read right, and changed right."""
     random = Random(f"{kind} {seed}")  # noqa: S311  draws examples, not keys
-    value = content(random, value_types.Record(kind))
+    value = content(random, value_types.RecordType(kind))
     data = _encoded(kind, value)
-    found = list(paths(value_types.Record(kind), value))
+    found = list(paths(value_types.RecordType(kind), value))
     for path, field in random.sample(found, min(len(found), 25)):
         text = f"""s() {{ {kind} v; event e(auto p) /t {kind} '{{{path}:p}}' {{
             v = MESSAGE; ROS_INFO("%d", p == v.{path});

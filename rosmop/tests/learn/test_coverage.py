@@ -1,4 +1,4 @@
-"""What of a specification is said to have been exercised, line by line."""
+"""Coverage of specifications by recordings, line by line."""
 
 from collections.abc import Sequence
 
@@ -76,7 +76,7 @@ def test_each_thing_has_its_line_and_its_count() -> None:
 
 
 def test_recordings_add_up() -> None:
-    """What one did not do another may; each begins with monitors in their initial state."""
+    """Recordings add up; each begins with monitors in their initial state."""
     counts = exercised(
         recorded("a", [("/open", 1)]),
         recorded("b", [("/shut", 0), ("/open", 0), ("/other", 0), ("/shut", 0)]),
@@ -111,14 +111,14 @@ def test_a_timeout_is_a_transition() -> None:
 
 
 def test_an_error_is_that_of_the_text() -> None:
-    """What is wrong with a specification is said with its own place and names."""
+    """An error in a specification has its original position and names."""
     with pytest.raises(SpecificationError) as caught:
         covered({"gate.rv": TEXT.replace("n--", "m--")}, standard_definitions(), [])
-    assert str(caught.value.findings[0]).startswith("gate.rv:7:28: error: there is no variable `m`")
+    assert str(caught.value.findings[0]).startswith("gate.rv:7:28: error: unknown variable `m`")
 
 
 def test_slices_are_counted_together() -> None:
-    """Of a parametric specification: what any of its slices exercised."""
+    """A parametric specification counts the parts that any slice exercised."""
     text = """gate(int id) {
     event open(int id) /open std_msgs/Int32 '{data:id}' { }
     event shut(int id) /shut std_msgs/Int32 '{data:id}' { if (id == 2) ROS_INFO("2"); }

@@ -8,7 +8,7 @@ from rosmop.learn.extremes import FEWEST_WINDOWS, upper
 
 
 def test_a_bound_holds_on_ten_times_as_many_windows() -> None:
-    """Of fifty learnt bounds on noise, at most two are passed in ten times as many windows as they were learnt from."""
+    """At most two of fifty learnt bounds on noise are exceeded in ten times as many windows."""
     chance = random.Random(1)  # noqa: S311  no secret
     passed = 0
     for _ in range(50):
@@ -37,6 +37,6 @@ def test_what_several_windows_reach_exactly_is_the_bound() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, FEWEST_WINDOWS - 1])
-def test_nothing_is_said_of_too_few_windows(count: int) -> None:
+def test_too_few_windows_give_no_bound(count: int) -> None:
     """Extremes of a few windows say nothing about the next one."""
     assert upper([float(number) for number in range(count)], 100) is None

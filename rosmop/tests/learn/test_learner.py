@@ -1,4 +1,4 @@
-"""What is learnt from recordings that are known, and what the text then warns of."""
+"""Learning from known recordings, and the warnings of the learnt text."""
 
 import math
 import random
@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import pytest
 
 from rosmop.check.sources import compiled_from
-from rosmop.learn.learner import LearningError, Learnt, learn
+from rosmop.learn.learner import LearningError, LearningResult, learn
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import message
 from roswire.standard import standard_definitions
@@ -76,13 +76,13 @@ DRIVES = [drive(seed) for seed in range(1, 9)]
 
 
 @pytest.fixture(scope="module")
-def learnt() -> Learnt:
-    """What eight drives teach."""
+def learnt() -> LearningResult:
+    """Return the result of learning from eight drives."""
     return learn(DRIVES, standard_definitions(), 0.3, lambda _: None)
 
 
-def warnings(learnt: Learnt, rows: Sequence[Row]) -> list[str]:
-    """What the text warns of in a recording."""
+def warnings(learnt: LearningResult, rows: Sequence[Row]) -> list[str]:
+    """Return the warnings of the text in a recording."""
     monitors = MonitorSet.of(compiled_from({"learnt.rv": learnt.text}, standard_definitions()))
     monitors.start(rows[0][1], frozenset(TYPES))
     found = []
@@ -93,12 +93,12 @@ def warnings(learnt: Learnt, rows: Sequence[Row]) -> list[str]:
     return found
 
 
-def test_a_new_drive_gives_no_alarm(learnt: Learnt) -> None:
-    """Drives that nobody learnt from are quiet, and nothing is dropped or changed."""
+def test_a_new_drive_gives_no_alarm(learnt: LearningResult) -> None:
+    """Drives outside of the training data are quiet, and nothing is dropped or changed."""
     assert [warnings(learnt, drive(seed).rows) for seed in (20, 21)] == [[], []]
 
 
-def test_the_recordings_are_split_and_named(learnt: Learnt) -> None:
+def test_the_recordings_are_split_and_named(learnt: LearningResult) -> None:
     """The comment at the head says what was learnt from, and what tested it."""
     assert {part.name for part in learnt.held_out}.isdisjoint(part.name for part in learnt.trained)
     assert len(learnt.held_out) == 2
@@ -145,12 +145,12 @@ def faulty(kind: str) -> list[Row]:
         ("unanswered", "/ask was not followed by /answer"),
     ],
 )
-def test_a_fault_is_warned_of(learnt: Learnt, kind: str, says: str) -> None:
+def test_a_fault_is_warned_of(learnt: LearningResult, kind: str, says: str) -> None:
     """Each kind of fault gives the warning that names it."""
     assert any(text.startswith(says) for text in warnings(learnt, faulty(kind)))
 
 
-def test_what_the_held_out_recordings_contradict_is_said() -> None:
+def test_contradictions_of_held_out_recordings_are_listed() -> None:
     """A bound that is passed there is widened, a value that is new there leaves the set out; both with their alarms."""
     odd = [drive(seed) for seed in range(1, 5)]
     rows = [(topic, time, number(50.0) if place == 600 else data) if topic == "/speed" else (topic, time, data)
@@ -192,7 +192,7 @@ def test_nothing_to_learn_from_is_an_error() -> None:
         learn([broken, DRIVES[1]], standard_definitions(), 0.3, lambda _: None)
 
 
-def test_what_is_left_out_to_keep_the_text_short_is_said() -> None:
+def test_omitted_conditions_are_listed() -> None:
     """Eighteen numbers of one topic get no more conditions than a person reads; the comment counts the others."""
     chance = random.Random(7)  # noqa: S311  no secret
 

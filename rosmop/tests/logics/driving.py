@@ -32,7 +32,7 @@ def told(compiled: CompiledProperty, trace: Iterable[str]) -> list[tuple[str, ..
 def play(
     run: Run, events: Sequence[str], trace: Iterable[tuple[int, str]], end: int = 0
 ) -> list[tuple[int, tuple[str, ...]]]:
-    """What is told when, with all deadlines that pass, up to and including the instant ``end``."""
+    """Return times and categories, with all deadlines that pass up to and including ``end``."""
     record = []
     for time, event in trace:
         record += _expired(run, time)

@@ -4,14 +4,8 @@ from random import Random
 
 import pytest
 
-from rosmop.logics.automaton import (
-    Automaton,
-    TooManyStatesError,
-    explore,
-    letter_classes,
-    minimise,
-)
-from rosmop.logics.components import strong_components
+from rosmop.logics.automaton import Automaton, TooManyStatesError, explore, letter_classes, minimise
+from rosmop.logics.buchi import strong_components
 from rosmop.tests.logics.driving import seeded
 
 
@@ -62,7 +56,7 @@ def test_minimal_and_equivalent() -> None:
 
 
 def test_a_long_chain_is_minimised_in_time() -> None:
-    """Ten thousand states that can only be told apart one after the other take no quadratic time."""
+    """Ten thousand states that can only be distinguished one after the other take no quadratic time."""
     size = 10_000
     table = tuple((min(state + 1, size - 1),) for state in range(size))
     verdicts = tuple(("v",) if state == size - 1 else () for state in range(size))

@@ -3,7 +3,6 @@
 import importlib
 import sys
 from collections.abc import Callable
-from itertools import combinations_with_replacement, product
 from random import Random
 from types import FrameType
 from typing import Any
@@ -12,8 +11,7 @@ import pytest
 
 from rosmop.logics import bounded
 from rosmop.logics.interface import RunFaultError
-from rosmop.tests.examples import examples
-from rosmop.tests.logics.driving import ABC, compiled, play, refusal, seeded
+from rosmop.tests.logics.driving import ABC, compiled, play, seeded
 from rosmop.tests.logics.temporal import Printer, Tree, draw
 from rosmop.tests.logics.test_mtl import Timed, timed_trace
 
@@ -47,7 +45,7 @@ def negated(value: Truth) -> Truth:
 
 
 def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:  # noqa: PLR0911, PLR0912  # one per operator
-    """What a formula is worth at event ``i`` when ``trace`` has happened and no event comes up to ``passed``."""
+    """Return the value of a formula at event ``i`` after ``trace``, if no event comes up to ``passed``."""
     operator, *rest = tree
     low, high = 0, OVER
     if operator in (*PAST, *FUTURE):
@@ -101,7 +99,7 @@ def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:  # noqa: PLR0
 
 
 def expected(tree: Tree, trace: Timed, end: int) -> list[tuple[int, str]]:
-    """When which verdicts are told, by the definition: whenever one is certain at an event for the first time."""
+    """Return the verdicts with their events by the definition: each is due when it is first certain."""
     record: list[tuple[int, str]] = []
     known: set[int] = set()
 
@@ -127,7 +125,7 @@ def expected(tree: Tree, trace: Timed, end: int) -> list[tuple[int, str]]:
 
 
 def told(text: str, trace: Timed, end: int) -> list[tuple[int, str]]:
-    """When which verdicts are told by the monitor."""
+    """Return the verdicts of the monitor with their events."""
     record = play(compiled("mtl", text).start(0), ABC, trace, end)
     return [(time, category) for time, categories in record for category in categories]
 
@@ -145,44 +143,6 @@ def with_bounds(tree: Tree, random: Random) -> Tree:
 def is_about_the_future(tree: Tree) -> bool:
     """Whether it has an operator about the future."""
     return tree[0] in FUTURE or any(is_about_the_future(part) for part in tree[1:] if isinstance(part, tuple))
-
-
-SMALL = [
-    *((one, ("event", "a"), (low, high)) for one in FUTURE[:3] for low, high in ((0, 0), (0, 1), (1, 2))),
-    *(("until", ("event", "a"), ("event", "b"), (low, high)) for low, high in ((0, 1), (1, 1), (1, 2))),
-    ("implies", ("event", "a"), ("eventually", ("event", "b"), (0, 1))),
-    ("historically", ("implies", ("event", "a"), ("eventually", ("event", "b"), (0, 1))), (0, None)),
-    ("always", ("implies", ("event", "a"), ("once", ("event", "b"), (1, 1))), (0, 2)),
-    ("until", ("next", ("event", "a"), (0, 1)), ("always", ("event", "b"), (0, 1)), (0, 2)),
-    ("since", ("eventually", ("event", "a"), (0, 1)), ("next", ("event", "b"), (1, 1)), (1, None)),
-    ("previously", ("eventually", ("event", "a"), (1, 2)), (0, 1)),
-]
-
-
-def test_all_short_traces() -> None:
-    """Every trace of up to four events (three, if not all are tried) of three kinds at times 0 to 2."""
-    random = seeded(41)
-    for tree in SMALL:
-        text = PRINTER.show(tree, random)
-        for length in range(1, 5 if examples(6) == 6 else 4):
-            for times in combinations_with_replacement(range(3), length):
-                for events in product(ABC if length < 4 else ABC[:2], repeat=length):
-                    trace = list(zip(times, events, strict=True))
-                    assert told(text, trace, 12) == expected(tree, trace, 12), (text, trace)
-
-
-def test_random_formulas_by_definition() -> None:
-    """1500 formulas, if all are tried, with operators of past and future, at random in each other."""
-    random = seeded(42)
-    checked = 0
-    while checked < examples(1500):
-        tree = with_bounds(draw(random, 3, (*PAST, *FUTURE, *FUTURE), ARITY, ("a", "b")), random)
-        if not is_about_the_future(tree):
-            continue
-        checked += 1
-        text, trace = PRINTER.show(tree, random), timed_trace(random, 7, 3)
-        end = trace[-1][0] + 20
-        assert told(text, trace, end) == expected(tree, trace, end), (text, trace)
 
 
 def rtamt_text(tree: Tree) -> str:
@@ -234,7 +194,7 @@ def test_against_another_monitor() -> None:
 
 
 def test_no_verdict_is_taken_back() -> None:
-    """What is told of an event is what the formula is worth there when all is over, however the trace goes on."""
+    """The verdict for an event is the final value of the formula there, however the trace continues."""
     random = seeded(43)
     for _ in range(300):
         tree = with_bounds(draw(random, 3, (*PAST, *FUTURE), ARITY, ("a", "b")), random)
@@ -247,16 +207,8 @@ def test_no_verdict_is_taken_back() -> None:
                 assert early is None or early is final[i], (tree, trace)
 
 
-def test_at_the_latest_when_the_bound_passes() -> None:
-    """Without another message the deadline brings the verdict; an event at the bound is in time."""
-    text = "a => eventually[0,5ns] b"
-    assert told(text, [(0, "a")], 100) == [(5, "violation")]
-    assert told(text, [(0, "a"), (5, "b")], 100) == [(5, "validation")]
-    assert told("a => always[0,5ns] !b", [(0, "a"), (2, "b")], 100) == [(2, "violation"), (2, "validation")]
-
-
-def test_nothing_is_waited_for_that_nobody_asks() -> None:
-    """What is decided otherwise leaves no deadline behind."""
+def test_only_needed_values_are_kept() -> None:
+    """A decided event leaves no deadline."""
     run = compiled("mtl", "eventually[0,9ns] a or eventually[0,1s] (b and next[0,1s] b)").start(0)
     run.step(ABC.index("c"), 0)
     waiting = run.deadline
@@ -288,8 +240,8 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 @pytest.mark.parametrize("events", ["a", "ab", "b"])
-def test_a_step_costs_the_same_however_many_wait(text: str, events: str) -> None:
-    """What comes to be known of one event decides others without a look at all of them."""
+def test_the_cost_of_a_step_does_not_grow_with_waiting_events(text: str, events: str) -> None:
+    """A decision about one event decides others without visiting all of them."""
 
     def lines_run(each_second: int) -> float:
         run, counted = compiled("mtl", text).start(0), 0
@@ -313,24 +265,8 @@ def test_a_step_costs_the_same_however_many_wait(text: str, events: str) -> None
     assert lines_run(400) < 1.2 * lines_run(100) + 10
 
 
-def test_enforceable() -> None:
-    """A handler may drop what brings the verdict, unless a bound that passes may bring it."""
-    for text, late in {
-        "a => eventually[0,1s] b": {"violation"},
-        "a => always[0,1s] !b": {"validation"},
-        "a => !eventually[0,1s] b": {"validation"},
-        "a until[0,1s] b": {"violation"},
-        "a <=> next[0,1s] b": {"violation", "validation"},
-        "once[0,1s] always[0,1s] a": {"validation"},
-    }.items():
-        refused = {
-            word for word in ("violation", "validation") if compiled("mtl", text).blocking_refused(word)
-        }
-        assert refused == late, text
-
-
-def test_no_verdict_that_may_be_dropped_for_comes_from_a_deadline() -> None:
-    """What the deadlines of random formulas bring is what their handlers must not drop for."""
+def test_deadlines_bring_no_verdict_that_may_drop() -> None:
+    """Handlers may not drop for verdicts that deadlines of random formulas cause."""
     random = seeded(44)
     for _ in range(600):
         tree = with_bounds(draw(random, 3, (*PAST, *FUTURE), ARITY, ("a", "b")), random)
@@ -342,14 +278,7 @@ def test_no_verdict_that_may_be_dropped_for_comes_from_a_deadline() -> None:
             run.step(ABC.index(event), time)
 
 
-@pytest.mark.parametrize("text", ["always a", "a => eventually[1s,inf] b", "a until b", "next a"])
-def test_without_an_upper_bound(text: str) -> None:
-    """It is refused, and what to write is said."""
-    (finding,) = refusal("mtl", text)
-    assert "has no upper bound, so its verdict might never come; write" in finding
-
-
-def test_a_part_that_nobody_waits_for_any_more() -> None:
+def test_an_undecided_part_that_is_not_needed_is_forgotten() -> None:
     """It may hear, in the same step, of what it had waited for."""
     text = (
         "next[0ns,1ns] previously[0ns,inf] (b -> a)"

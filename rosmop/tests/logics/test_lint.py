@@ -1,76 +1,22 @@
-"""What is said of a property before it runs, and its picture."""
+"""Facts about a property before it runs, and its picture."""
 
 from itertools import accumulate, product
 
 import pytest
 
 from rosmop.logics.dot import to_dot
-from rosmop.logics.past_monitors import ClockedPast
-from rosmop.logics.property_lint import TIME, Fact, analyse, shortest_trace_to
+from rosmop.logics.past_monitors import ClockedPastProperty
+from rosmop.logics.property_lint import TIME, PropertyFact, analyse, shortest_trace_to
 from rosmop.tests.logics.driving import compiled, seeded, told, traces
 from rosmop.tests.logics.temporal import draw
 from rosmop.tests.logics.test_mtl import ARITY, PRINTER, TEMPORAL, bounded
-
-
-def kinds(logic: str, formula: str, handled: tuple[str, ...]) -> list[tuple[str, str]]:
-    """The facts, short."""
-    return [(fact.kind, fact.category) for fact in analyse(compiled(logic, formula), handled)]
-
-
-@pytest.mark.parametrize(
-    ("logic", "formula", "handled", "expected"),
-    [
-        (
-            "ltl",
-            "[](a => <> b)",
-            ("violation",),
-            [("never runs", "violation"), ("never violated", "violation")],
-        ),
-        ("ltl", "a and b", ("violation",), [("violated at once", "violation")]),
-        ("ltl", "[] !a", ("violation", "validation"), [("never runs", "validation")]),
-        ("ptltl", "a or !a", (), [("never violated", "violation")]),
-        ("ptltl", "(*) a", ("violation",), [("violated at once", "violation")]),
-        ("ere", "a* | ~a*", ("fail",), [("never runs", "fail")]),
-        ("ere", "empty", ("match",), [("never runs", "match"), ("violated at once", "fail")]),
-        (
-            "fsm",
-            "s0 [ default s0 ] s1 [ a -> s0 ]",
-            ("s0", "s1", "fail"),
-            [("never runs", "s1"), ("never runs", "fail")],
-        ),
-        ("fsm", "s0 [ a -> s1, default s1 ] s1 [ default s1 ]", ("s0",), [("never runs", "s0")]),
-        ("tfsm", "s0 [ timeout 1s -> s1, a -> s0 ] s1 [ ]", ("s1", "timeout"), []),
-        ("tfsm", "s0 [ default s0 ]", ("timeout",), []),
-        (
-            "pattern",
-            "globally: some a",
-            ("violation",),
-            [("never runs", "violation"), ("never violated", "violation")],
-        ),
-        ("pattern", "globally: some a within 1s", ("violation",), []),
-        ("pattern", "globally: a requires b within 1s", ("validation",), [("never runs", "validation")]),
-        ("mtl", "a => once[0,1s] b", ("violation",), []),
-        ("mtl", "once[0,1s] a or !once[0,1s] a", (), [("never violated", "violation")]),
-        ("mtl", "previously once[0,1s] a", (), [("violated at once", "violation")]),
-        (
-            "mtl",
-            "a and !a and once[0,1s] b",
-            ("validation",),
-            [("never runs", "validation"), ("violated at once", "violation")],
-        ),
-        ("cfg", "S -> a S b | epsilon", ("fail",), []),
-    ],
-)
-def test_facts(logic: str, formula: str, handled: tuple[str, ...], expected: list[tuple[str, str]]) -> None:
-    """Handlers that never run, and properties with one verdict only, are told; nothing is told that is not certain."""
-    assert kinds(logic, formula, handled) == expected
 
 
 def test_violated_at_once_shows_a_trace() -> None:
     """The fact names a shortest trace that shows it."""
     facts = analyse(compiled("ltl", "false"), ())
     assert facts == [
-        Fact(
+        PropertyFact(
             "violated at once",
             "violation",
             "the property is violated at the first event, whatever it is",
@@ -96,13 +42,13 @@ def test_shortest_traces_are_shortest() -> None:
                 assert told(monitor, shown)[-1] == (category,)
 
 
-def test_of_a_time_bound_on_the_past_the_shortest_trace_leads_there() -> None:
+def test_shortest_traces_of_bounded_past_formulas_lead_to_the_category() -> None:
     """By the definition, with the time that it says has passed; where there is none no trace does."""
     random, clocked, none = seeded(18), 0, 0
     while clocked < 200:
         tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 3)
         monitor = compiled("mtl", PRINTER.show(tree, random))
-        if not isinstance(monitor, ClockedPast):
+        if not isinstance(monitor, ClockedPastProperty):
             continue
         clocked += 1
         for category in monitor.categories:
@@ -128,21 +74,8 @@ def test_of_a_time_bound_on_the_past_the_shortest_trace_leads_there() -> None:
     assert none
 
 
-def test_time_is_part_of_a_trace() -> None:
-    """Where only the passing of time leads on, the trace says so."""
-    assert shortest_trace_to(
-        compiled("tfsm", "s0 [ a -> s1 ] s1 [ timeout 1s -> late ] late [ ]"), "late"
-    ) == ("a", TIME)
-    assert shortest_trace_to(compiled("tfsm", "s0 [ a -> s0 ]"), "timeout") == ("a", TIME)
-    assert shortest_trace_to(compiled("pattern", "globally: a causes b within 1s"), "violation") == (
-        "a",
-        TIME,
-    )
-    assert shortest_trace_to(compiled("pattern", "globally: a requires b within 1s"), "violation") == ("a",)
-
-
 def test_categories_after_an_event() -> None:
-    """Which categories an event can lead to is told, so that a timer's handlers can be found."""
+    """The categories that an event can lead to are known, so that a timer's handlers can be found."""
     machine = compiled("fsm", "s0 [ a -> s1, b -> s0 ] s1 [ a -> s1, b -> s0 ]", ("a", "b"))
     assert machine.categories_after(0) == {"s1", "fail"}
     assert machine.categories_after(1) == {"s0", "fail"}

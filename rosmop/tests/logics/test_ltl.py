@@ -5,23 +5,16 @@ from itertools import product
 
 import pytest
 
-from rosmop.tests.examples import examples
-from rosmop.tests.logics.driving import compiled, refusal, seeded, told, traces
+from rosmop.tests.logics.driving import compiled, refusal, seeded, told
 from rosmop.tests.logics.temporal import Printer, Tree, draw
 
 AB = ("a", "b")
 UNARY = {"not": 1, "next": 1, "always": 1, "eventually": 1}
 TEMPORAL = ("next", "always", "eventually", "until", "release")
-PRINTER = Printer(
-    {"next": ("o", "~o"), "always": ("[]",), "eventually": ("<>",), "until": ("U",), "release": ("R", "~U")},
-    [["and"], ["xor"], ["or"], ["until", "release", "implies", "iff"]],
-    ["until", "release", "implies", "iff"],
-)
-
 PAST = ("previously", "once", "historically", "since", "dual since", "dual previously")
-MIXED = Printer(
+PRINTER = Printer(
     {
-        "next": ("o",), "always": ("[]",), "eventually": ("<>",), "until": ("U",), "release": ("R",),
+        "next": ("o", "~o"), "always": ("[]",), "eventually": ("<>",), "until": ("U",), "release": ("R", "~U"),
         "previously": ("(*)",), "once": ("<*>",), "historically": ("[*]",), "since": ("S",), "dual since": ("~S",),
         "dual previously": ("~(*)",),
     },
@@ -34,7 +27,7 @@ Lasso = tuple[tuple[str, ...], int]
 
 
 def lassos(events: tuple[str, ...], stem: int, loop: int) -> list[Lasso]:
-    """All with at most so many positions before and in the loop."""
+    """Yield all with at most this number of positions before and in the loop."""
     return [
         (word, length)
         for length in range(stem + 1)
@@ -121,22 +114,6 @@ def by_enumeration(tree: Tree, words: list[Lasso], longest: int) -> dict[tuple[s
     return {prefix: names[frozenset(found)] for prefix, found in verdicts.items()}
 
 
-@pytest.mark.parametrize(("events", "stem", "loop", "count"), [(AB, 5, 3, 120), (("a", "b", "x"), 4, 2, 80)])
-def test_verdicts_against_enumerated_continuations(
-    events: tuple[str, ...], stem: int, loop: int, count: int
-) -> None:
-    """A violation is where no continuation satisfies the formula, a validation where all do; `x` is not named."""
-    random = seeded(5)
-    words = lassos(events, stem, loop)
-    for _ in range(examples(count)):
-        tree = draw(random, 3, TEMPORAL, UNARY, AB)
-        text = PRINTER.show(tree, random)
-        monitor = compiled("ltl", text, events)
-        expected = by_enumeration(tree, words, 3)
-        for prefix in traces(events, 3):
-            assert told(monitor, prefix)[-1] == expected[prefix], (text, prefix)
-
-
 def unrolled(lasso: Lasso, turns: int) -> Lasso:
     """The same trace, its loop written down several times before it leads back."""
     word, back = lasso
@@ -149,26 +126,8 @@ def has(tree: Tree, operators: tuple[str, ...]) -> bool:
     return tree[0] in operators or any(has(part, operators) for part in tree[1:] if isinstance(part, tuple))
 
 
-def test_past_and_future_against_enumerated_continuations() -> None:
-    """Operators of both kinds in each other: the verdict is what all continuations have in common."""
-    random = seeded(7)
-    words = [unrolled(lasso, 6) for lasso in lassos(AB, 4, 2)]
-    arity = UNARY | dict.fromkeys(("previously", "once", "historically", "dual previously"), 1)
-    checked = 0
-    while checked < 100:
-        tree = draw(random, 3, (*TEMPORAL, *PAST), arity, AB)
-        if not (has(tree, PAST) and has(tree, TEMPORAL)):
-            continue
-        checked += 1
-        text = MIXED.show(tree, random)
-        monitor = compiled("ltl", text, AB)
-        expected = by_enumeration(tree, words, 3)
-        for prefix in traces(AB, 3):
-            assert told(monitor, prefix)[-1] == expected[prefix], (text, prefix)
-
-
 def test_many_operators_about_the_past() -> None:
-    """What looks back over past events only costs no more than what it remembers."""
+    """A formula about past events only costs no more than its memory."""
     monitor = compiled("ltl", "[](a => " + "(*) " * 7 + "b)", AB)
     assert told(monitor, "bbbbbbbab")[-2:] == [(), ()]
     assert told(monitor, "abbbbbbaa") == [("violation",)] * 9
@@ -191,38 +150,9 @@ def test_long_traces_of_random_formulas() -> None:
         assert decided == [final] * len(decided)
 
 
-def test_known_properties() -> None:
-    """The verdicts of properties from the literature, with the traces that show them."""
-    assert told(compiled("ltl", "[](a => o (!a U b))"), "abaa")[-2:] == [(), ("violation",)]
-    assert told(compiled("ltl", "a => <> b"), "b") == [("validation",)]
-    assert told(compiled("ltl", "[]<> a"), "bbbb") == [()] * 4
-    assert told(compiled("ltl", "true"), "ab") == [("validation",)] * 2
-    assert told(compiled("ltl", "a and b"), "ab") == [("violation",)] * 2
-
-
-def test_a_contradiction_is_found_before_it_shows() -> None:
-    """A formula that no trace satisfies is violated at the first event, even if only liveness contradicts itself."""
-    assert told(compiled("ltl", "[]<> a and <>[] !a"), "a") == [("violation",)]
-
-
-def test_chains_need_parentheses() -> None:
-    """Operators of the loosest level do not chain."""
-    assert refusal("ltl", "a U b => c") == [
-        "7:17: `=>` in a chain without parentheses; write which part belongs together"
-    ]
-    assert told(compiled("ltl", "a U (b => c)"), "c") == told(compiled("ltl", "a U (!b or c)"), "c")
-
-
-def test_formulas_about_the_past_are_refused() -> None:
-    """A formula about the past alone is pointed to ptltl; one with too many operators about it is refused."""
-    assert refusal("ltl", "[*] a") == ["7:11: a formula about the past; write `ptltl:` for `ltl:`"]
-    assert refusal("ltl", "a S b") == ["7:11: a formula about the past; write `ptltl:` for `ltl:`"]
+def test_a_formula_with_too_many_operators_about_the_past_is_rejected() -> None:
+    """Other errors are in `formulas.txt`."""
     assert "10 different operators about the past" in refusal("ltl", "[](a => " + "(*) " * 10 + "b)")[0]
-
-
-def test_an_event_with_the_name_of_an_operator() -> None:
-    """Where only an event fits, the operator's name is explained."""
-    assert refusal("ltl", "[] o", ("o", "b")) == ["7:14: `o` is an operator of ltl; rename the event"]
 
 
 @pytest.mark.parametrize(

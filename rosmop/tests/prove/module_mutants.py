@@ -9,10 +9,10 @@ from rosmop.check.sources import compiled_from
 from rosmop.fast.batch_codegen import written
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
-from rosmop.prove.decoding import Code, Instruction
+from rosmop.prove.decoding import Code, WasmInstruction
 from rosmop.prove.equality import EQUAL, Validation
 from rosmop.run.engine import MonitorSet
-from rosmop.runtime.values import Values
+from rosmop.runtime.values import ValueCodec
 from rosmop.tests.random_specifications import definitions
 from roswire.definitions import Definitions
 
@@ -21,7 +21,7 @@ _OTHER = {"add": "sub", "sub": "add", "mul": "add", "div": "mul", "and": "or", "
           "neg": "abs", "abs": "neg", "floor": "ceil", "ceil": "floor", "rem": "div"}  # fmt: skip
 
 
-def _comparison(one: Instruction) -> Iterator[Instruction]:
+def _comparison(one: WasmInstruction) -> Iterator[WasmInstruction]:
     family, _, name = one.name.partition(".")
     name, _, sign = name.partition("_")
     if name in _COMPARED:
@@ -33,7 +33,7 @@ def _comparison(one: Instruction) -> Iterator[Instruction]:
             yield replace(one, name=f"{family}.{turned}" + (f"_{sign}" if sign else ""))
 
 
-def _operation(one: Instruction) -> Iterator[Instruction]:
+def _operation(one: WasmInstruction) -> Iterator[WasmInstruction]:
     family, _, name = one.name.partition(".")
     name, _, sign = name.partition("_")
     if name in _OTHER and family in ("i32", "i64", "f32", "f64"):
@@ -43,12 +43,12 @@ def _operation(one: Instruction) -> Iterator[Instruction]:
         )
 
 
-def _sign(one: Instruction) -> Iterator[Instruction]:
+def _sign(one: WasmInstruction) -> Iterator[WasmInstruction]:
     if one.name.endswith(("_s", "_u")) and one.name not in ("i32.extend8_s", "i32.extend16_s"):
         yield replace(one, name=one.name[:-1] + ("u" if one.name.endswith("s") else "s"))
 
 
-def _width(one: Instruction) -> Iterator[Instruction]:
+def _width(one: WasmInstruction) -> Iterator[WasmInstruction]:
     widths = {
         "i32.load": "i32.load16_u", "i32.load8_u": "i32.load16_u", "i32.load16_u": "i32.load8_u",
         "i32.load8_s": "i32.load16_s", "i32.load16_s": "i32.load8_s", "i32.store8": "i32.store16",
@@ -59,36 +59,36 @@ def _width(one: Instruction) -> Iterator[Instruction]:
         yield replace(one, name=widths[one.name])
 
 
-def _offset(one: Instruction) -> Iterator[Instruction]:
+def _offset(one: WasmInstruction) -> Iterator[WasmInstruction]:
     if ".load" in one.name or ".store" in one.name:
         yield replace(one, operands=(one.operands[0] + 1,))
         yield replace(one, operands=(one.operands[0] + 8,))
 
 
-def _constant(one: Instruction) -> Iterator[Instruction]:
+def _constant(one: WasmInstruction) -> Iterator[WasmInstruction]:
     if one.name.endswith(".const"):
         yield replace(one, operands=(one.operands[0] + 1,))
         if one.operands[0]:
             yield replace(one, operands=(-one.operands[0],))
 
 
-def _check(one: Instruction) -> Iterator[Instruction]:
+def _check(one: WasmInstruction) -> Iterator[WasmInstruction]:
     """A bound that is not looked at, or after which the message goes on."""
     if one.name == "if" and one.body:
         if not one.otherwise:
-            yield Instruction("drop")
+            yield WasmInstruction("drop")
         yield replace(one, body=one.otherwise, otherwise=one.body)
 
 
-FAULTS: dict[str, Callable[[Instruction], Iterator[Instruction]]] = {
+FAULTS: dict[str, Callable[[WasmInstruction], Iterator[WasmInstruction]]] = {
     "comparison": _comparison, "operation": _operation, "sign": _sign, "width": _width, "offset": _offset,
     "constant": _constant, "check": _check,
 }  # fmt: skip
 
 
 def _trees(
-    body: Sequence[Instruction], change: Callable[[Instruction], Iterator[Instruction]]
-) -> Iterator[tuple[Instruction, ...]]:
+    body: Sequence[WasmInstruction], change: Callable[[WasmInstruction], Iterator[WasmInstruction]]
+) -> Iterator[tuple[WasmInstruction, ...]]:
     for place, one in enumerate(body):
         before, after = tuple(body[:place]), tuple(body[place + 1 :])
         changed = [*change(one)]
@@ -98,11 +98,11 @@ def _trees(
             yield (*before, other, *after)
 
 
-def operands(code: Code) -> Iterator[tuple[Instruction, ...]]:
+def operands(code: Code) -> Iterator[tuple[WasmInstruction, ...]]:
     """Each variable that is read, once the next one of its type instead."""
     kinds = [*code.parameters, *code.made]
 
-    def change(one: Instruction) -> Iterator[Instruction]:
+    def change(one: WasmInstruction) -> Iterator[WasmInstruction]:
         if one.name == "local.get":
             place = int(one.operands[0])
             same = [other for other, kind in enumerate(kinds) if kind == kinds[place] and other != place]
@@ -149,10 +149,10 @@ def compiled(text: str, known: Definitions | None = None) -> Compiled:
 
 
 def faulty(text: str, every: int = 1) -> Iterator[tuple[str, str]]:
-    """The kind of each fault that is put into the function of a specification's event, and what is said of it."""
+    """Yield the kind of each fault put into the function of a specification's event, and the result."""
     code = compiled(text)
     (group,) = groups(code.specifications)
-    values = Values(code.messages)
+    values = ValueCodec(code.messages)
     module = written(code.functions, [group.component], values)
     validation = Validation(code.functions, values, module, time.monotonic, patience=100)
     ((topic, (one,)),) = group.component.topics

@@ -1,4 +1,4 @@
-"""What is written of an event is proved to be what it means; a module that is wrong anywhere is found."""
+"""The code of an event is proved equal to its meaning; every wrong module is found."""
 
 import itertools
 import time
@@ -16,7 +16,7 @@ MONITORS = Path(__file__).parents[3] / "monitors"
 
 
 def answers(text: str, known: Definitions | None = None) -> dict[str, str]:
-    """What is known of each event of a specification, with as much time as it needs."""
+    """Return the result for each event of a specification, without a time limit."""
     return {one.event: one.answer for one in findings_of(compiled(text, known), time.monotonic, patience=600)}
 
 
@@ -37,7 +37,7 @@ SHIPPED = {
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_specifications(name: str) -> None:
-    """All events that have a module without loops are proved; of the others it is said why not."""
+    """All events that have a module without loops are proved; the others have the reason."""
     trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
     own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
     assert (
@@ -46,7 +46,7 @@ def test_shipped_specifications(name: str) -> None:
 
 
 def test_no_shipped_specification_is_left_out() -> None:
-    """A new one is proved, too."""
+    """A new one is also proved."""
     assert {path.stem for path in MONITORS.glob("*.rv")} == set(SHIPPED)
 
 
@@ -114,7 +114,7 @@ def test_what_is_not_proved_says_why(answer: str) -> None:
 
 
 def test_without_time_nothing_is_proved() -> None:
-    """What is not decided is said to be so."""
+    """An undecided event is reported as undecided."""
     clock = itertools.count(0.0, 1000.0)
     (found,) = findings_of(compiled(PROVED["conversions at the limits"]), lambda: next(clock), patience=0)
     assert (found.answer, found.differs) == ("not decided in time", False)

@@ -4,12 +4,12 @@ from random import Random
 
 import pytest
 
-from rosmop.runtime.wire import Message
+from rosmop.runtime.wire import WireMessage
 
 
 def test_what_is_written_twice_can_be_as_it_was() -> None:
     """A message is changed if its bytes differ at the end, whatever was written on the way."""
-    message = Message(bytearray(b"abcdef"), 0)
+    message = WireMessage(bytearray(b"abcdef"), 0)
     found = [message.changed]
     message.patch(1, b"xy")
     found.append(message.changed)
@@ -22,7 +22,7 @@ def test_what_is_written_twice_can_be_as_it_was() -> None:
 
 def test_what_is_written_as_it_was_touches_nothing() -> None:
     """`touched` is set by other bytes only, in place or of another length, until it is cleared."""
-    message = Message(bytearray(b"abcdef"), 0)
+    message = WireMessage(bytearray(b"abcdef"), 0)
     found = []
     for start, end, new in ((1, 3, b"bc"), (1, 3, b"bx"), (0, 2, b"abc"), (0, 3, b"abc"), (0, 1, b"z")):
         message.touched = 0
@@ -35,7 +35,7 @@ def test_a_received_buffer_that_cannot_be_written_is_left_alone() -> None:
     """Bytes and read-only views are copied before the first change."""
     received = b"abcdef"
     for buffer in (received, memoryview(received)):
-        message = Message(buffer, 0)
+        message = WireMessage(buffer, 0)
         message.patch(0, b"z")
         assert bytes(message.buffer) == b"zbcdef"
     assert received == b"abcdef"
@@ -43,7 +43,7 @@ def test_a_received_buffer_that_cannot_be_written_is_left_alone() -> None:
 
 def test_only_what_is_overwritten_is_kept_of_a_large_message() -> None:
     """A changed number does not cost a copy of the picture behind it."""
-    message = Message(memoryview(bytearray(1 << 20)), 0)
+    message = WireMessage(memoryview(bytearray(1 << 20)), 0)
     message.patch(8, b"\x01")
     message.patch(100, b"\x01\x02")
     assert message.changed
@@ -55,7 +55,7 @@ def test_patches_and_splices_agree_with_a_copy(seed: int) -> None:
     """Random edits give the bytes, and the answer to `changed`, of a plain copy that is compared."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     received = bytes(random.choices(b"ab", k=12))
-    message, copy = Message(bytearray(received), 0), bytearray(received)
+    message, copy = WireMessage(bytearray(received), 0), bytearray(received)
     for _ in range(random.randint(1, 5)):
         start = random.randrange(len(copy))
         end = min(len(copy), start + random.randint(1, 3))

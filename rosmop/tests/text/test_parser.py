@@ -16,7 +16,7 @@ def parsed(text: str) -> tree.Specification:
     return found
 
 
-def event(body: str = "", head: str = "event e() /t std_msgs/Empty '{}'") -> tree.Event:
+def event(body: str = "", head: str = "event e() /t std_msgs/Empty '{}'") -> tree.EventDefinition:
     """The event of a specification with one."""
     [found] = parsed(f"s() {{ {head} {{ {body} }} }}").events
     return found
@@ -99,7 +99,7 @@ TRIGGERS = [
 
 
 @pytest.mark.parametrize(("head", "expected"), TRIGGERS)
-def test_what_an_event_waits_for(head: str, expected: tuple[str, str, str | None]) -> None:
+def test_triggers_of_events(head: str, expected: tuple[str, str, str | None]) -> None:
     """Topics and services with both spellings of types, and typographic quotes."""
     trigger = event(head=head).trigger
     assert isinstance(trigger, tree.MessageTrigger)
@@ -148,7 +148,7 @@ def test_patterns_are_paths() -> None:
         for binding in trigger.pattern
     ]  # fmt: skip
     assert found == [
-        ("x.y[2]", "a", "NoneType"), ("z.w.v", "b", "NoneType"), ("z.c", None, "Unary"), ("s", None, "Text"),
+        ("x.y[2]", "a", "NoneType"), ("z.w.v", "b", "NoneType"), ("z.c", None, "UnaryExpression"), ("s", None, "StringLiteral"),
         ("k", None, "Name"), ("t", None, "Name"),
     ]  # fmt: skip
 
@@ -221,121 +221,19 @@ def test_a_statement_is_read(statement: str) -> None:
 
 REFUSALS = [
     ("", 1, 1, "there is no specification in this file"),
-    ("// nothing", 1, 1, "there is no specification in this file"),
-    ("a() {", 1, 6, "found the end of the file, expected a declaration, an `event`"),
-    ("a() { int x }", 1, 13, "found `}`, expected"),
-    (
-        "a() {\n evnt e() /t p/T '{}' { } }",
-        2,
-        2,
-        "`evnt e()` is not part of the language; an event begins with `event`: write `event e(…)`",
-    ),
-    ("a() {\n events e(int x) every 1s { } }", 2, 2, "an event begins with `event`: write `event e(…)`"),
-    (
-        "a() {\n dL: { x > 0 } }",
-        2,
-        6,
-        "found `{`, expected a formula; a property is `logic: formula @category",
-    ),
     ("a() {\n int x;\n\n  \n", 2, 8, "found the end of the file, expected a declaration, an `event`"),
-    ("a() { std::set<int> m; }", 1, 7, "`std::set<int> m` is not part of the language; use a `std::vector`"),
-    ("a() { double d[2][3]; }", 1, 14, "there are no arrays of arrays; use a `std::vector` of vectors"),
-    ("a() { event x() /t std_msgs/String {} {} }", 1, 36, "found `{`, expected a quote `'`"),
-    (
-        "a() { event x() /t String '{}' { } }",
-        1,
-        20,
-        "found `String`, expected a message type such as `std_msgs/String`",
-    ),
-    ("a() { event x() '{}' { } }", 1, 17, "found `'`, expected"),
-    ("a() { int n\nevent x() /t p/T '{}' { } }", 1, 12, "expected `;` behind this, found `event` in line 2"),
-    ("a() { static int n\nevent x() /t p/T '{}' { } }", 1, 19, "expected `;` behind this, found `event`"),
-    ("a() { int n, m\ncreation event x() /t p/T '{}' { } }", 1, 15, "expected `;` behind this"),
     ("a() { event x() /t p/T " + "/" * 5000 + "\n", 1, 20, "expected a message type"),
-    (
-        "a() { event x() every 3 parsec { } }",
-        1,
-        23,
-        "`parsec` is no unit of time; write one of ns, us, ms, s, m, min, h",
-    ),
-    ("a() { event x() every 1us { } }", 1, 23, "a period is from 1 ms to 31 years"),
-    (
-        "a() { event x() /t std_msgs/Empty '{}' { }\n ere: x\n { } }",
-        3,
-        2,
-        "found `{` after the formula, expected a handler `@category { … }`",
-    ),
-    ("a() {\n@fail { } }", 2, 1, "a handler belongs to a property"),
-    ("#if 0\na() { }\n#endif\n", 1, 1, "`#if`: there is no preprocessor; leave what you want there"),
-    (
-        "a() {\n # ifdef X\n  int x;\n #else\n  int y;\n#endif\n}",
-        2,
-        2,
-        "`#ifdef`: there is no preprocessor; leave what you want there, without conditions",
-    ),
-    ("#ifdef A\n#endif\n#ifdef B\n#ifdef C\n#endif\na() { }", 3, 1, "`#ifdef`: there is no preprocessor"),
-    (
-        "a() { event x() every 1s { if (y > MOST) return; } }\n#define MOST 0.5\n",
-        2,
-        1,
-        "`#define MOST`: there is no preprocessor; write `const double MOST = …;`",
-    ),
-    ("\ufeff#if 0\na() { }\n#endif\n", 1, 2, "`#if`: there is no preprocessor"),
-    ("/* */ #if 0\na() { }\n#endif\n", 1, 7, "`#if`: there is no preprocessor"),
-    ("#define sin(x) cos(x)\na() { double f() { return sin(1); } }", 1, 1, "`#define sin`"),
-    ("a() { bool f() { return a and b; } }", 1, 27, "`and` is not part of the language; write `&&`"),
-    ("a() { bool f() { return not b; } }", 1, 25, "`not` is not part of the language; write `!`"),
-    ("a() { /* what", 1, 7, "this comment does not end; write `*/` behind it"),
-    ("class A { };", 1, 1, "`class` is not part of the language; types cannot be declared"),
-    ("a() { struct b { int c; }; }", 1, 7, "`struct` is not part of the language"),
-    ("a() { event x() /t p/T '{data:}' { } }", 1, 31, "found `}`, expected"),
-    ("a() { event x() /t p/T '{a[x]:b}' { } }", 1, 28, "found `x`, expected a number"),
-    ("a() { event x() /t p/T '{a[1.5]:b}' { } }", 1, 28, "`1.5` is no index; write a whole number"),
 ]
 
 
 @pytest.mark.parametrize(("text", "line", "column", "reason"), REFUSALS)
-def test_a_refusal(text: str, line: int, column: int, reason: str) -> None:
-    """What is not of the grammar is refused at its place, with what was found and what to write."""
+def test_an_error_in_an_empty_or_long_text_has_a_position(
+    text: str, line: int, column: int, reason: str
+) -> None:
+    """Other errors of the syntax are in `rosmop/tests/check/findings.txt`."""
     found = refusal(text)
     assert found[:2] == (line, column)
     assert reason in found[2]
-
-
-IN_ACTIONS = [
-    ("x->y = 1;", 1, "`x->y` is not part of the language; there are no pointers; write `x.y`"),
-    ("if x { }", 4, "found `x`, expected `(`"),
-    ("c ? &x : 0;", 5, "there are no addresses; pass the variable itself"),
-    ("double d[2][3];", 8, "there are no arrays of arrays; use a `std::vector` of vectors"),
-    ("p = &x;", 5, "there are no addresses; pass the variable itself"),
-    ("y = 3 4;", 7, "found `4`, expected `;` or `,` or an operator"),
-    ('y = "abc;', 5, "a string ends on the line it begins on"),
-    ("y = 'abc';", 5, 'a character is one; write a string in double quotes, `"abc"`'),
-    (r'y = "\q";', 5, r"`\q` is no escape; write `\\` for a backslash"),
-    ("goto a;", 1, "`goto` is not part of the language; there are no jumps"),
-    ("try { } catch (int e) { }", 1, "`try` is not part of the language; there are no exceptions"),
-    ("auto f = [](int a) { };", 10, "there are no lambda functions; declare a helper function"),
-    ("std::list<int> m;", 1, "`std::list<int> m` is not part of the language; use a `std::vector`"),
-    ("x = nullptr;", 5, "`nullptr` is not part of the language; there are no pointers"),
-    ("enum A { B };", 1, "`enum` is not part of the language"),
-    ("else x = 1;", 1, "`else` is a word of the language: it cannot stand here, and is no name"),
-    ("x = 1", 6, "expected `;` behind this, found `}` in line 3"),
-    ("new int[3];", 1, "`new int[…]` is not part of the language; write a `std::vector`"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("body", "column", "reason"), IN_ACTIONS)
-def test_a_refusal_in_an_action(body: str, column: int, reason: str) -> None:
-    """C++ that is not part of the language is named, with what to write instead."""
-    line, found, text = refusal(f"a() {{ event x() /t std_msgs/String '{{}}' {{\n{body}\n}} }}")
-    assert (line, found) == (2, column)
-    assert reason in text
-
-
-def test_positions_count_characters_and_lines() -> None:
-    """Columns count from 1, a tab and a letter outside ASCII are one character each."""
-    text = "s() {\n\tevent e() /t std_msgs/Empty '{}' {\n\t\tx = \"\u00e4\"; ? } }"
-    assert refusal(text)[:2] == (3, 12)
 
 
 def test_a_file_has_a_limit() -> None:
@@ -343,7 +241,7 @@ def test_a_file_has_a_limit() -> None:
     assert "split it into several" in refusal("a" * (MAX_CHARACTERS + 1))[2]
 
 
-def test_trees_that_differ_only_in_place_are_equal() -> None:
+def test_trees_at_different_places_are_equal() -> None:
     """So that a specification that was moved in its file is still the same."""
     text = "s() { int a = 1; event e(int x) /t p/T '{a.b[1]:x, c:2}' when (x) { a++; } ere: e @match { } }"
     assert parsed(text) == parsed("\n\n  " + text.replace(" when", "\n   when"))

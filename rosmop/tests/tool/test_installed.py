@@ -1,5 +1,6 @@
-"""`pip install ./rosmop`: the command works where there is no appliance."""
+"""`pip install ./rosmop`: the command works without the appliance."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -8,10 +9,6 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
-from rosbags.rosbag1 import Writer
-
-from rosmop.tests.acting import message
-from roswire.standard import standard_definitions
 
 FOLDER = Path(__file__).parents[2]
 MONITORS = sorted((FOLDER.parent / "monitors").glob("*.rv"))
@@ -23,7 +20,7 @@ def run(*command: object, folder: Path = FOLDER) -> subprocess.CompletedProcess[
 
 
 def required(requirements: Iterable[str]) -> set[str]:
-    """Return the names of these distributions and of all that they need, without extras."""
+    """Return the names of these distributions and of their dependencies, without extras."""
     found: set[str] = set()
     waiting = list(requirements)
     while waiting:
@@ -36,7 +33,7 @@ def required(requirements: Iterable[str]) -> set[str]:
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A virtual environment that has the wheel and what it depends on, and nothing else."""
+    """Make a virtual environment with the wheel and its dependencies only."""
     folder = tmp_path_factory.mktemp("installed")
     built = run(sys.executable, "-P", "-m", "hatchling", "build", "--target", "wheel", "--directory", folder)
     assert built.returncode == 0, built.stderr
@@ -58,60 +55,62 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "venv"
 
 
-def test_it_has_all_of_the_language(environment: Path) -> None:
-    """Every module but the tests, and the wire format; no appliance and no compiler of WebAssembly."""
+def test_the_wheel_is_complete(environment: Path) -> None:
+    """Every module but the tests, and the wire format; no appliance, no WebAssembly compiler."""
     packages = next(environment.glob("lib/python*/site-packages"))
     ours = {path.relative_to(FOLDER) for path in FOLDER.rglob("*.py") if "tests" not in path.parts}
     assert {path.relative_to(packages / "rosmop") for path in (packages / "rosmop").rglob("*.py")} == ours
     for absent in ("appliance", "wasmtime"):
-        assert (
-            f"No module named '{absent}'"
-            in run(environment / "bin/python", "-P", "-c", f"import {absent}").stderr
-        )
+        done = run(environment / "bin/python", "-P", "-c", f"import {absent}")
+        assert f"No module named '{absent}'" in done.stderr
+    version = re.search(r'^__version__ = "(.+)"', (FOLDER.parent / "appliance/__init__.py").read_text(), re.M)
+    assert version is not None
+    assert (packages / f"rosmop-{version[1]}.dist-info").is_dir()
 
 
-def test_it_checks_specifications(environment: Path) -> None:
-    """What is shipped is right: exit status 0; what is wrong has its place, with exit status 1."""
+def test_shipped_specifications_are_valid(environment: Path) -> None:
+    """Check accepts every specification in `monitors/`."""
     done = run(environment / "bin/rosmop", "check", *MONITORS)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith(f"{len(MONITORS)} specifications right\n")
+    assert done.stdout.startswith(f"{len(MONITORS)} specifications OK\n")
 
 
 def test_errors_name_the_command(environment: Path, tmp_path: Path) -> None:
-    """A wrong specification has exit status 1, a missing file 2."""
+    """An invalid specification has exit status 1, a missing file 2."""
     (tmp_path / "a.rv").write_text("a() {\n  event e() /t std_msgs/None '{}' { }\n}\n")
     wrong = run(environment / "bin/rosmop", "check", "a.rv", folder=tmp_path)
     assert (wrong.returncode, wrong.stdout.partition(" error")[0]) == (1, "a.rv:2:16:")
     missing = run(environment / "bin/rosmop", "check", "b.rv", folder=tmp_path)
-    assert (missing.returncode, missing.stderr) == (
-        2,
-        "rosmop: cannot read b.rv: No such file or directory\n",
-    )
+    said = "rosmop: cannot read b.rv: No such file or directory\n"
+    assert (missing.returncode, missing.stderr) == (2, said)
     unproved = run(environment / "bin/rosmop", "check", "a.rv", "--prove", folder=tmp_path)
     assert "pip install 'rosmop[prove]'" in unproved.stderr
 
 
-def test_recordings_go_through_monitors(environment: Path, tmp_path: Path) -> None:
-    """The monitor is interpreted; what is learnt is right and says what recordings exercise."""
-    definitions = standard_definitions()
-    with Writer(tmp_path / "a.bag") as writer:
-        text, digest = definitions.full_text("std_msgs/Int32"), definitions.md5sum("std_msgs/Int32")
-        numbers = writer.add_connection("/n", "std_msgs/msg/Int32", msgdef=text, md5sum=digest)
-        for second in range(100):
-            writer.write(numbers, (1000 + second) * 10**9, message("std_msgs/Int32", data=second))
-    (tmp_path / "a.rv").write_text(
-        "a() {\n  event e(int x) /n std_msgs/Int32 '{data:x}' { if (x > 97) return; }\n}\n"
-    )
+def test_the_readme_links_to_files() -> None:
+    """Its links work in a checkout."""
+    links = re.findall(r"\]\(([^)]+)\)", (FOLDER / "README.md").read_text())
+    assert links
+    assert [link for link in links if not (FOLDER / link).is_file()] == []
 
-    def rosmop(*arguments: str) -> str:
-        done = run(environment / "bin/rosmop", *arguments, folder=tmp_path)
+
+def test_the_readme_shows_real_output(environment: Path, tmp_path: Path) -> None:
+    """Its files and commands, in order; then the written bag and the learnt specification are valid input."""
+    blocks = dict(re.findall(r"```(\w+)\n(.*?)```", (FOLDER / "README.md").read_text(), re.DOTALL))
+    (tmp_path / "limit.rv").write_text(blocks["cpp"])
+    (tmp_path / "record.py").write_text(blocks["python"])
+    made = run(environment / "bin/python", "record.py", folder=tmp_path)
+    assert made.returncode == 0, made.stderr
+
+    def output(command: str, *arguments: str) -> list[str]:
+        done = run(environment / "bin" / command, *arguments, folder=tmp_path)
         assert (done.returncode, done.stderr) == (0, "")
-        return done.stdout
+        return [line.rstrip() for line in done.stdout.splitlines()]
 
-    *lines, total = rosmop("run", "a.rv", "--bag", "a.bag", "--output", "b.bag").splitlines()
-    assert len(lines) == 2
-    assert total == "100 messages: 98 passed, 0 changed, 2 dropped; 0 verdicts, 0 faults"
-    assert rosmop("run", "a.rv", "--bag", "b.bag").startswith("98 messages: 98 passed")
-    assert rosmop("coverage", "a.rv", "--bag", "a.bag").endswith("exercised: 100.0 %\n")
-    rosmop("learn", "--bag", "a.bag", "--out", "learnt.rv")
-    assert "right" in rosmop("check", "learnt.rv")
+    shown = blocks["console"].splitlines()
+    commands = [line for line in shown if line.startswith("$ ")]
+    assert len(commands) == 4
+    assert shown == [part for line in commands for part in (line, *output(*line[2:].split()))]
+    assert output("rosmop", "check", "learnt.rv")[0] == "1 specification OK"
+    output("rosmop", "run", "limit.rv", "--bag", "drive.bag", "--output", "passed.bag")
+    assert output("rosmop", "run", "limit.rv", "--bag", "passed.bag")[0].startswith("98 messages: 98 passed")

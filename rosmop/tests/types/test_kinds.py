@@ -26,9 +26,9 @@ def test_the_common_type_of_two_numbers(left: Type, right: Type, result: Type) -
 
 def test_integers_of_one_width_and_sign_are_one_type() -> None:
     """`int` and `int32_t` are the same type under two names, `char` and `uint8_t` are not."""
-    assert value_types.Integer(32, True, "int32_t") == value_types.INT
+    assert value_types.IntegerType(32, True, "int32_t") == value_types.INT
     assert value_types.CHAR != value_types.UINT8
-    assert len({value_types.Integer(8, True, "x"), value_types.CHAR, value_types.INT8}) == 1
+    assert len({value_types.IntegerType(8, True, "x"), value_types.CHAR, value_types.INT8}) == 1
 
 
 CONVERTIBLE = [
@@ -38,12 +38,12 @@ CONVERTIBLE = [
     (value_types.CHARACTERS, value_types.STRING, True),
     (value_types.TIME, value_types.DURATION, False),
     (value_types.TIME, value_types.DOUBLE, False),
-    (value_types.Vector(value_types.INT), value_types.Vector(value_types.INT, 3), True),
-    (value_types.Vector(value_types.INT, 2), value_types.Vector(value_types.INT, 3), False),
-    (value_types.Vector(value_types.INT), value_types.Vector(value_types.DOUBLE), False),
-    (value_types.Vector(value_types.UINT8), value_types.Vector(value_types.BOOL), True),
-    (value_types.Record("a/B"), value_types.Record("a/B"), True),
-    (value_types.Record("a/B"), value_types.Record("a/C"), False),
+    (value_types.VectorType(value_types.INT), value_types.VectorType(value_types.INT, 3), True),
+    (value_types.VectorType(value_types.INT, 2), value_types.VectorType(value_types.INT, 3), False),
+    (value_types.VectorType(value_types.INT), value_types.VectorType(value_types.DOUBLE), False),
+    (value_types.VectorType(value_types.UINT8), value_types.VectorType(value_types.BOOL), True),
+    (value_types.RecordType("a/B"), value_types.RecordType("a/B"), True),
+    (value_types.RecordType("a/B"), value_types.RecordType("a/C"), False),
     (value_types.VOID, value_types.INT, False),
 ]
 
@@ -58,9 +58,9 @@ def test_what_can_be_assigned(source: Type, target: Type, possible: bool) -> Non
     ("kind", "text"),
     [
         (value_types.ULONG, "unsigned long"),
-        (value_types.Vector(value_types.STRING), "std::vector<std::string>"),
-        (value_types.Vector(value_types.DOUBLE, 36), "double[36]"),
-        (value_types.Record("geometry_msgs/Twist"), "geometry_msgs::Twist"),
+        (value_types.VectorType(value_types.STRING), "std::vector<std::string>"),
+        (value_types.VectorType(value_types.DOUBLE, 36), "double[36]"),
+        (value_types.RecordType("geometry_msgs/Twist"), "geometry_msgs::Twist"),
         (value_types.CHARACTERS, "char *"),
     ],
 )

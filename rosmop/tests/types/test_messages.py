@@ -1,4 +1,4 @@
-"""Tests of what is said about names that do not exist."""
+"""Tests of errors about unknown names."""
 
 import time
 
@@ -6,9 +6,9 @@ from rosmop.types.messages import nearest
 
 
 def test_the_nearest_name() -> None:
-    """A name that is nearly right is told the right one; where nothing is near, the few there are."""
+    """The error for a misspelt name has the similar name, or else the short list of names."""
     assert nearest("positon", ["name", "position"]) == "; did you mean `position`?"
-    assert nearest("xyz", ["name", "position"]) == "; there are: name, position"
+    assert nearest("xyz", ["name", "position"]) == "; known: name, position"
 
 
 def test_thousands_of_names_and_mistakes_cost_little() -> None:

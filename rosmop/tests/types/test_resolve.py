@@ -7,7 +7,7 @@ from rosmop.tests.acting import definitions
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
-from rosmop.types.messages import Messages
+from rosmop.types.messages import MessageTypes
 from rosmop.types.resolve import resolve
 from rosmop.types.value_types import Type
 
@@ -38,38 +38,38 @@ SPELLINGS = [
     ("int64_t", value_types.LONG),
     ("ros Time", value_types.TIME),
     ("ros Duration", value_types.DURATION),
-    ("geometry_msgs Twist", value_types.Record("geometry_msgs/Twist")),
+    ("geometry_msgs Twist", value_types.RecordType("geometry_msgs/Twist")),
 ]
 
 
 @pytest.mark.parametrize(("words", "kind"), SPELLINGS)
 def test_a_spelling(words: str, kind: Type) -> None:
     """Each spelling is its type."""
-    assert resolve(tree.TypeName(HERE, tuple(words.split())), Messages(definitions())) == kind
+    assert resolve(tree.TypeName(HERE, tuple(words.split())), MessageTypes(definitions())) == kind
 
 
 REFUSED = [
-    ("int int", "`int int` is no type"),
-    ("long long long", "is no type"),
-    ("unsigned signed", "is no type"),
-    ("char int", "is no type"),
-    ("unsigned double", "`unsigned double` is no type"),
-    ("state", "there is no type `state`"),
+    ("int int", "`int int` is not a type"),
+    ("long long long", "is not a type"),
+    ("unsigned signed", "is not a type"),
+    ("char int", "is not a type"),
+    ("unsigned double", "`unsigned double` is not a type"),
+    ("state", "unknown type `state`"),
     ("float64", "ROS's float64 is `double` in C++"),
     ("float32", "ROS's float32 is `float` in C++"),
-    ("uint", "there is no type `uint`; write `unsigned int`"),
+    ("uint", "unknown type `uint`; write `unsigned int`"),
     ("uint8", "ROS's uint8 is `uint8_t` in C++"),
     ("time", "ROS's time is `ros::Time` in C++"),
-    ("strin", "there is no type `strin`; did you mean `string`?"),
-    ("std deque", "there is no type `std::deque`; use a `std::vector`"),
-    ("std foo", "there is no type `std::foo`"),
+    ("strin", "unknown type `strin`; did you mean `string`?"),
+    ("std deque", "unknown type `std::deque`; use a `std::vector`"),
+    ("std foo", "unknown type `std::foo`"),
     ("geometry_msgs Twit", "did you mean `geometry_msgs/Twist`?"),
 ]
 
 
 @pytest.mark.parametrize(("words", "text"), REFUSED)
-def test_a_spelling_that_is_none(words: str, text: str) -> None:
-    """What is no type is refused, with what is near."""
+def test_an_invalid_spelling(words: str, text: str) -> None:
+    """An unknown type is rejected with a suggestion."""
     with pytest.raises(SpecificationError) as caught:
-        resolve(tree.TypeName(HERE, tuple(words.split())), Messages(definitions()))
+        resolve(tree.TypeName(HERE, tuple(words.split())), MessageTypes(definitions()))
     assert text in caught.value.findings[0].text

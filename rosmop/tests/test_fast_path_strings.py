@@ -1,6 +1,5 @@
 """Strings that variables keep: the module does with them what the interpreter does."""
 
-import struct
 from random import Random
 
 import pytest
@@ -9,9 +8,9 @@ from hypothesis import strategies as st
 
 from rosmop.fast import wasm_runner
 from rosmop.fast.abi import MOST_KEPT
+from rosmop.tests.both_ways import BothWays, plain, stamped
 from rosmop.tests.examples import examples
 from rosmop.tests.reload import replaced
-from rosmop.tests.test_walks import Fed, plain
 
 SOME = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck))
 LONG = b"0123456789abcdef" * (MOST_KEPT // 16)
@@ -19,13 +18,6 @@ TEXTS = (
     b"", b"a", b"abc", b"ab\0c", b"ab\0d", b"\0", b"\xff\xfe", b"\xc3\x28", b"abcdefgh", b"abcdefgi", b"abcdefghi",
     b"x" * 64, b"x" * 65, b"x" * 64 + b"y", LONG[:-1], LONG, LONG + b"z", LONG * 3,
 )  # fmt: skip
-
-
-def stamped(frame: bytes, count: int = 0, names: tuple[bytes, ...] = ()) -> bytes:
-    """An `own/Stamped`."""
-    body = struct.pack("<I", len(frame)) + frame + struct.pack("<IIdhI", 9, 8, 2.5, count, 0)
-    body += struct.pack("<BI", 0, len(names))
-    return body + b"".join(struct.pack("<I", len(name)) + name for name in names)
 
 
 def kept(
@@ -74,70 +66,72 @@ def test_random_programs_of_strings(seed: int) -> None:
     event = f"event o(std::string f, int x) /stamped own/Stamped '{{frame:f, count:x}}' {{ {other} }}"
     plainly = "event p(int x) /plain own/Plain '{count:x}' { b = a; if (x == 9) { c += \"p\"; } }"
     texts = [kept(body, f"{event} {plainly} {random.choice(LOGICS)}", FUNCTIONS)]
-    fed = Fed(*texts, *([OTHER] if random.random() < 0.3 else []), on_fault=random.choice(("drop", "pass")))
+    both = BothWays(
+        *texts, *([OTHER] if random.random() < 0.3 else []), on_fault=random.choice(("drop", "pass"))
+    )
     few = random.sample(TEXTS, 4)
     for time in range(1, 9):
-        fed.counting = random.random() < 0.7
+        both.counting = random.random() < 0.7
         names = tuple(random.choices(few, k=random.randint(0, 3)))
         bodies = [
             stamped(random.choice(few), random.choice((0, 0, 1, 2, 3, 4, 5, 6, 7)), names)
             for _ in range(random.choice((1, 2, 12)))
         ]
-        fed.check(bodies, "/stamped", time)
+        both.check(bodies, "/stamped", time)
         if random.random() < 0.4:
-            fed.check([plain(random.choice((7, 9)))] * 2, time=time)
+            both.check([plain(random.choice((7, 9)))] * 2, time=time)
 
 
 @pytest.mark.parametrize("text", TEXTS, ids=lambda text: f"{len(text)} {text[:6]!r}")
 def test_every_kind_of_string_is_kept_and_compared(text: bytes) -> None:
     """With each other one, in every order; up to the bound in the module, beyond it in the engine."""
-    fed = Fed(
+    both = BothWays(
         kept(
             'if (a < f) { n++; } if (f == a) { n += 3; } if (a >= c) { n += 5; } a = f; ROS_INFO("%s", a.c_str());'
         )
     )
     for other in TEXTS:
-        fed.check([stamped(text), stamped(other), stamped(text)], "/stamped")
-    assert bool(fed.came["together"]) == (len(text) <= MOST_KEPT)
+        both.check([stamped(text), stamped(other), stamped(text)], "/stamped")
+    assert bool(both.came["together"]) == (len(text) <= MOST_KEPT)
 
 
 def test_up_to_the_bound_nothing_is_for_the_engine() -> None:
     """A longer one is, as is the first message that looks at it; the next that replaces it is not."""
-    fed = Fed(kept("if (x == 1) { n += a.size(); } a = f; b = a;"))
-    fed.check([stamped(LONG[:size]) for size in (0, 1, 7, 1000, MOST_KEPT)], "/stamped")
-    assert fed.came["together"] == 1
-    assert fed.state()[:2] == [f"a {LONG!r}", f"b {LONG!r}"]
-    fed.check([stamped(LONG + b"x"), stamped(b"y")], "/stamped")
-    fed.check([stamped(b"z")], "/stamped")
-    assert fed.state()[0] == "a b'z'"
-    fed.check([stamped(LONG + b"x")], "/stamped")
-    before = fed.came["together"]
-    fed.check([stamped(b"z", 1)], "/stamped")
-    assert fed.came["together"] == before
-    assert f"n {MOST_KEPT + 1}" in fed.state()
+    both = BothWays(kept("if (x == 1) { n += a.size(); } a = f; b = a;"))
+    both.check([stamped(LONG[:size]) for size in (0, 1, 7, 1000, MOST_KEPT)], "/stamped")
+    assert both.came["together"] == 1
+    assert both.state()[:2] == [f"a {LONG!r}", f"b {LONG!r}"]
+    both.check([stamped(LONG + b"x"), stamped(b"y")], "/stamped")
+    both.check([stamped(b"z")], "/stamped")
+    assert both.state()[0] == "a b'z'"
+    both.check([stamped(LONG + b"x")], "/stamped")
+    before = both.came["together"]
+    both.check([stamped(b"z", 1)], "/stamped")
+    assert both.came["together"] == before
+    assert f"n {MOST_KEPT + 1}" in both.state()
 
 
 def test_lines_show_the_string_of_their_message() -> None:
     """Not what a later message of the same batch, or the end of the walk, put in its place."""
-    fed = Fed(kept('ROS_INFO("%s %s", a.c_str(), b.c_str()); b = a; a = f; ROS_INFO("%s", b.c_str());'))
+    both = BothWays(kept('ROS_INFO("%s %s", a.c_str(), b.c_str()); b = a; a = f; ROS_INFO("%s", b.c_str());'))
     for batch in ([b"one", b"two", b"three"], [b"four"], [b"five", b""]):
-        fed.check([stamped(frame) for frame in batch], "/stamped")
-    assert fed.came["together"] == 3
-    assert [line.text for line in fed.lines] == ["four three", "four", "five four", "five"]
+        both.check([stamped(frame) for frame in batch], "/stamped")
+    assert both.came["together"] == 3
+    assert [line.text for line in both.lines] == ["four three", "four", "five four", "five"]
 
 
 def test_a_fault_in_the_middle_takes_back_what_was_assigned() -> None:
     """The variables and the bytes that they stand for are those before the message, and then what the engine does."""
-    fed = Fed(
+    both = BothWays(
         kept(
             "std::string t = a; a = b; b = t; if (x == 7) { n = 1 / (x - 7); } a = f;",
             "event o(int x) /stamped own/Stamped '{count:x}' { c = b; n = 10 / (x - 6); b = a; }",
         )
     )
     for counts in ((1, 6, 2, 7, 3), (7, 6, 1), (6,), (1, 2)):
-        fed.check([stamped(b"m%d" % number, count) for number, count in enumerate(counts)], "/stamped")
-    assert fed.came["fault"] == 5
-    assert fed.came["together"] > 2
+        both.check([stamped(b"m%d" % number, count) for number, count in enumerate(counts)], "/stamped")
+    assert both.came["fault"] == 5
+    assert both.came["together"] > 2
 
 
 def test_strings_survive_wherever_the_module_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,31 +139,20 @@ def test_strings_survive_wherever_the_module_is_stopped(monkeypatch: pytest.Monk
     text = kept("{ std::string t = a; a = b; b = c; c = t; } if (x == 2) { a = f; } n++;")
     for fuel in [*range(3500, 6000, 37), *range(6000, 12000, 331)]:
         monkeypatch.setattr(wasm_runner, "FUEL", fuel)
-        fed = Fed(text)
+        both = BothWays(text)
         for time in range(1, 5):
-            fed.check([stamped(LONG[: 100 * number], number % 4) for number in range(11)], "/stamped", time)
+            both.check([stamped(LONG[: 100 * number], number % 4) for number in range(11)], "/stamped", time)
 
 
 def test_strings_go_to_the_set_that_follows() -> None:
     """A set that replaces this one, while the module has the state; and they are persisted as they are."""
     text = kept("a = f; if (x == 1) { b = f; }")
-    fed = Fed(text)
-    fed.check([stamped(b"one", 1), stamped(b"two\0\xff")], "/stamped")
-    fed.walker("/stamped")
+    both = BothWays(text)
+    both.check([stamped(b"one", 1), stamped(b"two\0\xff")], "/stamped")
+    both.lane("/stamped")
     following, _ = replaced(
-        fed.monitors, {"0.rv": text, "1.rv": OTHER}, fed.monitors.compiled.messages.definitions, 5
+        both.monitors, {"0.rv": text, "1.rv": OTHER}, both.monitors.compiled.messages.definitions, 5
     )
     names = following.interpreter.variables
     values = [names[code] for code in following.monitors[0].code.variables.values()]
     assert values[:3] == [b"two\0\xff", b"one", b"abc"]
-
-
-def test_a_message_that_ends_in_its_string_keeps_nobody_elses_bytes() -> None:
-    """Cut after each byte, with others behind it; lengths that lie."""
-    fed = Fed(kept("b = a; a = f;"))
-    whole = stamped(b"frame", 3, (b"x",))
-    for end in range(len(whole)):
-        fed.check([whole, whole[:end], stamped(b"z")], "/stamped")
-    for length in (6, 2**31, 2**32 - 1, 2**32 - 5):
-        fed.check([whole, struct.pack("<I", length) + whole[4:], stamped(b"z")], "/stamped")
-    assert fed.came["together"] > 30

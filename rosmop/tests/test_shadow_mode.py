@@ -1,4 +1,4 @@
-"""Specifications on trial: to the messages they are not there, and what they say is what enabled ones say."""
+"""Specifications in shadow mode do not affect messages, and their reports equal those of enabled ones."""
 
 from collections.abc import Collection, Iterator
 from random import Random
@@ -39,34 +39,34 @@ def number(data: int) -> bytes:
 
 
 class Both:
-    """Specifications up to one with that enabled, all of them with that on trial, and all others."""
+    """Return specifications with one enabled, with that one in shadow mode, and without it."""
 
-    def __init__(self, texts: dict[str, str], tried: str, on_fault: OnFault = "drop") -> None:
-        self.tried, self.on_fault = tried, on_fault
-        place = next(at for at, text in enumerate(texts.values()) if text.startswith(tried))
-        others = {file: text for file, text in texts.items() if not text.startswith(tried)}
+    def __init__(self, texts: dict[str, str], shadowed: str, on_fault: OnFault = "drop") -> None:
+        self.shadowed, self.on_fault = shadowed, on_fault
+        place = next(at for at, text in enumerate(texts.values()) if text.startswith(shadowed))
+        others = {file: text for file, text in texts.items() if not text.startswith(shadowed)}
         self.texts = dict(list(texts.items())[: place + 1])
         self.enabled = MonitorSet.of(compiled_from(self.texts, definitions()), on_fault)
-        self.with_trial = MonitorSet.of(compiled_from(texts, definitions()), on_fault, trials=[tried])
+        self.with_shadow = MonitorSet.of(compiled_from(texts, definitions()), on_fault, shadows=[shadowed])
         self.without = MonitorSet.of(compiled_from(others, definitions()), on_fault)
         self.stories = [self.story(self.enabled.start(0)), list(self._start())]
         self.without.start(0)
 
     def _start(self) -> Iterator[object]:
-        outcome = self.with_trial.start(0)
-        for tried in outcome.tried:
-            yield from self.story(tried)
+        outcome = self.with_shadow.start(0)
+        for shadowed in outcome.shadowed:
+            yield from self.story(shadowed)
         assert not self.story(outcome)
 
     def give(self, topic: str, body: bytes, time: int) -> None:
-        """A message for all; what goes on is what goes on without the one on trial."""
+        """Give all a message; it passes as it does without the one in shadow mode."""
         done = self.enabled.process(topic, bytearray(body), time)
         self.stories[0] += self.story(done)
-        left = self.with_trial.process(topic, bytearray(body), time)
+        left = self.with_shadow.process(topic, bytearray(body), time)
         expected = self.without.process(topic, bytearray(body), time)
         assert (left.result, bytes(left.buffer)) == (expected.result, bytes(expected.buffer))
         assert (list(left.events), list(left.verdicts)) == (list(expected.events), list(expected.verdicts))
-        tapped, self.with_trial.tapped[:] = list(self.with_trial.tapped), []
+        tapped, self.with_shadow.tapped[:] = list(self.with_shadow.tapped), []
         for one in tapped:
             would = one.give()
             self.stories[1] += self.story(would)
@@ -75,21 +75,21 @@ class Both:
                 assert bytes(would.buffer) == bytes(done.buffer)
 
     def promote(self, time: int) -> None:
-        """The one on trial comes into force, with its state."""
+        """Promote the one in shadow mode, with its state."""
         self.check(time)
         following = MonitorSet.of(compiled_from(self.texts, definitions()), self.on_fault)
-        following.succeed(self.with_trial, time)
+        following.succeed(self.with_shadow, time)
         assert not following.began
-        self.with_trial = following
+        self.with_shadow = following
 
     def go_on(self, topic: str, body: bytes, time: int) -> None:
         """A message for those that are all enabled now."""
         self.stories[0] += self.story(self.enabled.process(topic, bytearray(body), time))
-        self.stories[1] += self.story(self.with_trial.process(topic, bytearray(body), time))
+        self.stories[1] += self.story(self.with_shadow.process(topic, bytearray(body), time))
 
     def check(self, time: int) -> list[object]:
         """Until now both have told the same of it; that."""
-        for place, sets in enumerate(([self.enabled], [self.with_trial, *self.with_trial.trials])):
+        for place, sets in enumerate(([self.enabled], [self.with_shadow, *self.with_shadow.shadows])):
             for outcome in [outcome for one in sets for outcome in one.advance(time)]:
                 self.stories[place] += self.story(outcome)
         assert self.stories[0] == self.stories[1]
@@ -98,16 +98,16 @@ class Both:
     def story(self, outcome: Outcome) -> list[object]:
         """All that it did, in order."""
         before = [told for earlier in outcome.before for told in self.story(earlier)]
-        did: list[object] = [one for one in outcome.events if one.startswith(f"{self.tried}.")]
-        did += [one for one in outcome.verdicts if one.monitor == self.tried]
-        did += [(one.position, one.text) for one in outcome.faults if one.monitor == self.tried]
-        did += [one for one in outcome.log if one.monitor == self.tried]
+        did: list[object] = [one for one in outcome.events if one.startswith(f"{self.shadowed}.")]
+        did += [one for one in outcome.verdicts if one.monitor == self.shadowed]
+        did += [(one.position, one.text) for one in outcome.faults if one.monitor == self.shadowed]
+        did += [one for one in outcome.log if one.monitor == self.shadowed]
         did += [
             (one._replace(site=0), outcome.sites[one.site].position)
             for one in outcome.published
-            if one.monitor == self.tried
+            if one.monitor == self.shadowed
         ]
-        did += ["dropped", outcome.reason] * (outcome.dropped_by == self.tried)
+        did += ["dropped", outcome.reason] * (outcome.dropped_by == self.shadowed)
         return [*before, (outcome.time, did)] if did else before
 
 
@@ -138,7 +138,7 @@ def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> Non
     both.check(time)
 
 
-def test_that_compares_something() -> None:
+def test_the_random_specifications_reach_every_outcome() -> None:
     """Drops, changes, verdicts, faults and ticks come up."""
     found: set[str] = set()
     for seed in range(40):
@@ -181,7 +181,7 @@ def test_every_logic(logic: str) -> None:
 
 
 @pytest.mark.parametrize("logic", ["fsm", "ere", "cfg", "ltl", "ptltl", "ptcaret", "tick"])
-def test_every_logic_that_can_be_parametric(logic: str) -> None:
+def test_every_parametric_logic(logic: str) -> None:
     """Each slice has its own state, variables and ticks, from the first message that it sees."""
     names = ("begin", "end") if logic == "ptcaret" else ("e0", "e1")
     events = "".join(
@@ -209,7 +209,7 @@ def test_every_logic_that_can_be_parametric(logic: str) -> None:
 
 @pytest.mark.parametrize("handler", ["@enforced { late++; }", "@violation { late++; __RESET; }"])
 def test_what_is_enforced_at_a_deadline(handler: str) -> None:
-    """What would have been published is what is, at the same times, with the variables as they are then."""
+    """Withheld publications equal real ones, at the same times, with the same variables."""
     remedy = "help() { std_msgs::UInt8 one; one.data = late; PUBLISH(/n1, std_msgs/UInt8, one); }"
     events = "".join(f"event e{at}() /n{at} std_msgs/UInt8 '{{}}' {{ }} " for at in range(2))
     rule = f"pattern: globally: e0 causes e1 within 3ms enforced by help {handler}"
@@ -230,76 +230,46 @@ def test_what_is_enforced_at_a_deadline(handler: str) -> None:
 NUMBER = "int n) /n std_msgs/UInt8 '{data:n}'"
 
 
-def trial(*texts: str, tried: Collection[str]) -> MonitorSet:
+def shadow(*texts: str, shadowed: Collection[str]) -> MonitorSet:
     """A set, started."""
     found = MonitorSet.of(
-        compiled_from({f"{at}.rv": text for at, text in enumerate(texts)}, definitions()), trials=tried
+        compiled_from({f"{at}.rv": text for at, text in enumerate(texts)}, definitions()), shadows=shadowed
     )
     found.start(0)
     return found
 
 
-def test_it_sees_what_those_before_it_left_and_not_what_they_dropped() -> None:
-    """And those behind it see what it would have changed as it was."""
-    monitors = trial(
-        f"a() {{ event e({NUMBER} {{ if (n == 3) {{ return; }} n += 10; }} }}",
-        f"b() {{ event e({NUMBER} {{ n += 100; }} }}",
-        f"c() {{ event e({NUMBER} {{ n += 1; }} }}",
-        tried=["b"],
-    )
-    assert bytes(monitors.process("/n", bytearray(number(1)), 1).buffer) == number(12)
-    assert monitors.process("/n", number(3), 2).result == "dropped"
-    (tapped,) = monitors.tapped
-    assert (tapped.resource, tapped.data, tapped.time) == ("/n", number(11), 1)
-    assert bytes(tapped.give().buffer) == number(111)
-
-
 def test_requests_and_responses() -> None:
-    """Of services, too; their definition is the others' affair."""
+    """This holds for services also; their definition is decided by the others."""
     text = """s() { event asked(bool on) service /mode std_srvs/SetBool request '{data:on}' { if (on) { return; } } }"""
-    monitors = trial(text, tried=["s"])
+    monitors = shadow(text, shadowed=["s"])
     assert monitors.process_service("/mode", "request", b"\x01", 1).result == "passed"
     assert monitors.tapped.pop().give().result == "dropped"
     assert monitors.service_type_of("/mode") is None
-    assert monitors.service_type_of("/mode", tried=True) == "std_srvs/SetBool"
+    assert monitors.service_type_of("/mode", shadowed=True) == "std_srvs/SetBool"
 
 
-def test_those_that_share_variables_are_on_trial_together() -> None:
+def test_specifications_that_share_variables_are_in_shadow_mode_together() -> None:
     """However indirectly, in the order they have; what one would have dropped the next does not see."""
-    monitors = trial(
+    monitors = shadow(
         f"a() {{ int k = 0; event e({NUMBER} {{ k = n; if (n == 3) {{ return; }} }} }}",
         f"b() {{ event e({NUMBER} when (k > 1) {{ return; }} }}",
         f"c() {{ event e({NUMBER} {{ n = 7; }} }}",
-        tried=["b"],
+        shadowed=["b"],
     )
-    assert [one.name for one in monitors.tried] == ["a", "b"]
+    assert [one.name for one in monitors.shadowed] == ["a", "b"]
     assert [one.name for one in monitors.monitors] == ["c"]
     for data in (1, 2, 3):
         monitors.process("/n", number(data), data)
     assert [one.give().dropped_by for one in monitors.tapped] == ["", "b", "a"]
 
 
-def test_a_fault_and_a_loop_without_end_are_its_own() -> None:
-    """Others have their whole budget, and the messages; it has less."""
-    monitors = trial(
-        f"a() {{ event e({NUMBER} {{ while (true) {{ n = n; }} }} }}",
-        f"b() {{ event e({NUMBER} {{ for (int i = 0; i < 30000; i++) {{ n = n; }} n = 1 / (n - 1); }} }}",
-        tried=["a"],
-    )
-    outcome = monitors.process("/n", number(2), 1)
-    assert (outcome.result, list(outcome.faults)) == ("changed", [])
-    tried = monitors.tapped.pop().give()
-    assert tried.dropped_by == "a"
-    assert "more than 100000 instructions" in tried.faults[0].text
-    assert monitors.process("/n", number(1), 2).dropped_by == "b"
-
-
-def test_a_disabled_one_is_given_nothing_and_nothing_is_held() -> None:
-    """A specification that is declared `hold` holds no topic while it is on trial, nor when it comes from there."""
+def test_a_disabled_specification_sees_nothing_and_holds_nothing() -> None:
+    """A specification that is declared `hold` holds no topic in shadow mode, nor after its promotion."""
     text = f"hold a() {{ event e({NUMBER} {{ return; }} }}"
-    monitors = MonitorSet.of(compiled_from({"0.rv": text}, definitions()), trials=["a"])
+    monitors = MonitorSet.of(compiled_from({"0.rv": text}, definitions()), shadows=["a"])
     monitors.start(0, restarted=True)
-    assert not monitors.tried[0].held
+    assert not monitors.shadowed[0].held
     monitors.switch({"a": False}, 1)
     assert not monitors.wants("/n")
     monitors.switch({"a": True}, 2)
@@ -310,18 +280,18 @@ def test_a_disabled_one_is_given_nothing_and_nothing_is_held() -> None:
     assert not following.monitors[0].held
 
 
-def test_one_that_is_incomplete_begins_anew_when_it_comes_into_force() -> None:
-    """Not while it stays on trial; faults of the trial are not its faults in force."""
+def test_an_incomplete_state_is_reset_when_it_is_enforced() -> None:
+    """It does not while it stays in shadow mode; faults there do not count as faults in force."""
     text = f"a() {{ int k = 0; event e({NUMBER} {{ k += 1; if (n == 9) {{ n = n / (n - 9); }} }} }}"
     sources = {"0.rv": text}
-    monitors = trial(text, tried=["a"])
+    monitors = shadow(text, shadowed=["a"])
     for data in (1, 9):
         monitors.process("/n", number(data), data)
     for one in monitors.tapped:
         one.give()
-    still = MonitorSet.of(compiled_from(sources, definitions()), trials=["a"])
+    still = MonitorSet.of(compiled_from(sources, definitions()), shadows=["a"])
     still.succeed(monitors, 10, ["a"])
-    assert (still.trials[0].value("a", "k"), still.tried[0].faults, still.began) == (2, 1, ())
+    assert (still.shadows[0].value("a", "k"), still.shadowed[0].faults, still.began) == (2, 1, ())
     anew, kept = (MonitorSet.of(compiled_from(sources, definitions())) for _ in range(2))
     kept.succeed(still, 11)
     assert (kept.value("a", "k"), kept.monitors[0].faults, kept.began) == (2, 0, ())
@@ -329,11 +299,11 @@ def test_one_that_is_incomplete_begins_anew_when_it_comes_into_force() -> None:
     assert (anew.value("a", "k"), anew.began) == (0, ("a",))
 
 
-def test_a_topic_that_only_a_trial_wants_has_a_type_for_it_alone() -> None:
+def test_a_topic_of_shadow_mode_only_has_a_type_there_only() -> None:
     """A publisher with another definition is not refused for its sake."""
-    monitors = trial("s() { event e() /chatter std_msgs/String '{}' { } }", tried=["s"])
+    monitors = shadow("s() { event e() /chatter std_msgs/String '{}' { } }", shadowed=["s"])
     assert monitors.wants("/chatter")
-    assert (monitors.type_of("/chatter"), monitors.type_of("/chatter", tried=True)) == (
+    assert (monitors.type_of("/chatter"), monitors.type_of("/chatter", shadowed=True)) == (
         None,
         "std_msgs/String",
     )

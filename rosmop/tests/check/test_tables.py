@@ -1,0 +1,63 @@
+"""Findings of the check, and values of actions, by tables of sources and results (`rosmop/tests/transcripts.py`)."""
+
+import re
+from contextlib import suppress
+from pathlib import Path
+
+from rosmop.check.sources import compiled_from
+from rosmop.run.engine import MonitorSet
+from rosmop.tests.acting import act, action, definitions, load, message
+from rosmop.tests.both_ways import BothWays
+from rosmop.tests.stories import Step, Story, tell
+from rosmop.tests.transcripts import Case, table
+from rosmop.text.errors import SpecificationError
+
+TABLES = Path(__file__).parent
+
+
+@table(TABLES / "findings.txt")
+def test_the_check_reports_these_findings_at_these_places(case: Case) -> None:
+    """All errors and warnings of a source, with line, column and text; `accepted` if there is none."""
+    try:
+        found = MonitorSet.of(compiled_from({"x.rv": case.text}, definitions())).warnings
+    except SpecificationError as error:
+        found = error.findings
+    lines = [f"{one.position.line}:{one.position.column} {one.severity}: {one.text}" for one in found]
+    assert tuple(lines or ["accepted"]) == case.expected
+
+
+@table(TABLES / "values.txt")
+def test_an_action_prints_what_cpp_prints(case: Case) -> None:
+    """The interpreter prints the lines of C++ or the text of the fault; the module does what the interpreter does."""
+    outcome = act(case.text, before=case.beside)
+    lines = " ".join(line.text for line in outcome.log)
+    fault = "".join(f"fault: {one.text}" for one in outcome.faults)
+    assert (fault or lines,) == case.expected
+    assert not fault or (outcome.result, lines) == ("dropped", "")
+    for text in (case.text, unfolded(case)):
+        with suppress(SpecificationError):  # a size, or a case, that is no constant any more
+            BothWays(action(text, before=case.beside)).check([message("std_msgs/Int32")], "/t", 1_500_000_000)
+
+
+def unfolded(case: Case) -> str:
+    """Return the text with `x`, which is 0, added to its numbers: nothing is calculated before a message comes."""
+    if '"' in case.source:
+        return case.text
+    return case.frame.replace("…", re.sub(r"(?<![\w.])(\d+(\.\d+)?)(?![\w.])", r"(\1 + x)", case.source))
+
+
+@table(TABLES / "messages.txt")
+def test_an_event_reads_and_changes_its_message(case: Case) -> None:
+    """Messages by their fields, as another library reads them, each with its outcome (`rosmop/tests/stories.py`)."""
+    for line in case.expected:
+        given, _, expected = line.partition(" -> ")
+        step = Step(f"0s /t {given}".replace(" (zero)", ""), "", ())
+        [(_, lines)] = tell(Story("", {}, case.text, (step,)))
+        assert "; ".join(map(str.strip, lines)) == expected, given
+
+
+@table(TABLES / "enforcement.txt")
+def test_the_line_about_enforcement_says_how_or_what_it_would_take(case: Case) -> None:
+    """`check` prints it for each property."""
+    [monitor] = load(case.text).monitors
+    assert (monitor.properties[0].code.enforcement,) == case.expected

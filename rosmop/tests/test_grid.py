@@ -1,0 +1,100 @@
+"""Each back end has a row for each kind of node, and what leaves the module has a place and a reason."""
+
+from collections.abc import Collection
+from types import UnionType
+from typing import get_args
+
+import pytest
+
+from rosmop.check.sources import compiled_from
+from rosmop.fast import codegen
+from rosmop.fast.slow_paths import slow_paths
+from rosmop.form import nodes
+from rosmop.prove import form_terms
+from rosmop.run import interpreter
+from roswire.standard import standard_definitions
+
+GRID = {
+    "interpreter, statements": (interpreter.STATEMENTS, nodes.Statement),
+    "interpreter, expressions": (interpreter.EXPRESSIONS, nodes.Expression),
+    "WebAssembly, statements": (codegen.STATEMENTS, nodes.Statement),
+    "WebAssembly, expressions": (codegen.EXPRESSIONS, nodes.Expression),
+    "z3, statements": (form_terms.STATEMENTS, nodes.Statement),
+    "z3, expressions": (form_terms.EXPRESSIONS, nodes.Expression),
+}
+"""The certifier (`rosmop/certify`) reads tables of properties, and no statements or expressions."""
+
+
+@pytest.mark.parametrize("row", GRID)
+def test_each_back_end_has_a_row_for_each_kind_of_node(row: str) -> None:
+    """A missing or superfluous row is named."""
+    rows, kinds = GRID[row]
+    assert _names(get_args(kinds)) == _names(rows)
+
+
+def test_each_kind_of_node_is_in_the_grid() -> None:
+    """A new class of nodes is an expression, a statement, or one of the known parts of these."""
+    parts = {
+        "Spot",
+        "Skipper",
+        "Function",
+        "Write",
+        "PropertyClock",
+        "HandledCategory",
+        "Advance",
+        "Event",
+        "Component",
+    }
+    kinds: UnionType = nodes.Expression | nodes.Statement
+    assert _names(nodes.FormNode.__subclasses__()) == _names(get_args(kinds)) | parts
+
+
+def _names(kinds: Collection[type]) -> set[str]:
+    return {kind.__name__ for kind in kinds}
+
+
+HEAD = "s() { int n = 0; geometry_msgs::Twist twist; "
+EVENT = "event e(int x) /t std_msgs/Int32 '{data:x}'"
+SLOW = {
+    "nothing": (f"{EVENT} {{ if (x > 3) {{ return; }} n = x; }}", []),
+    "a whole topic": (f"{EVENT} {{\n n = sin(x); }}", [("/t", "", 2, "calls sin")]),
+    "a branch": (
+        f"{EVENT} {{ if (x > 3) {{\n PUBLISH(/told, geometry_msgs/Twist, twist); }} }}",
+        [("/t", "event s.e", 2, "publishes a message")],
+    ),
+    "a helper function": (
+        f"int f(int x) {{ if (x > 3) {{\n return sin(x); }} return x; }} {EVENT} {{ n = f(x); }}",
+        [("/t", "event s.e", 2, "calls sin")],
+    ),
+    "a handler": (
+        f"{EVENT} {{ }} fsm : idle [ e -> idle ] @idle {{\n n = sin(n); }}",
+        [("/t", "handler @idle of s", 2, "calls sin")],
+    ),
+    "time bounds": (
+        f"{EVENT} {{ }}\n pattern: globally: no e within 1ms @violation {{ n = 1; }}",
+        [("/t", "pattern property of s", 2, "runs a handler of a property with time bounds")],
+    ),
+    "no automaton": (
+        f"{EVENT} {{ }} {EVENT.replace('e(', 'f(').replace('/t', '/u')} {{ }} cfg: S -> e S f | epsilon @fail {{ }}",
+        [
+            ("/t", "", 1, "comes to a verdict with each message"),
+            ("/u", "", 1, "comes to a verdict with each message"),
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SLOW)
+def test_slow_paths_have_places_and_reasons(name: str) -> None:
+    """Each part that the interpreter processes is listed with topic, event or handler, line, and reason."""
+    body, expected = SLOW[name]
+    compiled = compiled_from({"s.rv": f"{HEAD}{body} }}"}, standard_definitions())
+    found = slow_paths(compiled)
+    assert [(one.topic, one.code, one.position.line, one.reason) for one in found] == expected
+
+
+def test_parametric_specifications_are_slow_paths() -> None:
+    """The engine processes each message of their topics."""
+    text = f"p(int x) {{ {EVENT} {{ }} }}"
+    (found,) = slow_paths(compiled_from({"p.rv": text}, standard_definitions()))
+    assert (found.topic, found.reason) == ("/t", "has a parametric specification")

@@ -1,0 +1,45 @@
+"""The command reads regular files only, and with a size limit."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from rosmop.tool.command import app
+from rosmop.tool.command_context import MAX_FILE
+
+SPECIFICATION = "m() { event e() /t std_msgs/Empty '{}' {} }\n"
+
+
+def huge(path: Path) -> None:
+    """Make a sparse file beyond the limit."""
+    path.touch()
+    os.truncate(path, MAX_FILE + 1)
+
+
+PIPE, DEVICE = "not a regular file: it is a named pipe", "not a regular file: it is a device"
+FILES: list[tuple[str, Callable[[Path], object], str]] = [
+    ("check given", os.mkfifo, PIPE),
+    ("check given", lambda path: path.symlink_to("/dev/zero"), DEVICE),
+    ("check given", Path.mkdir, "not a regular file: it is a folder"),
+    ("check given", huge, f"longer than {MAX_FILE} bytes"),
+    ("run m.rv --bag given", os.mkfifo, PIPE),
+    ("run m.rv --bag given", lambda path: path.symlink_to("/dev/zero"), DEVICE),
+    ("learn --bag given", os.mkfifo, PIPE),
+    ("coverage m.rv --bag given", os.mkfifo, PIPE),
+]
+
+
+@pytest.mark.parametrize(("command", "make", "reason"), FILES)
+def test_other_files_are_usage_errors(
+    command: str, make: Callable[[Path], object], reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command neither blocks nor fills the memory; it exits with 2 and the reason."""
+    monkeypatch.chdir(tmp_path)
+    Path("m.rv").write_text(SPECIFICATION)
+    make(Path("given"))
+    done = CliRunner().invoke(app, command.split())
+    assert done.exit_code == 2
+    assert reason in done.stderr
