@@ -7,10 +7,10 @@ Invariants:
 
 1. While the process runs, the age clock follows the monotonic clock. It ignores changes of the system clock and never
    goes back.
-2. Only the system clock tells how long the process was off. A gap of up to `_AT_ONCE` counts at once. A longer gap
-   counts after the system clock has been ahead for `_STANDS` of running time, by the smallest gap seen meanwhile. A
-   system clock that is behind adds nothing until it is corrected.
-3. The clock continues after a restart. Its file is written every `_SAVE`; time lost since then counts as time off.
+2. Only the system clock shows how long the process was off. A gap of up to `_AT_ONCE` is added at once. A longer gap is
+   added after the system clock has been ahead for `_STANDS` of running time; the smallest gap seen in that time counts.
+   A system clock that is behind adds nothing until it is corrected.
+3. The clock continues after a restart. Its file is written every `_SAVE`; time since the last write counts as time off.
 """
 
 import time
@@ -31,13 +31,13 @@ _log = structlog.get_logger()
 
 
 class _Kept(msgspec.Struct):
-    """Store the state of the clock; all fields are in nanoseconds."""
+    """The stored state of the clock; all fields are in nanoseconds."""
 
     lived: int  # running time of the machine while the process ran
     credited: int  # time since the epoch that counts in addition to `lived`
     believed: int  # the system clock minus `lived`, when last read
-    sets: int = 0  # the part that was set while the process ran and did not count
-    step: int = 0  # the gap at the start, until it counts
+    sets: int = 0  # changes of the system clock while the process ran, which were not counted
+    step: int = 0  # the gap at the start, until it is counted
     since: int = 0  # `lived` when the gap was first seen
 
 
@@ -46,9 +46,9 @@ def _monotonic() -> int:
 
 
 class AgeClock:
-    """Return nanoseconds since the epoch as if the system clock had never been wrong; keep them in the file at `path`.
+    """A callable clock: nanoseconds since the epoch as if the system clock had never been wrong, kept in `path`.
 
-    Without the file the clock starts at `begin()`, or now. Raises `OSError` if the file cannot be read.
+    Without the file, the clock starts at `begin()`, or now if that is None. Raises `OSError` if the file is unreadable.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class AgeClock:
         return kept.lived + kept.credited
 
     def _was_off(self, ahead: int) -> None:
-        """Count the gap of the system clock as time off, if it is credible."""
+        """Add the gap of the system clock as time off, once it is credible."""
         kept, counts = self._kept, 0
         if abs(ahead) <= _AT_ONCE:
             kept.step, counts = 0, max(0, ahead)

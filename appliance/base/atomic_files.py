@@ -13,7 +13,7 @@ _UNFINISHED = re.compile(r".+\.[0-9a-f]{8}\.new(-journal)?")
 
 
 class NotLastingError(OSError):
-    """Report a file that is replaced but not surely on the disk: after a power cut the old one may be back."""
+    """A replaced file may not be on the disk yet: after a power cut the old one may be back."""
 
 
 def name_to_make(path: Path) -> Path:
@@ -22,9 +22,9 @@ def name_to_make(path: Path) -> Path:
 
 
 def remove_unfinished(folder: str, place: int) -> None:
-    """Remove the temporary files of killed writers in a folder of `place` (a descriptor) and in its subfolders.
+    """Remove the temporary files of killed writers in `folder`, relative to the descriptor `place`, and below it.
 
-    No writer may be active. Files that cannot be removed stay; they block no writer.
+    No writer may be active. Files that cannot be removed stay; they do not block writers.
     """
     with contextlib.suppress(OSError):
         for _path, _folders, files, inside in os.fwalk(folder, follow_symlinks=False, dir_fd=place):
@@ -34,10 +34,10 @@ def remove_unfinished(folder: str, place: int) -> None:
 
 
 def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | None = None) -> None:
-    """Replace a file, on the disk when this returns. Raises `OSError`; the file before is then as it was.
+    """Replace a file and sync it to the disk. Raises `OSError`, which leaves the old file unchanged.
 
-    The file gets its `owner` (user and group; default: the writer) before its name. If several processes write at
-    once, one of their files remains, whole. Raises `NotLastingError` if the file is replaced, but perhaps not on disk.
+    `owner` (user and group; default: the writer) is set before the file gets its name. With concurrent writers, one
+    complete file remains. Raises `NotLastingError` if the file is replaced, but perhaps not on the disk.
     """
     making = name_to_make(path)
     try:

@@ -1,6 +1,6 @@
-"""Read files that a person names, or files in such a folder: regular files only, and with a size limit.
+"""Read files that a person names, or files in a folder they name: regular files only, with a size limit.
 
-A named pipe may block its reader for ever, a device may be endless, and a file may exceed the memory. Each raises an
+A named pipe may block its reader forever, a device may be endless, and a file may exceed the memory. Each raises an
 `OSError` that names the cause, so callers report it like a missing file.
 """
 
@@ -42,7 +42,7 @@ def open_given(path: Path) -> io.BufferedReader:
 
 
 def read_given(path: Path, longest: int = LONGEST) -> bytes:
-    """Return the bytes of such a file, `longest` at most. Raises `OSError`."""
+    """Return the bytes of a file, at most `longest`. Raises `OSError`."""
     with open_given(path) as file:
         data = file.read(longest + 1)
     if len(data) > longest:
@@ -51,13 +51,13 @@ def read_given(path: Path, longest: int = LONGEST) -> bytes:
 
 
 def read_given_text(path: Path, encoding: str = "utf-8", errors: str = "strict") -> str:
-    """Return the text of such a file, its lines ended by LF. Raises `OSError` and `UnicodeDecodeError`."""
+    """Return the text of a file, with LF line ends. Raises `OSError` and `UnicodeDecodeError`."""
     with io.TextIOWrapper(io.BytesIO(read_given(path)), encoding, errors) as text:
         return text.read()
 
 
 def lines_given(path: Path, longest: int) -> Iterator[bytes]:
-    """Yield the lines of such a file, each `longest` bytes at most. Raises `OSError`."""
+    """Yield the lines of a file, each at most `longest` bytes. Raises `OSError`."""
     with open_given(path) as file:
         for line in iter(lambda: file.readline(longest + 1), b""):
             if len(line) > longest:

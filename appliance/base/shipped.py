@@ -1,11 +1,11 @@
-"""Locate the files that ship with the program (examples, policies, monitors) and the list of Debian packages."""
+"""Locate the files that ship with the program (examples, policies, monitors) and dpkg's database."""
 
 import sys
 import time
 from pathlib import Path
 
 _CHECKOUT = Path(__file__).resolve().parents[2]
-# The top folder of a checkout, otherwise the folder of the wheel and the Debian package.
+# In a checkout: its top folder. Otherwise: where the wheel and the Debian package install the files.
 IS_CHECKOUT = (_CHECKOUT / "pyproject.toml").exists()
 SHIPPED = _CHECKOUT if IS_CHECKOUT else Path(sys.prefix) / "share" / "rosrv"
 DPKG = Path("/var/lib/dpkg")
@@ -13,6 +13,6 @@ _DAY = 86_400.0
 
 
 def before_program() -> float:
-    """Return the seconds by which the system clock is before the date of the program's files; 0 for less than a day."""
+    """Return how many seconds the system clock is behind the date of the program's files; 0 for less than a day."""
     before = Path(__file__).stat().st_mtime - time.time()
     return before if before > _DAY else 0.0

@@ -38,7 +38,7 @@ _MUST_BE = {
     "too_long": "{max_length} at most in number",
     "too_short": "{min_length} at least in number",
 }
-"""Descriptions of valid values, by type or first word of pydantic's error type, or by msgspec's type name."""
+"""Descriptions of valid values, by pydantic's error type, the first word of it, or msgspec's type name."""
 _BOUNDS = {">=": "at least", "<=": "at most", ">": "more than", "<": "less than"}
 _PARTS = {"str": "characters", "array": "entries", "object": "fields"}
 _BODY: dict[str, Callable[..., str]] = {
@@ -77,7 +77,7 @@ def not_yaml(problem: object) -> str:
 
 
 def nearest(word: str, candidates: Collection[str]) -> str | None:
-    """Return the candidate nearest to `word`."""
+    """Return the candidate most similar to `word`, or None if no candidate is similar or there are too many."""
     if len(candidates) > _MAXIMUM_CANDIDATES or len(word) > 100:
         return None
     folded = {candidate.casefold(): candidate for candidate in candidates}
@@ -99,7 +99,7 @@ def must_be(error: Mapping[str, Any]) -> str:
 
 
 def refusal(error: Mapping[str, Any]) -> str:
-    """Return the error of a command line or query value, from one of pydantic's `errors()`."""
+    """Return the error message for a command line or query value, from one of pydantic's `errors()`."""
     if error["type"] == "missing":
         return "must be given"
     if error["type"] == "value_error":  # our own validator wrote the sentence, which names the value
@@ -108,9 +108,9 @@ def refusal(error: Mapping[str, Any]) -> str:
 
 
 def body_refusal(text: str, choices: Collection[str] = ()) -> str:
-    """Return the error of a part of a body, from msgspec's `ValidationError` without its path.
+    """Return the error message for a part of a body, from msgspec's `ValidationError` without its path.
 
-    `choices`: the texts that the part may be, where it is one of a few.
+    `choices`: the valid strings of an enumeration.
     """
     no_choice = text.removeprefix("Invalid enum value ")
     if no_choice != text:

@@ -3,11 +3,11 @@
 Invariants:
 
 1. The code of an order calls `take_effect` before its first change. `take_effect` raises `WithdrawnError` if the client
-   gave up earlier (timeout, disconnection, kill). Nothing is changed then, and nothing will be.
-2. After `take_effect` the order runs to its end, whatever its client does. A client without an answer therefore knows
-   that nothing starts later; the audit log has every order that started.
-3. Work outside an order (a start, a signal, an automatic rollback) is never withdrawn, nor are tasks that outlive their
-   order.
+   gave up earlier (timeout, disconnection, kill). The order then changes nothing, now or later.
+2. After `take_effect` the order runs to its end, whatever its client does. A client that gave up therefore knows that
+   its order will not start later; the audit log has every order that started.
+3. Work outside an order (a start, a signal, an automatic rollback) is never withdrawn. Tasks that outlive their order
+   are not withdrawn either.
 
 The order is a context variable, shared by everything that is awaited for one request.
 """
@@ -20,14 +20,14 @@ WITHDRAWN = "its client did not wait any longer, so the order was withdrawn befo
 
 
 class WithdrawnError(Exception):
-    """Report that the client gave up before the order took effect; nothing was changed."""
+    """The client gave up before the order took effect; nothing was changed."""
 
     def __init__(self) -> None:
         super().__init__(WITHDRAWN)
 
 
 class _Order:
-    """Store `given_up()`, whether the client stopped waiting, and `begun`, after which that has no effect."""
+    """An order: `given_up()` returns whether the client stopped waiting, which is ignored once `begun` is true."""
 
     def __init__(self, given_up: Callable[[], bool]) -> None:
         self.given_up = given_up
@@ -45,7 +45,7 @@ def awaited(given_up: Callable[[], bool]) -> Iterator[None]:
     try:
         yield
     finally:
-        order.begun = True  # tasks that outlive it have a copy of the variable
+        order.begun = True  # tasks that outlive the order have a copy of the variable
         _PRESENT.reset(before)
 
 

@@ -1,1 +1,1 @@
-"""The configuration: every key with its default, where values come from, and the parts that are installed."""
+"""The configuration: all keys with their defaults, the sources of values, and the installed parts."""

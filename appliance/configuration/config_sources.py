@@ -1,14 +1,12 @@
-"""From file, environment and flags to `Settings`: later ones override earlier ones.
+"""Read `Settings` from file, environment and flags; later sources override earlier ones.
 
     1. defaults
-    2. `appliance.yaml` (`--config`, else `ROSRV_CONFIG`, else the one in the working directory if there
-       is one)
+    2. `appliance.yaml` (`--config`, else `ROSRV_CONFIG`, else the one in the working directory, if any)
     3. the environment: `ROSRV_LISTEN`, and `ROSRV_LIMITS__BODY_BYTES` for the key `body_bytes` under `limits`
     4. flags
 
-Every mistake is reported, all at once, each with where it stands and, for a key nobody knows, the
-nearest that is one. Relative paths in the file are relative to the file's folder; elsewhere to the
-working directory.
+All mistakes are reported at once, each with its location; for an unknown key also the nearest known key. Relative paths
+in the file are relative to the file's folder, all others to the working directory.
 """
 
 import dataclasses
@@ -35,7 +33,7 @@ if typing.TYPE_CHECKING:
 DEFAULT_FILE = Path("appliance.yaml")
 _PREFIX = "ROSRV_"
 _NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN", "ROSRV_API_URL", "ROSRV_API_CA"}
-# What Kubernetes and container links put there for a service that happens to be named `rosrv`.
+# Variables that Kubernetes and container links set for a service named `rosrv`.
 _SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*)|PORT|PORT_\d+_.*|NAME|ENV_.*)")
 _PATH_KEYS = (
     ("policy",), ("monitors",), ("state",), ("hosts",),
@@ -45,7 +43,7 @@ _PATH_KEYS = (
 KeyPath = tuple[str | int, ...]
 _SHORT_NAMES: dict[str, KeyPath] = {
     "ROSRV_CA_PASSPHRASE_FILE": ("ipsec", "ca_passphrase_file"),
-    "ROSRV_RELAY": ("relaying",),  # as --relay; with a table it is the section, like any other
+    "ROSRV_RELAY": ("relaying",),  # like --relay; a table is the value of the section `relay`
 }
 _FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
 _Section = typing.TypeVar("_Section", bound="DataclassInstance")
@@ -53,7 +51,7 @@ _Section = typing.TypeVar("_Section", bound="DataclassInstance")
 
 @dataclass(frozen=True)
 class Mistake:
-    """One thing that is wrong, and where it stands: `appliance.yaml:12`, `ROSRV_LISTEN`, `--listen`."""
+    """A mistake with its location: `appliance.yaml:12`, `ROSRV_LISTEN`, `--listen`."""
 
     place: str
     text: str
@@ -63,7 +61,7 @@ class Mistake:
 
 
 class ConfigError(Exception):
-    """The configuration is wrong; `mistakes` has everything that is."""
+    """The configuration has mistakes; the message lists all of them."""
 
     def __init__(self, mistakes: list[Mistake]) -> None:
         self.mistakes = sorted(mistakes, key=_line_of)
@@ -76,17 +74,17 @@ def _line_of(mistake: Mistake) -> int:
 
 
 def json_schema() -> dict[str, Any]:
-    """The JSON schema of `appliance.yaml`."""
+    """Return the JSON schema of `appliance.yaml`."""
     return _reader().json_schema()
 
 
 def read(values: Mapping[str, Any]) -> Settings:
-    """The settings that such a file has. Raises `pydantic.ValidationError`."""
+    """Return the settings with these values. Raises `pydantic.ValidationError`."""
     return _reader().validate_python(values)
 
 
 def plain(settings: Settings) -> dict[str, Any]:
-    """The settings as such a file has them."""
+    """Return the settings in the form of `appliance.yaml`."""
     found: dict[str, Any] = _reader().dump_python(settings, mode="json")
     return found
 
@@ -97,7 +95,7 @@ def _reader() -> TypeAdapter[Settings]:
 
 
 def resolve(file: Path | None, environment: Mapping[str, str], flags: Mapping[str, Any]) -> Settings:
-    """The settings in force. A flag that is None was not given. Raises `ConfigError`."""
+    """Return the resulting settings; flags that are None were not given. Raises `ConfigError`."""
     gathered = _Gathered()
     chosen = _choose_file(file, environment)
     if chosen is not None:
@@ -116,7 +114,7 @@ def _choose_file(file: Path | None, environment: Mapping[str, str]) -> Path | No
 
 
 class _Gathered:
-    """What was said so far, where each key was said, and what was wrong with it."""
+    """The values read so far, with the location of each key, and all mistakes."""
 
     def __init__(self) -> None:
         self._values: dict[str, Any] = {}
@@ -188,7 +186,7 @@ class _Gathered:
                 table[key] = {}
             table = table[key]
         table[path[-1]] = value
-        # Where the file stands no longer matters for what is under this key.
+        # Locations below this key are outdated.
         for older in [known for known in self._places if known[: len(path)] == path]:
             del self._places[older]
         self._places[path] = place
@@ -218,7 +216,7 @@ class _Gathered:
             return Mistake(place, _unknown_key(path))
         if kind == "missing":
             return Mistake(place, f"{_dotted(path)} must be given")
-        if kind == "value_error" and context:  # a sentence of ours, which names the value where that helps
+        if kind == "value_error" and context:  # our own message
             return Mistake(place, f"{_about(path, place)}{context['error']}")
         wanted = must_be(error)
         return Mistake(place, f"{_about(path, place)}must be {wanted}, not {self._value_at(path)!r}")
@@ -227,7 +225,7 @@ class _Gathered:
         for length in range(len(path), 0, -1):
             if path[:length] in self._places:
                 return self._places[path[:length]]
-        # A table where a plain value belongs: what is in it was said somewhere.
+        # A table instead of a plain value: use the location of its first key.
         return next(
             (place for known, place in self._places.items() if known[: len(path)] == path), "configuration"
         )
@@ -243,7 +241,7 @@ class _Gathered:
 
 
 def _about(path: KeyPath, place: str) -> str:
-    """Which key a mistake is about, unless its place is the flag of that name."""
+    """Return the key of a mistake as a prefix; empty if the location is the flag of that name."""
     return "" if not path or (place.startswith("--") and len(path) == 1) else f"{_dotted(path)}: "
 
 
@@ -255,7 +253,7 @@ def _unknown_key(path: KeyPath) -> str:
     known = sorted(_keys_at(Settings, path[:-1]))
     nearest = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)
     if not nearest:
-        # A key that stands on the wrong level is the other common mistake.
+        # Another common mistake is a key on the wrong level.
         elsewhere = [_dotted(key) for key in _all_keys(Settings, ()) if key[-1] == path[-1]]
         nearest = elsewhere[:1]
     advice = f"did you mean {nearest[0]}?" if nearest else f"known here: {', '.join(known)}"
@@ -263,7 +261,7 @@ def _unknown_key(path: KeyPath) -> str:
 
 
 def _with_absolute_paths(section: _Section) -> _Section:
-    """A copy in which no path depends on the working directory."""
+    """Return a copy with absolute paths."""
     changes: dict[str, Any] = {}
     for key in (field.name for field in dataclasses.fields(section)):
         value = getattr(section, key)
@@ -279,7 +277,7 @@ def _with_absolute_paths(section: _Section) -> _Section:
 
 
 def _resolve_path(values: dict[str, Any], path: tuple[str, ...], folder: Path) -> None:
-    """Make the path at a key relative to the file's folder, where there is one."""
+    """Prefix the path at a key with `folder`, if the key has a path."""
     *sections, key = path
     for section in sections:
         below = values.get(section)

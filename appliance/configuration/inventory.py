@@ -1,4 +1,4 @@
-"""What this program is and stands on, as a report of a defect and a site's list of its parts need it."""
+"""List the versions of this program and its parts, for bug reports and the site's inventory."""
 
 import functools
 import hashlib
@@ -16,7 +16,7 @@ import appliance
 from appliance.base.shipped import DPKG, SHIPPED
 from appliance.channel.answers.inventory_answers import Inventory, Part
 
-# Of packages.txt: what runs on the robot's machine.
+# The packages of packages.txt whose programs run on the robot's machine.
 RUNS = (
     "python3-rosmaster", "rosout", "iproute2", "iptables", "nftables", "charon-systemd",
     "libstrongswan-standard-plugins", "libcharon-extra-plugins", "strongswan-swanctl", "libseccomp2",
@@ -28,7 +28,7 @@ _COMMON = re.compile(r"/usr/share/common-licenses/([A-Za-z0-9.-]*[A-Za-z0-9])")
 
 @functools.cache
 def inventory() -> Inventory:
-    """What was installed when this was first asked; it reads hundreds of files."""
+    """Return the versions of the program and its parts; the first call reads hundreds of files."""
     build, listed = SHIPPED / "build.json", SHIPPED / "sbom.cdx.json"
     return Inventory(
         version=appliance.__version__,
@@ -43,7 +43,7 @@ def inventory() -> Inventory:
 
 
 def debian_packages(status: str) -> Iterator[Message]:
-    """What is installed, of the text of dpkg's list: the fields of each package."""
+    """Yield the fields of each installed package in dpkg's list."""
     for stanza in status.strip().split("\n\n"):
         fields = HeaderParser().parsestr(stanza)
         if fields["Status"] == "install ok installed":
@@ -51,12 +51,12 @@ def debian_packages(status: str) -> Iterator[Message]:
 
 
 def debian_licences(text: str) -> list[str]:
-    """The licences that a package's copyright file names, in Debian's own format or in words."""
+    """Return the licences in a package's copyright file, whether in Debian's machine-readable format or in prose."""
     return sorted(set(_LICENCE.findall(text) if "Format:" in text else _COMMON.findall(text)))
 
 
 def python_licences(fields: Message) -> list[str]:
-    """The licences that the metadata of a Python package names."""
+    """Return the licences in the metadata of a Python package."""
     classified = [
         str(classifier).rpartition(" :: ")[2]
         for classifier in fields.get_all("Classifier", [])
@@ -73,7 +73,7 @@ def _python() -> Iterator[Part]:
 
 
 def _debian() -> Iterator[Part]:
-    """None where the system is not Debian's kind, or does not show its list."""
+    """Yield the Debian packages that the program uses; none on a system without dpkg."""
     try:
         status = (DPKG / "status").read_text(errors="replace")
     except FileNotFoundError:
@@ -88,5 +88,5 @@ def _debian() -> Iterator[Part]:
 def _system() -> str:
     try:
         return platform.freedesktop_os_release()["PRETTY_NAME"]
-    except (OSError, KeyError):  # a system that does not say what it is
+    except (OSError, KeyError):  # a system without os-release
         return platform.system()

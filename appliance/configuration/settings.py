@@ -1,21 +1,27 @@
-"""The configuration of the appliance: every key with its default, as `appliance.yaml` spells it.
+"""Define every setting with its default, as in `appliance.yaml`.
 
-`appliance.configuration.config_sources` reads the file, the environment and the flags into it; the supervisor writes
-the result to `run/config.json` in the state directory, from where the other processes load it: what was
-checked once they have without pydantic, which takes each of them a tenth of a second. A key is here because
-something reads it. One file, for it is what an operator can say.
+`appliance.configuration.config_sources` fills `Settings` from the file, the environment and the flags. The supervisor
+writes the result to `run/config.json` in the state directory for the other processes.
 """
 
 import dataclasses
 import ipaddress
 import os
 import re
-from collections.abc import Callable
 from ipaddress import IPv4Network
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
 import msgspec
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ByteSize,
+    Field,
+    GetPydanticSchema,
+    IPvAnyAddress,
+    IPvAnyNetwork,
+)
 
 from appliance.signing.site_keys import checked_key
 
@@ -25,29 +31,8 @@ _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?")
 T = TypeVar("T")
 
 
-class Read:
-    """How pydantic reads a value that is annotated with this: what `how` of pydantic makes, said when it reads."""
-
-    def __init__(self, how: Callable[[Any], Any], named: str = "") -> None:
-        """`how(pydantic)` is an annotation, or several; `named` a type of pydantic's that reads it."""
-        self._how = how
-        self._named = named
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        """What pydantic asks of an annotation."""
-        import pydantic  # noqa: PLC0415  see the head
-
-        how = self._how(pydantic)
-        return handler.generate_schema(
-            Annotated[
-                getattr(pydantic, self._named) if self._named else source,
-                *(how if isinstance(how, tuple) else (how,)),
-            ]
-        )
-
-
 def key(*, description: str = "", default: Any = dataclasses.MISSING, **rules: Any) -> Any:
-    """A key with its default (or `default_factory`), what it is, and the rules of pydantic's `Field` for it."""
+    """Define a key with its default (or `default_factory`), description, and rules of pydantic's `Field`."""
     metadata = {"description": description or None, **rules}
     if isinstance(default, list):
         metadata["json_schema_extra"] = {"default": default}
@@ -59,27 +44,31 @@ def key(*, description: str = "", default: Any = dataclasses.MISSING, **rules: A
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(key,))
 def _section(cls: type[T]) -> type[T]:
-    """A table of keys; what it does not know is refused."""
-    cls.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]  # where pydantic looks for it
+    """Define a table of keys; unknown keys are rejected."""
+    cls.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]  # pydantic reads it there
     return dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
 
-Seconds = Annotated[float, Read(lambda its: its.Field(gt=0, le=86_400 * 365, allow_inf_nan=False))]
-Milliseconds = Annotated[float, Read(lambda its: its.Field(ge=1.0, le=1000.0, allow_inf_nan=False))]
-Count = Annotated[int, Read(lambda its: its.Field(gt=0))]
-Size = Annotated[int, Read(lambda its: its.Field(gt=0), "ByteSize")]
-SizeOfMebibytes = Annotated[int, Read(lambda its: its.Field(ge=1 << 20), "ByteSize")]  # one at least
-WithinAnHour = Annotated[float, Read(lambda its: its.Field(gt=0, le=3600, allow_inf_nan=False))]
+# msgspec and users of a setting see the annotated type; pydantic reads these.
+_BYTES = GetPydanticSchema(lambda _source, handler: handler(ByteSize))
+_NETWORK = GetPydanticSchema(lambda _source, handler: handler(IPvAnyNetwork))
+_ADDRESS = GetPydanticSchema(lambda _source, handler: handler(IPvAnyAddress))
+Seconds = Annotated[float, Field(gt=0, le=86_400 * 365, allow_inf_nan=False)]
+Milliseconds = Annotated[float, Field(ge=1.0, le=1000.0, allow_inf_nan=False)]
+Count = Annotated[int, Field(gt=0)]
+Size = Annotated[int, _BYTES, Field(gt=0)]
+SizeOfMebibytes = Annotated[int, _BYTES, Field(ge=1 << 20)]  # at least 1 MiB
+WithinAnHour = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
 
 
 class Unasked(str):
-    """A default for which nobody asked."""
+    """A string default, which shows that the user did not configure the value."""
 
     __slots__ = ()
 
 
 def split_address(text: str) -> tuple[str, int]:
-    """`HOST:PORT` or `[IPv6]:PORT` as host and port. Raises `ValueError`, which says what is wrong."""
+    """Parse `HOST:PORT` or `[IPv6]:PORT`. Raises `ValueError`."""
     host, colon, port = text.rpartition(":")
     if not colon or not port.isascii() or not port.isdigit() or int(port) > 65_535:
         raise ValueError(
@@ -95,7 +84,7 @@ def split_address(text: str) -> tuple[str, int]:
 
 
 def split_receiver(text: str) -> tuple[str, str, int]:
-    """`udp|tcp|tls://ADDRESS:PORT` as protocol, address and port. Raises `ValueError`."""
+    """Parse `udp|tcp|tls://ADDRESS:PORT`. Raises `ValueError`."""
     protocol, slashes, place = text.partition("://")
     example = "for example tls://10.0.0.9:6514 or udp://[fd00::9]:514"
     if not slashes or protocol not in ("udp", "tcp", "tls"):
@@ -104,9 +93,9 @@ def split_receiver(text: str) -> tuple[str, str, int]:
     try:
         ipaddress.ip_address(host)
     except ValueError:
-        raise ValueError(f"{host!r} is no address; names are not looked up, {example}") from None
+        raise ValueError(f"{host!r} is not an address; names are not looked up, {example}") from None
     if not port:
-        raise ValueError(f"{text!r}: port 0 is no receiver's, {example}")
+        raise ValueError(f"{text!r}: a receiver cannot have port 0, {example}")
     return protocol, host, port
 
 
@@ -137,12 +126,12 @@ def _checked_endpoint(text: str | None) -> str | None:
             ) from None
         return text
     if address.is_loopback or address.is_unspecified or address.is_multicast or address.is_link_local:
-        raise ValueError(f"{text} is no address at which other hosts reach the appliance, {example}")
+        raise ValueError(f"{text} is not an address at which other hosts reach the appliance, {example}")
     return str(address)
 
 
 def _none_if_empty(value: object) -> object:
-    return None if value == "" else value  # what compose hands on of a variable that is not set
+    return None if value == "" else value  # compose passes an unset variable as ""
 
 
 def _checked_name(text: str) -> str:
@@ -160,7 +149,7 @@ def _checked_api(text: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host, as configured, is this machine only."""
+    """Whether a configured host is this machine only."""
     if host == "localhost":
         return True
     try:
@@ -169,21 +158,17 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def _as_text(its: Any) -> Any:
-    return its.AfterValidator(str)
-
-
 @_section
 class Advertisement:
-    """The address that nodes of one network are told the appliance has."""
+    """The appliance's address for nodes of one network."""
 
-    network: Annotated[str, Read(_as_text, "IPvAnyNetwork")]
-    address: Annotated[str, Read(_as_text, "IPvAnyAddress")]
+    network: Annotated[str, _NETWORK, AfterValidator(str)]
+    address: Annotated[str, _ADDRESS, AfterValidator(str)]
 
 
 @_section
-class Limits:
-    """What RVMaster and the node faces accept; the defaults are beyond a large robot."""
+class LimitsSection:
+    """Limits of RVMaster and the proxy endpoints; the defaults exceed the needs of a large robot."""
 
     body_bytes: Size = key(default=16 << 20, description="body of a request")
     elements: Count = key(default=1_000_000, description="values in one request")
@@ -211,7 +196,7 @@ class Limits:
 class Syslog:
     """Where the audit log is forwarded to (RFC 5424), in a process of its own; off unless `to` is given."""
 
-    to: Annotated[str, Read(lambda its: its.AfterValidator(_checked_receiver))] | None = key(
+    to: Annotated[str, AfterValidator(_checked_receiver)] | None = key(
         default=None,
         description="udp://ADDRESS:PORT, tcp://… or tls://…: an address, so that nothing is asked of a name server",
     )
@@ -273,7 +258,7 @@ class Audit:
 
 
 @_section
-class Liveness:
+class LivenessSection:
     """When a node counts as gone; all in seconds."""
 
     interval: Seconds = key(default=5.0, description="between two looks at a node")
@@ -283,7 +268,7 @@ class Liveness:
 
 @_section
 class Relay:
-    """The limits of the relay; each key is a field of `appliance.relay.bounds.Limits`."""
+    """The limits of the relay; each key is a field of `appliance.relay.relay_limits.Limits`."""
 
     connections: Count = key(default=16_384, description="of all hosts")
     connections_per_host: Count = 8_192
@@ -304,10 +289,10 @@ class Relay:
 
 @_section
 class RecorderRules:
-    """The flight recorder: what was said before and after something happened. Off, for it keeps what a robot says."""
+    """The flight recorder, which keeps messages from before and after an incident. Off by default: it stores contents."""
 
     enabled: bool = key(default=False, description="whether anything is recorded")
-    memory: Annotated[int, Read(lambda its: its.Field(ge=16 << 20), "ByteSize")] = key(
+    memory: Annotated[int, _BYTES, Field(ge=16 << 20)] = key(
         default=64 << 20, description="of all relays together, for what they received last; it survives them"
     )
     before: WithinAnHour = key(default=60.0, description="seconds before what happened")
@@ -331,7 +316,7 @@ class RecorderRules:
         description="what begins a recording, besides an operator; service: a node's call, if the policy lets it",
     )
     per_hour: Count = key(default=6, description="recordings that one host may begin by one kind of trigger")
-    disk: Annotated[int, Read(lambda its: its.Field(ge=64 << 20), "ByteSize")] = key(
+    disk: Annotated[int, _BYTES, Field(ge=64 << 20)] = key(
         default=2 << 30, description="of all recordings; one has an eighth of it at most"
     )
     days: Seconds | None = key(default=30.0, description="after which a recording is removed; null: never")
@@ -342,8 +327,8 @@ class RecorderRules:
 
 
 @_section
-class Firewall:
-    """The firewall around the ROSMaster (isolation netns and container)."""
+class FirewallSection:
+    """The firewall around the ROS master (isolation netns and container)."""
 
     backend: Literal["auto", "iptables", "nft"] = key(
         default="auto", description="auto: what the kernel really enforces"
@@ -370,7 +355,8 @@ class Ipsec:
 
     pool: Annotated[
         IPv4Network,
-        Read(lambda its: (its.BeforeValidator(_is_ipv4), its.AfterValidator(_has_room_for_hosts))),
+        BeforeValidator(_is_ipv4),
+        AfterValidator(_has_room_for_hosts),
     ] = key(
         default=IPv4Network("10.113.11.0/24"),
         description="virtual addresses of the hosts in tunnels; the first one is the appliance's",
@@ -378,7 +364,8 @@ class Ipsec:
 
     endpoint: Annotated[
         str | None,
-        Read(lambda its: (its.BeforeValidator(_none_if_empty), its.AfterValidator(_checked_endpoint))),
+        BeforeValidator(_none_if_empty),
+        AfterValidator(_checked_endpoint),
     ] = key(
         default=None,
         description="address or name at which hosts reach the appliance from outside, for their kits;"
@@ -398,7 +385,7 @@ class Ipsec:
 
 @_section
 class ApiLimits:
-    """What the REST interface accepts; beyond it a client is told to come back later."""
+    """Limits of the REST interface; beyond them a client gets 429 or 503 with the time to repeat."""
 
     body_bytes: Size = key(default=1 << 20, description="body of a request")
     requests_per_second: Seconds = key(default=50.0, description="of one host, on average")
@@ -411,7 +398,7 @@ class ApiLimits:
 
 
 def relays_for_this_machine() -> int:
-    """How many relay processes there are unless it is configured: half of the cores, 1 to 4."""
+    """Return the default number of relay processes: half of the cores, 1 to 4."""
     return max(1, min(4, (os.cpu_count() or 1) // 2))
 
 
@@ -432,7 +419,7 @@ def _mediation_fits(mediation: str, info: Any) -> str:
 
 @_section
 class Settings:
-    """All of it."""
+    """All settings."""
 
     policy: Path = key(
         default=Path("policies/default.ini"), description="the access policy; read again on reload"
@@ -459,15 +446,15 @@ class Settings:
         le=1_000_000,
         description="slices of a parametric specification: bindings that are monitored at a time, about 700 bytes each",
     )
-    publish_as: Annotated[str, Read(lambda its: its.AfterValidator(_checked_name))] = key(
+    publish_as: Annotated[str, AfterValidator(_checked_name)] = key(
         default="/rosrv", description="the node name under which monitors publish"
     )
     monitors_on_rosout: bool = key(
         default=False,
-        description="put output, verdicts and faults of monitors on /rosout, too (the audit log always has them)",
+        description="also put output, verdicts and faults of monitors on /rosout (the audit log always has them)",
     )
     hide_publisher: bool = key(default=False, description="leave out what monitors publish in getSystemState")
-    site_keys: list[Annotated[str, Read(lambda its: its.AfterValidator(checked_key))]] = key(
+    site_keys: list[Annotated[str, AfterValidator(checked_key)]] = key(
         default=[],
         description="public keys (`ssh-ed25519 BASE64 COMMENT`); with any, a policy or specification that none of them"
         " signed is refused",
@@ -475,7 +462,7 @@ class Settings:
     state: Path = key(
         default=Path("/var/lib/rosrv"), description="directory of everything that must survive a restart"
     )
-    listen: Annotated[str, Read(lambda its: its.AfterValidator(_checked_address))] = key(
+    listen: Annotated[str, AfterValidator(_checked_address)] = key(
         default="0.0.0.0:11311", description="where nodes find their master"
     )
     rosmaster_port: int = key(
@@ -483,36 +470,32 @@ class Settings:
         default=12311,
         ge=0,
         le=65_535,
-        description="loopback port of the hidden ROSMaster; 0: any free one",
+        description="loopback port of the hidden ROS master; 0: any free one",
     )
     isolation: Literal["container", "netns", "none"] = key(
         default="netns", description="where the appliance lives; none: no firewall, for development only"
     )
     relaying: Literal["all", "monitored"] = key(
         default="all",
-        description="topics and services that go through the relay; `monitored` (those in [Monitor]) is no boundary",
+        description="topics and services that go through the relay; `monitored` (those in [Monitor]) is not a boundary",
     )
-    mediation: Annotated[
-        Literal["full", "monitored"], Read(lambda its: its.AfterValidator(_mediation_fits))
-    ] = key(
+    mediation: Annotated[Literal["full", "monitored"], AfterValidator(_mediation_fits)] = key(
         default="full",
         description="`monitored` tells nodes each other's real URIs; needs relaying: monitored",
     )
-    api: Annotated[
-        str, Read(lambda its: (its.BeforeValidator(_off_as_text), its.AfterValidator(_checked_api)))
-    ] = key(
+    api: Annotated[str, BeforeValidator(_off_as_text), AfterValidator(_checked_api)] = key(
         default_factory=lambda: Unasked("127.0.0.1:8443"),
         json_schema_extra={"default": "127.0.0.1:8443"},
         description="HOST:PORT of REST, or off; unless it is given here, another free port when this one is taken",
     )
-    api_tls: Annotated[bool, Read(lambda its: its.AfterValidator(_clear_text_stays_here))] = key(
+    api_tls: Annotated[bool, AfterValidator(_clear_text_stays_here)] = key(
         default=True, description="off: clear text, on a loopback address only"
     )
     api_require_proof: bool = key(
         default=False,
-        description="on: changes over REST are made for signed requests only (docs/rest.md), never for a bare token",
+        description="on: changes over REST need signed requests (docs/reference/rest.md); a bare token is not enough",
     )
-    api_networks: list[Annotated[str, Read(_as_text, "IPvAnyNetwork")]] = key(
+    api_networks: list[Annotated[str, _NETWORK, AfterValidator(str)]] = key(
         default=[], description="who may connect to REST besides this machine (the firewall's rule)"
     )
     api_published: bool = key(
@@ -535,17 +518,17 @@ class Settings:
         default=Path("ipsec/hosts.yaml"),
         description="the hosts that are meant to be enrolled; may be missing",
     )
-    relays: Annotated[int, Read(lambda its: its.Field(gt=0, le=16))] = key(
+    relays: Annotated[int, Field(gt=0, le=16)] = key(
         default_factory=relays_for_this_machine,
         description="relay processes that share topics and monitors; by default one for every two cores, at most 4",
     )
     advertise: list[Advertisement] = key(default=[])
-    limits: Limits = Limits()
+    limits: LimitsSection = LimitsSection()
     audit: Audit = Audit()
-    liveness: Liveness = Liveness()
+    liveness: LivenessSection = LivenessSection()
     relay: Relay = Relay()
     recorder: RecorderRules = RecorderRules()
-    firewall: Firewall = Firewall()
+    firewall: FirewallSection = FirewallSection()
     ipsec: Ipsec = Ipsec()
     api_limits: ApiLimits = ApiLimits()
 
@@ -569,11 +552,11 @@ class Settings:
 
     @property
     def own_services(self) -> list[str]:
-        """What the appliance itself offers to nodes: the service that has the flight recorder record."""
+        """Return the appliance's own services for nodes: the one that starts a recording."""
         offered = self.recorder.enabled and "service" in self.recorder.triggers
         return [f"{self.publish_as}/record_now"] if offered else []
 
 
 def load_resolved(path: Path) -> Settings:
-    """What the supervisor wrote for its children. Raises `OSError`, `msgspec.ValidationError`."""
+    """Load the supervisor's settings for its children. Raises `OSError`, `msgspec.ValidationError`."""
     return msgspec.json.decode(path.read_bytes(), type=Settings, dec_hook=lambda kind, text: kind(text))

@@ -1,1 +1,1 @@
-"""Namespaces, the firewall, and the ports of the machine that the nodes run on."""
+"""Network namespaces, the firewall, and the ports of machines with nodes."""

@@ -1,8 +1,8 @@
-"""What the connection tracker of a machine remembers, and how it forgets.
+"""Delete entries of the connection tracker.
 
-A rule that translates addresses is asked for the first packet of a conversation only. A host that sends UDP on and on
-(IKE, ESP in UDP) keeps its old entry alive, and its packets go where they went before the rules were there, or to an
-appliance that is gone. So entries of forwarded ports are deleted whenever the rules change.
+Address translation applies to the first packet of a connection only. A host that keeps sending UDP (IKE, ESP in UDP)
+keeps its old entry alive, so a change of the rules would not redirect its packets. Therefore entries of forwarded ports
+are deleted whenever the rules change.
 """
 
 import errno
@@ -20,9 +20,9 @@ _FAMILIES = (socket.AF_INET, socket.AF_INET6)
 
 
 def forget(namespace: Namespace, ports: Iterable[int]) -> int:
-    """Delete the entries of UDP packets to these ports of the namespace's own addresses, and count them.
+    """Delete the entries of UDP packets to these ports of the namespace's own addresses; return their number.
 
-    Entries of what the machine forwards for others stay. Raises: NetworkError when the kernel refuses.
+    Entries of forwarded packets stay. Raises `NetworkError`.
     """
     own = {address.partition("/")[0] for address in interfaces.addresses(namespace)}
     try:
@@ -45,7 +45,7 @@ def _forget(family: int, port: int, own: set[str]) -> int:
             try:
                 tracker.entry("del", tuple_orig=entry)
             except NetlinkError as error:
-                if error.code != errno.ENOENT:  # it ended by itself meanwhile
+                if error.code != errno.ENOENT:  # not an entry that ended meanwhile
                     raise
             else:
                 deleted += 1

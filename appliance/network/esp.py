@@ -1,4 +1,4 @@
-"""Where ESP runs: in the kernel where it has it, else in user space over a TUN device; found out by trying."""
+"""Find out whether ESP can run in the kernel, otherwise in user space over a TUN device."""
 
 import errno
 import os
@@ -14,12 +14,12 @@ from appliance.network.namespaces import Namespace, NetworkError
 Esp = Literal["kernel", "user space"]
 TUN = Path("/dev/net/tun")
 _SECONDS = 10.0
-# Addresses for documentation (RFC 5737): no packet ever matches the state that is tried.
+# Addresses for documentation (RFC 5737): no packet ever matches this state.
 _STATE = ("src", "192.0.2.1", "dst", "192.0.2.2", "proto", "esp", "spi")
 
 
 def choose_esp(namespace: Namespace) -> Esp:
-    """Where ESP can run in this namespace. Raises `NetworkError` when nowhere, with what to do."""
+    """Return where ESP can run in this namespace. Raises `NetworkError` with what to do."""
     refusal = _try_kernel(namespace)
     if refusal is None:
         return "kernel"
@@ -32,9 +32,9 @@ def choose_esp(namespace: Namespace) -> Esp:
 
 
 def lend_tun(uid: int, gid: int, tun: Path | None = None) -> None:
-    """Let this user open the TUN device, and no other user who could not before: an entry in its access control list.
+    """Let a user open the TUN device, if needed with an entry in its access control list.
 
-    Raises `NetworkError` when the system refuses, with what to do.
+    Raises `NetworkError` with what to do.
     """
     device, shown = tun or TUN, ""
     try:
@@ -51,14 +51,14 @@ def lend_tun(uid: int, gid: int, tun: Path | None = None) -> None:
         ) from error
 
 
-# An access control list as the kernel has it: a version, then tag, rights and id of each entry, sorted by tag.
+# The kernel's form of an access control list: a version, then tag, rights and id of each entry, sorted by tag.
 _ACL, _VERSION, _ENTRY = "system.posix_acl_access", struct.pack("<I", 2), struct.Struct("<HHI")
 _OWNER, _USER, _GROUP, _MASK, _OTHER = 1, 2, 4, 0x10, 0x20
 _NOBODY, _READ_WRITE = 0xFFFFFFFF, 6
 
 
 def _entries_of(device: Path, mode: int) -> list[tuple[int, int, int]]:
-    """Return the list that the device has: without one, what its mode says."""
+    """Return the entries of the device's access control list, or those that its mode stands for."""
     try:
         return list(_ENTRY.iter_unpack(os.getxattr(device, _ACL)[len(_VERSION) :]))
     except OSError as error:
@@ -68,7 +68,7 @@ def _entries_of(device: Path, mode: int) -> list[tuple[int, int, int]]:
 
 
 def _with_user(entries: list[tuple[int, int, int]], uid: int) -> bytes:
-    """Return the list with this user, who may read and write; the mask lets pass what any entry has."""
+    """Return the list with read and write access for this user; its mask permits the rights of all entries."""
     kept = [row for row in entries if row[0] != _MASK and row[::2] != (_USER, uid)]
     mask = _READ_WRITE
     for tag, rights, _id in kept:
@@ -78,7 +78,7 @@ def _with_user(entries: list[tuple[int, int, int]], uid: int) -> bytes:
 
 
 def _try_kernel(namespace: Namespace) -> str | None:
-    """Why the kernel does not take a state with the cipher of the tunnels; None when it does."""
+    """Return why the kernel rejects a state with the cipher of the tunnels, or None."""
     spi = f"0x{secrets.randbelow(0x7FFFFFFF) + 0x1000:x}"
     key = "0x" + secrets.token_hex(36)  # 256 bits and the salt
     cipher = ("reqid", "1", "mode", "tunnel", "aead", "rfc4106(gcm(aes))", key, "128")
@@ -97,7 +97,7 @@ def _ip(namespace: Namespace, arguments: list[str]) -> str | None:
     try:
         done = namespace.run(call)
     except FileNotFoundError:
-        return "the program `ip` is not here: apt install iproute2"
+        return "the program `ip` is missing: apt install iproute2"
     except subprocess.TimeoutExpired:
         return f"`ip` did not answer within {_SECONDS:.0f} seconds"
     return None if done.returncode == 0 else " ".join(done.stderr.split())[:200]

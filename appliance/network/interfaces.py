@@ -1,8 +1,7 @@
-"""Interfaces, addresses and routes inside a namespace, over netlink.
+"""Change interfaces, addresses and routes in a namespace, over netlink.
 
-Every function names the namespace it works in and waits until the kernel has done it. Addresses are written
-`10.77.0.10/24` or `fd77::10/64`; an IPv6 address is usable at once (no duplicate address detection: the
-networks made here have no strangers on them).
+Every function waits until the kernel is done. Addresses have the form `10.77.0.10/24` or `fd77::10/64`. An IPv6 address
+can be used at once, without duplicate address detection, because the networks made here have no other hosts.
 """
 
 import ipaddress
@@ -43,7 +42,7 @@ def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) 
 
 
 def create_bridge(namespace: Namespace, name: str) -> None:
-    """Make a bridge that forwards from the first frame (no spanning tree), up."""
+    """Make a bridge without spanning tree, up."""
     _netlink(
         namespace,
         f"making the bridge {name}",
@@ -71,7 +70,7 @@ def set_link(namespace: Namespace, name: str, *, up: bool) -> None:
 
 
 def delete_link(namespace: Namespace, name: str) -> None:
-    """Delete an interface (of a veth pair: both ends). Deleting what is not there is fine."""
+    """Delete an interface (of a veth pair: both ends), if it exists."""
 
     def delete(route: Any) -> None:
         for index in route.link_lookup(ifname=name):
@@ -98,7 +97,7 @@ def add_address(namespace: Namespace, name: str, address: str) -> None:
 
 
 def delete_address(namespace: Namespace, name: str, address: str) -> None:
-    """Take an address from the interface `name`. Deleting what is not there is fine."""
+    """Remove an address from the interface `name`, if it has it."""
     interface = ipaddress.ip_interface(address)
 
     def delete(route: Any) -> None:
@@ -107,7 +106,7 @@ def delete_address(namespace: Namespace, name: str, address: str) -> None:
                 length = interface.network.prefixlen
                 route.addr("del", index=index, address=str(interface.ip), prefixlen=length)
 
-    _netlink(namespace, f"taking {address} from {name}", delete)
+    _netlink(namespace, f"removing {address} from {name}", delete)
 
 
 def add_route(namespace: Namespace, destination: str, via: str) -> None:
@@ -123,7 +122,7 @@ def add_route(namespace: Namespace, destination: str, via: str) -> None:
 
 
 def add_near_route(namespace: Namespace, name: str, destination: str, *, source: str, hop_limit: int) -> None:
-    """Route the address `destination` out of the interface `name`; packets leave with `source` and this TTL."""
+    """Route the address `destination` to the interface `name`; packets leave with `source` and this TTL."""
     length = 128 if _family(destination) == socket.AF_INET6 else 32
     _netlink(
         namespace,
@@ -157,7 +156,7 @@ def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
         names = _names(route)
         held: dict[str, list[str]] = {name: [] for name in names.values()}
         for entry in route.get_addr():
-            # Of a point-to-point link IFA_ADDRESS is the other end's; IPv6 has IFA_LOCAL there only.
+            # On a point-to-point link IFA_ADDRESS is the other end's. IPv6 has IFA_LOCAL only on such a link.
             own = entry.get_attr("IFA_LOCAL") or entry.get_attr("IFA_ADDRESS")
             held.setdefault(names.get(entry["index"], ""), []).append(f"{own}/{entry['prefixlen']}")
         return held
@@ -167,7 +166,7 @@ def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class DefaultRoute:
-    """Where packets go that no other route is for; `source` is the address the route asks for, if it does."""
+    """A default route; `source` is its preferred source address, if it has one."""
 
     interface: str
     gateway: str | None
@@ -175,7 +174,7 @@ class DefaultRoute:
 
 
 def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
-    """Return the default route of IPv4 or IPv6 that is preferred (lowest metric), in the main table."""
+    """Return the default route of IPv4 or IPv6 with the lowest metric in the main table."""
 
     def read(route: Any) -> DefaultRoute | None:
         family = socket.AF_INET if version == 4 else socket.AF_INET6
@@ -197,7 +196,7 @@ def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
 
 
 def networks(namespace: Namespace) -> list[str]:
-    """Return every network that a route or an address of the namespace names, default routes left out."""
+    """Return every network of a route or an address of the namespace, without default routes."""
 
     def read(route: Any) -> list[str]:
         routes = [
@@ -211,10 +210,7 @@ def networks(namespace: Namespace) -> list[str]:
 
 
 def source_address_for(namespace: Namespace, peer: str) -> str:
-    """Return the address of this namespace that a packet to `peer` leaves with, as the routing table says.
-
-    Raises: NetworkError when there is no way to that address.
-    """
+    """Return the source address of packets to `peer` by the routing table. Raises `NetworkError` without a route."""
     family = _family(peer)
 
     def look_up(route: Any) -> str:
@@ -228,8 +224,8 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
 
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
-    """Do `work` with a netlink socket of the namespace; errors say what was attempted and where."""
-    from pyroute2 import IPRoute  # noqa: PLC0415  a hundred modules: not where no network is changed
+    """Run `work` with a netlink socket of the namespace; errors have the operation and the namespace."""
+    from pyroute2 import IPRoute  # noqa: PLC0415  a hundred modules, only needed to change a network
     from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415  likewise
 
     def inside() -> T:
@@ -244,12 +240,12 @@ def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
 
 
 def _names(route: Any) -> dict[int, str]:
-    """The names of the interfaces by index."""
+    """Return the names of the interfaces by index."""
     return {link["index"]: str(link.get_attr("IFLA_IFNAME")) for link in route.get_links()}
 
 
 def _held(route: Any, **of: int) -> list[str]:
-    """The addresses (`of` an interface), with their prefix lengths."""
+    """Return the addresses (`of` an interface, if given), with their prefix lengths."""
     return [f"{entry.get_attr('IFA_ADDRESS')}/{entry['prefixlen']}" for entry in route.get_addr(**of)]
 
 

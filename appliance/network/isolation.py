@@ -1,4 +1,4 @@
-"""Isolation `netns`: the appliance in a namespace of its own on a bare host.
+"""Isolation `netns`: run the appliance in a separate namespace on a bare host.
 
 ```
  hosts of the network                host                              namespace `rosrv`
@@ -8,24 +8,19 @@
                      +-------------------------------+         +---------------------------+
 ```
 
-Invariants:
-
-1. What arrives on an address of the host for a forwarded port goes to the namespace with its source address
-   kept; the host's own processes reach it by any address of the host and by 127.0.0.1 (::1 stays refused, for
-   it cannot leave a host). What the appliance opens bears the host's address on the network.
-2. A connection reaches the appliance under the address of the machine that made it. Rules of others that translate
-   addresses (of containers, virtual machines, clients of a hotspot) do not apply to the appliance's link: a
-   connection takes the first translation that it is given, and ROSRV-KEEP stands before all others and gives it its own
-   source. Should a forwarded packet bear an address of this machine all the same, ROSRV-POST drops it. While the
-   rules are not there (somebody flushed them) the appliance itself knows such a packet by its TTL: the host's own
-   have 255 on that link, and no router can pass a packet on with that.
-3. Nothing else of the namespace can be reached through the host, and a host that was no router does not
-   become one: forwarding is on, but the chain ROSRV-FWD lets only the appliance's packets pass.
-4. Whatever is changed is recorded first, so that `down`, or `up` after a crash, puts it back. Nothing
-   without a record is taken for ours: a namespace or interface of the same name is an error, not a
-   leftover.
-5. One appliance on a host: a lock that the kernel releases with the process says whether a record is a
-   leftover.
+1. Packets to an address of the host for a forwarded port go to the namespace with their source address. The host's own
+   processes reach it by any address of the host and by 127.0.0.1 (::1 stays refused, because it cannot leave a host).
+   Connections of the appliance have the host's address on the network.
+2. A connection arrives with the address of the machine that made it. Address translation by other programs (for
+   containers, virtual machines, hotspot clients) does not apply to the appliance's link: the first translation of a
+   connection wins, and ROSRV-KEEP, which keeps the source, comes first. If a forwarded packet still has an address of
+   this machine, ROSRV-POST drops it. If these rules are flushed, the appliance detects such packets by their TTL: the
+   host's own packets have 255 on that link, and a router decreases it.
+3. Nothing else in the namespace can be reached through the host, and the host does not become a router: forwarding is
+   enabled, but the chain ROSRV-FWD passes only the appliance's packets.
+4. Every change is recorded first, so that `down`, or `up` after a crash, undoes it. A namespace or interface of the
+   same name without a record is an error.
+5. One appliance runs on a host. Its lock ends with the process, so a record without a lock is left from a crash.
 """
 
 import contextlib
@@ -34,7 +29,7 @@ import ipaddress
 import itertools
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -43,7 +38,6 @@ from typing import Literal
 from appliance.base.atomic_files import write_whole
 from appliance.channel.answers.status import FirewallRule
 from appliance.network import interfaces
-from appliance.network.endings import end_processes
 from appliance.network.firewall import iptables
 from appliance.network.firewall.firewall import statuses
 from appliance.network.firewall.firewall_rules import (
@@ -51,56 +45,44 @@ from appliance.network.firewall.firewall_rules import (
     Chain,
     Family,
     Interface,
+    PacketRule,
+    PacketVerdict,
     PortRange,
-    Rule,
-    Verdict,
     family_of,
 )
 from appliance.network.firewall.nft import NftBackend
-from appliance.network.ip_forwarding import Forwarding
 from appliance.network.listening_sockets import listening_ports, udp_ports_in_use
-from appliance.network.namespaces import Namespace, NetworkError, require_privileges
-from appliance.network.public_address import Endpoint, outward_address
+from appliance.network.namespaces import Namespace, NetworkError, end_processes, require_privileges
+from appliance.network.public_address import PublicAddress, outward_address
 
 INSIDE = "eth0"
 _CANDIDATES = 64
 _TUNNELS = (PortRange.one(500), PortRange.one(4500))  # IKE; ESP in UDP
 _POOL = ipaddress.IPv4Network("10.111.0.0/16")
 _POOL6 = ipaddress.IPv6Network("fd52:4f53:5256::/48")
+_GLOBAL: dict[Family, str] = {4: "net/ipv4/ip_forward", 6: "net/ipv6/conf/all/forwarding"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class IsolationSettings:
-    """Where the appliance's namespace is, and what is forwarded to it.
-
-    `subnet` and `subnet6` None: the first one of a private pool that no route of the host names.
-    """
+    """The appliance's namespace, and the ports forwarded to it."""
 
     ports: tuple[PortRange, ...]  # TCP
     name: str = "rosrv"
-    subnet: str | None = None  # at least two addresses, such as 10.111.0.0/30
-    subnet6: str | None = None
-    directory: Path = Path("/run/rosrv")  # of the record and the lock, the same for all appliances of a host
+    directory: Path = Path("/run/rosrv")  # of record and lock, the same for all appliances of a host
 
     def __post_init__(self) -> None:
         if not self.ports:
             raise ValueError("isolation netns: no port to forward was given")
-        for text, version in ((self.subnet, 4), (self.subnet6, 6)):
-            if text is not None and (
-                family_of(text) != version or ipaddress.ip_network(text).num_addresses < 4
-            ):
-                raise ValueError(
-                    f"isolation netns: {text!r} is no IPv{version} network with room for two hosts"
-                )
 
     @property
     def link(self) -> str:
-        """The host's end of the veth pair."""
+        """Return the host's end of the veth pair."""
         return f"veth-{self.name}"[: interfaces.IFNAMSIZ]
 
 
 @dataclass(frozen=True)
-class Ends:
+class LinkAddresses:
     """The addresses of a subnet: the host's and the appliance's, without prefix length."""
 
     network: str
@@ -109,28 +91,75 @@ class Ends:
 
     @property
     def length(self) -> int:
-        """Prefix length, in bits."""
+        """Return the prefix length, in bits."""
         return ipaddress.ip_network(self.network).prefixlen
 
 
+class _IpForwarding:
+    """The forwarding settings of one host: enable them, and restore them.
+
+    The kernel copies the global setting to every interface, so the value of each interface is also recorded. A host
+    that forwards ignores router advertisements, its source of IPv6 routes, unless `accept_ra` is 2.
+    """
+
+    def __init__(self, host: Namespace) -> None:
+        self._host = host
+
+    def has_ipv6(self) -> bool:
+        """Whether the host uses IPv6."""
+        if not self._host.run(Path("/proc/sys/net/ipv6").exists):
+            return False
+        return self._host.sysctl("net/ipv6/conf/all/disable_ipv6") == "0"
+
+    def before(self, family: Family) -> bool:
+        """Whether the host already forwards."""
+        return self._host.sysctl(_GLOBAL[family]) != "0"
+
+    def record(self) -> dict[str, str]:
+        """Return the settings that `enable` may change, in the order to restore them."""
+        families: tuple[Family, ...] = (4, 6) if self.has_ipv6() else (4,)
+        keys = [_GLOBAL[family] for family in families]
+        for name in (*interfaces.links(self._host), "default"):
+            keys += [f"net/ipv{family}/conf/{name}/forwarding" for family in families]
+            keys += [f"net/ipv6/conf/{name}/accept_ra" for family in families if family == 6]
+        return {key: self._host.sysctl(key) for key in keys}
+
+    def enable(self, families: Sequence[Family]) -> None:
+        """Enable forwarding."""
+        if 6 in families and not self.before(6):
+            for name in interfaces.links(self._host):
+                key = f"net/ipv6/conf/{name}/accept_ra"
+                if self._host.sysctl(key) == "1":
+                    self._host.sysctl(key, "2")
+        for family in families:
+            if not self.before(family):
+                self._host.sysctl(_GLOBAL[family], "1")
+
+    def restore(self, record: dict[str, str]) -> None:
+        """Restore recorded settings; skip interfaces that no longer exist."""
+        for key, value in record.items():
+            if self._host.run((Path("/proc/sys") / key).exists) and self._host.sysctl(key) != value:
+                self._host.sysctl(key, value)
+
+
 class Isolation:
-    """The namespace of the appliance and its way to the host's networks."""
+    """The namespace of the appliance and its link to the host's networks."""
 
     def __init__(self, host: Namespace, settings: IsolationSettings) -> None:
         self._host = host
         self.settings = settings
         self.namespace = Namespace(settings.name)
-        self.ends: dict[Family, Ends] = {}
+        self.ends: dict[Family, LinkAddresses] = {}
         self._backend = NftBackend(host)
-        self._rules: tuple[Rule, ...] = ()
+        self._rules: tuple[PacketRule, ...] = ()
         self._routers: tuple[Family, ...] = ()
-        self._forwarding = Forwarding(host)
+        self._forwarding = _IpForwarding(host)
         self._lock: int | None = None
 
     def up(self) -> None:
-        """Make the namespace, its addresses and its forwarding; what a crash left is taken down first.
+        """Make the namespace, its addresses and its forwarding, after removing what a crash left.
 
-        Raises: PrivilegeError; NetworkError naming what is in the way. Nothing is left behind then.
+        Raises `PrivilegeError`, or `NetworkError` with the obstacle, and then leaves nothing behind.
         """
         require_privileges("isolation netns")
         self._take_lock()
@@ -145,7 +174,7 @@ class Isolation:
             raise
 
     def down(self) -> None:
-        """Take everything away again and put the host's settings back; taking down twice is fine."""
+        """Remove everything and restore the host's settings, if the isolation is up."""
         if self._lock is None:
             return
         try:
@@ -159,17 +188,17 @@ class Isolation:
             self._lock = None
 
     def host_address_for(self, peer: str) -> str:
-        """Return the address by which `peer` reaches the host: what nodes on that peer are to be told."""
+        """Return the address by which `peer` reaches the host, for nodes on that peer."""
         return interfaces.source_address_for(self._host, peer)
 
-    def endpoint(self) -> Endpoint:
-        """Where hosts of other networks reach the host. Raises: NetworkError when that cannot be told."""
+    def endpoint(self) -> PublicAddress:
+        """Return where hosts of other networks reach the host. Raises `NetworkError` if that is not known."""
         return outward_address(self._host, without=("lo", self.settings.link))
 
     def obstacles(self) -> tuple[str, ...]:
-        """Name chains of others on the host that drop forwarded packets unless told otherwise.
+        """Return chains of other programs on the host that drop forwarded packets by default.
 
-        A drop there cannot be undone from here; whoever owns the chain must let the appliance's link pass.
+        Our rules cannot override them; the owner of such a chain must accept the appliance's link.
         """
         link = self.settings.link
         return tuple(
@@ -178,14 +207,14 @@ class Isolation:
         )
 
     def translations(self) -> tuple[str, ...]:
-        """Name chains of others on the host that translate the addresses of other machines or containers.
+        """Return chains of other programs on the host that translate addresses of machines or containers.
 
-        They do not apply to connections to the appliance, which sees those hosts as they are.
+        They do not apply to connections to the appliance.
         """
         return (*self._backend.foreign_translations(), *iptables.foreign_translations(self._host))
 
     def forward_tunnels(self) -> None:
-        """Forward IKE and ESP (UDP 500 and 4500) too from now on. Raises: NetworkError if the host uses them itself."""
+        """Also forward IKE and ESP (UDP 500 and 4500). Raises `NetworkError` if the host uses these ports."""
         rules = isolation_rules(self.settings, self.ends, self._routers, udp=_TUNNELS)
         if rules == self._rules:
             return
@@ -198,7 +227,7 @@ class Isolation:
         self._install(rules)
 
     def put_rules_back(self) -> None:
-        """Install the rules on the host again, when somebody took them away."""
+        """Install the rules on the host again."""
         if self._rules:
             self._install(self._rules)
 
@@ -206,13 +235,13 @@ class Isolation:
         """Return the rules on the host with their counters."""
         return statuses(self._rules, self._backend.counters())
 
-    def _install(self, rules: tuple[Rule, ...]) -> None:
+    def _install(self, rules: tuple[PacketRule, ...]) -> None:
         self._backend.install(rules)
         self._rules = rules
         self._forget_tunnels()
 
     def _forget_tunnels(self) -> None:
-        """Let the next packet of each tunnel go where the rules say now."""
+        """Make the next packet of each tunnel follow the present rules."""
         from appliance.network import conntrack  # noqa: PLC0415  pyroute2: see `links`
 
         conntrack.forget(self._host, [port.first for port in _TUNNELS])
@@ -229,29 +258,29 @@ class Isolation:
                 self._host, settings.link, ends.appliance, source=ends.host, hop_limit=255
             )
             interfaces.add_route(inside, "default", ends.host)
-            if family == 4:  # so that packets the host sends from 127.0.0.1 may leave on this link
+            if family == 4:  # so that packets from 127.0.0.1 may leave on this link
                 self._host.sysctl(f"net/ipv4/conf/{settings.link}/route_localnet", "1")
         routers = tuple(family for family in self.ends if self._forwarding.before(family))
         self._routers = routers
-        self._install(isolation_rules(settings, self.ends, routers))  # before forwarding is turned on
+        self._install(isolation_rules(settings, self.ends, routers))  # before forwarding is enabled
         self._forwarding.enable(tuple(self.ends))
 
     def _choose_subnets(self) -> None:
         taken = [ipaddress.ip_network(text) for text in interfaces.networks(self._host)]
-        self.ends = {4: _choose(self.settings.subnet, _POOL, 30, taken)}
+        self.ends = {4: _choose(_POOL, 30, taken)}
         if self._forwarding.has_ipv6():
-            self.ends[6] = _choose(self.settings.subnet6, _POOL6, 64, taken)
+            self.ends[6] = _choose(_POOL6, 64, taken)
 
     def _refuse_foreign(self) -> None:
         name, link = self.settings.name, self.settings.link
         if self.namespace.exists():
             raise NetworkError(
-                f"there is a network namespace {name} that this appliance has not made: "
+                f"there is a network namespace {name} that this appliance did not make: "
                 f"`sudo ip netns delete {name}` if nobody needs it, or give the appliance another name"
             )
         if link in interfaces.links(self._host):
             raise NetworkError(
-                f"there is an interface {link} that this appliance has not made: `ip link delete {link}`"
+                f"there is an interface {link} that this appliance did not make: `ip link delete {link}`"
             )
         in_use = self._host.run(listening_ports)
         clashes = [
@@ -287,14 +316,14 @@ class Isolation:
         return self.settings.directory / "isolation.json"
 
     def _recorded_name(self) -> str:
-        """Return the namespace of the appliance that is running, for a message."""
+        """Return the name of the running appliance's namespace, for a message."""
         try:
             return f"namespace {json.loads(self._record.read_text(encoding='utf-8'))['namespace']}"
         except (OSError, ValueError, KeyError, TypeError):
             return "still starting"
 
     def _write_record(self) -> None:
-        """Write what will have to be put back, before anything is changed."""
+        """Record what to restore, before any change."""
         record = {
             "namespace": self.settings.name,
             "link": self.settings.link,
@@ -303,7 +332,7 @@ class Isolation:
         write_whole(self._record, json.dumps(record).encode(), 0o644)
 
     def _clear_leftovers(self) -> None:
-        """Undo what the record says, if there is one."""
+        """Undo the changes in the record, if there is one."""
         try:
             record = json.loads(self._record.read_text(encoding="utf-8"))
             leftover, link = Namespace(record["namespace"]), str(record["link"])
@@ -314,7 +343,7 @@ class Isolation:
             raise NetworkError(
                 f"{self._record} cannot be read ({error}): look at it and delete it"
             ) from error
-        self._forwarding.restore(settings)  # before the chain that keeps the host from being a router goes
+        self._forwarding.restore(settings)  # before ROSRV-FWD, which keeps the host from routing, is removed
         self._backend.remove()
         interfaces.delete_link(self._host, link)
         end_processes(leftover.processes())
@@ -325,75 +354,81 @@ class Isolation:
 
 def isolation_rules(
     settings: IsolationSettings,
-    ends: dict[Family, Ends],
+    ends: dict[Family, LinkAddresses],
     routers: tuple[Family, ...],
     *,
     udp: tuple[PortRange, ...] = (),
-) -> tuple[Rule, ...]:
+) -> tuple[PacketRule, ...]:
     """Return the rules on the host; `routers` are the families for which the host was a router before.
 
-    `udp` are ports that are forwarded besides the TCP ports of the settings.
+    `udp` ports are forwarded besides the TCP ports of the settings.
     """
     inward, outward = Interface(settings.link), Interface(settings.link, other=True)
-    forwarded = partial(Rule, chain=Chain.FORWARD)
-    leaving = partial(Rule, chain=Chain.LEAVING, leaves_on=inward)
+    forwarded = partial(PacketRule, chain=Chain.FORWARD)
+    leaving = partial(PacketRule, chain=Chain.LEAVING, leaves_on=inward)
     rules = [
-        Rule(
+        PacketRule(
             "the appliance does not reach the host's loopback",
-            Verdict.DROP,
+            PacketVerdict.DROP,
             chain=Chain.IN,
             arrives_on=inward,
             destination="127.0.0.0/8",
             new_connection=True,
         ),
-        forwarded("forwarded ports", Verdict.RETURN, leaves_on=inward, translated=True),
-        forwarded("no other way to the appliance", Verdict.DROP, leaves_on=inward, unknown=True),
-        Rule("the host's own loopback", Verdict.RETURN, chain=Chain.ARRIVING, arrives_on=LOOPBACK),
+        forwarded("forwarded ports", PacketVerdict.RETURN, leaves_on=inward, translated=True),
+        forwarded("no other way to the appliance", PacketVerdict.DROP, leaves_on=inward, unknown=True),
+        PacketRule(
+            "the host's own loopback", PacketVerdict.RETURN, chain=Chain.ARRIVING, arrives_on=LOOPBACK
+        ),
         leaving(
             "no packet of others under an address of the host",
-            Verdict.DROP,
-            arrives_on=outward,  # neighbour discovery is made here, and is said to arrive where it leaves
+            PacketVerdict.DROP,
+            arrives_on=outward,  # local neighbour discovery seems to arrive where it leaves
             local_source=True,
             forwarded=True,
         ),
-        leaving("the host's own packets: full TTL", Verdict.FULL_HOPS, forwarded=False),
+        leaving("the host's own packets: full TTL", PacketVerdict.FULL_HOPS, forwarded=False),
     ]
     for family, end in ends.items():
         if family not in routers:
             no_router = partial(forwarded, family=family, arrives_on=outward, leaves_on=outward)
-            rules.append(no_router(f"the host is no IPv{family} router", Verdict.DROP))
+            rules.append(no_router(f"the host is no IPv{family} router", PacketVerdict.DROP))
         rules += [_loopback(family, inward), *_true_sources(family, end, inward)]
         rules += [_forward("TCP", ports, end, outward) for ports in settings.ports]
         rules += [_forward("UDP", ports, end, outward) for ports in udp]
-        masqueraded = partial(Rule, chain=Chain.SOURCE_NAT, source=end.network, leaves_on=outward)
-        rules.append(masqueraded(f"the appliance's own connections, IPv{family}", Verdict.MASQUERADE))
+        masqueraded = partial(PacketRule, chain=Chain.SOURCE_NAT, source=end.network, leaves_on=outward)
+        rules.append(masqueraded(f"the appliance's own connections, IPv{family}", PacketVerdict.MASQUERADE))
     return tuple(rules)
 
 
-def _true_sources(family: Family, end: Ends, inward: Interface) -> tuple[Rule, ...]:
-    """Nobody has an address of the link but its two ends, and what enters it has the source it came with."""
-    elsewhere = partial(Rule, chain=Chain.ARRIVING, arrives_on=Interface(inward.name, other=True))
-    entering = partial(Rule, chain=Chain.KEPT_SOURCE, family=family, leaves_on=inward)
+def _true_sources(family: Family, end: LinkAddresses, inward: Interface) -> tuple[PacketRule, ...]:
+    """Drop packets that forge addresses of the link, and keep the sources of packets that enter it."""
+    elsewhere = partial(PacketRule, chain=Chain.ARRIVING, arrives_on=Interface(inward.name, other=True))
+    entering = partial(PacketRule, chain=Chain.KEPT_SOURCE, family=family, leaves_on=inward)
     return (
         elsewhere(
-            f"IPv{family} addresses of the appliance's link, from elsewhere", Verdict.DROP, source=end.network
+            f"IPv{family} addresses of the appliance's link, from elsewhere",
+            PacketVerdict.DROP,
+            source=end.network,
         ),
-        entering(f"to the appliance: nobody else translates IPv{family} sources", Verdict.KEEP_SOURCE),
+        entering(f"to the appliance: nobody else translates IPv{family} sources", PacketVerdict.KEEP_SOURCE),
     )
 
 
-def _loopback(family: Family, inward: Interface) -> Rule:
-    """127.0.0.1 is forwarded under the veth's address; ::1 cannot leave a host, so it stays refused."""
+def _loopback(family: Family, inward: Interface) -> PacketRule:
+    """Forward 127.0.0.1 under the veth's address; ::1 cannot leave a host, so it stays refused."""
     if family == 4:
-        local = partial(Rule, chain=Chain.KEPT_SOURCE, source="127.0.0.0/8", leaves_on=inward)
-        return local("from the host's own loopback", Verdict.MASQUERADE)
-    return Rule("not from ::1", Verdict.RETURN, chain=Chain.NAT, destination="::1")
+        local = partial(PacketRule, chain=Chain.KEPT_SOURCE, source="127.0.0.0/8", leaves_on=inward)
+        return local("from the host's own loopback", PacketVerdict.MASQUERADE)
+    return PacketRule("not from ::1", PacketVerdict.RETURN, chain=Chain.NAT, destination="::1")
 
 
-def _forward(protocol: Literal["TCP", "UDP"], ports: PortRange, end: Ends, outward: Interface) -> Rule:
-    return Rule(
+def _forward(
+    protocol: Literal["TCP", "UDP"], ports: PortRange, end: LinkAddresses, outward: Interface
+) -> PacketRule:
+    return PacketRule(
         f"{protocol} {ports} to the appliance, IPv{family_of(end.appliance)}",
-        Verdict.DNAT,
+        PacketVerdict.DNAT,
         chain=Chain.NAT,
         arrives_on=outward,
         tcp_ports=ports if protocol == "TCP" else None,
@@ -406,26 +441,10 @@ def _forward(protocol: Literal["TCP", "UDP"], ports: PortRange, end: Ends, outwa
 _Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
-def _choose(wanted: str | None, pool: _Network, length: int, taken: list[_Network]) -> Ends:
-    """Return the ends of the wanted subnet, or of the first one of the pool that collides with nothing."""
-    if wanted is not None:
-        network = ipaddress.ip_network(wanted)
-        for other in taken:
-            if _collide(network, other):
-                raise NetworkError(
-                    f"isolation netns: {network} collides with {other}, which this host has a route to"
-                )
-        return _ends(network)
+def _choose(pool: _Network, length: int, taken: list[_Network]) -> LinkAddresses:
+    """Return the ends of the first subnet of the pool without a route on the host."""
     candidates: Iterator[_Network] = iter(pool.subnets(new_prefix=length))
     for candidate in itertools.islice(candidates, _CANDIDATES):
-        if not any(_collide(candidate, other) for other in taken):
-            return _ends(candidate)
-    raise NetworkError(f"isolation netns: this host has routes to all of {pool}: give a free subnet")
-
-
-def _collide(one: _Network, other: _Network) -> bool:
-    return one.version == other.version and one.overlaps(other)
-
-
-def _ends(network: _Network) -> Ends:
-    return Ends(str(network), str(network[1]), str(network[2]))
+        if not any(candidate.version == other.version and candidate.overlaps(other) for other in taken):
+            return LinkAddresses(str(candidate), str(candidate[1]), str(candidate[2]))
+    raise NetworkError(f"isolation netns: this host has routes to all of {pool}")

@@ -1,4 +1,4 @@
-"""Who listens on which TCP port, as the kernel's tables say, in the namespace of the calling thread."""
+"""Read the kernel's tables of listening sockets, in the namespace of the calling thread."""
 
 import ipaddress
 import sys
@@ -10,12 +10,12 @@ _TCP_LISTEN = "0A"
 
 
 def listening_addresses(port: int) -> tuple[str, ...]:
-    """Return the addresses on which someone listens on a TCP port."""
+    """Return the addresses with a listener on a TCP port."""
     return tuple(sorted({_address(row.address) for row in _listeners() if row.port == port}))
 
 
 def listening_ports() -> set[int]:
-    """Return the TCP ports on which someone listens, on whatever address."""
+    """Return the TCP ports with a listener on any address."""
     return {row.port for row in _listeners()}
 
 
@@ -25,7 +25,7 @@ def listening_inodes(port: int) -> set[str]:
 
 
 def udp_ports_in_use() -> set[int]:
-    """Return the UDP ports that someone has bound, on whatever address."""
+    """Return the UDP ports that are bound on any address."""
     return {row.port for row in _rows("udp", "udp6")}
 
 
@@ -51,6 +51,6 @@ def _rows(*names: str) -> Iterator[_Row]:
 
 
 def _address(text: str) -> str:
-    """Read an address of /proc/net/tcp: words of 32 bits, each in the byte order of the machine."""
+    """Parse an address of /proc/net/tcp: words of 32 bits in the machine's byte order."""
     words = [text[index : index + 8] for index in range(0, len(text), 8)]
     return str(ipaddress.ip_address(b"".join(int(word, 16).to_bytes(4, sys.byteorder) for word in words)))

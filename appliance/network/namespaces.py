@@ -1,17 +1,15 @@
-"""Network namespaces: make one, run code or a program inside it, take it away.
+"""Make network namespaces, run code and programs in them, and delete them.
 
-A namespace here is a name under `/run/netns`, as `ip netns` makes them, so everything can also be looked at
-with `ip netns exec NAME …`. Being in a namespace is a property of a *thread*: each piece of work gets a
-thread of its own that moves into the namespace and ends there. Three things follow, and they are why it is
-done this way:
+A namespace is a name under `/run/netns`, as with `ip netns`. A *thread* is in a namespace, so each call gets its own
+thread, which moves into the namespace and ends there:
 
-1. No other thread of this process ever sees the namespace, and there is no way back that could fail.
-2. A program started with `popen` is inside before its first instruction: nothing runs between fork and exec
-   but what `subprocess` does anyway, so it is safe in a process with threads.
-3. The netlink library may be used whether or not the calling thread runs an asyncio loop.
+1. No other thread of this process is in the namespace, and no return from it can fail.
+2. A program started with `popen` is inside before its first instruction. Only `subprocess` runs between fork and exec,
+   so `popen` is safe in a process with threads.
+3. The netlink library works whether or not the calling thread runs an asyncio loop.
 
-The one price: a program that asks to be killed with its parent *thread* (`PR_SET_PDEATHSIG`) is killed at
-once, since that thread ends when `popen` returns. Use `entered()` for such a program.
+A program with `PR_SET_PDEATHSIG` would be killed when `popen` returns, because its parent *thread* ends then. Use
+`entered()` for such a program.
 """
 
 import contextlib
@@ -19,38 +17,47 @@ import ctypes
 import fcntl
 import os
 import re
+import select
+import signal
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
 
 DIRECTORY = Path("/run/netns")
-_HERE = Path("/proc/thread-self/ns/net")  # of the thread that looks
+_HERE = Path("/proc/thread-self/ns/net")  # of the calling thread
 _CLONE_NEWNET = 0x40000000
 _MS_BIND, _MS_REC, _MS_SHARED, _MNT_DETACH = 0x1000, 0x4000, 0x100000, 2
 _CAP_NET_ADMIN, _CAP_SYS_ADMIN = 12, 21
+_END_SECONDS = 3.0  # between SIGTERM and SIGKILL
+_ONLY_THERE = Path(
+    "sys/net/core/netdev_max_backlog"
+)  # only the machine's first network namespace has this setting
+_CONTAINER_MARKS = (".dockerenv", "run/.containerenv")  # of Docker and Podman
+_INITIAL_PIDS = "pid:[4026531836]"  # PROC_PID_INIT_INO: the machine's own process ids
 _VALID_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 
 T = TypeVar("T")
 
 
 class NetworkError(RuntimeError):
-    """This machine's network stands in the way; the message says what, where and what to do."""
+    """Report an obstacle in this machine's network; the message says what, where and what to do."""
 
 
 class PrivilegeError(NetworkError):
-    """The caller may not change the network of this machine."""
+    """Report that this process may not change the network of this machine."""
 
 
 def has_privileges() -> bool:
-    """Tell whether this process has CAP_SYS_ADMIN and CAP_NET_ADMIN, which making namespaces needs."""
+    """Whether this process has CAP_SYS_ADMIN and CAP_NET_ADMIN, to make namespaces."""
     return _has_capabilities(1 << _CAP_NET_ADMIN | 1 << _CAP_SYS_ADMIN)
 
 
 def require_network_admin(what: str) -> None:
-    """Raise PrivilegeError, naming `what` is wanted, unless this process may change its own network."""
+    """Raise `PrivilegeError` for `what` unless this process may change its own network."""
     if not _has_capabilities(1 << _CAP_NET_ADMIN):
         raise PrivilegeError(
             f"{what} needs CAP_NET_ADMIN: run it as root, give it to the container (cap_add: [NET_ADMIN]), "
@@ -65,7 +72,7 @@ def _has_capabilities(wanted: int) -> bool:
 
 
 def require_privileges(what: str) -> None:
-    """Raise PrivilegeError, naming `what` is wanted, unless namespaces can be made here."""
+    """Raise `PrivilegeError` for `what` unless this process can make namespaces."""
     if not has_privileges():
         raise PrivilegeError(
             f"{what} needs root (CAP_SYS_ADMIN and CAP_NET_ADMIN): run it with sudo, "
@@ -74,17 +81,19 @@ def require_privileges(what: str) -> None:
 
 
 class Namespace:
-    """A network namespace, by name. Making the object touches nothing: see `create` and `exists`."""
+    """A network namespace by name; the object itself does not create it."""
 
     def __init__(self, name: str) -> None:
         if not _VALID_NAME.fullmatch(name):
-            raise ValueError(f"{name!r} is no name for a network namespace: letters, digits and _ . - only")
+            raise ValueError(
+                f"{name!r} is not a name for a network namespace: letters, digits and _ . - only"
+            )
         self.name = name
         self.path = DIRECTORY / name
 
     @classmethod
     def own(cls) -> "Namespace":
-        """Return the namespace this process lives in; it can be neither made nor deleted."""
+        """Return the namespace of this process; it can be neither made nor deleted."""
         return _OwnNamespace()
 
     def __repr__(self) -> str:
@@ -97,7 +106,7 @@ class Namespace:
         return hash(self.path)
 
     def exists(self) -> bool:
-        """Tell whether a namespace is mounted under this name (a bare file left by a crash is none)."""
+        """Whether a namespace is mounted under this name (not a bare file from a crash)."""
         try:
             here, above = self.path.stat(), self.path.parent.stat()
         except OSError:
@@ -105,10 +114,7 @@ class Namespace:
         return here.st_dev != above.st_dev
 
     def create(self) -> "Namespace":
-        """Make it, with `lo` down and nothing else in it.
-
-        Raises: PrivilegeError; NetworkError if there is one of that name already.
-        """
+        """Create it, with only `lo`, which is down. Raises `PrivilegeError`, or `NetworkError` if the name exists."""
         require_privileges(f"making the network namespace {self.name}")
         with _directory_lock():
             if self.exists():
@@ -128,7 +134,7 @@ class Namespace:
         _mount(_HERE, self.path, _MS_BIND)
 
     def delete(self) -> None:
-        """Take the name away (if it is there); the namespace itself ends with the last process in it."""
+        """Delete the name, if it exists; the namespace itself ends with its last process."""
         if self.exists():
             require_privileges(f"deleting the network namespace {self.name}")
             if _libc().umount2(os.fsencode(self.path), _MNT_DETACH) != 0:
@@ -137,9 +143,9 @@ class Namespace:
 
     @contextlib.contextmanager
     def entered(self) -> Iterator[None]:
-        """Be in the namespace with the calling thread for the length of the block, and back afterwards.
+        """Move the calling thread into the namespace for the block, and back afterwards.
 
-        For short synchronous work (open a socket, start a program); never await inside the block.
+        For short synchronous work (open a socket, start a program); do not await in the block.
         """
         home = os.open(_HERE, os.O_RDONLY | os.O_CLOEXEC)
         try:
@@ -153,7 +159,7 @@ class Namespace:
             os.close(home)
 
     def run(self, function: Callable[[], T]) -> T:
-        """Call `function` in a thread inside the namespace; return what it returns, raise what it raises."""
+        """Call `function` in a thread inside the namespace; return its result or raise its exception."""
 
         def inside() -> T:
             self._enter()
@@ -166,9 +172,9 @@ class Namespace:
         return self.run(lambda: subprocess.Popen(args, **options))
 
     def sysctl(self, key: str, value: str | None = None) -> str:
-        """Set the kernel setting `key` if `value` is given; return what it is.
+        """Set the kernel setting `key` if `value` is given; return its value.
 
-        `key` is written `net.ipv4.ip_forward`, or with slashes when an interface name in it has a dot.
+        `key` has the form `net.ipv4.ip_forward`, or slashes instead if an interface name in it has a dot.
         """
         path = Path("/proc/sys", *key.split("/" if "/" in key else "."))
 
@@ -183,14 +189,14 @@ class Namespace:
             raise NetworkError(f"sysctl {key} in {self.name}: {error.strerror}") from error
 
     def lacks_syn_cookies(self) -> bool:
-        """Tell whether half-open connections can use up a listener's places here: forged first packets keep all out."""
+        """Whether forged first packets can fill a listener's queue of half-open connections."""
         try:
             return self.sysctl("net.ipv4.tcp_syncookies") == "0"
-        except NetworkError:  # a kernel that was built without them
+        except NetworkError:  # a kernel built without them
             return True
 
     def processes(self) -> list[int]:
-        """Return the ids of the processes that live in the namespace, this one never among them."""
+        """Return the ids of the processes in the namespace, without this one."""
         if not self.exists():
             return []
         mark = self.path.stat()
@@ -204,7 +210,7 @@ class Namespace:
         return sorted(found)
 
     def open(self) -> int:
-        """Return a new descriptor of the namespace (netlink moves interfaces by it); the caller closes it."""
+        """Return a new descriptor of the namespace, for netlink; the caller closes it."""
         try:
             return os.open(self.path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -221,7 +227,7 @@ class Namespace:
 
 
 class _OwnNamespace(Namespace):
-    """The namespace the process was started in."""
+    """The namespace of this process."""
 
     def __init__(self) -> None:
         self.name = "(own)"
@@ -231,7 +237,7 @@ class _OwnNamespace(Namespace):
         return True
 
     def _enter(self) -> None:
-        """A thread that is there already stays: a container may not use setns, not even to where it is."""
+        """Enter the namespace, unless the thread is already in it, because containers may not call setns."""
         if not os.path.samestat(_HERE.stat(), self.path.stat()):
             super()._enter()
 
@@ -243,7 +249,7 @@ class _OwnNamespace(Namespace):
 
 
 def namespaces(prefix: str = "") -> list[Namespace]:
-    """Return the named namespaces of this machine whose name begins with `prefix`, dead names included."""
+    """Return the named namespaces whose name begins with `prefix`, including dead names."""
     if not DIRECTORY.is_dir():
         return []
     names = sorted(entry.name for entry in DIRECTORY.iterdir())
@@ -251,7 +257,7 @@ def namespaces(prefix: str = "") -> list[Namespace]:
 
 
 def _in_thread(function: Callable[[], T]) -> T:
-    """Call `function` in a thread that ends with it."""
+    """Call `function` in a thread of its own."""
     outcome: Future[T] = Future()
 
     def work() -> None:
@@ -268,7 +274,7 @@ def _in_thread(function: Callable[[], T]) -> T:
 
 @contextlib.contextmanager
 def _directory_lock() -> Iterator[None]:
-    """Make `/run/netns` a shared mount, as `ip netns add` does, while no other process of ours is at it."""
+    """Make `/run/netns` a shared mount, as `ip netns add` does, under a lock."""
     DIRECTORY.mkdir(mode=0o755, exist_ok=True)
     lock = os.open(DIRECTORY.parent / "rosrv-netns.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
@@ -282,7 +288,7 @@ def _directory_lock() -> Iterator[None]:
 
 
 def _is_mount_point(path: Path) -> bool:
-    """Tell whether something is mounted here (`os.path.ismount` is blind to a bind onto itself)."""
+    """Whether something is mounted here (`os.path.ismount` misses a bind mount onto itself)."""
     with Path("/proc/thread-self/mountinfo").open(encoding="utf-8", errors="replace") as lines:
         return any(line.split(" ", 5)[4] == str(path) for line in lines)
 
@@ -305,3 +311,58 @@ def _os_failure(call: str, name: str) -> NetworkError:
     number = ctypes.get_errno()
     hint = ": needs root (CAP_SYS_ADMIN); run it with sudo" if number in (1, 13) else ""
     return NetworkError(f"network namespace {name}: {call}: {os.strerror(number)}{hint}")
+
+
+def lives_on_the_machines_network(proc: Path = Path("/proc")) -> bool:
+    """Whether this is the machine's first network namespace, and not a container's."""
+    return (proc / _ONLY_THERE).exists()
+
+
+def is_contained(root: Path = Path("/")) -> bool:
+    """Whether this process is in a container, with or without its own network."""
+    if any((root / mark).exists() for mark in _CONTAINER_MARKS):
+        return True
+    try:
+        return str((root / "proc/self/ns/pid").readlink()) != _INITIAL_PIDS
+    except OSError:
+        return False
+
+
+def bridges(classes: Path = Path("/sys/class/net")) -> list[str]:
+    """Return the bridges of this namespace: a container has none, a machine that runs containers has one."""
+    return sorted(link.name for link in classes.glob("*") if (link / "bridge").is_dir())
+
+
+def end_processes(pids: Sequence[int]) -> None:
+    """End processes by id with SIGTERM, and with SIGKILL after `_END_SECONDS`.
+
+    A descriptor refers to each process, so a reused id is never signalled.
+    """
+    descriptors: dict[int, int] = {}
+    for pid in pids:
+        with contextlib.suppress(OSError):
+            descriptors[os.pidfd_open(pid)] = pid
+    try:
+        for number, limit in ((signal.SIGTERM, _END_SECONDS), (signal.SIGKILL, _END_SECONDS)):
+            _signal_and_wait(descriptors, number, limit)
+    finally:
+        for descriptor in descriptors:
+            os.close(descriptor)
+
+
+def _signal_and_wait(descriptors: dict[int, int], number: signal.Signals, limit: float) -> None:
+    """Send a signal to the remaining processes and wait for their end, at most `limit` seconds."""
+    poll = select.poll()
+    waiting = set(descriptors)
+    for descriptor in descriptors:
+        try:
+            signal.pidfd_send_signal(descriptor, number)
+        except ProcessLookupError:
+            waiting.discard(descriptor)
+        else:
+            poll.register(descriptor, select.POLLIN)
+    deadline = time.monotonic() + limit
+    while waiting and (left := deadline - time.monotonic()) > 0:
+        for descriptor, _ in poll.poll(left * 1000):
+            poll.unregister(descriptor)
+            waiting.discard(descriptor)

@@ -1,9 +1,8 @@
-"""The probe: another local user tries to reach a port that must be closed to it.
+"""Probe a hidden port: try to reach it as another local user.
 
-Run at start and every minute. A child process drops to an unprivileged user inside the namespace and
-connects to the port over loopback, IPv4 and IPv6. That it is refused proves something only while someone
-listens, so the sockets that listen on the port are looked up too, and with them whether any of them can be
-reached from outside loopback at all.
+At the start and every minute, a child process becomes an unprivileged user inside the namespace and connects to the
+port over loopback, IPv4 and IPv6. A refusal proves nothing without a listener, so the addresses of the listening
+sockets are also read; they show whether a socket listens outside loopback.
 """
 
 import ipaddress
@@ -13,11 +12,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 
+from appliance.network.hang_detection import run_program
 from appliance.network.listening_sockets import listening_addresses
 from appliance.network.namespaces import Namespace, NetworkError
-from appliance.network.patience import run
 
-PROBE_UID = 61099  # nobody's: neither root nor one of the appliance's users
+PROBE_UID = 61099  # neither root nor a user of the appliance
 _CONNECT_SECONDS = 1.0
 
 _CHILD = """
@@ -39,47 +38,49 @@ for family, address in ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1"))
 """
 
 
-class Outcome(StrEnum):
-    """What an attempt to connect came to."""
+class ConnectOutcome(StrEnum):
+    """The outcome of an attempt to connect."""
 
     REACHED = "reached"
     REFUSED = "refused"
     TIMED_OUT = "timed out"
-    NO_SUCH_ADDRESS = "no such address"  # the machine has no such loopback: nobody can be reached on it
+    NO_SUCH_ADDRESS = "no such address"  # the machine lacks this loopback address
     UNCLEAR = "unclear"
 
 
 @dataclass(frozen=True)
-class Attempt:
-    """One attempt."""
+class ConnectAttempt:
+    """One attempt to connect."""
 
     address: str
-    outcome: Outcome
+    outcome: ConnectOutcome
     detail: str = ""
 
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """What another local user sees of a port."""
+    """The result of a probe."""
 
     port: int
     uid: int
-    attempts: tuple[Attempt, ...]
-    # Addresses on which someone listens on the port: without any nothing is proven
+    attempts: tuple[ConnectAttempt, ...]
+    # Addresses with a listener on the port; without a listener nothing is proven.
     listening: tuple[str, ...]
 
     @property
     def closed(self) -> bool:
-        """Nobody got through and every attempt had a clear end."""
-        return not any(attempt.outcome in (Outcome.REACHED, Outcome.UNCLEAR) for attempt in self.attempts)
+        """Whether no attempt connected, and every outcome is clear."""
+        return not any(
+            attempt.outcome in (ConnectOutcome.REACHED, ConnectOutcome.UNCLEAR) for attempt in self.attempts
+        )
 
     @property
     def listening_outside(self) -> tuple[str, ...]:
-        """The addresses of `listening` that are not loopback."""
+        """Return the addresses of `listening` that are not loopback."""
         return tuple(text for text in self.listening if not ipaddress.ip_address(text).is_loopback)
 
     def describe(self) -> str:
-        """Say in one line what was seen."""
+        """Return the result in one line."""
         seen = ", ".join(
             f"{attempt.address} {attempt.detail or attempt.outcome}" for attempt in self.attempts
         )
@@ -87,10 +88,7 @@ class ProbeResult:
 
 
 def probe_port(namespace: Namespace, port: int, uid: int = PROBE_UID) -> ProbeResult:
-    """Try to reach `port` over loopback as the user `uid`, which must not be root.
-
-    Raises: NetworkError when the attempt itself could not be made (that is no proof of a closed port).
-    """
+    """Try to reach `port` over loopback as the user `uid`, not root. Raises `NetworkError` if that cannot be tried."""
     if uid <= 0:
         raise ValueError("the probe must run as an unprivileged user, not as root")
     listening = namespace.run(lambda: listening_addresses(port))
@@ -105,7 +103,7 @@ def _run_child(namespace: Namespace, port: int, uid: int) -> str:
     arguments = [sys.executable, "-I", "-S", "-c", _CHILD, str(port), str(_CONNECT_SECONDS)]
     child = partial(namespace.popen, arguments, user=uid, group=uid, extra_groups=[], cwd="/", env={})
     try:
-        status, output, errors = run(child, "", f"the probe of port {port}")
+        status, output, errors = run_program(child, "", f"the probe of port {port}")
     except TimeoutError as error:
         raise NetworkError(str(error)) from None
     except OSError as error:
@@ -118,8 +116,8 @@ def _run_child(namespace: Namespace, port: int, uid: int) -> str:
     return output
 
 
-def _attempt(address: str, outcome: str) -> Attempt:
+def _attempt(address: str, outcome: str) -> ConnectAttempt:
     try:
-        return Attempt(address, Outcome(outcome))
+        return ConnectAttempt(address, ConnectOutcome(outcome))
     except ValueError:
-        return Attempt(address, Outcome.UNCLEAR, outcome)
+        return ConnectAttempt(address, ConnectOutcome.UNCLEAR, outcome)

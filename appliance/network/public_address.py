@@ -1,7 +1,7 @@
-"""Where hosts of other networks reach this machine, as far as the machine itself can tell.
+"""Find the address by which hosts of other networks reach this machine.
 
-What is in front of it (address translation, published ports of a container) it cannot see: whoever shows an address
-found here says why it was taken, so that a person can name another.
+The machine cannot see address translation, or published ports of its container, in front of it. So an address has a
+reason; operators see it and can configure another address.
 """
 
 import ipaddress
@@ -15,17 +15,17 @@ _VERSIONS = (4, 6)  # IPv4 first, which every ROS 1 host has
 
 
 @dataclass(frozen=True)
-class Endpoint:
-    """An address at which other hosts reach this machine; `reason`: why it is taken for that."""
+class PublicAddress:
+    """An address at which other hosts reach this machine, and the reason for this choice."""
 
     address: str
     reason: str
 
 
-def outward_address(namespace: Namespace, *, without: Sequence[str]) -> Endpoint:
-    """The address towards the default route; without such a route, the only address.
+def outward_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddress:
+    """Return the address towards the default route; without such a route, the only address.
 
-    Interfaces `without` do not count. Raises: NetworkError when there is no such address, or several.
+    Interfaces in `without` do not count. Raises `NetworkError` if there is no such address, or several.
     """
     for version in _VERSIONS:
         route = interfaces.default_route(namespace, version)
@@ -33,14 +33,14 @@ def outward_address(namespace: Namespace, *, without: Sequence[str]) -> Endpoint
             continue
         address = route.source or _first(namespace, route, version)
         if address is not None and _counts(address):
-            return Endpoint(address, "this machine's address towards its default route")
+            return PublicAddress(address, "this machine's address towards its default route")
     return only_address(namespace, without=without)
 
 
-def only_address(namespace: Namespace, *, without: Sequence[str]) -> Endpoint:
-    """The only IPv4 address of all interfaces but those `without`; if there is none, the only IPv6 address.
+def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddress:
+    """Return the only IPv4 address of all interfaces but those in `without`; if there is none, the only IPv6 address.
 
-    Raises: NetworkError when there is none at all, or there are several.
+    Raises `NetworkError` if there is none, or several.
     """
     held = interfaces.addresses_by_interface(namespace)
     own = [text.partition("/")[0] for name, texts in held.items() if name not in without for text in texts]
@@ -51,14 +51,14 @@ def only_address(namespace: Namespace, *, without: Sequence[str]) -> Endpoint:
     for version in _VERSIONS:
         of_it = [str(address) for address in found if address.version == version]
         if len(of_it) == 1:
-            return Endpoint(of_it[0], "the only address here")
+            return PublicAddress(of_it[0], "the only address here")
         if of_it:
             raise NetworkError(f"there are several addresses here ({', '.join(of_it)})")
     raise NetworkError("there is no address here but loopback and link-local ones")
 
 
 def _first(namespace: Namespace, route: interfaces.DefaultRoute, version: int) -> str | None:
-    """The address that packets to the gateway leave with; without a gateway (a modem), the interface's first one."""
+    """Return the source address of packets to the gateway; without a gateway (a modem), the interface's first one."""
     if route.gateway is not None:
         return interfaces.source_address_for(namespace, route.gateway)
     held = interfaces.addresses_by_interface(namespace).get(route.interface, [])

@@ -1,1 +1,1 @@
-"""Who may hold how much of what is finite: one way of counting (`pool`), one table of what is counted (`table`)."""
+"""Quotas on finite resources: one way of counting (`pool`), one table of the counted resources (`table`)."""

@@ -4,24 +4,24 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from typing import Generic, TypeVar
 
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 
 Holder = TypeVar("Holder", bound=Hashable)
 Member = TypeVar("Member")
-_MOST_MOVED = 64  # members that one search may move to the present standing of their hosts
+_MOST_MOVED = 64  # members that one search may move to the present quota class of their hosts
 
 
 class Queue(Generic[Holder, Member]):
-    """Keep members of hosts in order of insertion. `standing` returns the present standing of a host."""
+    """Members of hosts in order of insertion. `quota_class` returns the present quota class of a host."""
 
-    def __init__(self, standing: Callable[[Holder], Standing]) -> None:
-        self._standing = standing
-        self._lines = {level: OrderedDict[Member, tuple[Holder, float]]() for level in Standing}
+    def __init__(self, quota_class: Callable[[Holder], QuotaClass]) -> None:
+        self._quota_class = quota_class
+        self._lines = {level: OrderedDict[Member, tuple[Holder, float]]() for level in QuotaClass}
         self._line_of: dict[Member, OrderedDict[Member, tuple[Holder, float]]] = {}
 
     def put(self, member: Member, host: Holder, since: float) -> None:
         """Append a member, which waits from `since`."""
-        self._file(member, host, since, self._standing(host))
+        self._file(member, host, since, self._quota_class(host))
 
     def remove(self, member: Member) -> bool:
         """Remove a member; return whether it was waiting."""
@@ -31,15 +31,15 @@ class Queue(Generic[Holder, Member]):
         del line[member]
         return True
 
-    def longest(self, standing: Standing) -> tuple[Member, Holder, float] | None:
-        """Return the longest waiting member whose host has this standing now, its host, and the start of its wait."""
+    def longest(self, quota_class: QuotaClass) -> tuple[Member, Holder, float] | None:
+        """Return the longest waiting member whose host now has this class, its host, and the start of its wait."""
         for _ in range(_MOST_MOVED):
-            found = next(iter(self._lines[standing].items()), None)
+            found = next(iter(self._lines[quota_class].items()), None)
             if found is None:
                 break
             member, (host, since) = found
-            now = self._standing(host)
-            if now is standing:
+            now = self._quota_class(host)
+            if now is quota_class:
                 return member, host, since
             self._file(member, host, since, now)
         return None
@@ -47,10 +47,10 @@ class Queue(Generic[Holder, Member]):
     def __iter__(self) -> Iterator[Member]:
         return iter(list(self._line_of))
 
-    def _file(self, member: Member, host: Holder, since: float, standing: Standing) -> None:
+    def _file(self, member: Member, host: Holder, since: float, quota_class: QuotaClass) -> None:
         before = self._line_of.get(member)
         if before is not None:
             del before[member]
-        line = self._lines[standing]
+        line = self._lines[quota_class]
         line[member] = host, since
         self._line_of[member] = line

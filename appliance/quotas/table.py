@@ -1,8 +1,9 @@
-"""Define every finite resource that hosts can exhaust: its size, the share of each host, and the effect of the limit.
+"""Define every finite resource that hosts can exhaust: its size, the quota of each host, and the effect of the limit.
 
-docs/shares.md is generated from `SHARES` (`python -m distribution.shares_page`). Each row names the tests that attack
-it; `tests/unit/quotas/test_table.py` checks that they exist. Each row has a name here. The code takes the bounds of its
-pool from the row (`Pool("connections", RVMASTER_CONNECTIONS.bounds, …)`), so the page cannot differ from the code.
+docs/reference/quotas.md is generated from `QUOTA_ROWS` (`python -m distribution.quotas_page`). Each row names the tests
+that attack it; `tests/unit/quotas/test_table.py` checks that they exist. Each row has a name here. The code takes the
+bounds of its pool from the row (`Pool("connections", RVMASTER_CONNECTIONS.bounds, …)`), so the page cannot differ
+from the code.
 """
 
 from typing import NamedTuple
@@ -10,13 +11,14 @@ from typing import NamedTuple
 from appliance.quotas.pool import Bounds
 
 
-class Share(NamedTuple):
-    """Describe one row of the table.
+class QuotaRow(NamedTuple):
+    """One resource and its quotas.
 
     `thing` is the resource with its unit: "connections to RVMaster". `bounds` are the defaults. `at_limit` is the
-    effect on the host beyond its share, and on others. `alarm` names the audit event and the metric. `shown_by` lists
-    the tests that exhaust the resource, as paths below tests/. `setting` is the key in appliance.yaml that changes the
-    bounds ("limits.connections"), or "" if there is none.
+    effect on a host beyond its quota. `alarm` names the audit event and the metric. `shown_by` lists the tests that
+    exhaust the resource, as paths below tests/. `setting` is the key in appliance.yaml that changes the bounds
+    ("limits.connections"), or "" if there is none. `between` is the order among hosts, and which host makes room.
+    `counting` lists what counts as a host, as unknown or as kept, if that differs from the rule of the page.
     """
 
     thing: str
@@ -25,394 +27,430 @@ class Share(NamedTuple):
     alarm: str
     shown_by: tuple[str, ...]
     setting: str = ""
+    between: str = ""
+    counting: str = ""
 
 
-RVMASTER_CONNECTIONS = Share(
-    "connections to RVMaster and the nodes' faces",
-    Bounds(whole=4096, host=512, strangers=512, kept=1024),
-    "503 with the reason; a host within its share gets the place of an idle or unfinished connection of hosts"
-    " that have no more rights to it, strangers first",
-    "`limit exceeded`",
-    ("integration/master/test_shares.py::test_connections_of_two_hundred_addresses",),
+RVMASTER_CONNECTIONS = QuotaRow(
+    thing="connections to RVMaster and the proxy endpoints",
+    bounds=Bounds(whole=4096, host=512, unknown=512, kept=1024),
+    at_limit="503 with the reason",
+    between="a host within its quota replaces an idle or unfinished connection of a host of the same or a lower"
+    " class, unknown hosts first",
+    counting="unknown: no registration, and no rule or only `*` names the host; registered: the policy names it too",
+    alarm="`limit exceeded`",
     setting="limits.connections",
-)
-RVMASTER_ARRIVALS = Share(
-    "connections to RVMaster and the nodes' faces that are accepted and not opened yet",
-    Bounds(whole=2048, host=512, strangers=256, kept=1024),
-    "closed at once, without a word; a connection is opened when it is its host's turn; a stranger here is a host "
-    "without a registration that no rule or only `*` names",
-    "`limit exceeded`, one for many",
-    (
-        "unit/rpc/test_server.py::test_connections_that_come_faster_than_they_are_opened",
-        "unit/control/test_listener_limits.py::test_hosts_that_only_everybody_names_fill_no_place_of_a_named_host",
+    shown_by=(
+        "integration/master/test_quotas.py::test_connections_of_two_hundred_addresses",
+        "unit/control/test_listener_limits.py::test_connections_of_a_wildcard_displace_no_named_host",
     ),
 )
-RVMASTER_BYTES = Share(
-    "bytes of requests and answers under way, RVMaster and faces",
-    Bounds(whole=512 << 20, host=64 << 20, strangers=1 << 20, kept=192 << 20),
-    "503 with the reason; the request that holds most of a host that holds more makes room",
-    "`limit exceeded`",
-    (
-        "integration/master/test_shares.py::test_requests_of_two_hundred_addresses",
+RVMASTER_ARRIVALS = QuotaRow(
+    thing="connections to RVMaster and the proxy endpoints that are accepted and not opened yet",
+    bounds=Bounds(whole=2048, host=512, unknown=256, kept=1024),
+    at_limit="closed at once, without an answer",
+    between="connections are opened in turns of hosts",
+    counting="unknown: no registration, and no rule or only `*` names the host; registered: the policy names it too",
+    alarm="`limit exceeded`, one record for many connections",
+    shown_by=(
+        "integration/master/test_accept_queues.py::test_a_full_queue_of_unknown_hosts",
+        "unit/rpc/test_server.py::test_connections_that_come_faster_than_they_are_opened",
+        "unit/control/test_listener_limits.py::test_hosts_of_a_wildcard_leave_a_named_host_its_slot",
+        "unit/control/test_listener_limits.py::test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots",
+    ),
+)
+RVMASTER_BYTES = QuotaRow(
+    thing="bytes of requests and answers under way at RVMaster and the proxy endpoints",
+    bounds=Bounds(whole=512 << 20, host=64 << 20, unknown=1 << 20, kept=192 << 20),
+    at_limit="503 with the reason",
+    between="the largest request of a host that holds more makes room",
+    alarm="`limit exceeded`",
+    shown_by=(
+        "integration/master/test_quotas.py::test_requests_of_two_hundred_addresses",
         "unit/rpc/test_connection_table.py::test_bytes_are_freed_by_the_host_that_holds_most",
     ),
 )
-RVMASTER_FAREWELLS = Share(
-    "connections that RVMaster tells that they are too many",
-    Bounds(whole=256, host=8, strangers=64, kept=64),
-    "closed without a word",
-    "`limit exceeded`",
-    ("unit/rpc/test_connection_table.py::test_connections_turned_away_in_all",),
+RVMASTER_FAREWELLS = QuotaRow(
+    thing="connections that RVMaster is rejecting with a 503",
+    bounds=Bounds(whole=256, host=8, unknown=64, kept=64),
+    at_limit="closed without an answer",
+    alarm="`limit exceeded`",
+    shown_by=("unit/rpc/test_connection_table.py::test_connections_turned_away_in_all",),
 )
-RVMASTER_REQUESTS = Share(
-    "requests that RVMaster and faces serve at once",
-    Bounds(whole=64, host=16, strangers=8, kept=52),
-    "the request waits for its host's turn; hosts that the policy names as one network take turns as one, and"
-    " have half of the whole together",
-    "none: nothing is refused",
-    (
-        "integration/master/test_shares.py::test_requests_of_two_hundred_addresses",
+RVMASTER_REQUESTS = QuotaRow(
+    thing="requests that RVMaster and the proxy endpoints serve at once",
+    bounds=Bounds(whole=64, host=16, unknown=8, kept=52),
+    at_limit="the request waits for its host's turn",
+    between="hosts that the policy names as one network share turns and get at most half of the whole",
+    alarm="none: nothing is rejected",
+    shown_by=(
+        "integration/master/test_quotas.py::test_requests_of_two_hundred_addresses",
         "unit/rpc/test_fair_queue.py::test_requests_of_many_guests_leave_slots_for_the_robot",
     ),
 )
-RVMASTER_TIME = Share(
-    "processor time of control: microseconds in one turn of its loop",
-    Bounds(whole=2000, host=2000, strangers=2000, kept=0),
-    "work for the host waits (accepting connections, parsing, deciding, recording, answering); next is the host"
-    " that has used least, and all unknown hosts together count as one; a long request is divided into pieces",
-    "none: nothing is refused",
-    (
+RVMASTER_TIME = QuotaRow(
+    thing="microseconds of processor time in one turn of control's loop",
+    bounds=Bounds(whole=2000, host=2000, unknown=2000, kept=0),
+    at_limit="the host's work waits: accepting connections, parsing, deciding, recording, answering; a long request"
+    " is divided",
+    between="next is the host that has used least",
+    counting="all unknown hosts count as one host",
+    alarm="none: nothing is rejected",
+    shown_by=(
         "unit/rpc/test_processor_time.py::test_a_turn_of_the_loop_is_bounded",
         "unit/rpc/test_processor_time.py::test_the_robot_waits_for_one_piece_of_a_flood",
         "unit/rpc/test_processor_time.py::test_two_hundred_unknown_hosts_are_one",
         "unit/rpc/test_server.py::test_many_connections_are_accepted_in_one_turn",
     ),
 )
-PARAMETER_BYTES = Share(
-    "bytes of parameters",
-    Bounds(whole=64 << 20, host=32 << 20, strangers=8 << 20, kept=24 << 20),
-    "the value is refused, with the reason; one that takes no more than the value in its place is never"
-    " refused, and stays charged to the host that had set that one",
-    "`limit exceeded`",
-    (
-        "integration/master/test_shares.py::test_parameters_of_two_hundred_addresses",
-        "unit/master/test_parameter_charges.py::test_no_sequence_gets_beyond_a_share",
+PARAMETER_BYTES = QuotaRow(
+    thing="bytes of parameters",
+    bounds=Bounds(whole=64 << 20, host=32 << 20, unknown=8 << 20, kept=24 << 20),
+    at_limit="the value is rejected with the reason; a value that is not larger than the value that it replaces is"
+    " always accepted",
+    counting="a replacement that is not larger stays charged to the host of the replaced value",
+    alarm="`limit exceeded`",
+    setting="limits.parameter_bytes (the quotas scale with it)",
+    shown_by=(
+        "integration/master/test_quotas.py::test_parameters_of_two_hundred_addresses",
+        "unit/master/test_parameter_charges.py::test_no_sequence_exceeds_a_quota",
     ),
-    setting="limits.parameter_bytes (the parts are as large in proportion)",
 )
-LARGE_WRITES = Share(
-    "large values on their way to ROSMaster",
-    Bounds(whole=2, host=1, strangers=1, kept=1),
-    "the value waits for its host's turn; small calls go between",
-    "none: nothing is refused",
-    ("unit/rpc/test_bulk.py::test_large_values_of_a_host_go_one_at_a_time",),
+LARGE_WRITES = QuotaRow(
+    thing="large values under way to the ROS master",
+    bounds=Bounds(whole=2, host=1, unknown=1, kept=1),
+    at_limit="the value waits for its host's turn; small calls need not wait for it",
+    alarm="none: nothing is rejected",
+    shown_by=("unit/rpc/test_bulk.py::test_large_values_of_a_host_go_one_at_a_time",),
 )
-PROBES = Share(
-    "nodes that are asked at once whether they are there",
-    Bounds(whole=64, host=16, strangers=8, kept=24),
-    "the node is asked when it is its host's turn",
-    "none: nothing is refused",
-    ("unit/master/reconcile/test_liveness.py::test_silent_nodes_of_a_host_delay_no_look_at_anothers",),
+PROBES = QuotaRow(
+    thing="liveness checks of nodes under way",
+    bounds=Bounds(whole=64, host=16, unknown=8, kept=24),
+    at_limit="the check waits for its host's turn",
+    alarm="none: nothing is rejected",
+    shown_by=("unit/master/reconcile/test_liveness.py::test_silent_nodes_delay_no_check_of_other_hosts",),
 )
-NODE_CALLS_UNDER_WAY = Share(
-    "calls that are being made to nodes for ROSMaster",
-    Bounds(whole=512, host=128, strangers=64, kept=192),
-    "the call waits for the turn of its host",
-    "none: nothing is refused",
-    ("unit/master/endpoints/test_delivery.py::test_silent_nodes_of_a_host_delay_no_call_to_anothers",),
+NODE_CALLS_UNDER_WAY = QuotaRow(
+    thing="calls to nodes under way",
+    bounds=Bounds(whole=512, host=128, unknown=64, kept=192),
+    at_limit="the call waits for its host's turn",
+    alarm="none: nothing is rejected",
+    shown_by=("unit/master/endpoints/test_delivery.py::test_silent_nodes_delay_no_call_to_other_hosts",),
 )
-QUEUED_NODE_CALLS = Share(
-    "bytes of calls that wait for nodes",
-    Bounds(whole=96 << 20, host=64 << 20, strangers=0, kept=0),
-    "the host that has most loses the oldest call to the node that has most of it; the node is told how things"
-    " are once it answers",
-    "the process log; the node is looked at",
-    ("unit/master/endpoints/test_delivery.py::test_a_host_loses_only_calls_of_its_own",),
+QUEUED_NODE_CALLS = QuotaRow(
+    thing="bytes of calls that wait for nodes",
+    bounds=Bounds(whole=96 << 20, host=64 << 20, unknown=0, kept=0),
+    at_limit="the oldest call in the longest queue is dropped; the node gets the present state when it answers again",
+    between="the host with most bytes loses the call",
+    alarm="the process log",
+    shown_by=("unit/master/endpoints/test_delivery.py::test_a_host_loses_only_its_own_calls",),
 )
-RELAY_FRAMES = Share(
-    "bytes of unfinished messages in one relay",
-    Bounds(512 << 20, 256 << 20, 0, 0),
-    "a host gets no more than is left for all others: its publisher or client that sends more is cut and may come back;"
-    " up to 4 KiB of a connection are never refused",
-    "`limit exceeded`, `connection closed`; `rosrv_relay_memory_bytes`",
-    ("unit/relay/test_shares.py::test_unfinished_messages_of_a_guest_stop_nobody_else",),
+RELAY_FRAMES = QuotaRow(
+    thing="bytes of unfinished messages in one relay",
+    bounds=Bounds(whole=512 << 20, host=256 << 20, unknown=0, kept=0),
+    at_limit="the connection of the publisher or client is closed; it may connect again; up to 4 KiB of a connection"
+    " are always accepted",
+    between="a host gets at most as much as is left for all others",
+    alarm="`limit exceeded`, `connection closed`; `rosrv_relay_memory_bytes`",
     setting="relay.memory_bytes (half of it)",
+    shown_by=("unit/relay/test_shares.py::test_unfinished_messages_of_a_guest_stop_no_other_host",),
 )
-RELAY_QUEUES = Share(
-    "bytes that wait for subscribers and clients in one relay",
-    Bounds(256 << 20, 128 << 20, 0, 0),
-    "a host gets no more than is left for all others: messages for its slow subscribers are dropped, and one that"
-    " takes nothing of a message for ten seconds is cut",
-    "`rosrv_relay_dropped_total`, `rosrv_relay_memory_bytes`",
-    ("unit/relay/test_shares.py::test_subscribers_of_a_guest_that_never_read_stop_nobody_else",),
+RELAY_QUEUES = QuotaRow(
+    thing="bytes that wait for subscribers and clients in one relay",
+    bounds=Bounds(whole=256 << 20, host=128 << 20, unknown=0, kept=0),
+    at_limit="messages for the host's slow subscribers are dropped; a subscriber that reads nothing for ten seconds"
+    " is disconnected",
+    between="a host gets at most as much as is left for all others",
+    alarm="`rosrv_relay_dropped_total`, `rosrv_relay_memory_bytes`",
     setting="relay.memory_bytes (a quarter of it)",
+    shown_by=("unit/relay/test_shares.py::test_subscribers_of_a_guest_that_never_read_stop_no_other_host",),
 )
-RELAY_LATCHED = Share(
-    "bytes of latched messages in one relay",
-    Bounds(256 << 20, 128 << 20, 0, 0),
-    "a host gets no more than is left for all others, and who has most makes room for who has less: a message"
-    " that is not kept is passed on; a later subscriber gets it from the publisher once there is room again",
-    "`limit exceeded`; `rosrv_relay_memory_bytes`",
-    (
-        "unit/relay/test_shares.py::test_latched_messages_of_a_guest_stop_nobody_else",
+RELAY_LATCHED = QuotaRow(
+    thing="bytes of latched messages in one relay",
+    bounds=Bounds(whole=256 << 20, host=128 << 20, unknown=0, kept=0),
+    at_limit="the message is relayed and not kept; a later subscriber gets it from the publisher when there is room"
+    " again",
+    between="a host gets at most as much as is left for all others; the host with most makes room for hosts with"
+    " less",
+    alarm="`limit exceeded`; `rosrv_relay_memory_bytes`",
+    setting="relay.memory_bytes (a quarter of it)",
+    shown_by=(
+        "unit/relay/test_shares.py::test_latched_messages_of_a_guest_stop_no_other_host",
         "unit/relay/test_shares.py::test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots",
     ),
-    setting="relay.memory_bytes (a quarter of it)",
 )
-RELAY_CONNECTIONS = Share(
-    "connections to one relay",
-    Bounds(whole=16_384, host=8192, strangers=2048, kept=14_336),
-    "closed; a stranger here is a host without a grant, and the longest waiting one makes room for a newcomer;"
-    " a host with grants gets the place of a connection of the host that has most, while it has fewer",
-    "`connection refused`",
-    ("integration/master/test_shares.py::test_connections_to_the_relay",),
+RELAY_CONNECTIONS = QuotaRow(
+    thing="connections to one relay",
+    bounds=Bounds(whole=16_384, host=8192, unknown=2048, kept=14_336),
+    at_limit="closed",
+    between="a host with grants replaces a connection of the host that has most; a new unknown host replaces the"
+    " unknown connection that has waited longest",
+    counting="unknown: no grant",
+    alarm="`connection refused`",
     setting="relay.connections",
+    shown_by=("integration/master/test_quotas.py::test_connections_to_the_relay",),
 )
-RELAY_HEADERS = Share(
-    "bytes of unfinished connection headers in one relay, beyond 4 KiB each",
-    Bounds(64 << 20, 16 << 20, 16 << 20, 32 << 20),
-    "the long header that waits longest makes room, strangers' first; a peer whose header is beyond its share is turned"
-    " away",
-    "`connection refused`; `rosrv_relay_memory_bytes`",
-    (
-        "unit/relay/test_shares.py::test_headers_of_strangers_leave_room_for_the_robots",
+RELAY_HEADERS = QuotaRow(
+    thing="bytes of unfinished connection headers in one relay, beyond 4 KiB each",
+    bounds=Bounds(whole=64 << 20, host=16 << 20, unknown=16 << 20, kept=32 << 20),
+    at_limit="the connection is closed",
+    between="the long header that has waited longest makes room, those of unknown hosts first",
+    alarm="`connection refused`; `rosrv_relay_memory_bytes`",
+    shown_by=(
+        "unit/relay/test_shares.py::test_headers_of_unknown_hosts_leave_room_for_the_robots",
         "unit/relay/connections/test_pending_connections.py::test_long_headers_make_room_for_short_ones",
     ),
 )
-RELAY_TURN = Share(
-    "microseconds of processor time in one turn of a relay's loop",
-    Bounds(1000, 1000, 1000, 0),
-    "the host that has used most waits until the others that are ready have been served, and so does one whose last"
-    " message took longer than that, before its next; a stranger here is a host"
-    " without a grant; hosts with grants that no rule names, or only `*`, count as one; a change of the policy counts"
-    " from the next connection; new connections are accepted in a share of their own and charged to their host too; the"
-    " relay's links to control and its supervisor come first",
-    "none: nothing is refused",
-    (
+RELAY_TURN = QuotaRow(
+    thing="microseconds of processor time in one turn of a relay's loop",
+    bounds=Bounds(whole=1000, host=1000, unknown=1000, kept=0),
+    at_limit="the host's messages and new connections wait until the other ready hosts have been served",
+    between="next is the host that has used least; the relay's links to control and supervisor come first",
+    counting="unknown: no grant; hosts with grants that no rule or only `*` names count as one; a policy change"
+    " applies to new connections",
+    alarm="none: nothing is rejected",
+    shown_by=(
         "unit/relay/test_loop.py::test_a_host_with_little_to_do_waits_for_one_quantum_of_others",
         "unit/relay/test_loop.py::test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one",
         "unit/relay/test_loop.py::test_costly_messages_of_many_hosts_never_come_in_a_row",
         "unit/relay/test_loop.py::test_all_unknown_hosts_together_are_one_payer",
-        "unit/relay/test_relay.py::test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time",
-        "unit/relay/test_granted.py::test_hosts_that_only_everybody_names_pay_as_one",
+        "unit/relay/test_data_plane.py::test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time",
+        "unit/relay/test_grant_table.py::test_hosts_that_only_a_star_names_pay_as_one",
     ),
 )
-LIMITED_TOPIC = Share(
-    "messages and bytes of a topic with a limit, in percent of that limit (a host's is for two hosts that want all)",
-    Bounds(whole=100, host=50, strangers=50, kept=0),
-    "the messages are dropped; hosts have equal parts, and what one does not use goes to those that want more; unknown"
-    " hosts have one part together, and so have the hosts of a network that the policy names; nodes of one host share"
-    " its limit as a publisher in the same way",
-    "`rate limited`; `rosrv_relay_limited_total`",
-    (
-        "unit/relay/connections/test_rate_limit.py::test_a_host_within_its_part_loses_nothing_because_of_others",
-        "unit/relay/connections/test_rate_limit.py::test_names_of_a_host_share_its_limit",
-        "unit/relay/test_relay.py::test_a_limit_counts_hosts_and_not_node_names",
+LIMITED_TOPIC = QuotaRow(
+    thing="messages and bytes of a topic with a limit, in percent of the limit (one host: when two hosts want all)",
+    bounds=Bounds(whole=100, host=50, unknown=50, kept=0),
+    at_limit="the messages are dropped",
+    between="hosts have equal parts; an unused part goes to the others; nodes of one host share its limit as a"
+    " publisher in the same way",
+    counting="all unknown hosts count as one host, and so do the hosts of a network that the policy names",
+    alarm="`rate limited`; `rosrv_relay_limited_total`",
+    setting="[Limits]",
+    shown_by=(
+        "unit/relay/transport/test_rate_limit.py::test_a_host_within_its_part_loses_nothing_because_of_others",
+        "unit/relay/transport/test_rate_limit.py::test_names_of_a_host_share_its_limit",
+        "unit/relay/test_data_plane.py::test_a_limit_counts_hosts_and_not_node_names",
     ),
-    setting="[Limits] of the policy",
 )
-RELAY_MESSAGE = Share(
-    "microseconds of processor time that monitors take for one message, request or reply",
-    Bounds(10_000, 10_000, 0, 0),
-    "the message is cut off, which is a fault of the specification (`on_fault` decides whether it is dropped); for a"
-    " second after one, messages of that publication, or of all hosts that no rule but `*` names, have a tenth; the"
-    " messages behind it wait for their host's next"
-    " turn",
-    "`monitor fault`",
-    (
-        "unit/relay/monitors/test_interceptor.py::test_a_message_that_takes_longer_than_the_budget_is_a_fault",
+RELAY_MESSAGE = QuotaRow(
+    thing="microseconds of processor time that monitors take for one message, request or reply",
+    bounds=Bounds(whole=10_000, host=10_000, unknown=0, kept=0),
+    at_limit="the monitor is stopped with a fault (`on_fault` decides whether the message is dropped); for a second,"
+    " messages of that publication have a tenth of the time",
+    between="other messages of the host wait for its next turn",
+    counting="all hosts that no rule or only `*` names count as one publication",
+    alarm="`monitor fault`",
+    setting="relay.budget (milliseconds)",
+    shown_by=(
+        "unit/relay/monitors/test_interceptor.py::test_dialogue",
         "unit/relay/monitors/test_interceptor.py::test_hosts_that_the_policy_does_not_name_have_one_pace",
         "unit/relay/monitors/test_interceptor.py::test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn",
         "rosmop/tests/test_budget.py::test_every_walk_of_a_message_ends_with_its_time",
+        "unit/relay/monitors/test_time_budget.py::test_a_sender_of_costly_messages_has_the_whole_budget_ever_more_rarely",
     ),
-    setting="relay.budget (milliseconds)",
 )
-RECORDER_MEMORY = Share(
-    "bytes of messages that the flight recorder remembers (divided among the relays)",
-    Bounds(whole=64 << 20, host=32 << 20, strangers=0, kept=0),
-    "while there is room everybody may have it; then what is older than recorder.before goes first, and a topic or a"
-    " host beyond its part loses its own oldest messages",
-    "the recording says what is missing",
-    (
-        "unit/recorder/test_ring.py::test_flood_pushes_out_itself",
-        "unit/recorder/test_ring.py::test_many_topics_of_a_host_push_out_its_own",
+RECORDER_MEMORY = QuotaRow(
+    thing="bytes of messages that the flight recorder keeps, divided among the relays",
+    bounds=Bounds(whole=64 << 20, host=32 << 20, unknown=0, kept=0),
+    at_limit="the oldest messages of the topic or host are overwritten",
+    between="any host may use free memory; messages older than `recorder.before` are overwritten first",
+    alarm="the recording lists what is missing",
+    setting="recorder.memory (half of it for a host, a quarter for a topic)",
+    shown_by=(
+        "unit/recorder/test_ring.py::test_a_flood_displaces_only_itself",
+        "unit/recorder/test_ring.py::test_many_topics_of_a_host_displace_only_its_own",
     ),
-    setting="recorder.memory (a host's part is half of it, a topic's a quarter)",
 )
-RECORDER_DISK = Share(
-    "bytes of recordings (a stranger here is a host that no rule names, or what no host did; kept is the robot's and"
-    " operators')",
-    Bounds(whole=2 << 30, host=512 << 20, strangers=512 << 20, kept=512 << 20),
-    "the host that would have more makes room from its own, the oldest of the kind of trigger that has most; no host"
-    " displaces a recording of the robot, which gets half of the whole back from others; a host begins six recordings"
-    " an hour by each kind of trigger, and two hosts but the robot are recorded at once",
-    "`recording removed`, `recording missed`; `detail.not_recorded` of the record",
-    (
-        "unit/recorder/test_recording_store.py::test_a_guest_makes_room_from_its_own",
+RECORDER_DISK = QuotaRow(
+    thing="bytes of recordings",
+    bounds=Bounds(whole=2 << 30, host=512 << 20, unknown=512 << 20, kept=512 << 20),
+    at_limit="the host's oldest recording of its most frequent kind of trigger is removed; a host starts at most six"
+    " recordings an hour for each kind of trigger",
+    between="no host displaces recordings of the robot, which gets half of the whole back; two hosts besides the"
+    " robot are recorded at once",
+    counting="unknown: no rule names the host, or no host caused the recording; kept: for the robot and operators",
+    alarm="`recording removed`, `recording missed`; `detail.not_recorded` of the record",
+    setting="recorder.disk (an eighth of it for one recording)",
+    shown_by=(
+        "unit/recorder/test_recording_store.py::test_a_guest_makes_room_from_its_own_recordings",
         "unit/recorder/test_recording_store.py::test_no_guest_displaces_a_recording_of_the_robot",
         "unit/recorder/test_recording_plan.py::test_a_guests_flood_leaves_the_robot_its_recording",
         "unit/recorder/test_recording_plan.py::test_unknown_hosts_are_one",
-        "unit/recorder/test_recorder.py::test_a_flood_of_triggers_fills_no_disk",
+        "unit/recorder/test_recorder.py::test_a_flood_of_triggers_does_not_fill_the_disk",
     ),
-    setting="recorder.disk (one recording has an eighth of it)",
 )
-DRY_RUNS = Share(
-    "seconds of processor time of the compiler for the dry run that is under way (a host here is a token)",
-    Bounds(whole=10, host=10, strangers=0, kept=0),
-    "the dry run is refused, with the seconds; a second one of the same token is refused, those of others wait; an"
-    " order that needs the compiler (load, reload, …) ends the dry run, which is answered so",
-    "`rest call` with status 422 or 503",
-    (
-        "unit/compiler/test_process.py::test_nested_repetitions_end_with_the_budget_of_a_dry_run",
+DRY_RUNS = QuotaRow(
+    thing="seconds of processor time of the compiler for one dry run",
+    bounds=Bounds(whole=10, host=10, unknown=0, kept=0),
+    at_limit="the dry run is rejected with the seconds used; a second one of the same token is rejected",
+    between="dry runs of other tokens wait; an order that needs the compiler (load, reload, …) ends the dry run with"
+    " an error",
+    counting="a host is a token",
+    alarm="`rest call` with status 422 or 503",
+    shown_by=(
+        "unit/compiler/test_process.py::test_a_dry_run_ends_with_its_budget",
         "unit/specifications/test_compiler_link.py::test_an_order_ends_a_dry_run",
-        "unit/specifications/test_specifications.py::test_a_client_has_one_dry_run_at_a_time",
+        "unit/specifications/test_specification_manager.py::test_a_client_has_one_dry_run_at_a_time",
     ),
 )
-SLICES = Share(
-    "slices of a parametric specification (of bindings that have ended as many are remembered)",
-    Bounds(whole=100_000, host=50_000, strangers=0, kept=0),
-    "a host gets no more than is left for all others, and hosts without a registration are one: where the"
-    " specification only observes, the oldest slice of the same host is forgotten; where it drops, changes or"
-    " publishes messages, the message with a new binding is a fault; no slice is removed for another host's. There are"
-    " 1,000 in all where an event or a timer does not bind all parameters, or where a property has no tables",
-    "`monitor fault`, a line of the monitor; `rosrv_monitor_slices`",
-    (
+SLICES = QuotaRow(
+    thing="slices of a parametric specification (the engine also remembers as many ended bindings)",
+    bounds=Bounds(whole=100_000, host=50_000, unknown=0, kept=0),
+    at_limit="observing specifications free the host's oldest slice; in others, the message with a new binding is a"
+    " fault; 250 slices where an event or timer does not bind all parameters, 1,000 where a property has no"
+    " tables",
+    between="a host gets at most as many as are left for all others, and never displaces a slice of another host",
+    counting="hosts without a registration count as one",
+    alarm="`monitor fault`, a log line of the monitor; `rosrv_monitor_slices`",
+    setting="slices (a declaration in the specification; its first number)",
+    shown_by=(
         "rosmop/tests/test_slices_shares.py::test_a_guest_that_makes_up_ids_refuses_the_robot_nothing",
         "rosmop/tests/test_slices_shares.py::test_a_guest_that_makes_up_ids_pushes_out_its_own",
         "rosmop/tests/test_slices_shares.py::test_one_message_concerns_a_bounded_number_of_slices",
     ),
-    setting="slices (the first number)",
 )
-REST_CONNECTIONS = Share(
-    "connections to REST, TLS handshakes included",
-    Bounds(whole=512, host=64, strangers=192, kept=320),
-    "closed at once; a stranger here is a peer that showed no good token in the last 15 minutes, and the one that waits"
-    " longest makes room; next to be opened is the peer that has used least processor time, strangers together as one",
-    "none",
-    (
-        "integration/master/test_shares.py::test_handshakes_with_rest",
-        "unit/api/test_listener.py::test_a_known_peer_is_opened_before_strangers_that_came_first",
-        "unit/api/test_listener.py::test_strangers_in_the_handshake_make_room",
-    ),
+REST_CONNECTIONS = QuotaRow(
+    thing="connections to REST, including TLS handshakes",
+    bounds=Bounds(whole=512, host=64, unknown=192, kept=320),
+    at_limit="closed at once",
+    between="the unknown connection that has waited longest makes room; the peer that has used least processor time"
+    " is opened next, unknown hosts together as one",
+    counting="a host is a peer's address; unknown: no valid token in the last 15 minutes",
+    alarm="none",
     setting="api_limits.connections",
+    shown_by=(
+        "integration/master/test_quotas.py::test_handshakes_with_rest",
+        "unit/api/test_listener.py::test_a_known_peer_is_opened_before_waiting_unknown_hosts",
+        "unit/api/test_listener.py::test_unknown_hosts_in_the_handshake_make_room",
+    ),
 )
 _STREAMS_SHOWN_BY = (
-    "unit/api/test_streams.py::test_two_hundred_viewers_leave_places_to_operators",
-    "integration/api/test_audit.py::test_followers_have_a_share_each",
+    "unit/api/test_streams.py::test_two_hundred_viewers_leave_slots_to_operators",
+    "integration/api/test_audit.py::test_followers_have_a_quota_of_streams",
 )
-REST_STREAMS = Share(
-    "streams of REST, for each of: the audit log followed, /v1/live (a host here is a token, one without a registration"
-    " is a viewer's)",
-    Bounds(whole=16, host=6, strangers=0, kept=4),
-    "503 with the reason and Retry-After",
-    "`rest call` with status 503",
-    _STREAMS_SHOWN_BY,
-    setting="api_limits.streams (the parts are as large in proportion)",
+REST_STREAMS = QuotaRow(
+    thing="streams of REST by token: followers of the audit log, and of `/v1/live` (a limit for each)",
+    bounds=Bounds(whole=16, host=6, unknown=0, kept=4),
+    at_limit="503 with the reason and Retry-After",
+    counting="a host is a token; kept: not for viewers",
+    alarm="`rest call` with status 503",
+    setting="api_limits.streams (the quotas scale with it)",
+    shown_by=_STREAMS_SHOWN_BY,
 )
-REST_STREAM_PEERS = Share(
-    "streams of REST, by the machine that follows",
-    Bounds(whole=16, host=8, strangers=0, kept=0),
-    "503 with the reason and Retry-After",
-    "`rest call` with status 503",
-    _STREAMS_SHOWN_BY,
-    setting="api_limits.streams (the parts are as large in proportion)",
+REST_STREAM_PEERS = QuotaRow(
+    thing="streams of REST by client machine",
+    bounds=Bounds(whole=16, host=8, unknown=0, kept=0),
+    at_limit="503 with the reason and Retry-After",
+    counting="a host is a machine",
+    alarm="`rest call` with status 503",
+    setting="api_limits.streams (the quotas scale with it)",
+    shown_by=_STREAMS_SHOWN_BY,
 )
-REST_EXPORTS = Share(
-    "exports of the log and of evidence under way (a host here is a token, one without a registration is a viewer's)",
-    Bounds(whole=4, host=2, strangers=0, kept=1),
-    "503 with the reason and Retry-After",
-    "`rest call` with status 503",
-    _STREAMS_SHOWN_BY,
+REST_EXPORTS = QuotaRow(
+    thing="exports of the audit log and of evidence under way",
+    bounds=Bounds(whole=4, host=2, unknown=0, kept=1),
+    at_limit="503 with the reason and Retry-After",
+    counting="a host is a token; kept: not for viewers",
+    alarm="`rest call` with status 503",
+    shown_by=_STREAMS_SHOWN_BY,
 )
-AUDIT_KINDS = Share(
-    "kinds of folded denials in the audit log",
-    Bounds(whole=8192, host=256, strangers=64, kept=0),
-    "further denials are counted as one kind of that host; those of strangers as one kind of all strangers",
-    "`denials folded` with `scope` host or strangers",
-    (
-        "unit/audit/test_folding.py::test_strangers_with_reasons_of_their_own_take_no_kind_of_a_named_host",
-        "unit/audit/test_folding.py::test_many_named_hosts_keep_a_line_each",
-        "integration/master/test_audit_shares.py::test_strangers_push_no_denial_of_a_named_host_out",
+AUDIT_KINDS = QuotaRow(
+    thing="kinds of folded denials in the audit log",
+    bounds=Bounds(whole=8192, host=256, unknown=64, kept=0),
+    at_limit="further denials of the host are counted as one kind",
+    between="further denials of all unknown hosts are counted as one kind",
+    alarm="`denials folded` with `scope` `host` or `unknown hosts`",
+    shown_by=(
+        "unit/audit/test_folding.py::test_unknown_hosts_leave_named_hosts_their_kinds",
+        "unit/audit/test_folding.py::test_named_hosts_keep_a_line_each",
+        "integration/master/test_audit_quotas.py::test_unknown_hosts_do_not_displace_denials_of_named_hosts",
     ),
 )
-AUDIT_READ_KINDS = Share(
-    "kinds of folded reads in the audit log",
-    Bounds(whole=8192, host=512, strangers=0, kept=0),
-    "further reads are recorded in full and count as bytes of the host",
-    "none",
-    ("unit/audit/test_folding.py::test_reads_beyond_the_share_are_recorded_in_full",),
+AUDIT_READ_KINDS = QuotaRow(
+    thing="kinds of folded reads in the audit log",
+    bounds=Bounds(whole=8192, host=512, unknown=0, kept=0),
+    at_limit="further reads are recorded in full and charged to the host's bytes of audit records",
+    alarm="none",
+    shown_by=("unit/audit/test_folding.py::test_reads_beyond_the_quota_are_recorded_in_full",),
 )
-AUDIT_BYTES = Share(
-    "bytes of audit records to pay off; time pays 64 KiB a second of each host's",
-    Bounds(whole=1 << 40, host=16 << 20, strangers=0, kept=1 << 39),
-    "the host's calls wait, one of many parts is refused in words; strangers are served nothing, and what is"
-    " recorded of that is folded",
-    "`limit exceeded`",
-    (
-        "unit/audit/test_budget.py::test_two_hundred_hosts_leave_the_robot_its_share",
-        "unit/audit/test_budget.py::test_who_owes_too_much_waits_until_it_is_paid",
-        "integration/master/test_audit_shares.py::test_reads_with_long_keys_fill_no_disk",
+AUDIT_BYTES = QuotaRow(
+    thing="bytes of audit records that a host owes; its debt falls by 64 KiB a second",
+    bounds=Bounds(whole=1 << 40, host=16 << 20, unknown=0, kept=1 << 39),
+    at_limit="the host's calls wait; a multicall's excess parts are rejected with the reason",
+    between="records of unknown hosts, whose calls are denied, are folded",
+    alarm="`limit exceeded`",
+    shown_by=(
+        "unit/audit/test_budget.py::test_two_hundred_hosts_leave_the_robot_its_quota",
+        "unit/audit/test_budget.py::test_a_host_in_debt_waits_until_it_is_paid",
+        "integration/master/test_audit_quotas.py::test_reads_with_long_keys_do_not_fill_the_disk",
     ),
 )
-AUDIT_RESERVE = Share(
-    "bytes of the disk that are kept for the audit log",
-    Bounds(whole=64 << 20, host=1 << 20, strangers=0, kept=16 << 20),
-    "below it a host pays off 8 KiB a second, and its calls wait for that; of the last quarter only hosts with"
-    " a registration have any, the others are refused in words; on a full disk nothing is granted until there is room",
-    "`disk nearly full`; `rosrv status`",
-    (
-        "unit/audit/test_budget.py::test_the_last_of_the_disk_is_for_hosts_with_a_registration",
-        "unit/audit/test_disk_space.py::test_a_disk_that_fills_is_told_before_it_is_full",
-    ),
+AUDIT_RESERVE = QuotaRow(
+    thing="bytes of free disk space reserved for the audit log",
+    bounds=Bounds(whole=64 << 20, host=1 << 20, unknown=0, kept=16 << 20),
+    at_limit="a host's debt falls by 8 KiB a second and its calls wait; on a full disk every call is denied until"
+    " there is room",
+    between="the last quarter is for hosts with a registration; calls of others are rejected with the reason",
+    alarm="`disk nearly full`; `rosrv status`",
     setting="audit.reserve_bytes",
-)
-NODE_PORTS = Share(
-    "ports of [Ports] (one for each node and relay, and one more for each node)",
-    Bounds(whole=7000, host=5250, strangers=0, kept=0),
-    "a host may have three times as many as are left for all others, and hosts that the policy names as one network are"
-    " one; nodes without a registration make room at once; then registering is refused",
-    "the refused call's record",
-    (
-        "integration/master/test_shares.py::test_ports_and_names",
-        "unit/master/endpoints/test_endpoint_addresses.py::test_no_host_takes_all_ports",
+    shown_by=(
+        "unit/audit/test_budget.py::test_the_last_of_the_disk_is_for_registered_hosts",
+        "unit/audit/test_disk_space.py::test_low_space_raises_an_alarm_before_the_disk_is_full",
     ),
-    setting="[Ports] range of the policy",
 )
-NAMES = Share(
-    "registrations (topics, services and parameters of nodes)",
-    Bounds(whole=50_000, host=5000, strangers=0, kept=0),
-    "a host may have three times as many as are left, and hosts that the policy names as one network are one; then"
-    " registering is refused with the reason",
-    "`decision`: the refused call's record",
-    (
+NODE_PORTS = QuotaRow(
+    thing="ports of `[Ports]`: one for each node, and one for each node and relay",
+    bounds=Bounds(whole=7000, host=5250, unknown=0, kept=0),
+    at_limit="the registration is rejected with the reason",
+    between="a host gets at most three times what is left for all others; nodes without a registration make room at"
+    " once",
+    counting="hosts that the policy names as one network count as one",
+    alarm="`decision`: the record of the rejected call",
+    setting="[Ports] range",
+    shown_by=(
+        "integration/master/test_quotas.py::test_ports_and_names",
+        "unit/master/endpoints/test_node_ports.py::test_no_host_takes_all_ports",
+    ),
+)
+NAMES = QuotaRow(
+    thing="registrations (topics, services and parameters of nodes)",
+    bounds=Bounds(whole=50_000, host=5000, unknown=0, kept=0),
+    at_limit="the registration is rejected with the reason",
+    between="a host gets at most three times what is left",
+    counting="hosts that the policy names as one network count as one",
+    alarm="`decision`: the record of the rejected call",
+    setting="limits.topics_per_host (for a host)",
+    shown_by=(
         "integration/master/test_floods.py::test_registrations_of_one_node",
         "unit/master/calls/test_gate.py::test_a_host_has_as_many_registrations_as_are_left",
     ),
-    setting="limits.topics_per_host (a host's)",
 )
-GRANTS = Share(
-    "grants of the relays (permissions to subscribe to a topic or to call a service)",
-    Bounds(whole=200_000, host=20_000, strangers=0, kept=0),
-    "the host, or of all hosts that with most, loses its oldest grants that nobody is connected by",
-    "none: a node that asks again gets it again",
-    ("unit/master/endpoints/test_relay_control.py::test_grants_of_all_hosts_are_bounded",),
+GRANTS = QuotaRow(
+    thing="grants of the relays (permissions to subscribe to a topic or to call a service)",
+    bounds=Bounds(whole=200_000, host=20_000, unknown=0, kept=0),
+    at_limit="the host's oldest unused grants are removed; a node that asks again gets them again",
+    between="at the limit of the whole, the host with most grants loses them",
+    alarm="none",
+    shown_by=("unit/master/endpoints/test_relay_control.py::test_grants_of_all_hosts_are_bounded",),
 )
-IKE_HANDSHAKES = Share(
-    "IKE handshakes under way (a host is an address; nobody is known before his handshake)",
-    Bounds(whole=2000, host=5, strangers=2000, kept=0),
-    "not answered until one ends, after 15 s at most; from 30 on an address has to answer once before it counts",
-    "none: charon's log",
-    ("unit/ipsec/test_strongswan.py::test_two_hundred_addresses_leave_handshakes_for_hosts",),
+IKE_HANDSHAKES = QuotaRow(
+    thing="IKE handshakes under way",
+    bounds=Bounds(whole=2000, host=5, unknown=2000, kept=0),
+    at_limit="no answer until another handshake ends, after 15 s at most",
+    between="from 30 handshakes on, an address counts only after it has answered once",
+    counting="a host is an address; every host is unknown before its handshake",
+    alarm="charon's log",
+    shown_by=("unit/ipsec/test_strongswan.py::test_two_hundred_addresses_leave_handshakes_for_hosts",),
 )
-DESCRIPTORS = Share(
-    "descriptors of control, of each relay, of the supervisor (the api has a sixteenth of it)",
-    Bounds(whole=65_536, host=32_768, strangers=32_768, kept=32_768),
-    "never reached: where the system allows fewer, connections have no more than half of them, and those above it are"
-    " told so as above any other share",
-    "none",
-    ("unit/quotas/test_descriptors.py::test_all_shares_together_fit_the_descriptors",),
-    setting="the system's limit (nofile)",
+DESCRIPTORS = QuotaRow(
+    thing="file descriptors of control, of each relay and of the supervisor (the api has a sixteenth)",
+    bounds=Bounds(whole=65_536, host=32_768, unknown=32_768, kept=32_768),
+    at_limit="connections beyond half of the system's limit are rejected like those beyond any other quota",
+    alarm="none",
+    setting="nofile (the limit of the system)",
+    shown_by=("unit/quotas/test_descriptors.py::test_all_quotas_together_fit_the_descriptors",),
 )
 
-SHARES: tuple[Share, ...] = tuple(row for row in list(globals().values()) if isinstance(row, Share))
+QUOTA_ROWS: tuple[QuotaRow, ...] = tuple(row for row in list(globals().values()) if isinstance(row, QuotaRow))
 """Every row above, in the order of the page."""

@@ -1,7 +1,7 @@
-"""Hash the texts that come into force, so that the audit log identifies them.
+"""Hash policies and specifications when they take effect, so that the audit log identifies them.
 
-The hash of several texts is the hash of the lines that `sha256sum` prints for their files, sorted by name. `sha256sum`
-alone can compute it from the files.
+The hash of several texts is the hash of the lines that `sha256sum` prints for their files, sorted by name, so
+`sha256sum` alone can compute it.
 """
 
 import hashlib
@@ -10,12 +10,12 @@ from urllib.parse import quote
 
 
 def fingerprint(text: str | bytes) -> str:
-    """Return SHA-256 of a text, or of bytes, in hexadecimal."""
+    """Return the SHA-256 of a text or bytes, in hexadecimal."""
     return hashlib.sha256(text.encode() if isinstance(text, str) else text).hexdigest()
 
 
 def fingerprint_of_all(texts: Mapping[str, str]) -> str:
-    """Return SHA-256 of named texts; other names or texts have another hash."""
+    """Return the SHA-256 of named texts; a changed name or text changes the hash."""
     lines = sorted((file_name(name), fingerprint(text)) for name, text in texts.items())
     return fingerprint("".join(f"{digest}  {name}\n" for name, digest in lines))
 

@@ -1,6 +1,6 @@
 """Derive two keys from an access token, and sign orders with one of them. No I/O, no clock.
 
-The holder of a token need not send it. The client derives two keys from the token alone:
+The token itself need not be sent. The client derives two keys from it:
 
 - the *reading key* replaces the token in `Authorization: Bearer`. It permits all reads of the token and no changes.
 - the *signing key* (Ed25519) never leaves the client. It signs each order: the HTTP request as sent, with a challenge
@@ -8,11 +8,11 @@ The holder of a token need not send it. The client derives two keys from the tok
 
 Invariants:
 
-1. The appliance keeps SHA-256 of the reading key and the public half of the signing key (`TokenKeys`). Neither key
-   can be derived from them. A reader of the state, of a backup, or of all such traffic in the api can order nothing.
-2. The signed text has seven lines, each a whole part of the request, and no part may have a control character: no
-   two requests have the same text.
-3. A change of anything here is another version in the first line, in the derivations and in `docs/rest.md`.
+1. The appliance stores the SHA-256 of the reading key and the public half of the signing key (`TokenKeys`). Neither key
+   can be derived from them. Reading the state, a backup or the api's traffic is not enough to sign an order.
+2. The signed text has seven lines, each one part of the request. A part cannot contain control characters, so no two
+   requests have the same text.
+3. Any change here needs a new version in the first line, in the derivations and in `docs/reference/rest.md`.
 """
 
 import base64
@@ -32,11 +32,11 @@ _PROOF_FORM = re.compile(r"([!-~]{1,200}) ([A-Za-z0-9_-]{86})")
 
 
 class BadProofError(ValueError):
-    """Report an invalid proof, or a request that cannot be signed; the text has the reason."""
+    """A proof is invalid, or a request cannot be signed; the message has the reason."""
 
 
 class TokenKeys(NamedTuple):
-    """Store the verifiers of a token's keys: SHA-256 of the reading key, and the public signing key, each 32 bytes."""
+    """The verifiers of a token's keys: SHA-256 of the reading key, and the public signing key, 32 bytes each."""
 
     reading: bytes
     verifying: bytes
@@ -67,9 +67,9 @@ def reading_hash(key: str) -> bytes:
 def statement(
     challenge: str, *, method: str, target: str, if_match: str, content_type: str, body: bytes
 ) -> bytes:
-    """Return the text to sign. `target` is path and query as sent; a missing header is empty.
+    """Return the text to sign. `target` is path and query as sent; pass a missing header as an empty string.
 
-    Raises `BadProofError` for a part with a control character.
+    Raises `BadProofError` for a part with a control or non-ASCII character.
     """
     parts = (_VERSION, challenge, method, target, if_match, content_type, hashlib.sha256(body).hexdigest())
     for part in parts:
@@ -84,7 +84,7 @@ def proof_of(token: str, challenge: str, stated: bytes) -> str:
 
 
 def parse_proof(header: str) -> tuple[str, bytes]:
-    """Return challenge and signature. Raises `BadProofError`."""
+    """Return the challenge and the signature in a header value. Raises `BadProofError`."""
     found = _PROOF_FORM.fullmatch(header)
     if found is None:
         raise BadProofError(f"{HEADER} is not `CHALLENGE SIGNATURE`")

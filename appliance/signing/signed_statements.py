@@ -1,10 +1,9 @@
 """Write and parse the statements about the audit log that the signer signs: checkpoints and removals. No I/O.
 
 Invariants:
-1. A checkpoint names the log, its own number, the sequence, the hash at that sequence, the time, the hash of the
-   checkpoint before it, and up to which record the log's beginning is removed. Checkpoints of version 1 do not say what
-   is removed.
-2. A removal names the checkpoint up to which records go and the limit of the settings that it follows from.
+1. A checkpoint has the log, its own number, the sequence, the hash at that sequence, the time, the hash of the previous
+   checkpoint, and the last removed record. Checkpoints of version 1 do not have the last removed record.
+2. A removal has the checkpoint up to which records are removed, and the limit in the settings that required it.
 3. Each statement has exactly one text. Any other spelling, such as a leading zero, is invalid.
 """
 
@@ -16,7 +15,7 @@ NO_CHECKPOINT = "0" * 64  # the hash before the first checkpoint
 
 
 class Checkpoint(NamedTuple):
-    """Describe the chain at one time; `time` is in nanoseconds since the epoch, hashes in hexadecimal."""
+    """The state of the chain at one time; `time` is in nanoseconds since the epoch, hashes in hexadecimal."""
 
     log: str
     number: int
@@ -27,7 +26,7 @@ class Checkpoint(NamedTuple):
     removed: int | None = None
 
     def text(self) -> bytes:
-        """What is signed."""
+        """Return the text that is signed."""
         version, removed = (1, "") if self.removed is None else (2, f"removed {self.removed}\n")
         return (
             f"rosrv audit checkpoint {version}\nlog {self.log}\nnumber {self.number}\nsequence {self.sequence}\n"
@@ -42,7 +41,7 @@ _CHECKPOINT = re.compile(
 
 
 def parse_checkpoint(text: bytes) -> Checkpoint:
-    """Read a checkpoint's text. Raises `ValueError` for anything that is not exactly one."""
+    """Parse the text of a checkpoint. Raises `ValueError` for any other text."""
     match = _CHECKPOINT.fullmatch(text)
     if match is not None:
         log, number, sequence, digest, time, previous = (group.decode() for group in match.groups()[:6])
@@ -59,9 +58,9 @@ def checkpoint_hash(text: bytes) -> str:
 
 
 class Removal(NamedTuple):
-    """Describe the removal of all records up to a checkpoint: its number, sequence, hash there, and own hash.
+    """A removal of all records up to a checkpoint: its number, sequence, the hash there, and its own hash (`sealed`).
 
-    `limit` is the setting that it follows from, as the signer writes it.
+    `limit` is the setting that required the removal, as the signer writes it.
     """
 
     log: str
@@ -72,7 +71,7 @@ class Removal(NamedTuple):
     limit: str
 
     def text(self) -> bytes:
-        """What is signed."""
+        """Return the text that is signed."""
         return (
             f"rosrv audit removal 1\nlog {self.log}\ncheckpoint {self.checkpoint}\nsequence {self.sequence}\n"
             f"hash {self.hash}\nsealed {self.sealed}\nlimit {self.limit}\n"

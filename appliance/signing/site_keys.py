@@ -1,11 +1,11 @@
 """Sign texts, and verify signatures by the keys that the site's configuration names.
 
-A signature is a text of its own in OpenSSH's format (SSHSIG, its PROTOCOL.sshsig): what `ssh-keygen -Y sign -n rosrv`
-writes to FILE.sig. A key is a line of `ssh-ed25519`, as `ssh-keygen -t ed25519` writes it to KEY.pub.
+A signature is a separate file in OpenSSH's format (SSHSIG, see its PROTOCOL.sshsig), as written to FILE.sig by
+`ssh-keygen -Y sign -n rosrv`. A key is an `ssh-ed25519` line, as `ssh-keygen -t ed25519` writes it to KEY.pub.
 
 Invariants:
-1. A signature counts only for the text it was made of, under the namespace `rosrv`, with a key that is given: the key
-   that the signature itself carries says which of them, and is trusted for nothing else.
+1. A signature is valid only for the text it was made for, in the namespace `rosrv`, with a configured key. The key
+   inside the signature only selects one of the configured keys; it is not trusted otherwise.
 2. Without a configured key no signature is required or checked.
 """
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _NAMESPACE = b"rosrv"
 _ED25519 = b"ssh-ed25519"
 _MAGIC = b"SSHSIG"
-_HASHES = (b"sha512", b"sha256")  # those of the format
+_HASHES = (b"sha512", b"sha256")  # the hashes that SSHSIG allows
 _ARMOUR = re.compile(
     r"\s*-----BEGIN SSH SIGNATURE-----\n([A-Za-z0-9+/=\n]{1,4000})\n-----END SSH SIGNATURE-----\s*"
 )
@@ -34,7 +34,7 @@ _HOW = "sign it (rosrv sign FILE --key KEY) and leave FILE.sig beside it, or sen
 
 
 class UnsignedError(Exception):
-    """Report a text without a valid signature of the site; the message has the reason and the remedy."""
+    """A text has no valid signature of the site; the message has the reason and the remedy."""
 
 
 def checked_key(line: str) -> str:
@@ -60,7 +60,7 @@ def read_signature(file: Path) -> str:
 
 
 def signer(keys: Sequence[str], text: str, signature: str) -> str:
-    """Return the name of the key that signed this text; empty without keys. Raises `UnsignedError`."""
+    """Return the name of the key that signed this text; empty if no keys are configured. Raises `UnsignedError`."""
     if not keys:
         return ""
     from cryptography.exceptions import InvalidSignature  # noqa: PLC0415  only if a signature is checked
@@ -90,7 +90,7 @@ def signer(keys: Sequence[str], text: str, signature: str) -> str:
 
 
 def sign(text: str, key: "Ed25519PrivateKey") -> str:
-    """Return the signature of a text, byte for byte as `ssh-keygen -Y sign -n rosrv` does."""
+    """Return the signature of a text, byte for byte as `ssh-keygen -Y sign -n rosrv` makes it."""
     raw = key.sign(_message(text, _HASHES[0]))
     public = _wire(_ED25519, key.public_key().public_bytes_raw())
     fields = _wire(public, _NAMESPACE, b"", _HASHES[0], _wire(_ED25519, raw))
@@ -100,7 +100,7 @@ def sign(text: str, key: "Ed25519PrivateKey") -> str:
 
 
 def public_line(key: "Ed25519PrivateKey") -> str:
-    """Return the line of a key for `site_keys`, without a comment."""
+    """Return the public key as a line for `site_keys`, without a comment."""
     return f"ssh-ed25519 {base64.b64encode(_wire(_ED25519, key.public_key().public_bytes_raw())).decode()}"
 
 
@@ -118,7 +118,7 @@ def _public(line: str) -> bytes:
 
 
 def _read(signature: str) -> tuple[bytes, bytes, bytes, bytes]:
-    """Return public key, namespace, hash name and signature. Raises `ValueError`."""
+    """Return the public key, namespace, hash name and raw signature in a signature file. Raises `ValueError`."""
     found = _ARMOUR.fullmatch(signature.replace("\r\n", "\n"))
     try:
         blob = base64.b64decode(found[1].replace("\n", ""), validate=True) if found else b""
@@ -138,7 +138,7 @@ def _read(signature: str) -> tuple[bytes, bytes, bytes, bytes]:
 
 
 def _message(text: str, hashed: bytes) -> bytes:
-    """What is signed."""
+    """Return the text that is signed."""
     digest = hashlib.new(hashed.decode(), text.encode("utf-8", "surrogateescape")).digest()
     return _MAGIC + _wire(_NAMESPACE, b"", hashed, digest)
 

@@ -1,4 +1,4 @@
 """Durable state of control in SQLite: registry, parameters, policy revisions, settings.
 
-`Database` is the one writer thread; the tables' modules say what is kept. The audit log has a file of its own.
+`Database` is the one writer thread; the modules of the tables list what is stored. The audit log has its own file.
 """

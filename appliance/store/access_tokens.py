@@ -1,10 +1,9 @@
-"""Access tokens of REST: how one is made, what is kept of it, and how a given one is recognised. No I/O.
+"""Make and verify the access tokens of REST. No I/O.
 
 A token is `rosrv_<id>_<secret>`: the id (48 bits) finds the row, the secret (256 random bits) proves it. Invariants:
 
-1. The secret is never kept: only its scrypt hash with a salt of its own is, and what the keys that are derived from
-   it are recognised by (`order_proof.py`).
-2. The comparison takes the same time wherever the difference is.
+1. The secret is never stored: only its salted scrypt hash, and the data to verify its keys (`request_signing.py`).
+2. The comparison takes constant time.
 """
 
 import hashlib
@@ -17,18 +16,18 @@ from appliance.signing.request_signing import TokenKeys, keys_of
 
 _FORM = re.compile(r"rosrv_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,62}")
-# Who else may stand in a revision's or a record's `who`.
+# Other values of `who` in a revision or a record.
 _RESERVED = frozenset({"disk", "operator"})
 # 2**14 * 8 * 128 bytes = 16 MiB and some 40 ms for one check.
 _COST, _BLOCK, _PARALLEL, _LENGTH = 1 << 14, 8, 1, 32
 
 
 class BadTokenNameError(ValueError):
-    """A name no token can have; the text says which can."""
+    """A name that a token cannot have; the text describes valid names."""
 
 
 class TokenRow(NamedTuple):
-    """A token as it is kept; times are seconds since the epoch, `revoked` None while it is not."""
+    """A stored token. Times are seconds since the epoch; `revoked` is None unless it is revoked."""
 
     id: str
     name: str
@@ -38,15 +37,15 @@ class TokenRow(NamedTuple):
     created: float
     expires: float
     revoked: float | None
-    keys: TokenKeys | None = None  # None: made by a version that did not derive any
+    keys: TokenKeys | None = None  # None: made by a version that derived no keys
 
     def usable(self, now: float) -> bool:
-        """Whether it opens anything at this time."""
+        """Whether the token is valid at this time."""
         return self.revoked is None and now < self.expires
 
 
 def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[TokenRow, str]:
-    """A new token that ends after `seconds`: its row, and its text, which exists nowhere else.
+    """Return a new token that ends after `seconds`: its row, and its text, which is stored nowhere.
 
     Raises `BadTokenNameError`.
     """
@@ -63,13 +62,13 @@ def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[Tok
 
 
 def parse_token(text: str) -> tuple[str, str] | None:
-    """The id and the secret of a token's text; None when it is none."""
+    """Return the id and the secret of a token's text; None if it is not a token."""
     found = _FORM.fullmatch(text)
     return None if found is None else (found[1], found[2])
 
 
 def hash_secret(secret: str, salt: bytes) -> bytes:
-    """What is kept of a secret."""
+    """Return the hash of a secret, which is stored."""
     return hashlib.scrypt(
         secret.encode("ascii"), salt=salt, n=_COST, r=_BLOCK, p=_PARALLEL, dklen=_LENGTH, maxmem=64 << 20
     )

@@ -1,15 +1,15 @@
-"""Statements that are on their way to the database, kept in a file so that a killed process loses none.
+"""Write-ahead file: statements on their way to the database, so that a killed process loses none.
 
-A statement is appended (one small write to the page cache, microseconds, no waiting for a disk) before anything is
-answered because of it. When the database has taken all of them the file is emptied. After a crash the statements that
-are still in it are carried out again: each is idempotent, and their order is kept.
+A statement is appended before any answer that depends on it. The append is one small write to the page cache: it takes
+microseconds and waits for no disk. When the database has all statements, the file is emptied. After a crash the
+statements in it are executed again: each is idempotent, and their order is kept.
 
-What that wins over a commit of each statement (`python -m benchmarks.state_writes`): the thread that answers everybody
-is held up for half as long by a registration (20 µs, not 45), and never by SQLite's one writer, which keeps a tree of
-parameters of 16 MiB for a third of a second. Beside any tree one registration in a hundred would wait 3 to 17 ms, where
-both cores are busy; ahead of it, 0.06 ms.
+Measured against a commit of each statement (`python -m benchmarks.state_writes`), a registration blocks the thread
+that answers nodes for half as long (20 µs, not 45). SQLite's one writer never blocks it; that writer takes a third of
+a second for a tree of parameters of 16 MiB. With commits beside a tree, one registration in a hundred would wait 3 to
+17 ms if both cores are busy; with this file, 0.06 ms.
 
-What this outlasts is the death of the process, and after `sync` that of the machine's power, as the database's own WAL.
+The file survives the death of the process and, after `sync`, a power failure, as the database's own WAL does.
 """
 
 import errno
@@ -37,8 +37,8 @@ class WriteAheadClosedError(OSError):
 class WriteAhead:
     """The file at `path`. Raises `OSError` when it cannot be opened.
 
-    Any thread may use it. The number of its descriptor is read under the lock alone: `close` waits for a write that is
-    under way, and every later use raises `WriteAheadClosedError`. So nothing is written to a file that gets the number.
+    Any thread may use it. Its descriptor's number is read only under the lock: `close` waits for a write that is under
+    way, and every later use raises `WriteAheadClosedError`. So no write goes to another file that reuses the number.
     """
 
     def __init__(self, path: Path) -> None:
@@ -56,7 +56,7 @@ class WriteAhead:
             yield self._open_descriptor
 
     def left(self) -> list[Statement]:
-        """What an earlier process could not bring to the database; a torn last statement was never answered for."""
+        """Return the statements that an earlier process did not write to the database, without a torn last one."""
         with self._descriptor() as descriptor:
             data = os.pread(descriptor, os.fstat(descriptor).st_size, 0)
         decoder = msgspec.msgpack.Decoder(tuple[str, list[Any]])
@@ -72,7 +72,7 @@ class WriteAhead:
         return statements
 
     def append(self, statements: Sequence[Statement]) -> None:
-        """Keep statements, by one write. Raises `OSError` when the disk is full."""
+        """Append statements with one write. Raises `OSError` when the disk is full."""
         bodies = [self._encoder.encode(statement) for statement in statements]
         data = b"".join([_LENGTH.pack(len(body)) + body for body in bodies])
         with self._descriptor() as descriptor:
@@ -83,14 +83,14 @@ class WriteAhead:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def taken(self, count: int) -> None:
-        """The database has the `count` oldest statements; the file is emptied when those were all."""
+        """Note that the database has the `count` oldest statements; empty the file when no others wait."""
         with self._descriptor() as descriptor:
             self._waiting -= count
             if not self._waiting:
                 os.ftruncate(descriptor, 0)
 
     def clear(self) -> None:
-        """The database has everything."""
+        """Empty the file: the database has everything."""
         with self._descriptor() as descriptor:
             os.ftruncate(descriptor, 0)
 

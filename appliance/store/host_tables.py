@@ -1,4 +1,4 @@
-"""The tables of hosts that come through tunnels: who is enrolled, with which certificate, who is awaited."""
+"""The tables of hosts that come through tunnels: enrolled hosts, their certificates, awaited hosts."""
 
 import json
 from typing import NamedTuple
@@ -26,13 +26,13 @@ CREATE TABLE IF NOT EXISTS revocation (
     serial TEXT PRIMARY KEY, name TEXT NOT NULL, moment REAL NOT NULL, expires REAL NOT NULL
 ) WITHOUT ROWID;
 """
-_LONGEST_SECONDS = 398 * 86_400.0  # of a certificate's life, as the authority has it
+_LONGEST_SECONDS = 398 * 86_400.0  # the longest life of a certificate that the authority makes
 
 
 class HostRow(NamedTuple):
     """An enrolled host: its virtual address, its certificate's serial number (hexadecimal) and end.
 
-    Times are seconds since the epoch; `revoked` is None while it may come. The address stays its name's.
+    Times are seconds since the epoch; `revoked` is None while the host may come. The name keeps its address.
     """
 
     name: str
@@ -44,7 +44,7 @@ class HostRow(NamedTuple):
 
 
 class NextCertificate(NamedTuple):
-    """A certificate that its host has been given and has not said to have put in place."""
+    """A certificate that its host has received and not yet confirmed as installed."""
 
     serial: str
     expires: float
@@ -52,7 +52,7 @@ class NextCertificate(NamedTuple):
 
 
 class CertificateRow(NamedTuple):
-    """The certificate (PEM) of a host, when it was made, and the one that is to follow it."""
+    """The certificate (PEM) of a host, when it was made, and its successor."""
 
     name: str
     made: float
@@ -61,7 +61,7 @@ class CertificateRow(NamedTuple):
 
 
 class PortsRow(NamedTuple):
-    """What was seen of a machine's ROS ports from outside; `name` is a host's, or an address."""
+    """The check of a machine's ROS ports from outside; `name` is a host's, or an address."""
 
     name: str
     state: str
@@ -70,8 +70,8 @@ class PortsRow(NamedTuple):
     who: str
 
 
-class AwaitedRow(NamedTuple):
-    """A host that is awaited with a one-time token, of which only the hash is kept. One for each name."""
+class EnrolmentTokenRow(NamedTuple):
+    """An awaited host and the hash of its one-time token. There is one for each name."""
 
     name: str
     id: str
@@ -84,8 +84,8 @@ class AwaitedRow(NamedTuple):
     who: str
 
 
-class RevokedRow(NamedTuple):
-    """A certificate that is no longer its host's: since when, and its own end. `name` is empty if not known."""
+class RevokedCertificateRow(NamedTuple):
+    """A revoked certificate: when it was revoked, and when it ends. `name` is empty if not known."""
 
     serial: str
     name: str
@@ -94,17 +94,17 @@ class RevokedRow(NamedTuple):
 
 
 class HostTables:
-    """Reads and writes them."""
+    """The tables of hosts, with methods to read and write them."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def save(self, row: HostRow) -> None:
-        """Keep a host, its new certificate, or that it is revoked."""
+        """Store a host, its new certificate, or its revocation."""
         self._database.put("host", *row)
 
     def hosts(self) -> list[HostRow]:
-        """All hosts that were ever enrolled, by name."""
+        """Return all hosts that were ever enrolled, by name."""
         return [HostRow(*row) for row in self._database.query("SELECT * FROM host ORDER BY name")]
 
     def save_certificate(self, row: CertificateRow) -> None:
@@ -112,7 +112,7 @@ class HostTables:
         self._database.put("host_certificate", *row[:-1], *(row.next or (None, None, None)))
 
     def certificates(self) -> list[CertificateRow]:
-        """The certificates of all hosts."""
+        """Return the certificates of all hosts."""
         return [
             CertificateRow(
                 name, made, certificate, NextCertificate(*following) if following[0] is not None else None
@@ -121,45 +121,45 @@ class HostTables:
         ]
 
     def save_ports(self, row: PortsRow) -> None:
-        """Keep what was seen of a machine's ports."""
+        """Store the port check of a machine."""
         self._database.put("host_ports", row.name, row.state, json.dumps(row.open), row.checked, row.who)
 
     def ports(self) -> list[PortsRow]:
-        """Everything that was seen of ports."""
+        """Return all port checks."""
         rows = self._database.query("SELECT * FROM host_ports")
         return [PortsRow(name, state, json.loads(opened), *told) for name, state, opened, *told in rows]
 
-    def save_awaited(self, row: AwaitedRow) -> None:
-        """Keep a one-time token, in the place of an earlier one of its name."""
+    def save_awaited(self, row: EnrolmentTokenRow) -> None:
+        """Store a one-time token; it replaces an earlier one of the same name."""
         self._database.put("enrolment_token", *row[:-2], json.dumps(row.kit), row.who)
 
     def forget_awaited(self, name: str) -> None:
-        """A token was used, or has ended."""
+        """Remove a token that was used or has ended."""
         self._database.delete("enrolment_token", name=name)
 
-    def awaited(self) -> list[AwaitedRow]:
-        """The tokens that were not used."""
+    def awaited(self) -> list[EnrolmentTokenRow]:
+        """Return the unused tokens."""
         rows = self._database.query("SELECT * FROM enrolment_token")
-        return [AwaitedRow._make((*row[:-2], json.loads(row[-2]), row[-1])) for row in rows]
+        return [EnrolmentTokenRow._make((*row[:-2], json.loads(row[-2]), row[-1])) for row in rows]
 
-    def save_revoked(self, row: RevokedRow) -> None:
-        """Keep that a certificate is revoked."""
+    def save_revoked(self, row: RevokedCertificateRow) -> None:
+        """Store that a certificate is revoked."""
         self._database.submit("INSERT OR IGNORE INTO revocation VALUES (?, ?, ?, ?)", row)
 
     def forget_revoked(self, before: float) -> None:
-        """Certificates that ended before this moment are good for nothing, revoked or not."""
+        """Remove certificates that ended before this time: they are invalid without a revocation."""
         self._database.submit("DELETE FROM revocation WHERE expires < ?", (before,))
         self._database.submit(
             "DELETE FROM revoked_certificate WHERE moment < ?", (before - _LONGEST_SECONDS,)
         )
 
-    def revoked(self) -> list[RevokedRow]:
-        """All revoked certificates, the first one first."""
-        # Before there was `revocation`, the end was not kept: it came within the longest life there is.
+    def revoked(self) -> list[RevokedCertificateRow]:
+        """Return all revoked certificates, the earliest revocation first."""
+        # Rows from before the table `revocation` have no end; it comes within the longest life.
         rows = self._database.query(
             "SELECT serial, name, moment, expires FROM revocation UNION ALL"
             " SELECT serial, '', moment, moment + ? FROM revoked_certificate"
             " WHERE serial NOT IN (SELECT serial FROM revocation) ORDER BY moment",
             (_LONGEST_SECONDS,),
         )
-        return [RevokedRow(*row) for row in rows]
+        return [RevokedCertificateRow(*row) for row in rows]

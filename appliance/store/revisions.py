@@ -1,4 +1,4 @@
-"""Keep revisions: list them, go back to one, and limit the time of a change that is not confirmed."""
+"""Store revisions, list them, roll back to one, and roll back changes that are not confirmed in time."""
 
 import asyncio
 import contextlib
@@ -21,15 +21,15 @@ DISK = "disk"
 
 
 class Row(Protocol):
-    """A kept revision."""
+    """A stored revision."""
 
     @property
     def revision(self) -> int:
-        """Its number; 0 before the first."""
+        """Return its number; 0 before the first."""
 
     @property
     def who(self) -> str:
-        """The operator who brought it into force, or `DISK`."""
+        """Return the operator who brought it into force, or `DISK`."""
 
     def _asdict(self) -> dict[str, Any]: ...
 
@@ -38,10 +38,10 @@ R = TypeVar("R", bound=Row)
 
 
 class Revisions(ABC, Generic[R]):
-    """Keep the revisions of one thing, and change the one in force one change at a time.
+    """The revisions of one thing, which are changed one at a time.
 
-    A change can have a time limit: it goes back automatically unless it is confirmed, over restarts of control and of
-    the appliance. Where going back raises `refusal` or `StoreError` and changes nothing, it is tried again after
+    A change can have a time limit: it is rolled back automatically unless confirmed, also after restarts of control and
+    of the appliance. A rollback that raises `refusal` or `StoreError` changes nothing and is tried again after
     `_AGAIN_SECONDS`, because no person may be there to do it.
     """
 
@@ -60,7 +60,7 @@ class Revisions(ABC, Generic[R]):
     ) -> None:
         """Read revisions with `rows(limit)`, the newest first, and write them with `save`.
 
-        `nothing` is in force until the start. The store has the time limit under the name `setting`.
+        `nothing` is in force until the start. The store keeps the time limit under the name `setting`.
         """
         self.store = store
         self._rows = rows
@@ -74,24 +74,24 @@ class Revisions(ABC, Generic[R]):
 
     @property
     def revision(self) -> int:
-        """The number of the revision in force; 0 for none."""
+        """Return the number of the revision in force; 0 for none."""
         return self.in_force.revision
 
     @property
     def tag(self) -> int | str:
-        """Names the state that a change is meant for: `expected` of a request."""
+        """Return the name of the present state, which a request gives as `expected`."""
         return self.revision
 
     @abstractmethod
     async def _go_back(self, revision: int) -> None:
-        """Bring a revision into force again that was not confirmed in time."""
+        """Bring the former revision into force again, because the present one was not confirmed in time."""
 
     # --- start ---
 
     def _find_last(self, *, restarted: bool) -> bool:
-        """Set the last revision in force; return whether the start takes it whatever the disk has.
+        """Set the last revision in force; return whether the start uses it whatever the disk has.
 
-        After a crash of control (`restarted`) it does. At the appliance's start it does so for an operator's own
+        It does after a crash of control (`restarted`). At the appliance's start it does so only for an operator's own
         revision (a rollback, REST).
         """
         self.in_force = next(iter(self._rows(1)), self.in_force)
@@ -103,13 +103,13 @@ class Revisions(ABC, Generic[R]):
         if kept:
             back_to, deadline, length = (*kept.split(), "inf")[:3]  # up to 0.1.0 the length was not kept
             within = float(length)
-            # Not later than after its whole length: the clock may have been set back since.
+            # The whole length at most: the clock may have been set back since.
             self._limit(int(back_to), min(float(deadline), time.time() + within), within)
 
     # --- reading ---
 
     async def _kept(self) -> list[R]:
-        """Return all kept revisions, the newest first."""
+        """Return all stored revisions, the newest first."""
         return await asyncio.to_thread(self._rows)
 
     def _described(self, row: R) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class Revisions(ABC, Generic[R]):
         return next((row for row in await self._kept() if row.revision == revision), None)
 
     async def _wanted(self, revision: int | None) -> R:
-        """Return the kept revision to go back to (None: the one before the present).
+        """Return the stored revision to roll back to (None: the one before the present).
 
         Raises `refusal` if there is none, and `outdated` if another came into force while they were read.
         """
@@ -148,7 +148,7 @@ class Revisions(ABC, Generic[R]):
             yield
 
     def _put_in_force(self, row: R, within: float | None = None) -> None:
-        """Keep a revision that comes into force; unless confirmed, it goes back after `within` seconds."""
+        """Store a revision that comes into force; unless confirmed, it is rolled back after `within` seconds."""
         if within is not None:  # first, because control may die while the change is made
             back_to = self.revision if self.confirm_by is None else self._back_to
             self._limit(back_to, time.time() + within, within)
@@ -179,7 +179,7 @@ class Revisions(ABC, Generic[R]):
             try:
                 await self._go_back(back_to)
             except (self.refusal, StoreError) as error:
-                if self.confirm_by is None:  # it went back before the error
+                if self.confirm_by is None:  # it was rolled back before the error
                     _log.error("an unconfirmed change went back, and this is not kept", reason=str(error))
                     return
                 _log.error("an unconfirmed change cannot go back yet", revision=back_to, error=str(error))

@@ -50,11 +50,11 @@ CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) 
 """
 
 
-LARGEST_CHANGE = 64 << 10  # bytes of one parameter that is kept at once
+LARGEST_CHANGE = 64 << 10  # bytes of one parameter whose change is stored at once
 
 
 class IncarnationRow(NamedTuple):
-    """One incarnation as it is kept; `changed` is monotonic seconds, for the order only.
+    """A stored incarnation; `changed` is monotonic seconds, for the order only.
 
     `relay_port` is its port on the first relay process, `more_relay_ports` are those on the others.
     """
@@ -73,7 +73,7 @@ class IncarnationRow(NamedTuple):
 
 
 class RegistrationRow(NamedTuple):
-    """One registration as it is kept; `ordinal` is its place in the order they were made."""
+    """A stored registration; `ordinal` counts registrations in the order they were made."""
 
     key: str
     kind: str
@@ -93,9 +93,9 @@ class PermissionRow(NamedTuple):
 
 
 class RevisionRow(NamedTuple):
-    """One policy that was in force; `loaded` is seconds since the epoch, `who` loaded it from where.
+    """One policy that was in force; `loaded` is seconds since the epoch, `who` is who loaded it from where.
 
-    `signature` is the site's, or empty.
+    `signature` is the site's; empty if unsigned.
     """
 
     revision: int
@@ -126,17 +126,17 @@ class StateStore:
         self._parameter_changes = 0  # the number of the last one
 
     async def settled(self) -> None:
-        """Wait until everything saved so far is on the disk. Raises `StoreError` when it cannot be written."""
+        """Wait until everything saved so far is on the disk. Raises `StoreError` if it cannot be written."""
         await self.database.settled()
 
     def close(self, seconds: float | None = None) -> None:
-        """Write what is left, within so many seconds (None: however long it takes), and close."""
+        """Write the rest within `seconds` (None: without a limit), and close."""
         self.database.close(seconds)
 
     # --- registry ---
 
     def save_incarnation(self, row: IncarnationRow) -> None:
-        """Keep an incarnation, or its new `life`."""
+        """Store an incarnation, or its new `life`."""
         with self.database.together():
             self.database.put("incarnation", *row[:-1])
             self.database.delete("relay_port", key=row.key)
@@ -158,7 +158,7 @@ class StateStore:
         self.database.delete("registration", key=key, kind=kind, resource=resource)
 
     def load_registry(self) -> tuple[list[IncarnationRow], list[RegistrationRow]]:
-        """Everything that is kept, registrations in order."""
+        """Return everything that is stored, registrations in order."""
         query = self.database.query
         ports: dict[str, tuple[int, ...]] = {}
         for key, port in query("SELECT key, port FROM relay_port ORDER BY key, relay"):
@@ -182,23 +182,23 @@ class StateStore:
         self.database.delete("permission", **row._asdict())
 
     def permissions(self) -> list[PermissionRow]:
-        """All grants that are kept."""
+        """Return all stored grants."""
         return [PermissionRow(*row) for row in self.database.query("SELECT * FROM permission")]
 
     # --- parameters ---
 
     def save_parameters(self, tree: dict[str, Any]) -> None:
-        """Keep the whole parameter tree, in the place of the changes before it."""
+        """Store the whole parameter tree; it replaces the changes before it."""
         self.database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
-        # Changes that stay though the tree has them (after a crash) are made once more, in order: the tree is the same.
+        # After a crash, changes that the tree has may stay: made again in order, they give the same tree.
         self.database.submit(
             "DELETE FROM parameter_change WHERE number <= ?", (self._parameter_changes,), ahead=False
         )
 
     def note_parameter(self, key: str, value: Any) -> None:
-        """Keep one change until the tree is kept: a parameter has this value, or None: it is gone.
+        """Store one change until the tree is stored: the parameter has this value (None: it is gone).
 
-        When this returns the change outlasts the process. A large value does not: it is kept with the tree.
+        From then on the change outlasts the process. A large value does not: it is only stored with the tree.
         """
         data = None if value is None else msgspec.msgpack.encode(value)
         if data is not None and len(data) > LARGEST_CHANGE:
@@ -207,18 +207,18 @@ class StateStore:
         self.database.put("parameter_change", self._parameter_changes, key, data)
 
     def parameter_changes(self) -> list[tuple[str, Any]]:
-        """The changes since the tree was kept, in order; None for a parameter that is gone."""
+        """Return the changes since the tree was stored, in order; None for a parameter that is gone."""
         query = "SELECT number, key, value FROM parameter_change ORDER BY number"
         rows = self.database.query(query)
         self._parameter_changes = rows[-1][0] if rows else 0
         return [(key, None if data is None else msgspec.msgpack.decode(data)) for _number, key, data in rows]
 
     def parameter_owned(self, key: str, host: str) -> None:
-        """From this key on the parameters are this host's."""
+        """Store that this host owns the parameters at and below this key."""
         self.database.put("parameter_owner", key, host)
 
     def parameters_disowned(self, key: str) -> None:
-        """This key and those below it have no owner of their own any more."""
+        """Remove the owners of this key and of those below it."""
         above = key.rstrip("/")  # '0' follows '/'
         self.database.submit(
             "DELETE FROM parameter_owner WHERE key = ? OR (key > ? AND key < ?)",
@@ -226,24 +226,24 @@ class StateStore:
         )
 
     def parameter_owners(self) -> list[tuple[str, str]]:
-        """The keys from which on parameters are another host's, and the host."""
+        """Return each key at which another owner begins, and the host that owns it and the keys below."""
         return [(key, host) for key, host in self.database.query("SELECT key, host FROM parameter_owner")]
 
     def load_parameters(self) -> dict[str, Any]:
-        """The kept parameter tree; empty when there is none."""
+        """Return the stored parameter tree; empty if there is none."""
         rows = self.database.query("SELECT tree FROM parameters WHERE id = 1")
         return msgspec.msgpack.decode(rows[0][0], type=dict[str, Any]) if rows else {}
 
     # --- revisions of the policy and of the specifications ---
 
     def save_revision(self, row: RevisionRow) -> None:
-        """Keep a policy that comes into force."""
-        # First: a revision without its signature would be refused by a start in between.
+        """Store a policy that comes into force."""
+        # The signature first: a start in between would reject a revision without it.
         self.database.put("policy_signature", row.revision, row.signature)
         self.database.put("policy_revision", *row[:-1])
 
     def revisions(self, limit: int = -1) -> list[RevisionRow]:
-        """Return kept revisions, the newest first: all, or the last `limit`."""
+        """Return the last `limit` revisions (-1: all), the newest first."""
         rows = self.database.query(
             "SELECT policy_revision.*, coalesce(signature, '') FROM policy_revision"
             " LEFT JOIN policy_signature USING (revision) ORDER BY revision DESC LIMIT ?",
@@ -252,24 +252,24 @@ class StateStore:
         return [RevisionRow(*row) for row in rows]
 
     def save_monitor_revision(self, row: MonitorRevisionRow) -> None:
-        """Keep specifications that come into force."""
+        """Store specifications that come into force."""
         self.database.put("monitor_revision", *row)
 
     def monitor_revisions(self, limit: int = -1) -> list[MonitorRevisionRow]:
-        """Return kept revisions of the specifications, the newest first: all, or the last `limit`."""
+        """Return the last `limit` revisions of the specifications (-1: all), the newest first."""
         rows = self.database.query("SELECT * FROM monitor_revision ORDER BY revision DESC LIMIT ?", (limit,))
         return [MonitorRevisionRow(*row) for row in rows]
 
     # --- tokens ---
 
     def save_token(self, row: TokenRow) -> None:
-        """Keep a token, or that it is revoked."""
+        """Store a token, or its revocation."""
         self.database.put("token", *row[:-1])
         if row.keys is not None:
             self.database.put("token_keys", row.id, *row.keys)
 
     def tokens(self) -> list[TokenRow]:
-        """All tokens that were ever made, the oldest first."""
+        """Return all tokens that were ever made, the oldest first."""
         kept = {token: TokenKeys(*keys) for token, *keys in self.database.query("SELECT * FROM token_keys")}
         rows = self.database.query("SELECT * FROM token ORDER BY created")
         return [TokenRow._make((*row, kept.get(row[0]))) for row in rows]
@@ -277,9 +277,9 @@ class StateStore:
     # --- settings ---
 
     def save_setting(self, name: str, value: str) -> None:
-        """Keep a named value."""
+        """Store a named value."""
         self.database.put("setting", name, value)
 
     def settings(self) -> dict[str, str]:
-        """All named values."""
+        """Return all named values."""
         return dict(self.database.query("SELECT name, value FROM setting"))

@@ -1,8 +1,8 @@
 """One SQLite file with one writer thread: statements are queued, written in groups, and can be awaited.
 
-What was queued together is committed together with whatever else is waiting (group commit). A process that is killed
-loses nothing: what is queued stands in a file of its own until the database has it (`ahead`). A machine that loses its
-power loses nothing that was awaited (`settled`): what an operator was told is done.
+Waiting statements are committed together (group commit). A killed process loses nothing: queued statements are in a
+separate file until the database has them (`ahead`). A power failure loses nothing that was awaited (`settled`), so a
+change that was reported to an operator as done stays done.
 """
 
 import asyncio
@@ -22,13 +22,13 @@ import structlog
 from appliance.store.ahead import Parameter, Parameters, WriteAhead
 
 _GROUP = 2_000
-_GATHER_SECONDS = 0.02  # a statement that nobody awaits waits this long for company: it is safe in `ahead`
+_GATHER_SECONDS = 0.02  # time to gather statements that are not awaited: they are safe in `ahead`
 
 _ROWS = 64  # of one statement
 
 _CATCH_UP_SECONDS = 1.0
 _SETTLE_SECONDS = 5.0
-_ROOM = 4 << 20  # bytes: the log of SQLite grows so far, and few texts are longer
+_ROOM = 4 << 20  # bytes: SQLite's log grows to this, and few texts are longer
 
 _LEFT = "changes that the file state.ahead took are made at the next start, others are lost"
 
@@ -47,15 +47,14 @@ class _Gathered(NamedTuple):
 
 
 class StoreError(Exception):
-    """The state cannot be read or written; the text says which file and why."""
+    """The state cannot be read or written; the text names the file and the reason."""
 
 
 class Database:
     """The state file at `path`, created with `schema` when it is new.
 
-    Raises `StoreError` when the file is no database or cannot be opened. `failed` hears of a write that could not
-    be done (a full disk), once until it can: nothing is dropped, the write is tried again until it succeeds or the
-    database is closed.
+    Raises `StoreError` if the file is not a database or cannot be opened. `failed` is called once when writing fails (a
+    full disk). Nothing is dropped: the write is tried again until it succeeds or the database is closed.
     """
 
     def __init__(self, path: Path, schema: str, *, failed: Callable[[str], None]) -> None:
@@ -82,7 +81,7 @@ class Database:
             raise StoreError(f"{path.with_suffix('.ahead')}: {error}") from error
         self._gathered: _Gathered | None = None
         self._queue: queue.SimpleQueue[_Queued | Callable[[], None] | None] = queue.SimpleQueue()
-        self._order = threading.Lock()  # statements are in the file ahead as they are in the queue
+        self._order = threading.Lock()  # statements have the same order in the file ahead and in the queue
         self._closed = False
         self._closing = threading.Event()
         self._hurry = threading.Event()
@@ -90,9 +89,10 @@ class Database:
         self._thread.start()
 
     def query(self, sql: str, parameters: Parameters = ()) -> list[tuple[Any, ...]]:
-        """Read rows, with what was queued before; for start-up, and else in a thread: it waits while the disk is slow.
+        """Read rows, including those queued before. After start-up, call it in a thread: it waits while the disk is
+        slow.
 
-        What cannot be written in `_CATCH_UP_SECONDS` is not among them, and is not waited for while the disk is full.
+        Statements that are not written within `_CATCH_UP_SECONDS` are missing; on a full disk it does not wait.
         """
         if self._thread.is_alive() and not self._failing:
             written = threading.Event()
@@ -106,9 +106,9 @@ class Database:
             raise StoreError(f"{self._path}: {error}") from error
 
     def submit(self, sql: str, parameters: Parameters = (), *, ahead: bool = True) -> None:
-        """Queue one statement; when this returns it outlasts the process (unless not `ahead`: for large values).
+        """Queue one statement. With `ahead` it survives the process from then on; large values go without.
 
-        Of an INSERT the row stands at the end. Raises `StoreError` after `close`, as all do that submit.
+        An INSERT must end with its row. Raises `StoreError` after `close`, like all methods that submit.
         """
         statement = _Queued(sql, parameters, ahead)
         gathered = self._gathered
@@ -119,7 +119,7 @@ class Database:
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """What this thread submits inside is kept by one write, at the end: only then it outlasts the process."""
+        """Gather what this thread submits inside into one write at the end; before it, nothing outlasts the process."""
         if self._gathered is not None:
             yield
             return
@@ -151,17 +151,17 @@ class Database:
             )
 
     def put(self, table: str, *row: Parameter, ahead: bool = True) -> None:
-        """Queue a row of a table, in the place of the one that has its key; see `submit`."""
+        """Queue a row of a table; it replaces the row with the same key. See `submit`."""
         marks = ", ".join("?" * len(row))
         self.submit(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", row, ahead=ahead)  # noqa: S608  fixed names
 
     def delete(self, table: str, **where: Parameter) -> None:
-        """Queue that the rows with these values in these columns are gone; see `submit`."""
+        """Queue the removal of the rows with these values in these columns; see `submit`."""
         wanted = " AND ".join(f"{column} = ?" for column in where)
         self.submit(f"DELETE FROM {table} WHERE {wanted}", tuple(where.values()))  # noqa: S608  fixed names
 
     def require_room(self) -> None:
-        """Raises `StoreError` when the disk does not take what an order would change: nothing is to be changed then."""
+        """Raise `StoreError` if the disk is too full for the changes of an order: nothing may be changed then."""
         disk = os.statvfs(self._path.parent)
         free = disk.f_bavail * disk.f_frsize
         if self._failing or free < _ROOM:
@@ -179,7 +179,7 @@ class Database:
 
         def call_back() -> None:
             self._sync()
-            with contextlib.suppress(RuntimeError):  # the loop has ended: nobody waits any more
+            with contextlib.suppress(RuntimeError):  # the loop has ended, and with it all waiting callers
                 loop.call_soon_threadsafe(tell)
 
         with self._order:
@@ -191,7 +191,7 @@ class Database:
                 raise StoreError(f"{self._failing}; make room: until then a restart undoes what was ordered")
 
     def close(self, seconds: float | None = None) -> None:
-        """Write what is queued, within so many seconds (None: however long it takes), and close the file.
+        """Write the queue within `seconds` (None: without a limit), and close the file.
 
         Nothing is taken any more from the beginning of this on.
         """
@@ -270,7 +270,7 @@ class Database:
 
 
 def _joined(statements: list[_Queued]) -> Iterator[_Queued]:
-    """The same, rows of one table that follow each other as one statement: each costs the loop a turn of its thread."""
+    """Yield the statements, consecutive rows of one table as one: each costs the loop a turn of its thread."""
     for (sql, ahead), same in itertools.groupby(
         statements, lambda statement: (statement.sql, statement.ahead)
     ):
@@ -283,7 +283,7 @@ def _joined(statements: list[_Queued]) -> Iterator[_Queued]:
 
 
 def _advice(error: sqlite3.Error) -> str:
-    # Subclasses are about the place (a full disk, a lock, rights); the class itself means that the content is wrong.
+    # Subclasses report the environment (a full disk, a lock, rights); the class itself, wrong content.
     if type(error) is sqlite3.DatabaseError:
         return "move the file away to start with an empty state"
     return "make room there and let it be written, or name another directory with --state DIR"

@@ -1,4 +1,4 @@
-"""Make audit records of events in control, and block answers while no record can be made."""
+"""Make audit records of events in control, and block answers while the log cannot be written."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -6,17 +6,17 @@ from typing import Any, NamedTuple
 
 from appliance.audit.events import SEVERITIES
 from appliance.audit.log import AuditLog
-from appliance.audit.record import Record, RuleReference, Severity
+from appliance.audit.record import AuditRecord, RuleReference, Severity
 from appliance.policy.model import Decision, Rule
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from appliance.telemetry.metrics import Meter
 
-# The text for callers. Operators find the path and the error in the output, in `rosrv status`, and later in the log.
+# The text for callers. Operators see the path and the error in the output, in `rosrv status`, and later in the log.
 NOT_RECORDED = "the audit log cannot be written; nothing is granted until it can"
 
 
 class Asker(NamedTuple):
-    """Describe a caller: host, claimed `caller_id`, arrival of the call (monotonic ns), and the target node."""
+    """A caller: its host, claimed `caller_id`, the arrival of the call (monotonic ns), and the target node."""
 
     host: str
     caller_id: str
@@ -25,15 +25,15 @@ class Asker(NamedTuple):
 
 
 Recordings = Callable[[str, str | None, Severity, str | None, int], dict[str, str]]
-"""Return the details of an event's recording for its record, as `RecordingPlan.detail`."""
+"""Returns the details that an event's record has about its recording, as `RecordingPlan.detail` does."""
 
 
 class AuditTrail:
-    """Records decisions and events under the running policy revision.
+    """The writer of decisions and events under the running policy revision.
 
     `strict`: an answer waits until its record is on disk. `deny_when_failed`: every request is denied while the log
-    cannot be written. Denials of unknown hosts are marked (`detail.stranger`). Events that a host beyond its quota of
-    the log causes without a call are only counted.
+    cannot be written. Denials of unknown hosts have `detail.unknown_host`. If a host is over its quota of the log, the
+    events it causes without a decision are only counted.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class AuditTrail:
 
     @property
     def obstacle(self) -> str | None:
-        """Return why nothing can be granted now (the log cannot be written), or None; safe to show to unknown hosts."""
+        """Return why nothing can be granted now, or None; the text is safe to show to unknown hosts."""
         if self._deny_when_failed and self._log.failed is not None:
             return NOT_RECORDED
         return None
@@ -59,21 +59,21 @@ class AuditTrail:
         return self._log.budget.shut_out(host)
 
     def owing(self, host: str) -> str:
-        """Return why this host must wait before its next record; empty if it need not."""
+        """Return why this host must wait before its next record; empty if it may proceed."""
         return self._log.budget.owing(host)
 
     async def still_owing(self, host: str) -> str:
-        """Return `owing` after the log has caught up; repetitions then no longer count."""
+        """Return `owing`, checked again after the log has caught up, when repetitions no longer count."""
         if self.owing(host):
             await self._log.wait_durable()
         return self.owing(host)
 
     def pause(self, host: str) -> float:
-        """Return the seconds for which calls of this host wait before the next check; 0 if they need not."""
+        """Return the seconds that calls of this host wait before the next check; 0 for none."""
         return self._log.budget.pause(host)
 
     async def durable(self) -> str | None:
-        """Wait until all records so far are on disk. Return the reason if they must be and cannot."""
+        """Wait until all records so far are on disk. With `deny_when_failed`, return the reason if they cannot be."""
         failure = await self._log.wait_durable()
         return failure if self._deny_when_failed else None
 
@@ -88,10 +88,10 @@ class AuditTrail:
         reads: bool = False,
         **asked_of: str,
     ) -> str:
-        """Record a decision, and return the id of its record, which exists unless the decision is only counted.
+        """Record a decision and return the id of its record. A decision that is only counted has no such record.
 
         `asked_of` is the object of a command: a parameter, a node. `reads`: the call changes nothing, so repetitions
-        are only counted if it is allowed.
+        of an allowed call are only counted.
         """
         word = decision.word
         detail: dict[str, Any] = {"call": method, **asked_of}
@@ -102,7 +102,7 @@ class AuditTrail:
         now = time.time_ns()
         severity = Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING
         detail |= self._recordings("decision", word, severity, asker.host, now)
-        record = Record(
+        record = AuditRecord(
             id=self._ids.next(),
             time=now,
             event="decision",
@@ -116,7 +116,7 @@ class AuditTrail:
             revision=self.revision,
             reason=decision.reason,
             duration_us=(time.monotonic_ns() - asker.arrived) // 1000,
-            stranger=self._marked(asker.host, word, detail),
+            unknown=self._marked(asker.host, word, detail),
             detail=detail,
             folds=reads and word == "allow",
         )
@@ -139,16 +139,16 @@ class AuditTrail:
         reads: bool = False,
         **detail: Any,
     ) -> str:
-        """Record an event that is not a decision; return the id as `decided` does. `more` has further details.
+        """Record an event that is not a decision; return the id like `decided`. `more` has further details.
 
-        `severity` is for an event of varying severity (`audit/events.py`).
+        `severity` overrides the event's own (`audit/events.py`).
         `reads`: the event changed nothing, so repetitions are only counted.
         """
         now, severity = time.time_ns(), severity or SEVERITIES.get(event, Severity.INFO)
         detail = {**(more or {}), **detail, **self._recordings(event, decision, severity, host, now)}
-        stranger = self._marked(host, decision, detail)
+        unknown = self._marked(host, decision, detail)
         return self._log.record(
-            Record(
+            AuditRecord(
                 id=self._ids.next(),
                 time=now,
                 event=event,
@@ -162,21 +162,19 @@ class AuditTrail:
                 revision=self.revision,
                 reason=reason,
                 detail=detail,
-                stranger=stranger,
+                unknown=unknown,
                 folds=reads or (decision is None and host is not None and bool(self.owing(host))),
             )
         )
 
     def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
-        """Whether this denies an unknown host; if so, mark the detail."""
-        stranger = (
-            host is not None and decision == "deny" and self._log.budget.standing(host) is Standing.STRANGER
-        )
-        if stranger:
-            detail["stranger"] = True
-        return stranger
+        """Whether this denies an unknown host; if so, mark it in `detail`."""
+        if host is None or decision != "deny" or self._log.budget.quota_class(host) is not QuotaClass.UNKNOWN:
+            return False
+        detail["unknown_host"] = detail["stranger"] = True  # the second is its name of 0.1.0; deprecated
+        return True
 
 
 def rule_reference(rule: Rule | None) -> RuleReference | None:
-    """Return the policy's rule in the form of a record."""
+    """Return a rule in the form that a record stores."""
     return None if rule is None else RuleReference(rule.section, rule.key, rule.file, rule.line)

@@ -1,8 +1,8 @@
 """Define every metric by name, and keep the counters of RVMaster.
 
-`/metrics` and docs/metrics.md are both generated from `METRICS` (`python -m appliance.telemetry.metrics`). Counting
-costs a few additions for each request, without formatting. Labels have few values: calls, categories and roles are
-fixed; topics and services are those on a relay, with a limit on the number of names (`appliance.control.measurements`).
+`/metrics` and docs/reference/metrics.md are both generated from `METRICS` (`python -m appliance.telemetry.metrics`).
+Counting costs a few additions per request and no formatting. Labels have few values: calls, categories and roles are
+fixed; topics and services are those on a relay, limited in number by `appliance.control.measurements`.
 """
 
 import bisect
@@ -17,7 +17,7 @@ BOUNDS = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1,
 
 
 class Metric(NamedTuple):
-    """Describe one metric; `name` is the one in Prometheus."""
+    """A metric; `name` is its name in Prometheus."""
 
     name: str
     kind: Literal["counter", "gauge", "histogram"]
@@ -73,20 +73,13 @@ METRICS = (
     _counter(
         "rosrv_monitor_events_total",
         "what monitors did: verdict, drop, change, fault, log, publish; what several changed counts for each;"
-        " `trial drop`, … of those on trial",
+        " `shadow drop`, … of those in shadow mode",
         "kind",
         "monitor",
     ),
-    _gauge(
-        "rosrv_monitor_margin",
-        "how close a comparison of numbers at this line and column came today (UTC) while it was true, and while not",
-        "monitor",
-        "place",
-        "holds",
-    ),
     _gauge("rosrv_monitor_slices", "slices that a parametric specification has now", "monitor"),
     _gauge("rosrv_monitor_slice_limit", "slices that it may have at a time", "monitor"),
-    _gauge("rosrv_monitors", "monitors: enabled, trial (shadow mode), disabled, holding, failing", "state"),
+    _gauge("rosrv_monitors", "monitors: enabled, shadow (mode), disabled, holding, failing", "state"),
     _gauge(
         "rosrv_switched_off",
         "monitors disabled or in shadow mode by an order, sections of the policy audit-only: forgotten, or not yet",
@@ -142,7 +135,7 @@ METRICS = (
 
 @dataclass(slots=True)
 class Histogram:
-    """Count durations by upper bound; `counts` has one entry more than `BOUNDS`, for longer ones."""
+    """A histogram of durations by upper bound; the last of `counts` is for durations above all `BOUNDS`."""
 
     counts: list[int] = field(default_factory=lambda: [0] * (len(BOUNDS) + 1))
     sum: float = 0.0
@@ -158,7 +151,7 @@ class Histogram:
 
 
 class Meter:
-    """Count events of RVMaster since its start."""
+    """The counters of RVMaster's events since its start."""
 
     def __init__(self) -> None:
         self.decisions: Counter[tuple[str, str]] = Counter()
@@ -171,7 +164,7 @@ class Meter:
         self.decision_seconds.observe(seconds)
 
     def called(self, call: str, seconds: float) -> None:
-        """Count an answered call of the table; `call` must not be text from a client."""
+        """Count an answered call; `call` is a name of the call table, never text from a client."""
         histogram = self.calls.get(call)
         if histogram is None:
             histogram = self.calls[call] = Histogram()
@@ -179,7 +172,7 @@ class Meter:
 
 
 def markdown() -> str:
-    """Return the generated part of docs/metrics.md."""
+    """Return the generated part of docs/reference/metrics.md."""
     lines = ["| metric | kind | labels | meaning |", "|---|---|---|---|"]
     lines += [
         f"| `{row.name}` | {row.kind} | {', '.join(f'`{label}`' for label in row.labels) or '-'} | {row.help} |"

@@ -1,1 +1,1 @@
-"""The appliance's firewall: one list of rules, two back ends, and the proof that the kernel enforces them."""
+"""The appliance's firewall: a list of rules, two back ends, and a test that the kernel enforces the rules."""

@@ -1,9 +1,8 @@
-"""The proof that a back end works here: try it on a port of our own, and see who is refused.
+"""Test that a back end works here, with a port of our own on loopback.
 
-A kernel may accept rules that it never applies (another one is behind the tables, a match extension is a
-stub, a container engine filters the calls). So a back end is taken only after a port of ours on loopback
-was reached before the rule, refused while the rule names another user, and reached again when it names us,
-on IPv4 and IPv6.
+A kernel may accept rules that it never applies (a match extension is a stub, or a container engine filters the calls).
+So a back end is used only after three tests on IPv4 and IPv6: the port is reached without a rule, refused with a rule
+for another user, and reached with a rule for this user.
 """
 
 import errno
@@ -14,22 +13,19 @@ from appliance.network.firewall.backend import Backend, FirewallError
 from appliance.network.firewall.firewall_rules import inner_port
 from appliance.network.namespaces import Namespace
 
-_SECONDS = 20.0  # of a slow machine: who is let in or refused is told at once
+_SECONDS = 20.0  # for a slow machine: usually the answer comes at once
 _LOOPBACK = ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1"))
 
 
 def prove(backend: Backend, namespace: Namespace) -> None:
-    """Install rules for a port of our own, try them, and take them away again.
-
-    Raises: FirewallError, saying what was not enforced; whatever the back end raises.
-    """
+    """Install rules for a port of our own, try them, and remove them. Raises `FirewallError`."""
     own, other = os.geteuid(), os.geteuid() + 1
     try:
         for family, address in _LOOPBACK:
             with namespace.entered():
                 server = _listen(family, address)
             if server is None:
-                continue  # no such family here, so nothing to protect on it
+                continue  # this family is missing, so there is nothing to protect
             with server:
                 port = server.getsockname()[1]
                 _expect(namespace, server, "before any rule", reached=True)
@@ -51,7 +47,7 @@ def _listen(family: socket.AddressFamily, address: str) -> socket.socket | None:
 
 
 def _expect(namespace: Namespace, server: socket.socket, when: str, *, reached: bool) -> None:
-    """Connect to `server` from a thread in the namespace."""
+    """Connect to `server` from the namespace. Raises `FirewallError` unless the result is `reached`."""
     address = server.getsockname()[:2]
 
     def connect() -> str | None:

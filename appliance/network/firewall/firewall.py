@@ -1,8 +1,7 @@
-"""The firewall of the appliance's namespace: chooses a back end that works, installs the rules, says how
-they stand.
+"""Run the firewall of the appliance's namespace: choose a back end that works, install the rules, report them.
 
-Order of use: `install` before ROSMaster starts, `update` when a port becomes known or a host is enrolled,
-`remove` when the appliance stops. Installing replaces whatever an earlier life left, of either back end.
+Call `install` before `rosmaster` starts, `update` when a port becomes known or a host is enrolled, and `remove` at the
+end. `install` replaces rules of an earlier run, of either back end.
 """
 
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import Literal
 from appliance.channel.answers.status import FirewallRule
 from appliance.network.firewall.backend import Backend, FirewallError, RuleCounter
 from appliance.network.firewall.backend_check import prove
-from appliance.network.firewall.firewall_rules import Family, FirewallSettings, Rule, appliance_rules
+from appliance.network.firewall.firewall_rules import Family, FirewallSettings, PacketRule, appliance_rules
 from appliance.network.firewall.iptables import IptablesBackend
 from appliance.network.firewall.nft import NftBackend
 from appliance.network.namespaces import Namespace, require_network_admin
@@ -21,32 +20,32 @@ BackendChoice = Literal["auto", "nft", "iptables"]
 
 @dataclass(frozen=True)
 class FirewallReport:
-    """How the firewall stands."""
+    """The state of the firewall."""
 
     backend: str | None  # None: not installed
     rules: tuple[FirewallRule, ...]
-    not_used: tuple[str, ...]  # why a back end that was tried was not taken
+    not_used: tuple[str, ...]  # why a back end was not used
 
     @property
     def intact(self) -> bool:
-        """Every rule is in the kernel."""
+        """Whether every rule is in the kernel."""
         return self.backend is not None and all(rule.in_force for rule in self.rules)
 
 
 class Firewall:
-    """The rules of one namespace, by a given back end or the first proven to work (nft, then iptables)."""
+    """The rules of one namespace, with a given back end or the first that works (nft, then iptables)."""
 
     def __init__(self, namespace: Namespace, backend: BackendChoice = "auto") -> None:
         self._namespace = namespace
         self._choice = backend
         self._backend: Backend | None = None
-        self._rules: tuple[Rule, ...] = ()
+        self._rules: tuple[PacketRule, ...] = ()
         self._not_used: list[str] = []
 
     def install(self, settings: FirewallSettings) -> str:
-        """Choose a back end, clear what an earlier life left, install the rules; return the back end's name.
+        """Choose a back end, remove old rules, install the rules; return the back end's name.
 
-        Raises: PrivilegeError; FirewallError when no back end works, with the reason of each.
+        Raises `PrivilegeError`, or `FirewallError` with the reason of each back end.
         """
         require_network_admin("the firewall")
         if self._backend is None:
@@ -57,10 +56,7 @@ class Firewall:
         return self._backend.name
 
     def update(self, settings: FirewallSettings) -> None:
-        """Replace the rules by those of new settings; if that fails, the old ones stay in force.
-
-        Raises: FirewallError, also when `install` was not called before.
-        """
+        """Replace the rules by those of new settings. Raises `FirewallError`; the old rules then stay in force."""
         if self._backend is None:
             raise FirewallError("the firewall is not installed yet: call install first")
         rules = appliance_rules(settings)
@@ -68,7 +64,7 @@ class Firewall:
         self._rules = rules
 
     def remove(self) -> None:
-        """Take every rule of the appliance away, of either back end; none there is fine."""
+        """Remove all rules of the appliance, with both back ends."""
         for backend in self._all():
             if self._backend is not None and backend.name == self._backend.name:
                 backend.remove()
@@ -77,7 +73,7 @@ class Firewall:
         self._backend, self._rules = None, ()
 
     def report(self) -> FirewallReport:
-        """Say which rules are in force, with their counters."""
+        """Report which rules are in force, with their counters."""
         backend, not_used = self._backend, tuple(self._not_used)
         if backend is None:
             return FirewallReport(None, statuses(self._rules, ()), not_used)
@@ -87,11 +83,11 @@ class Firewall:
     def _all(self) -> tuple[Backend, ...]:
         return (NftBackend(self._namespace), IptablesBackend(self._namespace))
 
-    def _choose(self, rules: tuple[Rule, ...]) -> Backend:
-        """Return the first candidate that is proven to work and takes all the rules, which are then installed."""
+    def _choose(self, rules: tuple[PacketRule, ...]) -> Backend:
+        """Return the first back end that works and accepts all rules, which are then installed."""
         backends = self._all()
         for backend in backends:
-            self._clear(backend)  # first, for a rule of either that is left over would spoil the proof
+            self._clear(backend)  # first: an old rule of either would disturb the test
         self._not_used = []
         for backend in backends:
             if self._choice in ("auto", backend.name):
@@ -104,12 +100,12 @@ class Firewall:
                 else:
                     return backend
         raise FirewallError(
-            f"no firewall can be had in {self._namespace.name}: {'; '.join(self._not_used)}. "
+            f"no firewall works in {self._namespace.name}: {'; '.join(self._not_used)}. "
             "Give the container CAP_NET_ADMIN (iptables: CAP_NET_RAW too), or choose `isolation: none`"
         )
 
     def _clear(self, backend: Backend) -> None:
-        """Take away what an earlier life left with a back end. One that cannot be used here left nothing."""
+        """Remove old rules of a back end. A back end that cannot be used here has none."""
         try:
             backend.remove()
         except FirewallError as error:
@@ -119,12 +115,11 @@ class Firewall:
 
 
 def statuses(
-    rules: tuple[Rule, ...], counters: tuple[RuleCounter, ...], families: tuple[Family, ...] = (4, 6)
+    rules: tuple[PacketRule, ...], counters: tuple[RuleCounter, ...], families: tuple[Family, ...] = (4, 6)
 ) -> tuple[FirewallRule, ...]:
-    """Join the rules with what the kernel says of them; the counts of both families are added up.
+    """Join the rules with their counters in the kernel, the sum of both families.
 
-    A rule is in force when the kernel has it at least once for each family it is for (or once for both), of those
-    that the kernel has at all (`families`).
+    A rule is in force if the kernel has it once for each of its families (or once for both); only `families` count.
     """
     of_rule: dict[tuple[str, str], list[RuleCounter]] = {}
     for counter in counters:

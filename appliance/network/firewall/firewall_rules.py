@@ -1,16 +1,10 @@
-"""The rules of the firewall, as data: what is refused, and in which chain. No I/O.
+"""Define the rules of the firewall as data. No I/O.
 
-Invariants:
-
-1. The appliance's own rules only ever *refuse* (or RETURN to the rules of others): installing them opens
-   nothing that another firewall on the machine has closed.
-2. A connection is refused at its first packet, a SYN without ACK, whatever the connection tracker thinks of
-   it: no `NOTRACK` rule opens the port, and packets of sockets already closed are left alone (rejecting
-   those makes them linger).
-3. Who may connect is said positively, then all others are refused. A packet whose owner is unknown is
-   refused.
-4. What counts the connections of a host counts those that it has answered in: the address of a first packet can be
-   anybody's, and he must not pay for it.
+1. The rules only refuse, or RETURN to the rules of other programs: they open nothing that another firewall closed.
+2. A connection is refused at its first packet, a SYN without ACK, whatever the connection tracker knows. So a `NOTRACK`
+   rule cannot open the port, and packets of closed sockets pass (rejecting them would delay their end).
+3. Permitted users are listed; all others, and packets without a known owner, are refused.
+4. A limit per host counts connections after the handshake, because the address of a first packet can be forged.
 """
 
 import ipaddress
@@ -25,7 +19,7 @@ MAX_PORT = 65535
 
 
 class Chain(StrEnum):
-    """The chains of the appliance; each is hooked into the kernel where HOOKS says."""
+    """The chains of the appliance; `HOOKS` has their hooks in the kernel."""
 
     IN = "ROSRV-IN"
     OUT = "ROSRV-OUT"
@@ -38,15 +32,15 @@ class Chain(StrEnum):
 
 
 class Hook(NamedTuple):
-    """Where the kernel tries a chain: chains of one place in the order of their priorities, smallest first."""
+    """The hook of a chain in the kernel; chains of one hook run by priority, smallest first."""
 
     place: str
     kind: Literal["filter", "nat"] = "filter"
     priority: int = 0
 
 
-# A connection takes the first translation that any chain of the kind `nat` gives it, whoever made the chain. Everybody
-# else's are at 100 (firewalld's at 110); none may be before -199.
+# The first matching chain of the kind `nat` translates a connection, whichever program made the chain. Other programs
+# use priority 100 (firewalld: 110); none may be below -199.
 HOOKS: dict[Chain, tuple[Hook, ...]] = {
     Chain.IN: (Hook("INPUT"),),
     Chain.OUT: (Hook("OUTPUT"),),
@@ -57,21 +51,21 @@ HOOKS: dict[Chain, tuple[Hook, ...]] = {
     Chain.KEPT_SOURCE: (Hook("POSTROUTING", "nat", -199),),
     Chain.LEAVING: (Hook("POSTROUTING", priority=300),),  # after all translation
 }
-COUNTED_MARK = 0x40000000  # the bit of the connection tracker's mark that says so
+COUNTED_MARK = 0x40000000  # a bit of the connection tracker's mark
 SOURCE_TRANSLATIONS = frozenset({"MASQUERADE", "SNAT", "NETMAP"})  # targets of iptables
 
 
-class Verdict(StrEnum):
-    """What becomes of a packet that matches."""
+class PacketVerdict(StrEnum):
+    """The verdict on a matching packet."""
 
-    RETURN = "RETURN"  # none of the appliance's business: on to the rules of others
+    RETURN = "RETURN"  # continue with the rules of other programs
     RESET = "RESET"  # TCP reset: the peer sees "connection refused"
     DROP = "DROP"
     DNAT = "DNAT"
     MASQUERADE = "MASQUERADE"
-    COUNTED = "COUNTED"  # the connection is marked: what matches `answered` is no more true of it
-    KEEP_SOURCE = "KEEP SOURCE"  # translated to the source it has: no later chain can give it another
-    # TTL or hop limit 255, and on: a router that passes the packet on makes it smaller
+    COUNTED = "COUNTED"  # mark the connection; `answered` no longer matches
+    KEEP_SOURCE = "KEEP SOURCE"  # translate to the present source, so no later chain can change it
+    # set TTL or hop limit to 255 and continue; routers decrease it
     FULL_HOPS = "FULL HOPS"
 
 
@@ -85,7 +79,7 @@ class PortRange:
     def __post_init__(self) -> None:
         if not 1 <= self.first <= self.last <= MAX_PORT:
             raise ValueError(
-                f"{self.first}-{self.last} is no range of ports (1 to {MAX_PORT}, smaller first)"
+                f"{self.first}-{self.last} is not a range of ports (1 to {MAX_PORT}, smaller first)"
             )
 
     @classmethod
@@ -94,7 +88,7 @@ class PortRange:
         return cls(port, port)
 
     def overlaps(self, other: "PortRange") -> bool:
-        """Return whether some port is in both."""
+        """Whether a port is in both."""
         return self.first <= other.last and other.first <= self.last
 
     def __str__(self) -> str:
@@ -103,7 +97,7 @@ class PortRange:
 
 @dataclass(frozen=True)
 class Interface:
-    """A network interface; with `other`, every interface but that one."""
+    """A network interface; with `other`, every other interface."""
 
     name: str
     other: bool = False
@@ -114,7 +108,7 @@ class Interface:
 
 @dataclass(frozen=True)
 class RateLimit:
-    """Where it stands in a rule: more than `per_second` new connections of one host, after a burst of `burst`."""
+    """A limit that matches more than `per_second` new connections of one host, after a burst of `burst`."""
 
     per_second: int
     burst: int
@@ -125,11 +119,11 @@ class RateLimit:
 
 
 @dataclass(frozen=True)
-class Rule:
-    """One rule: it matches when everything that is given matches."""
+class PacketRule:
+    """A rule; it matches if all given conditions match."""
 
     purpose: str  # shown by `rosrv status` and kept as the rule's comment; at most 100 characters
-    verdict: Verdict
+    verdict: PacketVerdict
     _: KW_ONLY
     chain: Chain
     family: Family | None = None  # None: both
@@ -141,23 +135,23 @@ class Rule:
     udp_ports: PortRange | None = None
     from_ports: PortRange | None = None  # of TCP
     opening: bool = False  # a SYN without ACK
-    accepting: bool = False  # a SYN with ACK: the answer of a socket that listens
+    accepting: bool = False  # a SYN with ACK: the answer of a listening socket
     uid: int | None = None  # the owner of the local socket; chain OUT only
     clear_text: bool = False  # did not come (OUT: does not leave) through IPsec
     above: RateLimit | None = None
     local_destination: bool = False  # an address of this machine
     local_source: bool = False  # an address of this machine
-    forwarded: bool | None = None  # chain LEAVING only: passed on for another machine (False: made here)
-    distant: bool = False  # a router passed it on: its TTL or hop limit is below 255
-    new_connection: bool = False  # as the connection tracker sees it
-    unknown: bool = False  # of no connection that the tracker knows: new, untracked, invalid
-    answered: bool = False  # of a connection, not counted yet, whose opener has answered our SYN-ACK
-    translated: bool = False  # belongs to a connection whose destination was translated
+    forwarded: bool | None = None  # chain LEAVING only: for another machine (False: made here)
+    distant: bool = False  # forwarded by a router: TTL or hop limit below 255
+    new_connection: bool = False  # new to the connection tracker
+    unknown: bool = False  # not of a tracked connection: new, untracked, invalid
+    answered: bool = False  # of an uncounted connection whose opener answered our SYN-ACK
+    translated: bool = False  # of a connection with a translated destination
     to: str | None = None  # of DNAT: the address
 
     def __post_init__(self) -> None:
         impossible = {
-            "only TCP can be reset": self.verdict is Verdict.RESET and self.tcp_ports is None,
+            "only TCP can be reset": self.verdict is PacketVerdict.RESET and self.tcp_ports is None,
             "a packet is TCP or UDP, not both": self.udp_ports is not None and self.is_tcp,
             f"a packet has an owner in {Chain.OUT} only": self.uid is not None
             and self.chain is not Chain.OUT,
@@ -165,7 +159,7 @@ class Rule:
             and self.chain is not Chain.LEAVING,
             "a limit counts who has answered; others may be named by anybody": self.above is not None
             and not self.answered,
-            "DNAT and its address go together": (self.verdict is Verdict.DNAT) != (self.to is not None),
+            "DNAT and its address go together": (self.verdict is PacketVerdict.DNAT) != (self.to is not None),
         }
         for reason, is_so in impossible.items():
             if is_so:
@@ -173,18 +167,18 @@ class Rule:
 
     @property
     def is_tcp(self) -> bool:
-        """Whether something of TCP's header is matched."""
+        """Whether the rule matches a part of the TCP header."""
         return self.tcp_ports is not None or self.from_ports is not None or self.opening or self.accepting
 
     def families(self) -> tuple[Family, ...]:
-        """Return the families the rule is for: its own, that of its addresses, or both."""
+        """Return the families of the rule: its own, that of its addresses, or both."""
         given = self.source or self.destination or self.to
         if given is not None:
             return (family_of(given),)
         return (4, 6) if self.family is None else (self.family,)
 
     def describe(self) -> str:
-        """Return the matches and the verdict in words of netfilter, for people."""
+        """Return the matches and the verdict in netfilter's terms."""
         matches = {
             "in": self.arrives_on,
             "out": self.leaves_on,
@@ -216,8 +210,8 @@ class Rule:
 
 
 @dataclass(frozen=True)
-class Forwarder:
-    """The local user that sends the audit log on, and the one receiver that it may reach."""
+class ForwarderAccess:
+    """The local user that forwards the audit log, and the only receiver that it may reach."""
 
     uid: int
     address: str
@@ -228,16 +222,16 @@ class Forwarder:
         PortRange.one(self.port)
         family_of(self.address)
         if self.uid < 0:
-            raise ValueError(f"forwarder: {self.uid} is no user id")
+            raise ValueError(f"forwarder: {self.uid} is not a user id")
 
 
 @dataclass(frozen=True, kw_only=True)
-class OwnNode:
-    """The local user of the appliance's own node (rosout), who may reach it, and whom it may reach.
+class OwnNodeAccess:
+    """Access to and from the appliance's own node (rosout).
 
-    It listens on every address, at a port that the kernel chooses for its node API and at one of `ports` for messages.
-    So its API is called at `address`, one of loopback's that nobody else may connect to, and it takes no other
-    connection but the relay's at `ports`. `master_port` (None: not known yet) is where it finds its master.
+    The node listens on every address: for its node API at a port that the kernel chooses, and for messages at one of
+    `ports`. Its API is called at `address`, a loopback address that only control may connect to; only the relay may
+    connect to `ports`. `master_port` is the port of its master (None: not known yet).
     """
 
     uid: int
@@ -249,27 +243,25 @@ class OwnNode:
     def __post_init__(self) -> None:
         family_of(self.address)
         if min(self.uid, self.relay_uid) < 0:
-            raise ValueError(f"own node: {min(self.uid, self.relay_uid)} is no user id")
+            raise ValueError(f"own node: {min(self.uid, self.relay_uid)} is not a user id")
 
 
 @dataclass(frozen=True, kw_only=True)
 class FirewallSettings:
-    """What the rules of the appliance's own namespace are built from.
+    """The values for the rules of the appliance's namespace.
 
-    `rosmaster_port` and `inner_port` may be unknown (None) before their processes run: `Firewall.update`
-    adds them. Hosts in `tunnel_only` are accepted through IPsec only: by the kernel's policy, or, when ESP
-    runs in user space, on `tunnel_interface`. `api_networks` says who reaches the REST port besides
-    loopback: nobody, if empty. `neighbours` are addresses of the machine at the other end of the link (isolation
-    netns): only packets that it made itself may bear them, which come with a full TTL. `client_ports` are those
-    that the kernel gives to whoever does not choose: the own nodes (rosout) listen there on every address, whatever
-    ROS_IP says.
+    `rosmaster_port` and `inner_port` may be unknown (None) until their processes run. Hosts in `tunnel_only` are
+    accepted through IPsec only: by the kernel's policy, or on `tunnel_interface` if ESP runs in user space.
+    `api_networks` may reach the REST port besides loopback. `neighbours` are addresses of the machine at the other end
+    of the link (isolation netns): only its own packets may have them, which arrive with a full TTL. `client_ports` is
+    the kernel's local port range, where the own node (rosout) listens on every address, whatever ROS_IP is.
     """
 
     control_uid: int
     rosmaster_uid: int
     rosmaster_port: int | None = None
     inner_port: int | None = None
-    own_node: OwnNode | None = None
+    own_node: OwnNodeAccess | None = None
     master_port: int = 11311
     node_ports: PortRange | None = None
     client_ports: PortRange | None = None
@@ -278,7 +270,7 @@ class FirewallSettings:
     neighbours: tuple[str, ...] = ()
     tunnel_only: tuple[str, ...] = ()
     tunnel_interface: str | None = None
-    forwarder: Forwarder | None = None
+    forwarder: ForwarderAccess | None = None
     new_connections: RateLimit | None = RateLimit(per_second=1000, burst=2000)
 
     def __post_init__(self) -> None:
@@ -289,11 +281,11 @@ class FirewallSettings:
             family_of(network)
         for name in ("control_uid", "rosmaster_uid"):
             if getattr(self, name) < 0:
-                raise ValueError(f"{name} {getattr(self, name)} is no user id")
+                raise ValueError(f"{name} {getattr(self, name)} is not a user id")
 
     @property
     def api_ports(self) -> PortRange | None:
-        """The REST port as a range; None without REST."""
+        """Return the REST port as a range, or None."""
         return None if self.api_port is None else PortRange.one(self.api_port)
 
 
@@ -301,18 +293,21 @@ LOOPBACK = Interface("lo")
 OUTSIDE = Interface("lo", other=True)
 _ANY_PORT = PortRange(1, MAX_PORT)
 
-# What most rules share: first packets from outside, and those that local users send over loopback.
-_arriving = partial(Rule, chain=Chain.IN, arrives_on=OUTSIDE, opening=True)
-_connecting = partial(Rule, chain=Chain.OUT, leaves_on=LOOPBACK, opening=True)
-_sending = partial(Rule, chain=Chain.OUT)
+# Conditions that most rules share: first packets from outside, and from local users over loopback.
+_arriving = partial(PacketRule, chain=Chain.IN, arrives_on=OUTSIDE, opening=True)
+_connecting = partial(PacketRule, chain=Chain.OUT, leaves_on=LOOPBACK, opening=True)
+_sending = partial(PacketRule, chain=Chain.OUT)
 
 
-def appliance_rules(settings: FirewallSettings) -> tuple[Rule, ...]:
-    """Return the rules of the appliance's namespace, in the order in which they are tried."""
+def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
+    """Return the rules of the appliance's namespace in order."""
     return (
         *(
             _arriving(
-                f"{neighbour}: the machine's own packets only", Verdict.DROP, source=neighbour, distant=True
+                f"{neighbour}: the machine's own packets only",
+                PacketVerdict.DROP,
+                source=neighbour,
+                distant=True,
             )
             for neighbour in settings.neighbours
         ),
@@ -333,69 +328,66 @@ def appliance_rules(settings: FirewallSettings) -> tuple[Rule, ...]:
 
 
 def family_of(address: str) -> Family:
-    """Return the family of an address or network.
-
-    Raises: ValueError, naming the text, if it is neither.
-    """
+    """Return the family of an address or network. Raises `ValueError`."""
     try:
         return 6 if ipaddress.ip_network(address).version == 6 else 4
     except ValueError as error:
-        text = f"{address!r} is no address or network such as 10.1.2.3 or 10.1.2.0/24: {error}"
+        text = f"{address!r} is not an address or network such as 10.1.2.3 or 10.1.2.0/24: {error}"
         raise ValueError(text) from None
 
 
-def inner_port(name: str, port: int | None, user: str, uid: int) -> tuple[Rule, ...]:
-    """Return the rules of a port that one local user alone may connect to, over loopback; none for None."""
+def inner_port(name: str, port: int | None, user: str, uid: int) -> tuple[PacketRule, ...]:
+    """Return the rules of a port that only one local user may connect to, over loopback; none for None."""
     return () if port is None else _inner_ports(name, PortRange.one(port), user, uid)
 
 
-def _inner_ports(name: str, ports: PortRange, user: str, uid: int) -> tuple[Rule, ...]:
+def _inner_ports(name: str, ports: PortRange, user: str, uid: int) -> tuple[PacketRule, ...]:
     return (
-        _arriving(f"{name}: not from outside", Verdict.RESET, tcp_ports=ports),
-        _connecting(f"{name}: {user} may", Verdict.RETURN, tcp_ports=ports, uid=uid),
-        _connecting(f"{name}: no other user", Verdict.RESET, tcp_ports=ports),
+        _arriving(f"{name}: not from outside", PacketVerdict.RESET, tcp_ports=ports),
+        _connecting(f"{name}: {user} may", PacketVerdict.RETURN, tcp_ports=ports, uid=uid),
+        _connecting(f"{name}: no other user", PacketVerdict.RESET, tcp_ports=ports),
     )
 
 
-def _rosmaster(settings: FirewallSettings) -> tuple[Rule, ...]:
-    """Once the inner faces are there, ROSMaster connects to nothing else."""
+def _rosmaster(settings: FirewallSettings) -> tuple[PacketRule, ...]:
+    """Let `rosmaster` connect only to the master-side endpoint, once that exists."""
     if settings.inner_port is None:
         return ()
     uid = settings.rosmaster_uid
     return (
-        _connecting("rosmaster: connects to nothing else", Verdict.RESET, tcp_ports=_ANY_PORT, uid=uid),
+        _connecting("rosmaster: connects to nothing else", PacketVerdict.RESET, tcp_ports=_ANY_PORT, uid=uid),
         _sends_nothing_out("rosmaster", uid),
     )
 
 
-def _own_node(settings: FirewallSettings) -> tuple[Rule, ...]:
-    """Control alone calls the own node, and that reaches its master, faces and relays only."""
+def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
+    """Let only control call the own node, and let that reach only its master, proxy endpoints and relays."""
     node = settings.own_node
     if node is None:
         return ()
     api = partial(_sending, destination=node.address, tcp_ports=_ANY_PORT, opening=True)
     answer = partial(_sending, uid=node.uid, accepting=True)
     return (
-        api("own node's API: control may", Verdict.RETURN, uid=settings.control_uid),
-        api("own node's API: no other user", Verdict.RESET),
+        api("own node's API: control may", PacketVerdict.RETURN, uid=settings.control_uid),
+        api("own node's API: no other user", PacketVerdict.RESET),
         *_inner_ports("own node's messages", node.ports, "relay", node.relay_uid),
-        answer("own node: control is answered", Verdict.RETURN, source=node.address),
-        answer("own node: the relay is answered", Verdict.RETURN, from_ports=node.ports),
-        answer("own node: nobody else is answered", Verdict.DROP),
+        answer("own node: control is answered", PacketVerdict.RETURN, source=node.address),
+        answer("own node: the relay is answered", PacketVerdict.RETURN, from_ports=node.ports),
+        answer("own node: nobody else is answered", PacketVerdict.DROP),
         *inner_port("own node's master", node.master_port, "rosout", node.uid),
         *_ports_of_others(node.uid, settings),
         _sends_nothing_out("own node", node.uid),
     )
 
 
-def _ports_of_others(uid: int, settings: FirewallSettings) -> Iterator[Rule]:
-    """What the own node has no business with: RVMaster's port, REST, low ports, and those of the kernel's choice.
+def _ports_of_others(uid: int, settings: FirewallSettings) -> Iterator[PacketRule]:
+    """Block the own node from RVMaster's port, REST, low ports, and the kernel's local port range.
 
-    Not said positively: which ports the faces and relays have, a new policy may change.
+    The permitted ports are not listed instead, because a new policy may change them.
     """
     chosen, faces = settings.client_ports, settings.node_ports
     if faces is not None and chosen is not None and faces.overlaps(chosen):
-        yield _connecting("own node: faces and relays", Verdict.RETURN, tcp_ports=faces, uid=uid)
+        yield _connecting("own node: faces and relays", PacketVerdict.RETURN, tcp_ports=faces, uid=uid)
     closed = {
         "RVMaster port": PortRange.one(settings.master_port),
         "REST port": settings.api_ports,
@@ -404,25 +396,25 @@ def _ports_of_others(uid: int, settings: FirewallSettings) -> Iterator[Rule]:
     }
     for name, ports in closed.items():
         if ports is not None:
-            yield _connecting(f"own node: no {name}", Verdict.RESET, tcp_ports=ports, uid=uid)
+            yield _connecting(f"own node: no {name}", PacketVerdict.RESET, tcp_ports=ports, uid=uid)
 
 
-def _sends_nothing_out(name: str, uid: int) -> Rule:
-    return _sending(f"{name}: sends nothing out", Verdict.DROP, leaves_on=OUTSIDE, uid=uid)
+def _sends_nothing_out(name: str, uid: int) -> PacketRule:
+    return _sending(f"{name}: sends nothing out", PacketVerdict.DROP, leaves_on=OUTSIDE, uid=uid)
 
 
-def _tunnel_only(network: str, interface: str | None) -> tuple[Rule, ...]:
-    """An address that is taken from, and sent to, through its tunnel only."""
+def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
+    """Accept packets of a network, and send to it, through its tunnel only."""
     outside = Interface(interface, other=True) if interface else None
-    refused = partial(Rule, verdict=Verdict.DROP, clear_text=interface is None)
+    refused = partial(PacketRule, verdict=PacketVerdict.DROP, clear_text=interface is None)
     return (
         refused(f"{network}: through its tunnel only", chain=Chain.IN, source=network, arrives_on=outside),
         refused(f"{network}: never in clear text", chain=Chain.OUT, destination=network, leaves_on=outside),
     )
 
 
-def _forwarding(forwarder: Forwarder | None) -> tuple[Rule, ...]:
-    """The forwarder's packets go to its receiver; whatever else its user sends goes nowhere."""
+def _forwarding(forwarder: ForwarderAccess | None) -> tuple[PacketRule, ...]:
+    """Let the forwarder's user send to its receiver only."""
     if forwarder is None:
         return ()
     sending = partial(_sending, uid=forwarder.uid)
@@ -430,30 +422,30 @@ def _forwarding(forwarder: Forwarder | None) -> tuple[Rule, ...]:
     return (
         sending(
             "audit log's forwarder: its receiver",
-            Verdict.RETURN,
+            PacketVerdict.RETURN,
             destination=forwarder.address,
             tcp_ports=None if forwarder.datagrams else ports,
             udp_ports=ports if forwarder.datagrams else None,
         ),
-        sending("audit log's forwarder: nobody else", Verdict.DROP),
+        sending("audit log's forwarder: nobody else", PacketVerdict.DROP),
     )
 
 
-def _api(settings: FirewallSettings) -> tuple[Rule, ...]:
+def _api(settings: FirewallSettings) -> tuple[PacketRule, ...]:
     ports = settings.api_ports
     if ports is None:
         return ()
     return (
         *_rate_limit(settings.new_connections, "REST port", ports),
         *(
-            _arriving(f"REST port: {network} may", Verdict.RETURN, source=network, tcp_ports=ports)
+            _arriving(f"REST port: {network} may", PacketVerdict.RETURN, source=network, tcp_ports=ports)
             for network in settings.api_networks
         ),
-        _arriving("REST port: no other network", Verdict.RESET, tcp_ports=ports),
+        _arriving("REST port: no other network", PacketVerdict.RESET, tcp_ports=ports),
     )
 
 
-def _rate_limits(settings: FirewallSettings) -> tuple[Rule, ...]:
+def _rate_limits(settings: FirewallSettings) -> tuple[PacketRule, ...]:
     limit, nodes = settings.new_connections, settings.node_ports
     return (
         *_rate_limit(limit, "RVMaster port", PortRange.one(settings.master_port)),
@@ -461,8 +453,8 @@ def _rate_limits(settings: FirewallSettings) -> tuple[Rule, ...]:
     )
 
 
-def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[Rule]:
-    """Nobody outside has business with the ports of the own nodes; with those that were chosen, he may have."""
+def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[PacketRule]:
+    """Close the local port range, where the own node listens, to outside; except ports that are configured."""
     if settings.client_ports is None:
         return
     chosen = {
@@ -472,21 +464,22 @@ def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[Rule]:
     }
     for name, ports in chosen.items():
         if ports is not None and ports.overlaps(settings.client_ports):
-            yield _arriving(f"{name}: not one of the kernel's choice", Verdict.RETURN, tcp_ports=ports)
-    yield _arriving("own nodes' ports: not from outside", Verdict.RESET, tcp_ports=settings.client_ports)
+            yield _arriving(f"{name}: not one of the kernel's choice", PacketVerdict.RETURN, tcp_ports=ports)
+    yield _arriving(
+        "own nodes' ports: not from outside", PacketVerdict.RESET, tcp_ports=settings.client_ports
+    )
 
 
-def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[Rule, ...]:
-    """Count the connections of each host; what is above the limit is dropped, and sent again by the host's kernel.
+def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[PacketRule, ...]:
+    """Limit the connections of each host; packets above the limit are dropped, and the host's kernel sends them again.
 
-    Counted is the first packet after the handshake, once for each connection: who sends it has received our SYN-ACK,
-    so the address is not somebody else's. First packets are the kernel's affair: it remembers as many half-open
-    connections as the listener asked for, and answers more of them with SYN cookies, which take no memory.
+    The first packet after the handshake counts: its sender received our SYN-ACK, so its address is not forged. Against
+    forged first packets the kernel limits half-open connections, and answers more with SYN cookies, without memory.
     """
     if limit is None:
         return ()
-    established = partial(Rule, chain=Chain.IN, arrives_on=OUTSIDE, tcp_ports=ports, answered=True)
+    established = partial(PacketRule, chain=Chain.IN, arrives_on=OUTSIDE, tcp_ports=ports, answered=True)
     return (
-        established(f"{name}: new connections per host", Verdict.DROP, above=limit),
-        established(f"{name}: counted", Verdict.COUNTED),
+        established(f"{name}: new connections per host", PacketVerdict.DROP, above=limit),
+        established(f"{name}: counted", PacketVerdict.COUNTED),
     )

@@ -1,11 +1,10 @@
 """The iptables back end: legacy xtables through python-iptables (libiptc), IPv4 and IPv6.
 
-The chains are in the table `filter`; address translation is left to nft (the library cannot build the NAT
-targets of current xtables). What stands in the kernel is changed by one commit for each family. The library
-has a cache of tables for the whole process, which keeps the namespace it was opened in; so each piece of
-work opens its tables anew, in a thread inside the namespace, one at a time (`_ONE_AT_A_TIME`), and under
-the lock that the `iptables` programs use. Rules are appended below `Chain.append_rule`, which would send
-the standard output of the whole process through a pipe for a moment to check them.
+The chains are in the table `filter`; address translation needs nft (the library cannot build the NAT targets of current
+xtables). The rules of a family change in one commit. The library caches tables for the whole process, with the
+namespace they were opened in. So each call opens its tables in a thread inside the namespace, one at a time
+(`_ONE_AT_A_TIME`), and under the lock of the `iptables` programs. `Chain.append_rule` is not used, because it redirects
+the standard output of the whole process to check a rule.
 """
 
 import contextlib
@@ -27,12 +26,12 @@ from appliance.network.firewall.firewall_rules import (
     Chain,
     Family,
     Interface,
-    Rule,
-    Verdict,
+    PacketRule,
+    PacketVerdict,
 )
 from appliance.network.namespaces import Namespace
 
-LOCK = Path("/run/xtables.lock")  # the one of the `iptables-legacy` programs
+LOCK = Path("/run/xtables.lock")  # the lock of the `iptables-legacy` programs
 _ONE_AT_A_TIME = threading.Lock()  # guards state of the library, which is global
 _EXPIRE_MILLISECONDS = 10_000
 _MODPROBE_SECONDS = 20.0
@@ -43,7 +42,7 @@ Extension = tuple[str, tuple[tuple[str, str | tuple[str, ...]], ...]]
 
 @dataclass(frozen=True)
 class RenderedRule:
-    """A rule in the words of xtables: what `iptables -A CHAIN …` would be given."""
+    """A rule in the terms of xtables, as in `iptables -A CHAIN …`."""
 
     chain: str
     family: Family
@@ -62,21 +61,19 @@ class IptablesBackend:
 
     @property
     def families(self) -> tuple[Family, ...]:
-        """Without IPv6 where the kernel was started without it."""
+        """Return the families that the kernel has: without IPv6 if it is disabled."""
         return self._namespace.run(_families)
 
-    def install(self, rules: tuple[Rule, ...]) -> None:
-        """Replace the appliance's chains, one family after the other."""
+    def install(self, rules: tuple[PacketRule, ...]) -> None:
+        """Replace the appliance's chains, first of IPv4, then of IPv6."""
         elsewhere = [rule.purpose for rule in rules if rule.chain not in _CHAINS]
         if elsewhere:
-            raise BackendMissingError(
-                f"address translation is done with nft, not iptables: {'; '.join(elsewhere)}"
-            )
+            raise BackendMissingError(f"address translation needs nft, not iptables: {'; '.join(elsewhere)}")
         rendered = [line for rule in rules for line in render_rule(rule)]
         self._in_tables(lambda table: table.replace(rendered))
 
     def remove(self) -> None:
-        """Unhook and delete the appliance's chains. A table that nobody has used is not made for that."""
+        """Unhook and delete the appliance's chains, without creating unused tables."""
         _in_used_tables(self._namespace, "filter", lambda table: table.replace([]))
 
     def counters(self) -> tuple[RuleCounter, ...]:
@@ -86,7 +83,7 @@ class IptablesBackend:
         return tuple(found)
 
     def _in_tables(self, work: "Callable[[_Table], None]") -> None:
-        """Do `work` with the table of each family, inside the namespace."""
+        """Run `work` with the table of each family, inside the namespace."""
 
         def inside() -> None:
             with _ONE_AT_A_TIME, _xtables_lock():
@@ -98,34 +95,34 @@ class IptablesBackend:
 
 
 def load_modules() -> None:
-    """Have the kernel load legacy xtables, while this process may still load modules; whether it did, `install` says.
+    """Load the kernel modules of legacy xtables, which the kernel does not load automatically.
 
-    Unlike those of nftables and the extensions, the kernel does not load these by itself.
+    Call this while the process may still load modules; `install` reports a failure.
     """
     command = ["modprobe", "--quiet", "--all", "ip_tables", "ip6_tables"]
-    with contextlib.suppress(OSError, subprocess.TimeoutExpired):  # a container has no such program
+    with contextlib.suppress(OSError, subprocess.TimeoutExpired):  # a container has no modprobe
         subprocess.run(command, capture_output=True, timeout=_MODPROBE_SECONDS, check=False)
 
 
 def foreign_translations(namespace: Namespace) -> tuple[str, ...]:
-    """Name the chains of legacy xtables that give connections another source."""
+    """Return the chains of legacy xtables that translate the source of connections."""
     return _foreign(namespace, "nat", lambda table: table.translating())
 
 
 def foreign_forward_drops(namespace: Namespace) -> tuple[str, ...]:
-    """Name the chains of legacy xtables that drop forwarded packets by default."""
+    """Return the chains of legacy xtables that drop forwarded packets by default."""
     return _foreign(namespace, "filter", lambda table: table.dropping("FORWARD"))
 
 
 def _foreign(namespace: Namespace, name: str, look: "Callable[[_Table], list[str]]") -> tuple[str, ...]:
-    """What `look` finds in the table `name` of each family; nothing where nobody has used that table."""
+    """Return what `look` finds in the table `name` of each family, if the table is in use."""
     found: list[str] = []
     _in_used_tables(namespace, name, lambda table: found.extend(look(table)))
     return tuple(found)
 
 
 def _in_used_tables(namespace: Namespace, name: str, work: "Callable[[_Table], None]") -> None:
-    """Do `work` with the table `name` of each family where somebody has used it; the library is loaded only then."""
+    """Run `work` with the table `name` of each family if it is in use; the library is loaded only then."""
 
     def inside() -> None:
         used = [family for family in _families() if name in _tables_in_use(family)]
@@ -139,7 +136,7 @@ def _in_used_tables(namespace: Namespace, name: str, work: "Callable[[_Table], N
 
 
 def _tables_in_use(family: Family) -> list[str]:
-    """The tables that somebody has opened since the machine started; opening one would make it."""
+    """Return the tables in use; opening another one would create it."""
     names = "ip6_tables_names" if family == 6 else "ip_tables_names"
     try:
         return Path("/proc/thread-self/net", names).read_text(encoding="ascii").split()
@@ -147,7 +144,7 @@ def _tables_in_use(family: Family) -> list[str]:
         return []
 
 
-def render_rule(rule: Rule) -> list[RenderedRule]:
+def render_rule(rule: PacketRule) -> list[RenderedRule]:
     """Return the rule for each of its families."""
     return [
         RenderedRule(rule.chain.value, family, _attributes(rule), _matches(rule, family), _target(rule))
@@ -155,7 +152,7 @@ def render_rule(rule: Rule) -> list[RenderedRule]:
     ]
 
 
-def _attributes(rule: Rule) -> tuple[tuple[str, str], ...]:
+def _attributes(rule: PacketRule) -> tuple[tuple[str, str], ...]:
     given = {
         "protocol": _protocol(rule),
         "in_interface": _interface(rule.arrives_on),
@@ -166,13 +163,13 @@ def _attributes(rule: Rule) -> tuple[tuple[str, str], ...]:
     return tuple((name, value) for name, value in given.items() if value is not None)
 
 
-def _protocol(rule: Rule) -> str | None:
+def _protocol(rule: PacketRule) -> str | None:
     if rule.udp_ports is not None:
         return "udp"
     return "tcp" if rule.is_tcp else None
 
 
-def _matches(rule: Rule, family: Family) -> tuple[Extension, ...]:
+def _matches(rule: PacketRule, family: Family) -> tuple[Extension, ...]:
     tcp: list[tuple[str, str | tuple[str, ...]]] = []
     if rule.tcp_ports is not None:
         tcp.append(("dport", str(rule.tcp_ports).replace("-", ":")))
@@ -199,8 +196,8 @@ def _matches(rule: Rule, family: Family) -> tuple[Extension, ...]:
     return (*matches, ("comment", (("comment", rule.purpose),)))
 
 
-def _tracked(rule: Rule) -> list[Extension]:
-    """The matches of what the connection tracker knows."""
+def _tracked(rule: PacketRule) -> list[Extension]:
+    """Return the matches of the connection tracker's state."""
     matches: list[Extension] = []
     if rule.new_connection:
         matches.append(("conntrack", (("ctstate", "NEW"),)))
@@ -215,7 +212,7 @@ def _tracked(rule: Rule) -> list[Extension]:
 
 
 def _hashlimit(per_second: int, burst: int) -> tuple[tuple[str, str], ...]:
-    """Give each source address one bucket; rules with the same limit share it, whatever their ports."""
+    """Return a limit with one bucket per source address, shared by rules with the same limit."""
     return (
         ("hashlimit-above", f"{per_second}/sec"),
         ("hashlimit-burst", str(burst)),
@@ -225,10 +222,10 @@ def _hashlimit(per_second: int, burst: int) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _target(rule: Rule) -> Extension:
-    if rule.verdict is Verdict.RESET:
+def _target(rule: PacketRule) -> Extension:
+    if rule.verdict is PacketVerdict.RESET:
         return ("REJECT", (("reject-with", "tcp-reset"),))
-    if rule.verdict is Verdict.COUNTED:
+    if rule.verdict is PacketVerdict.COUNTED:
         return ("CONNMARK", (("or-mark", f"{COUNTED_MARK:#x}"),))
     return (rule.verdict.value, ())
 
@@ -243,7 +240,7 @@ _CHAINS = (Chain.IN, Chain.OUT, Chain.FORWARD)
 
 
 class _Table:
-    """The table of one family, open in the namespace of the thread."""
+    """An open table of one family in the namespace of the thread."""
 
     def __init__(self, library: Any, table: Any, family: Family) -> None:
         self._library = library
@@ -251,7 +248,7 @@ class _Table:
         self._family = family
 
     def replace(self, all_rules: list[RenderedRule]) -> None:
-        """Put the rules of this family in the place of all that the appliance has here, in one commit."""
+        """Replace all chains of the appliance in this family, in one commit."""
         rules = [rule for rule in all_rules if rule.family == self._family]
         present = {chain for chain in _CHAINS if self._table.is_chain(chain.value)}
         wanted = {chain for chain in _CHAINS if any(rule.chain == chain for rule in rules)}
@@ -271,7 +268,7 @@ class _Table:
             self._table.commit()
 
     def counters(self) -> list[RuleCounter]:
-        """Return the rules of the chains that are hooked in everywhere they should be."""
+        """Return the rules of the chains with all their hooks."""
         return [
             self._counter(chain, rule)
             for chain in _CHAINS
@@ -281,12 +278,12 @@ class _Table:
         ]
 
     def translating(self) -> list[str]:
-        """Name the chains that have a target which translates sources."""
+        """Return the chains with a target that translates sources."""
         chains = [str(chain.name) for chain in self._table.chains]
         return [self._named(name) for name in chains if self._targets(name) & SOURCE_TRANSLATIONS]
 
     def dropping(self, chain: str) -> list[str]:
-        """Name a built-in chain if its policy is DROP."""
+        """Return a built-in chain's name if its policy is DROP."""
         drops = self._library.Chain(self._table, chain).get_policy().name == "DROP"
         return [self._named(chain)] if drops else []
 
@@ -312,7 +309,7 @@ class _Table:
                 self._table.delete_entry(hook.place, jump.rule, jump.mask)
 
     def _hooks(self, chain: Chain, hook: str) -> int:
-        """Count the jumps to a chain; of foreign rules nothing but the target is looked at."""
+        """Count the jumps to a chain; only the targets of foreign rules are read."""
         count, entry = 0, self._table.first_rule(hook)
         while entry:
             count += self._table.get_target(entry) == chain.value.encode()
@@ -340,7 +337,7 @@ class _Table:
 
 
 def _comment(rule: Any) -> str:
-    """Read a rule's comment out of its match: asking the library would borrow our standard output."""
+    """Read a rule's comment from its match; the library's own function would redirect our standard output."""
     for match in rule.matches:
         if match.name == "comment":
             content = bytes(match.match_buf)[_MATCH_HEADER:]
@@ -350,7 +347,7 @@ def _comment(rule: Any) -> str:
 
 @contextlib.contextmanager
 def _opened(family: Family, name: str = "filter") -> Iterator[_Table]:
-    """Open the table in the namespace of the calling thread, and close it for the next one."""
+    """Open a table in the namespace of the calling thread."""
     library = _library()
     program = "ip6tables" if family == 6 else "iptables"
     table = None
@@ -365,7 +362,7 @@ def _opened(family: Family, name: str = "filter") -> Iterator[_Table]:
                 f"the kernel has no {program} table {name} ({message}): modprobe {program[:-1]}_{name}, "
                 "CAP_NET_ADMIN and CAP_NET_RAW are needed; or choose the back end nft"
             ) from error
-        raise FirewallError(f"{program} refused the rules in table {name}: {message}") from error
+        raise FirewallError(f"{program} rejected the rules in table {name}: {message}") from error
     finally:
         if table is not None:
             table.close()
@@ -374,9 +371,9 @@ def _opened(family: Family, name: str = "filter") -> Iterator[_Table]:
 
 def _library() -> Any:
     try:
-        with warnings.catch_warnings(action="ignore"):  # its sources are of an older Python
+        with warnings.catch_warnings(action="ignore"):  # its sources are for an older Python
             import iptc  # noqa: PLC0415 - loading it looks for the C libraries, which a machine may lack
-    except Exception as error:  # the library raises bare exceptions when a C library is not there
+    except Exception as error:  # the library raises bare exceptions if a C library is missing
         raise BackendMissingError(
             f"the firewall back end iptables needs libiptc and xtables: "
             f"sudo apt install iptables; a wheel, its extra [iptables] ({error})"
@@ -385,7 +382,7 @@ def _library() -> Any:
 
 
 def _families() -> tuple[Family, ...]:
-    """IPv6 is left out where the kernel was started without it."""
+    """Return the families that the kernel has: without IPv6 if it is disabled."""
     return (4, 6) if Path("/proc/sys/net/ipv6").exists() else (4,)
 
 

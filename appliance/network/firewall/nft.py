@@ -1,12 +1,10 @@
-"""The nftables back end: libnftables' JSON through `nft -j -f -`, one transaction for everything.
+"""The nftables back end: libnftables' JSON through `nft -j -f -`, in one transaction.
 
-The appliance has a table of its own, `inet rosrv`, for IPv4 and IPv6. In it a base chain for each hook
-jumps to the chain with the rules, so that the chains have the same names and shape as with iptables. A
-verdict of another table can only add refusals to ours, never undo them.
+The appliance has its own table, `inet rosrv`, for IPv4 and IPv6. In it a base chain for each hook jumps to the chain
+with the rules, so the chains have the same names and shape as with iptables. Other tables can only refuse more.
 
-A limit for each host is a set of buckets, which the kernel does not make larger than its size: the rule that adds to a
-full set just does not match. So each such rule has a second one behind it: hosts that got no bucket share one, instead
-of going without a limit. (iptables drops what finds its table full.)
+A limit per host is a set of buckets of limited size, and a rule that adds to a full set does not match. So a second
+rule gives all hosts without a bucket a shared one. (iptables drops packets if its table is full.)
 """
 
 import json
@@ -23,19 +21,19 @@ from appliance.network.firewall.firewall_rules import (
     Family,
     Hook,
     Interface,
+    PacketRule,
+    PacketVerdict,
     PortRange,
     RateLimit,
-    Rule,
-    Verdict,
 )
+from appliance.network.hang_detection import run_program
 from appliance.network.namespaces import Namespace
-from appliance.network.patience import run
 
 TABLE = "rosrv"
 _FAMILY = "inet"
 _METER_SIZE = 65535  # hosts
 _METER_SECONDS = 60
-_OF_A_FAMILY = (Verdict.DNAT, Verdict.KEEP_SOURCE, Verdict.FULL_HOPS)
+_OF_A_FAMILY = (PacketVerdict.DNAT, PacketVerdict.KEEP_SOURCE, PacketVerdict.FULL_HOPS)
 _FULL_HOPS = 255
 _SHARED = " (no bucket left)"  # after the purpose, in the comment of the second rule
 
@@ -47,12 +45,12 @@ class NftBackend:
     """The rules of one namespace in nftables."""
 
     name = "nft"
-    families: tuple[Family, ...] = (4, 6)  # a table of `inet` has both, whatever the kernel was started with
+    families: tuple[Family, ...] = (4, 6)  # a table of `inet` has both
 
     def __init__(self, namespace: Namespace) -> None:
         self._namespace = namespace
 
-    def install(self, rules: tuple[Rule, ...]) -> None:
+    def install(self, rules: tuple[PacketRule, ...]) -> None:
         """Replace the table in one transaction."""
         self._nft(["-f", "-"], json.dumps({"nftables": [*_delete_table(), _table("add"), *render(rules)]}))
 
@@ -70,7 +68,7 @@ class NftBackend:
         return _counters([rule for rule in rules if rule["chain"] in hooked])
 
     def foreign_forward_drops(self) -> tuple[str, ...]:
-        """Name the chains of other tables that hook forwarded packets with the policy drop."""
+        """Return the chains of other tables that drop forwarded packets by default."""
         return tuple(
             f"nftables chain {chain['family']} {chain['table']} {chain['name']}"
             for chain in self._list("chain", "list", "chains")
@@ -78,7 +76,7 @@ class NftBackend:
         )
 
     def foreign_translations(self) -> tuple[str, ...]:
-        """Name the chains of other tables that give forwarded connections another source address."""
+        """Return the chains of other tables that translate the source of forwarded connections."""
         rules = self._list("rule", "list", "ruleset")
         found = (
             f"nftables chain {rule['family']} {rule['table']} {rule['chain']}"
@@ -88,20 +86,20 @@ class NftBackend:
         return tuple(dict.fromkeys(found))
 
     def _list(self, kind: str, *arguments: str) -> list[Json]:
-        """What nft lists of one kind: `table`, `chain` or `rule`."""
+        """Return the entries of one kind that nft lists: `table`, `chain` or `rule`."""
         text = self._nft(list(arguments), "")
         try:
             return [entry[kind] for entry in json.loads(text)["nftables"] if kind in entry]
         except json.JSONDecodeError as error:
             raise FirewallError(f"nft {' '.join(arguments)}: the answer is not JSON: {error}") from error
         except (KeyError, TypeError) as error:
-            reason = f"the answer is not what is understood: {_first_lines(text)}"
+            reason = f"the answer has an unknown form: {_first_lines(text)}"
             raise FirewallError(f"nft {' '.join(arguments)}: {reason}") from error
 
     def _nft(self, arguments: list[str], text: str) -> str:
         nft = partial(self._namespace.popen, ["nft", "-j", *arguments])
         try:
-            status, out, err = run(nft, text, "nft")
+            status, out, err = run_program(nft, text, "nft")
         except FileNotFoundError:
             raise BackendMissingError(
                 "the firewall back end nft needs the program `nft`: sudo apt install nftables"
@@ -112,12 +110,12 @@ class NftBackend:
             raise FirewallError(f"nft cannot be run: {error.strerror}") from error
         if status != 0:
             reason = _first_lines(err or out)
-            raise FirewallError(f"nft refused the rules in {self._namespace.name}: {reason}")
+            raise FirewallError(f"nft rejected the rules in {self._namespace.name}: {reason}")
         return out
 
 
-def render(rules: tuple[Rule, ...]) -> list[Json]:
-    """Return the commands of libnftables' JSON schema that make the table with these rules."""
+def render(rules: tuple[PacketRule, ...]) -> list[Json]:
+    """Return the JSON commands that make the table with these rules."""
     chains = [chain for chain in Chain if any(rule.chain is chain for rule in rules)]
     limits = sorted({_meter(rule, family) for rule in rules if rule.above for family in rule.families()})
     return [
@@ -128,8 +126,8 @@ def render(rules: tuple[Rule, ...]) -> list[Json]:
     ]
 
 
-def render_rule(rule: Rule) -> list[Json]:
-    """Return the rule as libnftables wants it: once, or once per family where the rule differs by it."""
+def render_rule(rule: PacketRule) -> list[Json]:
+    """Return the rule in libnftables' form, once or once per family."""
     same = rule.above is None and not rule.distant and rule.verdict not in _OF_A_FAMILY
     if same and len(rule.families()) == 2:
         return [_body(rule, [], None)]
@@ -143,8 +141,8 @@ def render_rule(rule: Rule) -> list[Json]:
     ]
 
 
-def _transport(rule: Rule) -> list[Json]:
-    """The matches of a TCP or UDP header."""
+def _transport(rule: PacketRule) -> list[Json]:
+    """Return the matches of a TCP or UDP header."""
     expressions: list[Json] = []
     for transport, ports in (("tcp", rule.tcp_ports), ("udp", rule.udp_ports)):
         if ports is not None:
@@ -157,7 +155,7 @@ def _transport(rule: Rule) -> list[Json]:
     return expressions
 
 
-def _body(rule: Rule, head: list[Json], family: int | None) -> Json:
+def _body(rule: PacketRule, head: list[Json], family: int | None) -> Json:
     protocol = "ip6" if family == 6 else "ip"
     expressions = list(head)
     for key, interface in (("iifname", rule.arrives_on), ("oifname", rule.leaves_on)):
@@ -179,22 +177,22 @@ def _body(rule: Rule, head: list[Json], family: int | None) -> Json:
     return {"chain": rule.chain.value, "expr": expressions, "comment": rule.purpose}
 
 
-def _origin(rule: Rule, protocol: str) -> list[Json]:
-    """The matches of where a packet comes from and goes to, as the machine's routes and interfaces say."""
+def _origin(rule: PacketRule, protocol: str) -> list[Json]:
+    """Return the matches of a packet's origin and destination by routes and interfaces."""
     expressions: list[Json] = []
     if rule.local_destination:
         expressions.append(_match({"fib": {"result": "type", "flags": ["daddr"]}}, "local"))
     if rule.local_source:
         expressions.append(_match({"fib": {"result": "type", "flags": ["saddr"]}}, "local"))
-    if rule.forwarded is not None:  # what is made here has no interface that it came in by
+    if rule.forwarded is not None:  # local packets have no input interface
         expressions.append(_match(_meta("iif"), 0, "!=" if rule.forwarded else "=="))
     if rule.distant:
         expressions.append(_match(_hops(protocol), _FULL_HOPS, "!="))
     return expressions
 
 
-def _tracked(rule: Rule) -> list[Json]:
-    """The matches of what the connection tracker knows."""
+def _tracked(rule: PacketRule) -> list[Json]:
+    """Return the matches of the connection tracker's state."""
     expressions: list[Json] = []
     if rule.new_connection:
         expressions.append(_match({"ct": {"key": "state"}}, "new", "in"))
@@ -211,29 +209,29 @@ def _tracked(rule: Rule) -> list[Json]:
     return expressions
 
 
-def _verdict(rule: Rule, protocol: str) -> Json:
-    if rule.verdict is Verdict.RESET:
+def _verdict(rule: PacketRule, protocol: str) -> Json:
+    if rule.verdict is PacketVerdict.RESET:
         return {"reject": {"type": "tcp reset"}}
-    if rule.verdict is Verdict.DNAT:
+    if rule.verdict is PacketVerdict.DNAT:
         return {"dnat": {"family": protocol, "addr": rule.to}}
-    if rule.verdict is Verdict.KEEP_SOURCE:
+    if rule.verdict is PacketVerdict.KEEP_SOURCE:
         return {"snat": {"family": protocol, "addr": _payload(protocol, "saddr")}}
-    if rule.verdict is Verdict.FULL_HOPS:
+    if rule.verdict is PacketVerdict.FULL_HOPS:
         return {"mangle": {"key": _hops(protocol), "value": _FULL_HOPS}}
-    if rule.verdict is Verdict.COUNTED:
+    if rule.verdict is PacketVerdict.COUNTED:
         return {"mangle": {"key": _MARK, "value": {"|": [_MARK, COUNTED_MARK]}}}
     return {rule.verdict.value.lower(): None}
 
 
-def _over_limit(rule: Rule, protocol: str) -> Json:
+def _over_limit(rule: PacketRule, protocol: str) -> Json:
     assert rule.above is not None  # noqa: S101 - the caller asked
     name = _meter(rule, 6 if protocol == "ip6" else 4)
     element = _payload(protocol, "saddr")
     return {"set": {"op": "add", "elem": element, "set": f"@{name}", "stmt": [_limit(rule.above)]}}
 
 
-def _shared(rule: Rule, own: Json, family: Family) -> Json:
-    """The rule behind `own`, for the hosts that it could not give a bucket."""
+def _shared(rule: PacketRule, own: Json, family: Family) -> Json:
+    """Return the rule after `own`, for hosts without a bucket."""
     assert rule.above is not None  # noqa: S101 - the caller asked
     address = _payload("ip6" if family == 6 else "ip", "saddr")
     expressions: list[Json] = []
@@ -249,8 +247,8 @@ def _limit(above: RateLimit) -> Json:
     return {"limit": {"rate": above.per_second, "burst": above.burst, "per": "second", "inv": True}}
 
 
-def _meter(rule: Rule, family: int) -> str:
-    """Name the set that holds the buckets: a host has one bucket for all its ports."""
+def _meter(rule: PacketRule, family: int) -> str:
+    """Return the name of the set of buckets: a host has one bucket for all ports."""
     assert rule.above is not None  # noqa: S101 - the caller asked
     return f"new-ipv{family}-{rule.above.per_second}-{rule.above.burst}"
 
@@ -261,7 +259,7 @@ def _meter_set(name: str) -> Json:
 
 
 def _hook(chain: Chain, hook: Hook) -> list[Json]:
-    """A base chain at a hook of the kernel, and its jump to the chain with the rules."""
+    """Return a base chain at a hook of the kernel, with its jump to the chain with the rules."""
     base = {
         "name": f"{chain.value}-{hook.place}",
         "type": hook.kind,
@@ -276,7 +274,7 @@ def _hook(chain: Chain, hook: Hook) -> list[Json]:
 
 
 def _delete_table() -> list[Json]:
-    """Delete the table whether it is there or not: adding what exists is no error."""
+    """Delete the table if it exists: adding an existing table is not an error."""
     return [_table("add"), _table("delete")]
 
 
@@ -318,7 +316,7 @@ def _ports(ports: PortRange) -> object:
 
 
 def _translates_source(rule: Json) -> bool:
-    """Whether a rule has `masquerade` or `snat`, as nft or as the iptables on top of it writes them."""
+    """Whether a rule has `masquerade` or `snat`, in the form of nft or of iptables-nft."""
     return any(
         "masquerade" in part or "snat" in part or part.get("xt", {}).get("name") in SOURCE_TRANSLATIONS
         for part in rule["expr"]
@@ -327,7 +325,7 @@ def _translates_source(rule: Json) -> bool:
 
 
 def _counters(rules: list[Json]) -> tuple[RuleCounter, ...]:
-    """The rules as they are counted: the two of a limit for each host as one, which neither is without the other."""
+    """Return the rules with their counters; the two rules of a limit count as one, and only together."""
     shared = {_key(counter): counter for counter in map(_counter, rules) if counter.purpose.endswith(_SHARED)}
     found = []
     for rule in rules:

@@ -1,8 +1,7 @@
-"""Waiting for a program as long as it gets on: a slow machine is waited for, with words, and what hangs is not.
+"""Wait for a program while it progresses, and end it if it hangs.
 
-How long a program takes says little: under emulation, or beside others that take all processors, `nft` may need a
-minute for what is done in ten milliseconds elsewhere. What hangs is known by that it gets no further: it uses no
-processor time, and does not wait for a processor or a disk either.
+A time limit alone is not enough: under emulation or load `nft` may need a minute instead of ten milliseconds. A program
+hangs if it uses no processor time and does not wait for a processor or a disk.
 """
 
 import logging
@@ -13,10 +12,10 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 STILL_SECONDS = 20.0
-LONGEST_SECONDS = 600.0  # also of what runs in a circle
+LONGEST_SECONDS = 600.0  # also for an endless loop
 _LOOK_SECONDS = 0.5
 _SAY_SECONDS = 10.0
-# In /proc/PID/stat, behind the name: see proc_pid_stat(5).
+# Fields of /proc/PID/stat after the name: proc_pid_stat(5).
 _STATE, _MAJOR_FAULTS, _TIMES = 0, 9, slice(11, 13)
 
 Start = Callable[..., "subprocess.Popen[str]"]
@@ -24,16 +23,16 @@ Start = Callable[..., "subprocess.Popen[str]"]
 log = logging.getLogger("rosrv")
 
 
-class Progress:
-    """What a process, by its id, has got done so far."""
+class ProcessActivity:
+    """The progress of a process."""
 
     def __init__(self, pid: int) -> None:
         self._stat = Path("/proc", str(pid), "stat")
         self._seen: tuple[str, ...] = ()
         self._since = time.monotonic()
 
-    def still_seconds(self) -> float:
-        """Seconds since it was last seen to get on, or to wait for a processor or a disk; look every second or so."""
+    def stalled_seconds(self) -> float:
+        """Return the seconds since it last progressed or waited for processor or disk; call this every second or so."""
         now = time.monotonic()
         try:
             fields = self._stat.read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
@@ -45,11 +44,10 @@ class Progress:
         return now - self._since
 
 
-def run(program: Start, text: str, what: str) -> tuple[int, str, str]:
-    """Start a program, give it its input and wait for its end: exit status, output, errors.
+def run_program(program: Start, text: str, what: str) -> tuple[int, str, str]:
+    """Start a program, send its input and wait for its end; return exit status, output and errors.
 
-    `program` is given the pipes, as `subprocess.Popen` has them. Raises: TimeoutError, as `communicate`, and what
-    starting it raises.
+    `program` gets the pipes as arguments of `subprocess.Popen`. Raises `TimeoutError`, `OSError`.
     """
     pipe = subprocess.PIPE
     with program(stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
@@ -58,21 +56,21 @@ def run(program: Start, text: str, what: str) -> tuple[int, str, str]:
 
 
 def communicate(process: "subprocess.Popen[str]", text: str, what: str) -> tuple[str, str]:
-    """Give a program its input and wait for its end; what it said. Every now and then says that `what` is waited for.
+    """Send a program its input and wait for its end; return output and errors. Log long waits for `what`.
 
-    Raises: TimeoutError, with words, when it hangs; it is killed then.
+    Raises `TimeoutError` if it hangs, after it is killed.
     """
-    began, progress, said = time.monotonic(), Progress(process.pid), _SAY_SECONDS
-    # A second `communicate` would not go on with the input.
+    began, progress, said = time.monotonic(), ProcessActivity(process.pid), _SAY_SECONDS
+    # A second `communicate` would not continue the input.
     with ThreadPoolExecutor(1, "communicate") as pool:
         talk = pool.submit(process.communicate, text)
         while not wait((talk,), _LOOK_SECONDS).done:
-            waited, still = time.monotonic() - began, progress.still_seconds()
+            waited, still = time.monotonic() - began, progress.stalled_seconds()
             if still > STILL_SECONDS or waited > LONGEST_SECONDS:
                 process.kill()
-                how = f"got no further for {still:.0f} seconds" if still > STILL_SECONDS else "did not end"
+                how = f"made no progress for {still:.0f} seconds" if still > STILL_SECONDS else "did not end"
                 raise TimeoutError(f"{what} {how}: ended after {waited:.0f} seconds")
             if waited > said:
                 said *= 2
-                log.warning("this machine is slow: %s has run for %.0f s and is waited for", what, waited)
+                log.warning("this machine is slow: waiting for %s, which has run for %.0f s", what, waited)
         return talk.result()

@@ -1,0 +1,57 @@
+"""Parse the times that people give on the command line and over REST: `1h` ago, a date, or RFC 3339."""
+
+import re
+from datetime import UTC, datetime, timedelta
+
+_SECOND = 1_000_000_000
+_UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
+
+
+class TimestampError(ValueError):
+    """A time cannot be parsed; the message lists the valid forms."""
+
+
+def parse_timestamp(text: str, now: int) -> int:
+    """Return nanoseconds since the epoch. `1h` means one hour before `now`; a time without a zone is UTC.
+
+    `10:32` is the most recent 10:32; `today` and `yesterday` begin at midnight. A time outside the range of the log
+    is clamped to it. Raises `TimestampError`.
+    """
+    ago = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)([smhdw])", text, re.ASCII)
+    if ago is not None:
+        return _bounded(now - int(float(ago[1]) * _UNITS[ago[2]] * _SECOND))
+    try:
+        return parse_date(_dated(text, now))
+    except ValueError as error:
+        raise TimestampError(
+            f"'{text}' is not a valid time: use 30s, 5m, 1h, 2d or 1w (that long ago), 10:32, yesterday,"
+            " 'yesterday 10:32', 2026-03-01, or 2026-03-01T12:00:00Z"
+        ) from error
+
+
+def _dated(text: str, now: int) -> str:
+    """Replace `today` or `yesterday` by its date, and put a date before a bare time."""
+    found = re.fullmatch(r"(?:(today|yesterday)(?:[ T](?=.)|$))?(\d\d:\d\d(?::\d\d)?)?", text, re.ASCII)
+    if not text or found is None:
+        return text
+    day, time = found.groups()
+    moment = datetime.fromtimestamp(now // _SECOND, UTC)
+    later = day is None and time > moment.strftime("%H:%M:%S")
+    date = (moment - timedelta(days=day == "yesterday" or later)).date().isoformat()
+    return f"{date} {time}" if time else date
+
+
+def parse_date(text: str) -> int:
+    """Return the nanoseconds since the epoch of a date or an RFC 3339 time. Raises `ValueError`."""
+    # datetime keeps microseconds only, but the log prints nanoseconds, and a printed time must be valid input.
+    fraction = re.search(r"\.(\d{1,9})", text)
+    whole = text if fraction is None else text.replace(fraction[0], "", 1)
+    moment = datetime.fromisoformat(whole)
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    nanoseconds = 0 if fraction is None else int(fraction[1].ljust(9, "0"))
+    return _bounded(int(moment.timestamp()) * _SECOND + nanoseconds)
+
+
+def _bounded(time: int) -> int:
+    return max(-(1 << 63), min(time, (1 << 63) - 1))
