@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import ParamSpec, Self, TypeVar
 
 from appliance.policy.model import Address
-from appliance.quotas.pool import Bounds, Standing
+from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.quotas.table import LARGE_WRITES
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.processor_time import ProcessorTime
@@ -21,17 +21,17 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 AT_ONCE = 2
-_BOUNDS = Bounds(whole=AT_ONCE, host=1, strangers=1, kept=1)
+_BOUNDS = Bounds(whole=AT_ONCE, host=1, unknown=1, kept=1)
 _VALUE, _TEXT, _MEMBER, _ARRAY, _STRUCT = 45, 35, 40, 50, 40  # approximate bytes that XML-RPC adds to a value
 
 
-def bulk_turns(standing: Callable[[Address], Standing]) -> Turns:
+def bulk_turns(quota_class: Callable[[Address], QuotaClass]) -> Turns:
     """Return the turns that all requests share."""
-    return Turns(_BOUNDS, standing)
+    return Turns(_BOUNDS, quota_class)
 
 
 class Bulk:
-    """Reserve the bulk of one request when it is needed, and release it at the end.
+    """The bulk of one request: reserved when it is needed, and released at the end.
 
     Work outside the request's own steps (in a thread, in another task) is charged to the host here.
     """
@@ -80,19 +80,19 @@ class Bulk:
 
 
 class LargeWrites:
-    """Limit the number of large values on their way to the ROS master, to one of each host.
+    """The limit of large values on their way to the ROS master: one of each host.
 
     The ROS master is one Python process: many threads that read large values would block all others. A call with a
     turn waits only for the ROS master.
     """
 
-    def __init__(self, enough: int, standing: Callable[[Address], Standing]) -> None:
-        self._turns = Turns(LARGE_WRITES.bounds, standing)
+    def __init__(self, enough: int, quota_class: Callable[[Address], QuotaClass]) -> None:
+        self._turns = Turns(LARGE_WRITES.bounds, quota_class)
         self._enough = enough
 
     @contextlib.asynccontextmanager
     async def turn(self, host: Address, values: list[Value]) -> AsyncIterator[bool]:
-        """Surround a write of these values to the ROS master; yield whether they are large and had to take a turn."""
+        """Surround a write of these values to the ROS master; yield whether they are large and so took a turn."""
         if weigh(values, self._enough) < self._enough:
             yield False
             return

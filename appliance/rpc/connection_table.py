@@ -1,15 +1,14 @@
-"""Who is connected to listeners, what the connections hold, and who makes room when there is none.
+"""Count connections by host, with the bytes they hold, and choose connections that make room.
 
 Invariants:
 
-1. Connections, the bytes they hold (bodies that are not answered, answers that are not taken) and those that are being
-   told that they are too many are pools of `appliance/quotas`: no number of addresses has more than its class may.
-2. A host that is within its own share and finds its class or the whole full gets the place of another connection, if
-   there is one: of the lowest standing that is not above its own, an idle one before one whose request is not whole and
-   that before one that is served, and the one that is so for the longest. `patience` says for how long it is so at
-   least: at RVMaster an idle one costs its client nothing (ROS clients connect again), of its own standing what is
-   unfinished makes room after a second, and what is served never does.
-3. Where bytes are short, the connection that holds most of a host that holds more makes room.
+1. Connections, the bytes they hold (requests without an answer, answers not read yet) and connections that wait for
+   their refusal are pools of `appliance/quotas`: no number of addresses gets more than its class may have.
+2. If a host is within its share but its class or the whole is full, it gets the place of another connection. Candidates
+   have its own quota class or a lower one. The lowest class comes first, then idle, unfinished and served connections
+   in this order, then the longest wait. `patience` is the minimum wait: at RVMaster an idle connection makes room at
+   once (ROS clients reconnect), an unfinished one of the same quota class after a second, and a served one never.
+3. If bytes are short, the largest connection of a host that holds more makes room.
 """
 
 import asyncio
@@ -19,114 +18,117 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import Generic, Protocol
 
-from appliance.quotas.pool import Bounds, Holder, Pool, Standing
+from appliance.quotas.pool import Bounds, Holder, Pool, QuotaClass
 from appliance.quotas.queue import Queue
 from appliance.quotas.table import RVMASTER_ARRIVALS, RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_FAREWELLS
 
 
 class Stage(StrEnum):
-    """Where a connection is in its requests."""
+    """The stage of a connection."""
 
     IDLE = "idle"
-    """Everything it asked is answered."""
+    """All requests are answered."""
 
     UNFINISHED = "unfinished"
-    """Its next request, or its turn, is awaited, or that it takes its answer."""
+    """It waits for the rest of a request, for its turn, or for the peer to read an answer."""
 
     SERVED = "served"
-    """It is being served."""
+    """A handler works on its request."""
 
 
-class Connection(Protocol):
-    """What is asked of a connection here; `deadline` is in monotonic seconds."""
+class TrackedConnection(Protocol):
+    """A connection, as the table needs it; `deadline` is in monotonic seconds."""
 
     deadline: float
 
     @property
     def holding(self) -> int:
-        """The bytes that are held for it and that its end sets free."""
+        """Return the bytes held for it, which its end releases."""
 
     def expire(self) -> None:
-        """The deadline has passed."""
+        """Handle a passed deadline."""
 
     def abort(self) -> None:
         """End now, and `leave`."""
 
 
-Patience = Callable[[Standing, Stage, bool], float]
-"""Seconds that a connection of this standing keeps its place at this stage (True: from hosts of its own standing)."""
+Patience = Callable[[QuotaClass, Stage, bool], float]
+"""Return the seconds that a connection keeps its place. True: against hosts of the same quota class."""
 
 
-def _of_ros(_standing: Standing, stage: Stage, own: bool) -> float:
+def _of_ros(_quota_class: QuotaClass, stage: Stage, own: bool) -> float:
     if stage is Stage.SERVED:
         return math.inf
     return 1.0 if own and stage is Stage.UNFINISHED else 0.0
 
 
-class Visitors(Generic[Holder]):
-    """All connections of every listener that shares it, by host. `standing` says what is known of a host now.
+class ConnectionTable(Generic[Holder]):
+    """Count the connections of all listeners that share it. `quota_class` returns the present quota class of a host.
 
-    `standing_of_arrivals` counts connections that wait to be opened (None: the same).
+    `connection_class` does so for connections, open or not (None: `quota_class`).
     """
 
     def __init__(
         self,
-        standing: Callable[[Holder], Standing],
+        quota_class: Callable[[Holder], QuotaClass],
         *,
         connections: Bounds = RVMASTER_CONNECTIONS.bounds,
         held: Bounds = RVMASTER_BYTES.bounds,
         farewells: Bounds = RVMASTER_FAREWELLS.bounds,
         arriving: Bounds = RVMASTER_ARRIVALS.bounds,
-        standing_of_arrivals: Callable[[Holder], Standing] | None = None,
+        connection_class: Callable[[Holder], QuotaClass] | None = None,
         patience: Patience = _of_ros,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._standing = standing
+        self._quota_class = quota_class
+        self._connection_class = of_connections = connection_class or quota_class
         self._patience = patience
         self._clock = clock
-        self.connected: Pool[Holder] = Pool("connections open", connections, standing)
-        self.held: Pool[Holder] = Pool("bytes in requests and answers under way", held, standing)
-        self.farewells: Pool[Holder] = Pool("connections that are turned away", farewells, standing)
-        self.arriving: Pool[Holder] = Pool(
-            "connections that wait to be opened",
-            arriving,
-            standing_of_arrivals or standing,
-            "hosts that no rule or only * names, without a registration,",
+        unknown = "hosts that no rule or only * names, without a registration,"
+        self.connected: Pool[Holder] = Pool("connections open", connections, of_connections, unknown)
+        self.held: Pool[Holder] = Pool("bytes in requests and answers under way", held, quota_class)
+        self.farewells: Pool[Holder] = Pool(
+            "connections that are turned away", farewells, of_connections, unknown
         )
-        self._of: dict[Connection, tuple[Holder, Pool[Holder]]] = {}
-        self._queues: dict[Stage, Queue[Holder, Connection]] = {stage: Queue(standing) for stage in Stage}
-        self._stages: dict[Connection, Stage] = {}
+        self.arriving: Pool[Holder] = Pool(
+            "connections that wait to be opened", arriving, of_connections, unknown
+        )
+        self._of: dict[TrackedConnection, tuple[Holder, Pool[Holder]]] = {}
+        self._queues: dict[Stage, Queue[Holder, TrackedConnection]] = {
+            stage: Queue(of_connections) for stage in Stage
+        }
+        self._stages: dict[TrackedConnection, Stage] = {}
 
     @property
-    def connections(self) -> frozenset[Connection]:
-        """All that are here, those that are being turned away included."""
+    def connections(self) -> frozenset[TrackedConnection]:
+        """Return all connections, also those being turned away."""
         return frozenset(self._of)
 
-    def enter(self, connection: Connection, host: Holder) -> str:
-        """Count a connection in; why not, when there is no room and nobody makes it."""
+    def enter(self, connection: TrackedConnection, host: Holder) -> str:
+        """Add a connection; return why not, if there is no room and no connection makes room (else empty)."""
         why = self._take(self.connected, host, 1)
         if not why:
             self._of[connection] = host, self.connected
             self.file(connection, Stage.UNFINISHED)
         return why
 
-    def turn_away(self, connection: Connection, host: Holder) -> bool:
-        """Whether a connection that is too many may stay until it was told so; it is counted then."""
+    def turn_away(self, connection: TrackedConnection, host: Holder) -> bool:
+        """Count a connection beyond the limit that stays for its refusal; return False if it may not."""
         if self.farewells.take(host):
             return False
         self._of[connection] = host, self.farewells
         return True
 
-    def leave(self, connection: Connection) -> None:
-        """Count a connection out, if it is in."""
+    def leave(self, connection: TrackedConnection) -> None:
+        """Remove a connection; ignore an unknown one."""
         if connection in self._stages:
             self._queues[self._stages.pop(connection)].remove(connection)
         host, pool = self._of.pop(connection, (None, self.connected))
         if host is not None:
             pool.give_back(host)
 
-    def file(self, connection: Connection, stage: Stage) -> None:
-        """The connection is at this stage from now on."""
+    def file(self, connection: TrackedConnection, stage: Stage) -> None:
+        """Set the stage of a connection."""
         host, pool = self._of.get(connection, (None, self.farewells))
         if host is None or pool is not self.connected:
             return
@@ -137,15 +139,15 @@ class Visitors(Generic[Holder]):
         self._queues[stage].put(connection, host, self._clock())
 
     def hold(self, host: Holder, size: int) -> str:
-        """Count bytes in that are kept for a host; why not (nothing is counted) when it is too much."""
+        """Count bytes held for a host. If they are too many, return the reason and count nothing."""
         return self._take(self.held, host, size)
 
     def release(self, host: Holder, size: int) -> None:
-        """Count bytes out."""
+        """Release bytes."""
         self.held.give_back(host, size)
 
     async def sweep(self) -> None:
-        """Every second, close the connections whose deadline has passed; runs until cancelled."""
+        """Expire connections past their deadline, once a second, until cancelled."""
         while True:
             await asyncio.sleep(1.0)
             now = time.monotonic()
@@ -162,30 +164,30 @@ class Visitors(Generic[Holder]):
             why = pool.take(host, amount)
         return why
 
-    def _to_make_room(self, host: Holder) -> Connection | None:
-        """The connection whose place this host may have."""
-        mine = self._standing(host)
-        for standing in Standing:
-            if standing > mine:
+    def _to_make_room(self, host: Holder) -> TrackedConnection | None:
+        """Return the connection whose place this host may have."""
+        mine = self._connection_class(host)
+        for quota_class in QuotaClass:
+            if quota_class > mine:
                 return None
             for stage, queue in self._queues.items():
-                found = queue.longest(standing)
-                patience = self._patience(standing, stage, standing is mine)
+                found = queue.longest(quota_class)
+                patience = self._patience(quota_class, stage, quota_class is mine)
                 if found is not None and self._clock() - found[2] >= patience:
                     return found[0]
         return None
 
-    def _to_free_bytes(self, host: Holder) -> Connection | None:
-        """The connection that holds most of all that may be ended for this host."""
-        mine, most = self._standing(host), self.held.held(host)
+    def _to_free_bytes(self, host: Holder) -> TrackedConnection | None:
+        """Return the connection with the most bytes among those that may be ended for this host."""
+        mine, most = self._quota_class(host), self.held.held(host)
         able = [
             connection
             for connection in self._queues[Stage.UNFINISHED]
             if connection.holding
             and (
-                self._standing(self._of[connection][0]) < mine
+                self._quota_class(self._of[connection][0]) < mine
                 or self.held.held(self._of[connection][0]) > most
             )
-            and self._standing(self._of[connection][0]) <= mine
+            and self._quota_class(self._of[connection][0]) <= mine
         ]
         return max(able, key=lambda visitor: visitor.holding, default=None)

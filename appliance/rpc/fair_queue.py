@@ -2,7 +2,7 @@
 
 Slots are a pool of `appliance/quotas`. A host without a free slot waits. The next slot goes to the host with the
 longest wait since its last turn, whatever the number and duration of other hosts' requests. Hosts that are alike (the
-policy names them as one network) share one turn and half of the slots, so many addresses bring no advantage.
+policy names them as one network) share one turn and half of the slots, so additional addresses are useless.
 """
 
 import asyncio
@@ -10,7 +10,7 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Hashable
 
 from appliance.policy.model import Address
-from appliance.quotas.pool import Bounds, Pool, Standing
+from appliance.quotas.pool import Bounds, Pool, QuotaClass
 
 Queue = deque[asyncio.Future[None]]
 
@@ -21,7 +21,7 @@ def itself(host: Address) -> Hashable:
 
 
 class Turns:
-    """Give slots to requests within the shares of `bounds`; other requests wait in turn.
+    """The slots of requests within the shares of `bounds`; other requests wait in turn.
 
     While a slot is free, requests wait only because of their host's share, or that of hosts alike. `alike(host)` is
     equal for hosts that share turns. `pause(host)` returns the seconds until the next check of a host that owes for its
@@ -31,11 +31,11 @@ class Turns:
     def __init__(
         self,
         bounds: Bounds,
-        standing: Callable[[Address], Standing],
+        quota_class: Callable[[Address], QuotaClass],
         alike: Callable[[Address], Hashable] = itself,
         pause: Callable[[str], float] = lambda _host: 0.0,
     ) -> None:
-        self.slots: Pool[Address] = Pool("requests being served", bounds, standing)
+        self.slots: Pool[Address] = Pool("requests being served", bounds, quota_class)
         self._alike = alike
         self.pause = pause
         self._together = max(bounds.host, bounds.whole // 2)

@@ -1,12 +1,12 @@
-"""The bounded front of every HTTP server of the appliance: RVMaster's, the faces' and REST's.
+"""Bound the connections of every HTTP server of the appliance: RVMaster, the proxy endpoints, and REST.
 
-It reads what a connection sends with a parser of its own (httptools) and bounds it; the server behind it serves the
-requests. Invariants:
+The front reads with a parser of its own (httptools), within limits; the server behind it serves the requests.
+Invariants:
 
-1. A connection has a place among the `Visitors` from the moment it is accepted, its TLS handshake included.
-2. A handshake takes at most `head_seconds`, and so does the head of a request; a head has at most `head_bytes`.
-3. At most `most_waiting` requests of a connection wait while one is being answered.
-4. A connection that makes no progress is closed by the sweep, whatever state it is in.
+1. A connection has a place among the `ConnectionTable` from the time it is accepted, TLS handshake included.
+2. A handshake and the head of a request take at most `head_seconds` each; a head has at most `head_bytes`.
+3. At most `most_waiting` requests of a connection wait behind one.
+4. The sweep closes a connection without progress in every state.
 """
 
 import asyncio
@@ -21,15 +21,15 @@ from typing import Any
 import httptools
 
 from appliance.policy.model import Address, address_of
-from appliance.rpc.connection_table import Stage, Visitors
+from appliance.rpc.connection_table import ConnectionTable, Stage
 
-# A head of many short fields is as long as the bytes it came in.
+# Counts the bytes around each field, so that a head of many short fields has its full size.
 _FIELD_FRAMING = len(": \r\n")
 
 
 @dataclass(frozen=True, slots=True)
 class HttpLimits:
-    """Bounds of the HTTP layer; bytes and seconds."""
+    """The bounds of the HTTP layer, in bytes and seconds."""
 
     head_bytes: int = 64 << 10
     head_seconds: float = 10.0
@@ -40,72 +40,72 @@ class HttpLimits:
 
     @property
     def framing_bytes(self) -> int:
-        """What a request may have beside its body: the head, chunk sizes, trailers."""
+        """Return the bytes that a request may have besides its body: head, chunk sizes, trailers."""
         return self.head_bytes + self.body_bytes // 16
 
 
 class Front(asyncio.BaseProtocol, ABC):
-    """One connection; `sock` where it has a place before there is a transport."""
+    """The reading side of one connection. With `sock`, it has a place before it has a transport."""
 
     transport: asyncio.Transport
     most_waiting: int
 
     def __init__(
-        self, limits: HttpLimits, visitors: Visitors[Any], sock: socket.socket | None = None
+        self, limits: HttpLimits, connection_table: ConnectionTable[Any], sock: socket.socket | None = None
     ) -> None:
         self.limits = limits
-        self.visitors = visitors
+        self.connection_table = connection_table
         self.closing = False
         self.in_request = False
         self.head_done = False
-        self.received = 0  # bytes of the request that is being read, framing included
+        self.received = 0  # bytes of the present request, framing included
         self._socket = sock
         self._head_bytes = 0
         self.allow(limits.head_seconds)
 
     def allow(self, seconds: float) -> None:
-        """So long may pass until the next progress."""
+        """Set the deadline of the next progress."""
         self.deadline = time.monotonic() + seconds
 
     @abstractmethod
     def reject(self, status: bytes, what: str) -> None:
-        """Answer with this status, and close: `what` the peer did, in words."""
+        """Answer with this status and close the connection. `what` describes the peer's act."""
 
     @property
     @abstractmethod
     def waiting(self) -> int:
-        """Requests that wait behind the one that is being answered."""
+        """Return the number of requests behind the present one."""
 
     @property
     @abstractmethod
     def is_quiet(self) -> bool:
-        """Whether nothing is being answered: then the next head has its deadline."""
+        """Whether no answer is under way, so that the next head has a deadline."""
 
     @property
     def is_open(self) -> bool:
-        """Whether there is a transport."""
+        """Whether it has a transport."""
         return self._socket is None
 
     def open(self, transport: asyncio.Transport) -> bool:
-        """Begin with the transport; False (and it is cut) for a connection that has ended already."""
+        """Begin with the transport. Return False and cut it if the connection has ended already."""
         self.transport, self._socket = transport, None
         if self.closing or not transport.get_extra_info("peername"):
             self.abort()
             return False
-        # asyncio does it for sockets that were made with the protocol's number only; else an answer's body waits 40 ms.
+        # asyncio sets it only for sockets with a protocol number; without it an answer's body waits 40 ms.
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.parser = httptools.HttpRequestParser(self)
         self.allow(self.limits.head_seconds)
         return True
 
     def parse(self, data: bytes) -> None:
-        """Parse a piece of what came, within the limits."""
+        """Parse a piece of input, within the limits."""
         if self.closing:
             return
         try:
             self.parser.feed_data(data)
         except httptools.HttpParserUpgrade:
-            pass  # the server has refused it when its head was complete, or goes on without
+            pass  # the server refused it after its head, or goes on without an upgrade
         except httptools.HttpParserError as error:
             if not self.closing:
                 self.reject(b"400 Bad Request", f"sent something that is not HTTP: {error}")
@@ -115,36 +115,36 @@ class Front(asyncio.BaseProtocol, ABC):
                 self._reject_head()
 
     def on_message_begin(self) -> None:
-        """A request begins."""
+        """Begin a request."""
         if self.waiting >= self.most_waiting and not self.closing:
             what = f"sent {self.most_waiting} requests more while one was being answered"
             self.reject(b"400 Bad Request", what)
         if self.closing:
-            raise ConnectionAbortedError  # what else came is not looked at
+            raise ConnectionAbortedError  # ignore the rest of the input
         self.in_request, self.head_done = True, False
         self.received = self._head_bytes = 0
         if self.is_quiet:
-            self.visitors.file(self, Stage.UNFINISHED)
+            self.connection_table.file(self, Stage.UNFINISHED)
             self.allow(self.limits.head_seconds)
 
     def on_url(self, url: bytes) -> None:
-        """A piece of the path."""
+        """Count a piece of the path."""
         self._head_bytes += len(url)
         if self._head_bytes > self.limits.head_bytes and not self.closing:
             self._reject_head()
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """One field."""
+        """Count one field."""
         self._head_bytes += len(name) + len(value) + _FIELD_FRAMING
         if self._head_bytes > self.limits.head_bytes and not self.closing:
             self._reject_head()
 
     def on_headers_complete(self) -> None:
-        """The head is there."""
+        """End the head."""
         self.head_done = True
 
     def on_message_complete(self) -> None:
-        """The request is there."""
+        """End the request."""
         self.in_request = False
 
     def _reject_head(self) -> None:
@@ -152,30 +152,30 @@ class Front(asyncio.BaseProtocol, ABC):
 
     @property
     def holding(self) -> int:
-        """Bytes that are held for it and that its end sets free."""
+        """Return the bytes held for it, which its end releases."""
         return 0
 
     def leave(self) -> None:
-        """Count for nothing any more; to say it twice is fine."""
+        """Leave the counts; a second call is fine."""
         self.closing = True
-        self.visitors.leave(self)
+        self.connection_table.leave(self)
 
     def expire(self) -> None:
-        """Called by the sweep when the deadline has passed."""
+        """Handle a passed deadline."""
         self.abort()
 
     def abort(self) -> None:
-        """Cut the connection now; it counts for nothing from here on."""
+        """Cut the connection now, and leave the counts."""
         self.leave()
         if self._socket is None:
             self.transport.abort()
         else:
-            with contextlib.suppress(OSError):  # whoever reads or writes there finds the end
+            with contextlib.suppress(OSError):  # readers and writers find the end
                 self._socket.shutdown(socket.SHUT_RDWR)
 
 
 def plain_address(text: str) -> Address:
-    """The address without scope, an IPv4 address in IPv6 clothes as the IPv4 address it is."""
+    """Return the address without scope; an IPv4-mapped IPv6 address as IPv4."""
     address = address_of(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
         return address_of(str(address.ipv4_mapped))

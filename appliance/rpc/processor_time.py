@@ -1,15 +1,15 @@
-"""Processor time of one event loop, shared by hosts: start-time fair queueing.
+"""Share the processor time of one event loop among hosts: start-time fair queueing.
 
 Work for a host (accept a connection, read a piece of a request, one step of a handler) is measured and charged.
 Invariants:
 
 1. In one turn of the loop, work runs for `TURN_SECONDS` and at most one piece longer; the rest waits for later turns.
-   The pieces themselves are short: whoever has a long task divides it, with `await asyncio.sleep(0)` between.
-2. Of the classes of hosts that wait, the one that has used least runs next, and in a class the host that has used
-   least. All unknown hosts are one class. This is deficit round robin without the round: a class that comes back
-   waits for one piece, not for a piece of every other class.
-3. Nobody saves up: a class that waited for nothing begins where the others are. What it used too much it still owes.
-4. While nobody waits and the turn has time left, work runs at once.
+   Pieces are short: a long task is divided by `await asyncio.sleep(0)`.
+2. The waiting class of hosts with the least use runs next, and in it the host with the least use. All unknown hosts
+   are one class. This is deficit round robin without the round: a class that comes back waits for one piece, not for a
+   piece of each other class.
+3. No class saves time: after a break it starts with the use of the waiting classes. It keeps its debt.
+4. While no work waits and the turn has time left, work runs at once.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ from appliance.policy.model import Address
 from appliance.quotas.table import RVMASTER_TIME
 
 TURN_SECONDS = RVMASTER_TIME.bounds.whole / 1e6
-_MOST_KEPT = 1024  # entries of what was used, before those that owe nothing are removed
+_MOST_KEPT = 1024  # entries of use, before those without a debt are removed
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
@@ -33,16 +33,16 @@ Steps = Generator[Any, Any, T]
 
 
 class Line(Generic[Key, Item]):
-    """Items that wait, by key: the next is of the key that has used least. All in seconds.
+    """Waiting items by key. The key with the least use, in seconds, is next.
 
-    `start` is what the key that was next last had used, and where a key begins that comes back.
+    `start` is the use of the latest key that was next. A key that comes back starts there.
     """
 
     def __init__(self) -> None:
         self.start = 0.0
         self._used: dict[Key, float] = {}
         self._items: dict[Key, deque[Item]] = {}
-        self._order: list[tuple[float, int, Key]] = []  # a heap; what a key has used may be more by now
+        self._order: list[tuple[float, int, Key]] = []  # a heap; the use of a key may be higher by now
         self._count = 0
 
     def __len__(self) -> int:
@@ -52,17 +52,17 @@ class Line(Generic[Key, Item]):
         return bool(self._items)
 
     def used(self, key: Key) -> float:
-        """What a key has used; at least what those have used that wait."""
+        """Return the use of a key; at least that of the waiting keys."""
         return max(self._used.get(key, self.start), self.start)
 
     def charge(self, key: Key, seconds: float) -> None:
-        """Add to what a key has used."""
+        """Add to the use of a key."""
         self._used[key] = self.used(key) + seconds
         if len(self._used) > _MOST_KEPT:
             self._used = {one: used for one, used in self._used.items() if used > self.start}
 
     def put(self, key: Key, item: Item) -> None:
-        """The item waits, the last one of its key."""
+        """Append an item to those of its key."""
         queue = self._items.get(key)
         if queue is None:
             self._items[key] = deque([item])
@@ -71,7 +71,7 @@ class Line(Generic[Key, Item]):
             queue.append(item)
 
     def pop(self) -> tuple[Key, Item]:
-        """The next item, and its key; of keys that have used the same, that which waits longest."""
+        """Return the next key and item. Among keys with equal use, the longest waiting one is next."""
         while self._order[0][0] < self.used(self._order[0][2]):
             heapq.heapreplace(self._order, self._entry(self._order[0][2]))
         key = self._order[0][2]
@@ -91,7 +91,7 @@ class Line(Generic[Key, Item]):
 
 
 class ProcessorTime:
-    """Runs work for hosts. `kind(host)` is the same for hosts that share as one; `clock` counts processor seconds."""
+    """A runner of work. `kind(host)` is equal for hosts that share as one; `clock` returns processor seconds."""
 
     def __init__(
         self,
@@ -102,19 +102,19 @@ class ProcessorTime:
         self._clock = clock
         self._classes: Line[Hashable, None] = Line()  # an item for each piece of work
         self._hosts: dict[Hashable, Line[Address, Work]] = {}  # of classes that wait
-        self._spent = 0.0  # in this turn of the loop
-        self._since: float | None = None  # when the piece began that runs now
+        self._spent = 0.0  # seconds in this turn of the loop
+        self._since: float | None = None  # the start of the running piece
         self._turn_ends = False  # whether the end of this turn is scheduled
-        self._granted = False  # a step that may run now and has not begun
+        self._granted = False  # whether a step may run and has not begun
 
     @property
     def waiting(self) -> int:
-        """The pieces of work that wait."""
+        """Return the number of waiting pieces of work."""
         return len(self._classes)
 
     @property
     def free(self) -> bool:
-        """Whether work may run at once: nobody waits, and this turn has time left."""
+        """Whether work may run at once: no work waits, and this turn has time left."""
         return not self._classes and not self._granted and self._left > 0
 
     @property
@@ -123,7 +123,7 @@ class ProcessorTime:
         return TURN_SECONDS - self._spent - running
 
     def run(self, host: Address, work: Work) -> bool:
-        """Run short work for a host, now (True) or when it is its turn; what it raises is reported to the loop."""
+        """Run short work for a host now (True) or at its turn. Report exceptions to the loop."""
         if self.free:
             self._do(host, work)
             return True
@@ -131,41 +131,41 @@ class ProcessorTime:
         return False
 
     def steps(self, host: Address, work: Coroutine[Any, Any, T]) -> "_InSteps[T]":
-        """Carry out a coroutine: each of its steps, from one `await` to the next, runs when it is the host's turn."""
+        """Run a coroutine. Each step, from one `await` to the next, waits for the host's turn."""
         return _InSteps(self, host, work)
 
     async def spend(self, host: Address, work: Coroutine[Any, Any, T]) -> T:
-        """As `steps`, for a task."""
+        """Run a coroutine as `steps` does, and return its result."""
         return await _InSteps(self, host, work)
 
     def charge(self, host: Address, seconds: float) -> None:
-        """Count time that was used for a host, in this turn."""
+        """Charge time of this turn to a host."""
         self._spent += seconds
         self.charge_beside(host, seconds)
         self._end_turn_later()
 
     def charge_beside(self, host: Address, seconds: float) -> None:
-        """Count time that was used for a host, in another thread."""
+        """Charge time of another thread to a host."""
         kind = self._kind(host)
         self._classes.charge(kind, seconds)
         if (hosts := self._hosts.get(kind)) is not None:
             hosts.charge(host, seconds)
 
     def begin(self) -> bool:
-        """A piece begins; False inside another one, which is charged with it."""
+        """Begin a piece of work. Return False inside another piece, which is charged for both."""
         if self._since is not None:
             return False
         self._since = self._clock()
         return True
 
     def end(self, host: Address) -> None:
-        """The piece that began has ended; it was for this host."""
+        """End the piece of work, and charge it to this host."""
         assert self._since is not None  # noqa: S101  by `begin`
         seconds, self._since = self._clock() - self._since, None
         self.charge(host, seconds)
 
     def turn_of(self, host: Address) -> "asyncio.Future[None]":
-        """A future that is done when it is the host's turn; whoever has it calls `taken`, also if it is cancelled."""
+        """Return a future that is done at the host's turn; call `taken` afterwards, also after a cancellation."""
         turn = asyncio.get_running_loop().create_future()
 
         def grant() -> None:
@@ -177,7 +177,7 @@ class ProcessorTime:
         return turn
 
     def taken(self, turn: "asyncio.Future[None]") -> None:
-        """The step that this turn was for has run, or will not."""
+        """End a granted turn, after its step or instead of it."""
         if turn.done() and not turn.cancelled():
             self._granted = False
             self._go_on()
@@ -213,7 +213,7 @@ class ProcessorTime:
             self._end_turn_later()
 
     def _go_on(self) -> None:
-        """Run what waits, as long as this turn has time left; of granted steps one at a time."""
+        """Run waiting work while this turn has time left; grant one step at a time."""
         while self._classes and not self._granted and self._left > 0:
             kind, _ = self._classes.pop()
             hosts = self._hosts[kind]
@@ -223,7 +223,7 @@ class ProcessorTime:
 
 
 class _InSteps(Generic[T]):
-    """Awaits a coroutine step by step (`ProcessorTime.steps`)."""
+    """Await a coroutine step by step (`ProcessorTime.steps`)."""
 
     __slots__ = ("_host", "_time", "_work")
 

@@ -1,14 +1,13 @@
-"""XML-RPC calls that the appliance makes: to ROSMaster on kept-alive connections, to nodes on fresh ones.
+"""Make the appliance's XML-RPC calls: to the ROS master on kept connections, to nodes on new ones.
 
-Every call has a time limit, every response a size limit; a peer that is slow, silent or lies costs his caller a
-`CallFailedError` and nobody else anything.
+Each call has a time limit, each response a size limit. A slow, silent or lying peer costs its caller a
+`CallFailedError`, and other callers nothing.
 """
 
 import asyncio
 import socket
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import cast
 
 import httptools
@@ -16,34 +15,33 @@ import httptools
 from appliance.rpc.bulk import weigh
 from roswire.errors import PeerError
 from roswire.uris import NodeUri, node_uri
-from roswire.xmlrpc import FaultReceived, Limits, Value, build_call, parse_response
+from roswire.xmlrpc import FaultReceived, Value, XmlRpcLimits, build_call, parse_response
 
 
 class CallFailedError(Exception):
-    """The call got no usable answer; the text says what happened at which address."""
+    """A call without a usable answer; the text has the reason and the address."""
 
 
 class RefusedError(CallFailedError):
-    """The other side refuses connections or cannot be reached: nobody is there."""
+    """The peer refuses connections or cannot be reached: no server is there."""
 
 
 class UnreachedError(CallFailedError):
-    """The time was over before there was a connection: the other side's machine is away, or its answers are."""
+    """The time limit passed before a connection: the peer's machine or its packets are missing."""
 
 
 class UnansweredError(CallFailedError):
-    """There was a connection and the time was over before an answer: the other side hangs, or is very slow."""
+    """The time limit passed after a connection and before an answer: the peer hangs or is very slow."""
 
 
 class BrokenOffError(CallFailedError):
-    """The connection broke before the answer was there: whether the call was carried out is not known."""
+    """The connection broke before the answer. The call may have been carried out."""
 
 
 class XmlRpcClient:
-    """Calls one XML-RPC server at `uri`; up to `pool` connections are kept open and reused.
+    """A client of one XML-RPC server at `uri`, which reuses up to `pool` connections (0: a new one for each call).
 
-    `timeout` is seconds for one whole call, `pool` 0 means a fresh connection for each. `disconnected` hears when
-    the server closes a kept connection.
+    `timeout` is in seconds, for one whole call. `disconnected` is called when the server closes a kept connection.
     """
 
     def __init__(
@@ -52,17 +50,17 @@ class XmlRpcClient:
         *,
         timeout: float,
         pool: int = 0,
-        limits: Limits | None = None,
+        limits: XmlRpcLimits | None = None,
         disconnected: Callable[[], None] | None = None,
     ) -> None:
         self.uri = uri
         self._disconnected = disconnected
         self._timeout = timeout
         self._pool = pool
-        self._limits = limits or Limits()
+        self._limits = limits or XmlRpcLimits()
         self._idle: deque[_Connection] = deque()
         host = f"[{uri.host}]" if ":" in uri.host else uri.host
-        # ROSMaster, to whom connections are kept, needs no more fields; reading one takes it 10 µs.
+        # The ROS master, to which connections are kept, needs no other fields; each costs it 10 µs.
         more = "" if pool else "User-Agent: rosrv\r\nContent-Type: text/xml\r\nConnection: close\r\n"
         head = f"POST {uri.path} HTTP/1.1\r\nHost: {host}:{uri.port}\r\n{more}Content-Length: %d\r\n\r\n"
         self._head = head.encode("ascii")
@@ -71,16 +69,11 @@ class XmlRpcClient:
         """Call `method` and return its value. Raises `CallFailedError` (or `RefusedError`)."""
         body = await self._written(method, params)
         request = self._head % len(body) + body
-        attempt = _Attempt()
         seconds = self._timeout + len(request) // _READ_IN_A_SECOND
         try:
-            response = await self._exchange(request, seconds, attempt)
+            response = await self._exchange(request, seconds)
         except TimeoutError:
-            if attempt.connected:
-                why = f"{self._where} did not answer {method} within {seconds:g} s"
-                raise UnansweredError(why) from None
-            why = f"{self._where} cannot be reached: no connection within {seconds:g} s"
-            raise UnreachedError(why) from None
+            raise UnansweredError(f"{self._where} did not answer {method} within {seconds:g} s") from None
         except OSError as error:
             raise _kind(error)(f"{self._where} could not be called: {error.strerror or error}") from error
         try:
@@ -101,25 +94,27 @@ class XmlRpcClient:
     def _where(self) -> str:
         return node_uri(self.uri.host, self.uri.port, self.uri.path)
 
-    async def _exchange(self, request: bytes, seconds: float, attempt: "_Attempt") -> bytes:
+    async def _exchange(self, request: bytes, seconds: float) -> bytes:
+        """Return the response. Raises `UnreachedError`, and `TimeoutError` or another `OSError` after a connection."""
         loop = asyncio.get_running_loop()
         deadline = loop.time() + seconds
         while self._idle:
             connection = self._idle.pop()
             if connection.alive:
-                attempt.connected = True
                 try:
                     return await self._request(connection, request, deadline)
                 except ConnectionResetError:
                     if connection.answering:
                         raise
-                    continue  # kept-alive connections may be closed by the server at any time: ask on another
-        attempt.connected = False
-        async with asyncio.timeout_at(deadline):
-            _transport, connection = await loop.create_connection(
-                lambda: _Connection(self._limits.body, self._disconnected), self.uri.host, self.uri.port
-            )
-        attempt.connected = True
+                    continue  # the server may close a kept connection at any time: use another
+        try:
+            async with asyncio.timeout_at(deadline):
+                _transport, connection = await loop.create_connection(
+                    lambda: _Connection(self._limits.body, self._disconnected), self.uri.host, self.uri.port
+                )
+        except TimeoutError:
+            why = f"{self._where} cannot be reached: no connection within {seconds:g} s"
+            raise UnreachedError(why) from None
         return await self._request(connection, request, deadline)
 
     async def _request(self, connection: "_Connection", request: bytes, deadline: float) -> bytes:
@@ -137,16 +132,9 @@ class XmlRpcClient:
                 connection.close()
 
     def close(self) -> None:
-        """Close the kept connections."""
+        """Close the idle connections."""
         while self._idle:
             self._idle.pop().close()
-
-
-@dataclass(slots=True)
-class _Attempt:
-    """How far a call came."""
-
-    connected: bool = False
 
 
 class _Connection(asyncio.Protocol):
@@ -163,7 +151,7 @@ class _Connection(asyncio.Protocol):
         self.alive = True
 
     def request(self, data: bytes) -> "asyncio.Future[bytes]":
-        """Send one request; the future has the response's body."""
+        """Send one request, and return a future of the response's body."""
         self._answer = asyncio.get_running_loop().create_future()
         self._parser = httptools.HttpResponseParser(self)
         self._body = bytearray()
@@ -174,7 +162,7 @@ class _Connection(asyncio.Protocol):
         return self._answer
 
     def give_up(self) -> None:
-        """The time for the answer is over."""
+        """Fail the answer: its time limit passed."""
         self._fail(TimeoutError())
 
     def close(self) -> None:
@@ -239,6 +227,6 @@ def _kind(error: OSError) -> type[CallFailedError]:
 
 
 _HEAD_LIMIT = 64 << 10
-_READ_IN_A_SECOND = 1 << 20  # bytes, by Python's reader on a slow machine: it has more time for what is large
-_OFFLOAD = 256 << 10  # bytes of a call or an answer that are written or read on the event loop
+_READ_IN_A_SECOND = 1 << 20  # bytes, by Python's reader on a slow machine: large values get more time
+_OFFLOAD = 256 << 10  # bytes of a call or answer that the event loop writes or reads itself
 _UNREACHABLE = frozenset({101, 111, 113})  # ENETUNREACH, ECONNREFUSED, EHOSTUNREACH

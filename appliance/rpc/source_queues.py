@@ -1,0 +1,137 @@
+"""Sort new connections by their source address into two accept queues, in the kernel.
+
+The kernel has one queue of a listening socket, in order of arrival, so a flood delays every connection behind it. Two
+sockets of one port (`SO_REUSEPORT`) have a queue each, and a program picks the queue of a connection by its address.
+
+Only the order depends on the queue: every connection is decided by its address after it is accepted. While there is no
+second socket (control restarts), the first takes all connections.
+"""
+
+import array
+import ipaddress
+import socket
+import struct
+from collections.abc import Callable, Iterable
+
+import structlog
+
+from appliance.policy.policy import Policy
+
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+Program = Callable[[], bytes]
+"""Return the program for the policy in force: the same object until the policy changes."""
+
+FIRST, SECOND = 0, 1  # the sockets of a port, as the kernel numbers them
+_MOST_INSTRUCTIONS = 1024  # in a program; each listener has a copy
+
+_ATTACH = 51  # SO_ATTACH_REUSEPORT_CBPF
+# Classic BPF, as in linux/bpf_common.h and linux/filter.h.
+_LOAD, _LOAD_STORED, _STORE, _AND, _JUMP, _JUMP_EQUAL, _RETURN = 0x20, 0x60, 0x02, 0x54, 0x05, 0x15, 0x06
+_PROTOCOL = -0x1000  # SKF_AD_OFF + SKF_AD_PROTOCOL
+_SOURCE = {4: 12 - 0x100000, 6: 8 - 0x100000}  # the source address, from SKF_NET_OFF
+_WORD = 0xFFFFFFFF
+
+_LOOPBACK = (ipaddress.ip_network("127.0.0.0/8"), ipaddress.ip_network("::1"))
+
+_log = structlog.get_logger()
+
+
+class NamedFirst:
+    """The source of the program that sorts connections: this machine and hosts that the policy names come first."""
+
+    def __init__(self, policy: Callable[[], Policy]) -> None:
+        self._policy = policy
+        self._of: Policy | None = None
+        self._program = b""
+
+    def __call__(self) -> bytes:
+        """Return the program for the policy in force."""
+        policy = self._policy()
+        if policy is not self._of:
+            self._of, self._program = policy, first_for([*_LOOPBACK, *policy.hosts.networks()])
+        return self._program
+
+
+class SourceQueues:
+    """The second listening socket of a port, for connections that `program` sends there.
+
+    Raises `OSError` if the kernel has no such queues.
+    """
+
+    def __init__(self, first: socket.socket, program: Program, backlog: int) -> None:
+        self._program = program
+        self._attached: bytes | None = None
+        self._first = first
+        first.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        self.second = socket.socket(first.family, socket.SOCK_STREAM)
+        try:
+            for option in (socket.SO_REUSEADDR, socket.SO_REUSEPORT):
+                self.second.setsockopt(socket.SOL_SOCKET, option, 1)
+            if first.family == socket.AF_INET6:
+                only = first.getsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY)
+                self.second.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, only)
+            self.second.bind(first.getsockname())
+            self.second.listen(backlog)
+            self._attach(program())
+        except OSError:
+            self.second.close()
+            raise
+
+    def update(self) -> None:
+        """Attach the program of the policy in force, unless it is attached already."""
+        program = self._program()
+        if program is self._attached:
+            return
+        try:
+            self._attach(program)
+        except OSError as error:
+            _log.error("connections are sorted by an earlier policy", reason=str(error))
+            self._attached = program  # so that it is not tried again
+
+    def _attach(self, program: bytes) -> None:
+        code = array.array("B", program)
+        address, size = code.buffer_info()
+        self._first.setsockopt(socket.SOL_SOCKET, _ATTACH, struct.pack("HP", size // 8, address))
+        self._attached = program
+
+
+def first_for(networks: Iterable[Network]) -> bytes:
+    """Return the program that sends these sources to the first socket, and all others to the second.
+
+    If there are too many networks for a program, it sends all sources to the first socket.
+    """
+    networks = list(networks)
+    code = [_instruction(_LOAD, _PROTOCOL)]
+    for version, ethertype in ((4, 0x0800), (6, 0x86DD)):
+        tests = _tests(version, [network for network in networks if network.version == version])
+        code += [_instruction(_JUMP_EQUAL, ethertype, 1, 0), _instruction(_JUMP, len(tests)), *tests]
+    code.append(_instruction(_RETURN, SECOND))
+    if len(code) > _MOST_INSTRUCTIONS:
+        _log.warning("the policy names too many networks to sort connections", networks=len(networks))
+        code = [_instruction(_RETURN, FIRST)]
+    return b"".join(code)
+
+
+def _tests(version: int, networks: list[Network]) -> list[bytes]:
+    """Return the instructions that compare the source address with each network, word by word."""
+    words = 4 if version == 6 else 1
+    code = []
+    for word in range(words):
+        code += [_instruction(_LOAD, _SOURCE[version] + 4 * word), _instruction(_STORE, word)]
+    for network in networks:
+        test = [_instruction(_RETURN, FIRST)]
+        for word in reversed(range(words)):
+            shift = 32 * (words - 1 - word)
+            mask, wanted = (
+                int(network.netmask) >> shift & _WORD,
+                int(network.network_address) >> shift & _WORD,
+            )
+            if mask:
+                differs = _instruction(_JUMP_EQUAL, wanted, 0, len(test))
+                test = [_instruction(_LOAD_STORED, word), _instruction(_AND, mask), differs, *test]
+        code += test
+    return [*code, _instruction(_RETURN, SECOND)]
+
+
+def _instruction(operation: int, operand: int, if_true: int = 0, if_false: int = 0) -> bytes:
+    return struct.pack("HBBI", operation, if_true, if_false, operand & _WORD)
