@@ -1,20 +1,34 @@
-"""What operators' tools ask of the running appliance; the base of each request names the struct that answers it.
+"""The requests of operators' tools to the running appliance, each with the struct that answers it.
 
 Over the admin socket: one JSON document per line in each direction, one request per connection at a time. The
 socket is in the state directory, for its owner and root only, and takes `AnyRequest`: all but `ChallengeWanted`. Over
-REST the api process passes on `RestRequest`, all that has `@rest`, and gets the same document back. `@rest` says which
-HTTP request asks it, and the least role that may: the command line makes its calls from that, control derives from it
-once more what a client has signed and who may ask it, and a test holds the api's routes against it.
+REST the api process passes on `RestRequest`, all that has `@rest`, and gets the same document back.
 
-`expected` is the revision that the asker has seen: a change is refused when another one is in force by now.
+`@rest` is a request's row in the table of operations (`channel/rest_operation.py`): method, path, roles, ETag. The
+docstring of a request is its description in the contract, unless the row has `words`.
+
+`expected` is the revision that the client has seen: a change is rejected when another one is in force by now.
 """
 
 import functools
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, NamedTuple, TypeVar, Union, cast, get_args
+from collections.abc import Callable, Coroutine, Iterator
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Generic,
+    Literal,
+    NamedTuple,
+    ParamSpec,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+)
 
 import msgspec
 
+from appliance.channel import rest_bodies as bodies
 from appliance.channel.answers import (
     evidence_answers,
     graph_answers,
@@ -28,13 +42,52 @@ from appliance.channel.answers import (
     token_answers,
 )
 from appliance.channel.answers.token_answers import TokenRole
+from appliance.channel.rest_operation import Operation, Versioned, parameter, rest, rows
 
 A = TypeVar("A")
-PARAMETERS = {"names": "name", "topics": "topic"}
-"""What a field is called in a query, where it may stand there several times."""
+P = ParamSpec("P")
+
+POLICY = Versioned("policy", "/v1/policy", "Another policy is in force than If-Match names.")
+MONITORS = Versioned(
+    "monitors",
+    "/v1/monitors",
+    "The monitors were changed, switched or resumed since they had the ETag of If-Match.",
+    seconds=40.0,  # RVMaster compiles, and then the relay
+)
+HOSTS = Versioned("table of hosts", "/v1/hosts", "The table of hosts is another than If-Match names.")
 
 _WITHIN = ("confirm_within",)
 _LOADED = (*_WITHIN, "force", "shadow")
+_NO_REVISION = {404: "There is no such revision."}
+_NO_MONITOR = {404: "There is no such monitor, or revision."}
+_NO_RECORDING = {404: "There is no such recording, or the flight recorder is off."}
+_NO_HOST = {404: "There is no such host."}
+_CHARON_SECONDS = 45.0  # charon may have to be started first
+
+Revision = Annotated[int, parameter("its number", ge=1, le=bodies.LONGEST_REVISION, examples=[1])]
+Confirm = Annotated[
+    float | None,
+    parameter(
+        "seconds after which it goes back automatically unless confirmed",
+        gt=0,
+        le=86_400,
+        allow_inf_nan=False,
+    ),
+]
+Force = Annotated[bool, parameter("also where that cuts a topic whose publisher has another type")]
+Shadow = Annotated[bool, parameter("the specifications come into force in shadow mode")]
+OneMonitor = Annotated[str, parameter("of a monitor", min_length=1, max_length=256, examples=["censor"])]
+SomeMonitors = Annotated[list[OneMonitor], parameter(name="name", min_length=1, max_length=1000)]
+RecordingId = Annotated[
+    str,
+    parameter(
+        "of a recording", name="recording_id", pattern="^[0-9a-f]{20}$", examples=["18ea0bb9b11c1024196c"]
+    ),
+]
+OneHost = Annotated[
+    str,
+    parameter("of a host", min_length=1, max_length=63, pattern=bodies.HOST_NAME, examples=["ocu-1"]),
+]
 
 
 class AdminRequest(msgspec.Struct, Generic[A], frozen=True, tag_field="verb", forbid_unknown_fields=True):
@@ -42,141 +95,135 @@ class AdminRequest(msgspec.Struct, Generic[A], frozen=True, tag_field="verb", fo
 
 
 class WaitingRequest(AdminRequest[A], Generic[A], frozen=True):
-    """One whose answer waits for charon, the signer, the recorder or a topic's messages: others go past it."""
+    """A request that waits for charon, the signer, the recorder or a topic's messages: others go past it."""
 
 
-R = TypeVar("R", bound=AdminRequest[Any])
+def answers(
+    request: type[AdminRequest[A]], *, who: bool = False
+) -> Callable[[Callable[P, Coroutine[Any, Any, A]]], Callable[P, Coroutine[Any, Any, A]]]:
+    """Mark a method of control as the answer to a request; `who`: it also takes the client's name."""
+
+    def mark(method: Callable[P, Coroutine[Any, Any, A]]) -> Callable[P, Coroutine[Any, Any, A]]:
+        method.answers = Answers(request, who)  # type: ignore[attr-defined]  # read by `methods_of`
+        return method
+
+    return mark
 
 
-class Operation(NamedTuple):
-    """How one thing is asked over REST; `role` None: without a token. Without a path the api asks it to answer others.
-
-    A field of the request stands in the path (of a list: the only element), in the query, in `If-Match` (`expected`),
-    or else in the body, under its name. `says` is what the body has besides; `fixed` are fields that the operation
-    stands for. Both tell the operations of one path apart: the first that fits is meant.
-    """
+class Answers(NamedTuple):
+    """The mark of a method that answers a request."""
 
     request: type[AdminRequest[Any]]
-    role: TokenRole | None
-    method: str
-    path: str
-    query: tuple[str, ...]
-    says: Mapping[str, Any]
-    fixed: Mapping[str, Any]
-
-    def body(self) -> list[msgspec.structs.FieldInfo]:
-        """The fields that the body has."""
-        elsewhere = {"expected", *self.query, *self.fixed}
-        fields = msgspec.structs.fields(self.request)
-        return [
-            field for field in fields if field.name not in elsewhere and f"{{{field.name}}}" not in self.path
-        ]
+    who: bool
 
 
-_OPERATIONS: dict[type, tuple[Operation, ...]] = {}
-
-
-def rest(
-    role: TokenRole | None,
-    method: str = "",
-    path: str = "",
-    query: tuple[str, ...] = (),
-    *,
-    says: Mapping[str, Any] = {},
-    fixed: Mapping[str, Any] = {},
-) -> Callable[[type[R]], type[R]]:
-    """The request is asked over REST in this way, besides those that stand below this one."""
-
-    def add(request: type[R]) -> type[R]:
-        operation = Operation(request, role, method, path, query, says, fixed)
-        _OPERATIONS[request] = (operation, *_OPERATIONS.get(request, ()))
-        return request
-
-    return add
+def methods_of(kind: type) -> Iterator[tuple[Answers, Callable[..., Coroutine[Any, Any, Any]]]]:
+    """Yield the functions of a class that answer requests, with their marks."""
+    for method in (method for base in kind.__mro__ for method in vars(base).values()):
+        if isinstance(mark := getattr(method, "answers", None), Answers):
+            yield mark, method
 
 
 def verb_of(request: AdminRequest[Any]) -> str:
-    """The name of a request, as it stands in `verb`."""
+    """Return the name of a request, as `verb` has it."""
     return str(type(request).__struct_config__.tag)
 
 
-@rest("viewer", "GET", "/v1/status")
+@rest("viewer", "GET", "/v1/status", name="status", tag="status")
 class StatusWanted(AdminRequest[status.Status], frozen=True, tag="status"):
     """The running appliance: processes, isolation, policy, graph, audit log."""
 
 
-@rest("viewer", "GET", "/v1/inventory")
+@rest("viewer", "GET", "/v1/inventory", name="inventory", tag="status")
 class InventoryWanted(AdminRequest[inventory_answers.Inventory], frozen=True, tag="inventory"):
-    """What runs: version, build, parts with their licences, what is used of the kernel."""
+    """The running software: version, build, parts with their licences, and the kernel's features in use."""
 
 
-@rest("operator", "POST", "/v1/policy/reload", _WITHIN)
+@rest("operator", "POST", "/v1/policy/reload", _WITHIN, name="reload_policy", of=POLICY)
 class PolicyReload(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy reload"):
-    """Read the policy file again; back by itself after `confirm_within` seconds unless confirmed."""
+    """Read the policy file again."""
 
-    confirm_within: float | None = None
+    confirm_within: Confirm = None
     expected: int | None = None
 
 
-@rest("operator", "POST", "/v1/policy/rollback")
+@rest("operator", "POST", "/v1/policy/rollback", name="roll_back_policy", body=bodies.Rollback, of=POLICY)
 class PolicyRollback(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy rollback"):
-    """Back to a kept revision; None: the one before the present."""
+    """Bring a kept revision into force again, as a new one."""
 
-    revision: int | None = None
+    revision: int | None = None  # None: the one before the present
     expected: int | None = None
 
 
-@rest("operator", "POST", "/v1/policy/confirm")
+@rest("operator", "POST", "/v1/policy/confirm", name="confirm_policy", of=POLICY)
 class PolicyConfirm(AdminRequest[policy_answers.PolicyConfirmed], frozen=True, tag="policy confirm"):
-    """Keep a change that would go back by itself."""
+    """Keep a policy that was loaded with `confirm_within`."""
 
     expected: int | None = None
 
 
-@rest("admin", "POST", "/v1/policy", _WITHIN)
+@rest(
+    "admin", "POST", "/v1/policy", _WITHIN, name="load_policy", body=bodies.PolicyText, text="the policy",
+    of=POLICY, dry_run="loading a policy",
+)  # fmt: skip
 class PolicyLoad(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy load"):
-    """Bring a text into force that is not the file's: check, test, swap, decide again what is live."""
+    """Check, test and load a new text, decide again what is live, and report; for admins.
+
+    A text with an error changes nothing: the answer (422) has every finding with its line and column.
+    """
 
     text: str
     note: str = ""
-    confirm_within: float | None = None
+    confirm_within: Confirm = None
     expected: int | None = None
     signature: str = ""
 
 
 @rest("viewer")
 class PolicyWanted(AdminRequest[policy_answers.PolicyKnown], frozen=True, tag="policy"):
-    """The text of a revision (None: the one in force), and with what it is judged: its tests, the robot."""
+    """The text of a revision (None: the one in force), and what it is judged with: its tests, the robot."""
 
     revision: int | None = None
 
 
-@rest("viewer", "GET", "/v1/policy/revisions")
+@rest(
+    "viewer", "GET", "/v1/policy/revisions/{revision}", name="policy_revision",
+    problems={404: "There is no such revision."},
+)  # fmt: skip
+class PolicyRevisionWanted(AdminRequest[policy_answers.RevisionText], frozen=True, tag="policy revision"):
+    """A kept revision with its text."""
+
+    revision: Revision
+
+
+@rest("viewer", "GET", "/v1/policy/revisions", name="policy_revisions")
 class PolicyRevisions(AdminRequest[policy_answers.PolicyRevisionList], frozen=True, tag="policy revisions"):
     """The kept revisions, the newest first."""
 
 
 @rest("viewer")
 class RegistrationsWanted(AdminRequest[graph_answers.Registrations], frozen=True, tag="registrations"):
-    """What is live now and a change of the policy may end."""
+    """The live registrations that a change of the policy may end."""
 
 
-@rest("viewer", "GET", "/v1/graph")
+@rest("viewer", "GET", "/v1/graph", name="graph")
 class GraphWanted(AdminRequest[graph_answers.Graph], frozen=True, tag="graph"):
     """Nodes, topics and services, who is mediated, and rates."""
 
 
-@rest("operator", "GET", "/v1/messages", ("topic", "messages", "seconds", "latched"))
+@rest(
+    "operator", "GET", "/v1/messages", ("topic", "messages", "seconds", "latched"), name="topic_messages",
+    problems={404: "No node publishes or subscribes to it."}, tag="graph",
+)  # fmt: skip
 class TopicLook(WaitingRequest[graph_answers.TopicMessages], frozen=True, tag="topic look"):
-    """The next messages of a topic, read as fields; it is recorded who looked. At most 20, and for ten seconds.
+    """The next messages of a topic as subscribers get them, read as fields. It is recorded who looked."""
 
-    `latched`: what its publishers latched comes first; whoever looks on has it already.
-    """
-
-    topic: str
-    messages: int = 1
-    seconds: float = 2.0
-    latched: bool = True
+    topic: Annotated[str, parameter("its name", max_length=500, examples=["/scan"])]
+    messages: Annotated[int, parameter("how many at most", ge=1, le=20)] = 1
+    seconds: Annotated[float, parameter("how long they are waited for", gt=0, le=10)] = 2.0
+    latched: Annotated[bool, parameter("a latched message first; false for whoever looks on and has it")] = (
+        True
+    )
 
 
 @rest(None)
@@ -184,36 +231,36 @@ class MetricsWanted(AdminRequest[measures.Measures], frozen=True, tag="metrics")
     """The status, and everything that control counts."""
 
 
-@rest("viewer", "GET", "/v1/monitors", ("texts",))
+@rest("viewer", "GET", "/v1/monitors", ("texts",), name="monitors", of=MONITORS)
 class MonitorsWanted(AdminRequest[monitor_answers.Monitors], frozen=True, tag="monitors"):
-    """The monitors with their state and counters; with `texts`, also the specifications themselves."""
+    """All monitors with state and counters, and whether they are equal to the files of the folder."""
 
-    texts: bool = False
+    texts: Annotated[bool, parameter("with the texts of the specifications")] = False
 
 
-@rest("admin", "POST", "/v1/monitors", _LOADED)
-class MonitorLoad(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor load"):
-    """Add or replace files of specifications, and the message definitions they need (`package/Type.msg`).
+@rest(
+    "admin", "POST", "/v1/monitors", _LOADED, name="load_monitors", body=bodies.NewSpecifications, of=MONITORS,
+    dry_run="loading specifications",
+)  # fmt: skip
+class MonitorLoad(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor load"):
+    """Compile and load specifications; those in files of the same name are replaced, in one swap. For admins.
 
-    `signatures` are the site's, by the names of both.
-    Of this and every change below, `expected` is the tag of the monitors that it is meant for; None for any. What is
-    loaded or removed goes back by itself after `confirm_within` seconds unless confirmed. With `shadow` the
-    monitors come into force in shadow mode; with `force` also where that cuts a topic whose publisher has another type.
+    A text with an error changes nothing: the answer (422) has every finding with its line and column.
     """
 
     files: dict[str, str]
     definitions: dict[str, str] = {}
     note: str = ""
     expected: str | None = None
-    confirm_within: float | None = None
+    confirm_within: Confirm = None
     signatures: dict[str, str] = {}
-    force: bool = False
-    shadow: bool = False
+    force: Force = False
+    shadow: Shadow = False
 
 
-@rest("operator")
+@rest("operator", of=MONITORS)
 class MonitorTry(WaitingRequest[monitor_answers.Tried], frozen=True, tag="monitor try"):
-    """What loading these would do (see `MonitorLoad`): they are compiled, and nothing changes."""
+    """Compile these and report what loading them would do (see `MonitorLoad`); nothing changes."""
 
     files: dict[str, str]
     definitions: dict[str, str] = {}
@@ -223,201 +270,242 @@ class MonitorTry(WaitingRequest[monitor_answers.Tried], frozen=True, tag="monito
     shadow: bool = False
 
 
-@rest("admin", "PUT", "/v1/monitors/{name}", _LOADED)
-class MonitorReplace(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor replace"):
-    """Put a text in the place of the file that the monitor `name` stands in, or of the file of this name.
-
-    `signatures` are those of the definitions.
+@rest(
+    "admin", "PUT", "/v1/monitors/{name}", _LOADED, name="replace_monitor", body=bodies.NewText,
+    text="the specification", of=MONITORS, problems=_NO_MONITOR,
+    dry_run="loading specifications",
+)  # fmt: skip
+class MonitorReplace(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor replace"):
+    """Load a new text in place of the file that defines this monitor (or of the file of this name). For admins;
+    operators may only make a dry run.
     """
 
-    name: str
+    name: OneMonitor
     text: str
     definitions: dict[str, str] = {}
     note: str = ""
     expected: str | None = None
-    confirm_within: float | None = None
+    confirm_within: Confirm = None
     signature: str = ""
     signatures: dict[str, str] = {}
-    force: bool = False
-    shadow: bool = False
+    force: Force = False
+    shadow: Shadow = False
 
 
-@rest("operator", "POST", "/v1/monitors/reload", ("prune", *_LOADED))
-class MonitorReload(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor reload"):
-    """Take what the folder of specifications has now; what it does not have stays, unless `prune`."""
+@rest(
+    "operator", "POST", "/v1/monitors/reload", ("prune", *_LOADED), name="reload_monitors", of=MONITORS,
+    admin_with={"prune": "removing what the folder does not have"},
+)  # fmt: skip
+class MonitorReload(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor reload"):
+    """Take what the folder has now; what it does not have stays, unless an admin says `prune`."""
 
     expected: str | None = None
-    prune: bool = False
-    confirm_within: float | None = None
-    force: bool = False
-    shadow: bool = False
+    prune: Annotated[bool, parameter("also remove what the folder does not have")] = False
+    confirm_within: Confirm = None
+    force: Force = False
+    shadow: Shadow = False
 
 
-@rest("admin", "DELETE", "/v1/monitors", ("names", "confirm_within"))
-@rest("admin", "DELETE", "/v1/monitors/{names}", _WITHIN)
-class MonitorRemove(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor remove"):
-    """Remove specifications, by the names of their files or monitors."""
+@rest(
+    "admin", "DELETE", "/v1/monitors", ("names", "confirm_within"), name="remove_monitors",
+    words="The same for several at once.", of=MONITORS, problems=_NO_MONITOR,
+)  # fmt: skip
+@rest(
+    "admin", "DELETE", "/v1/monitors/{name}", _WITHIN, name="remove_monitor", of=MONITORS, problems=_NO_MONITOR,
 
-    names: list[str]
+)  # fmt: skip
+class MonitorRemove(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor remove"):
+    """Remove the file of a monitor (or the file of this name); refused where others use its variables."""
+
+    names: SomeMonitors
     expected: str | None = None
-    confirm_within: float | None = None
+    confirm_within: Confirm = None
 
 
-@rest("admin", "POST", "/v1/monitors/rollback")
-class MonitorRollback(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor rollback"):
-    """Back to a kept revision; None: the one before the present."""
+@rest(
+    "admin", "POST", "/v1/monitors/rollback", name="roll_back_monitors", body=bodies.Rollback, of=MONITORS,
 
-    revision: int | None = None
+)  # fmt: skip
+class MonitorRollback(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor rollback"):
+    """Bring a kept revision into force again, as a new one; what comes back is switched as it was."""
+
+    revision: int | None = None  # None: the one before the present
     expected: str | None = None
 
 
-@rest("operator", "POST", "/v1/monitors/confirm")
+@rest("operator", "POST", "/v1/monitors/confirm", name="confirm_monitors", of=MONITORS)
 class MonitorConfirm(AdminRequest[monitor_answers.MonitorsConfirmed], frozen=True, tag="monitor confirm"):
-    """Keep specifications that would go back by themselves."""
+    """Keep specifications that were loaded with `confirm_within`."""
 
     expected: str | None = None
 
 
-@rest("viewer", "GET", "/v1/monitors/revisions")
+@rest("viewer", "GET", "/v1/monitors/revisions", name="monitor_revisions")
 class MonitorRevisions(
     AdminRequest[monitor_answers.MonitorRevisionList], frozen=True, tag="monitor revisions"
 ):
-    """The kept revisions of the specifications."""
+    """The kept revisions of the specifications, the newest first."""
 
 
-@rest("viewer", "GET", "/v1/monitors/revisions/{revision}")
+@rest("viewer", "GET", "/v1/monitors/revisions/{revision}", name="monitor_revision", problems=_NO_MONITOR)
 class MonitorRevisionWanted(AdminRequest[monitor_answers.RevisionTexts], frozen=True, tag="monitor revision"):
-    """The texts of a kept revision."""
+    """A kept revision with its texts."""
 
-    revision: int
+    revision: Revision
 
 
-@rest("operator", "PATCH", "/v1/monitors")
-@rest("operator", "PATCH", "/v1/monitors/{names}")
+_SWITCH = """
+Enable or disable a monitor, put it into shadow mode (`{"shadow": true}`) or from there into force (`false`).
+
+`{"enabled": false, "for_seconds": 600}` disables it for ten minutes. `{"held": false}` lets the topics that it
+holds go on.
+"""
+_ONE = "/v1/monitors/{name}"
+_SEVERAL = "/v1/monitors"
+
+
+@rest(
+    "operator", "PATCH", _SEVERAL, name="switch_monitors", words="The same for several at once.",
+    body=bodies.SwitchMany, of=MONITORS, problems=_NO_MONITOR,
+)  # fmt: skip
+@rest(
+    "operator", "PATCH", _ONE, name="switch_monitor", words=_SWITCH, body=bodies.Switch, of=MONITORS,
+    problems=_NO_MONITOR,
+)  # fmt: skip
 class MonitorSwitch(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor switch"):
-    """Let the events of these monitors happen, or not: for `for_seconds`, or (None) until they are enabled again."""
+    """Enable or disable the events of these monitors: for `for_seconds`, or (None) until they are enabled again."""
 
-    names: list[str]
+    names: SomeMonitors
     enabled: bool
     expected: str | None = None
     for_seconds: float | None = None
 
 
-@rest("operator", "PATCH", "/v1/monitors", ("force",))
-@rest("operator", "PATCH", "/v1/monitors/{names}", ("force",))
+@rest("operator", "PATCH", _SEVERAL, ("force",), of=MONITORS)
+@rest("operator", "PATCH", _ONE, ("force",), of=MONITORS)
 class MonitorShadow(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor shadow"):
     """Put these monitors into shadow mode, or (false) bring those in shadow mode into force; `force` as of a load."""
 
-    names: list[str]
+    names: SomeMonitors
     shadow: bool
     expected: str | None = None
-    force: bool = False
+    force: Force = False
 
 
-@rest("operator", "PATCH", "/v1/monitors")
-@rest("operator", "PATCH", "/v1/monitors/{names}")
+@rest("operator", "PATCH", _SEVERAL, of=MONITORS)
+@rest("operator", "PATCH", _ONE, of=MONITORS)
 class MonitorTrial(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor trial"):
-    """The same under the name of earlier versions; deprecated."""
+    """Put monitors into shadow mode by its name of earlier versions; deprecated."""
 
-    names: list[str]
+    names: SomeMonitors
     trial: bool
     expected: str | None = None
 
 
-@rest("operator", "PATCH", "/v1/monitors", says={"held": False})
-@rest("operator", "PATCH", "/v1/monitors/{names}", says={"held": False})
+@rest("operator", "PATCH", _SEVERAL, says={"held": False}, of=MONITORS)
+@rest("operator", "PATCH", _ONE, says={"held": False}, of=MONITORS)
 class MonitorResume(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor resume"):
     """Let the topics that these monitors hold go on."""
 
-    names: list[str]
+    names: SomeMonitors
     expected: str | None = None
 
 
-@rest("viewer", "GET", "/v1/recordings")
+@rest("viewer", "GET", "/v1/recordings", name="recordings", problems=_NO_RECORDING)
 class RecordingsWanted(WaitingRequest[recording_answers.Recordings], frozen=True, tag="recordings"):
-    """The recordings that are kept."""
+    """All recordings that are kept, the oldest first."""
 
 
-@rest("viewer", "GET", "/v1/recordings/{id}")
+@rest("viewer", "GET", "/v1/recordings/{recording_id}", name="recording", problems=_NO_RECORDING)
 class RecordingWanted(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording"):
-    """One of them."""
+    """Why a recording was made, and what it has."""
 
-    id: str
+    id: RecordingId
 
 
-@rest("operator", "POST", "/v1/recordings")
+@rest(
+    "operator", "POST", "/v1/recordings", name="record_now", body=bodies.NewRecording, status=201,
+    good="It is being made.", problems=_NO_RECORDING,
+)  # fmt: skip
 class RecordNow(WaitingRequest[recording_answers.RecordingBegun], frozen=True, tag="record now"):
-    """Record from `before` seconds before now to `after` seconds after; None: as configured."""
+    """Record the last seconds, and the next ones, of what the robot says."""
 
-    before: float | None = None
+    before: float | None = None  # seconds before now; None: as configured
     after: float | None = None
     note: str = ""
 
 
-@rest("investigator", "GET", "/v1/recordings/{id}/bag")
+@rest("investigator", "GET", "/v1/recordings/{recording_id}/bag")
 class RecordingFetch(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording fetch"):
-    """Somebody takes the messages of a recording: it is recorded who."""
+    """Record who fetches the messages of a recording."""
 
-    id: str
+    id: RecordingId
 
 
-@rest("investigator", "GET", "/v1/recordings/{id}/messages", ("topics",))
+@rest("investigator", "GET", "/v1/recordings/{recording_id}/messages", ("topics",))
 class RecordingRead(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording read"):
-    """Somebody reads messages of a recording, of these topics (none: of all): it is recorded who."""
+    """Record who reads messages of a recording, of these topics (none: of all)."""
 
-    id: str
-    topics: list[str] = []
+    id: RecordingId
+    topics: Annotated[list[str], parameter(name="topic")] = []
 
 
-@rest("investigator", "POST", "/v1/recordings/memory")
+@rest(
+    "investigator", "POST", "/v1/recordings/memory", name="recording_of_memory", body=bodies.MemorySpan,
+    problems=_NO_RECORDING,
+)  # fmt: skip
 class RecordingOfMemory(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording memory"):
-    """What is in memory, to be read: from `since` to `until`, nanoseconds since the epoch (None: all, now).
+    """Make a recording of the data in memory, which can be fetched for ten minutes, or until the next such request."""
 
-    It is no recording that is kept: for ten minutes, or until somebody else asks, it can be fetched as one.
-    """
-
-    since: int | None = None
+    since: int | None = None  # nanoseconds since the epoch; None: all that there is
     until: int | None = None
 
 
-@rest("admin", "DELETE", "/v1/recordings/{id}")
+@rest("admin", "DELETE", "/v1/recordings/{recording_id}", name="remove_recording", problems=_NO_RECORDING)
 class RecordingRemove(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording remove"):
-    """Remove a recording."""
+    """Remove a recording; it is recorded who removed it. For admins."""
 
-    id: str
+    id: RecordingId
 
 
 class TokenAdd(AdminRequest[token_answers.NewToken], frozen=True, tag="token add"):
-    """Make a token that ends after `seconds`; the answer is the only place where its text ever stands."""
+    """Make a token that ends after `seconds`; its text is in the answer and nowhere else."""
 
     name: str
     role: TokenRole
     seconds: float
 
 
-@rest("admin", "GET", "/v1/tokens")
+@rest("admin", "GET", "/v1/tokens", name="tokens")
 class TokenList(AdminRequest[token_answers.Tokens], frozen=True, tag="token list"):
     """All access tokens that were made, without their secrets; for admins."""
 
 
-@rest("admin", "DELETE", "/v1/tokens/{name}")
+@rest(
+    "admin", "DELETE", "/v1/tokens/{name}", name="revoke_token",
+    problems={422: "There is no token of this name that can be used."},
+)  # fmt: skip
 class TokenRevoke(AdminRequest[token_answers.Token], frozen=True, tag="token revoke"):
-    """End a token now."""
+    """End a token now: from then on it is answered with 401, and open streams of its holder end. For admins."""
 
-    name: str
+    name: Annotated[str, parameter(min_length=1, max_length=80, examples=["shift"])]
 
 
-@rest("admin", "POST", "/v1/hosts", says={"how": "token"}, fixed={"new": True})
-@rest("admin", "POST", "/v1/hosts/{name}/token", fixed={"new": False})
+@rest(
+    "admin", "POST", "/v1/hosts", name="enrol_host", words="Let a host in: by a one-time token that it brings with"
+    " its own signing request, or by a kit.", body=bodies.NewHost, says={"how": "token"}, fixed={"new": True},
+    of=HOSTS, status=201, good="Enrolled: the kit (how=kit); or a one-time token (how=token)",
+    seconds=_CHARON_SECONDS,
+)  # fmt: skip
+@rest(
+    "admin", "POST", "/v1/hosts/{name}/token", name="host_token", body=bodies.TokenWishes, fixed={"new": False},
+    of=HOSTS, seconds=_CHARON_SECONDS,
+)  # fmt: skip
 class HostToken(WaitingRequest[host_answers.EnrolmentToken], frozen=True, tag="host token"):
-    """Make a token by which a host enrols itself once within `token_seconds`; an earlier one of the name ends.
+    """A one-time token: with it the host enrols itself, for the first time or again with another key."""
 
-    Its text is in the answer and nowhere else. `endpoint` (None: the appliance finds it), `ports` and `open` are kept
-    with it for whoever makes the host's kit. With `new` it is refused for a host that is enrolled; else such a host
-    may come with another key.
-    """
-
-    name: str
+    name: OneHost
+    # These three are kept with the token, to make the host's kit later; endpoint None: the appliance finds it.
     endpoint: str | None = None
     ports: str = "32768-60999"
     open: list[str] = []
@@ -425,10 +513,12 @@ class HostToken(WaitingRequest[host_answers.EnrolmentToken], frozen=True, tag="h
     days: float = 90
     address: str | None = None
     expected: int | None = None
-    new: bool = False
+    new: bool = False  # rejected for a host that is enrolled; else such a host may come with another key
 
 
-@rest("admin", "POST", "/v1/hosts", says={"how": "kit"})
+@rest(
+    "admin", "POST", "/v1/hosts", says={"how": "kit"}, of=HOSTS, seconds=_CHARON_SECONDS, filled=("request",)
+)
 class HostAdd(WaitingRequest[host_answers.KitParts], frozen=True, tag="host add"):
     """Enrol a host by a signing request (PKCS #10, PEM) for the key that it has, for `days`.
 
@@ -442,7 +532,7 @@ class HostAdd(WaitingRequest[host_answers.KitParts], frozen=True, tag="host add"
     expected: int | None = None
 
 
-@rest(None)
+@rest(None, seconds=_CHARON_SECONDS)
 class HostEnrol(WaitingRequest[host_answers.KitParts], frozen=True, tag="host enrol"):
     """The host itself, at the real address `peer`, brings its token and a signing request (PEM)."""
 
@@ -451,17 +541,20 @@ class HostEnrol(WaitingRequest[host_answers.KitParts], frozen=True, tag="host en
     peer: str
 
 
-@rest("admin", "POST", "/v1/hosts/{name}/kit")
+@rest(
+    "admin", "POST", "/v1/hosts/{name}/kit", name="new_host_kit", body=bodies.NewKit, of=HOSTS, problems=_NO_HOST,
+    seconds=_CHARON_SECONDS, filled=("request",), good="The kit: an archive (.tar.gz)",
+)  # fmt: skip
 class HostRenew(WaitingRequest[host_answers.KitParts], frozen=True, tag="host renew"):
-    """A new certificate for an enrolled host; the one before is revoked."""
+    """A new certificate for an enrolled host, in a kit; the one before is revoked, its tunnel closed."""
 
-    name: str
+    name: OneHost
     request: str
     days: float = 90
     expected: int | None = None
 
 
-@rest(None)
+@rest(None, seconds=_CHARON_SECONDS)
 class HostRenewItself(WaitingRequest[host_answers.NewCertificate], frozen=True, tag="host renew itself"):
     """A host asks through its tunnel, at its virtual address `peer`, for a certificate for a new key.
 
@@ -475,7 +568,7 @@ class HostRenewItself(WaitingRequest[host_answers.NewCertificate], frozen=True, 
     peer: str
 
 
-@rest(None)
+@rest(None, seconds=_CHARON_SECONDS)
 class HostRenewed(AdminRequest[host_answers.Renewed], frozen=True, tag="host renewed"):
     """A host at its virtual address `peer` has put its new certificate in place: the one before ends now."""
 
@@ -483,48 +576,50 @@ class HostRenewed(AdminRequest[host_answers.Renewed], frozen=True, tag="host ren
     peer: str
 
 
-@rest("viewer", "GET", "/v1/hosts")
+@rest("viewer", "GET", "/v1/hosts", name="hosts", of=HOSTS)
 class HostList(AdminRequest[host_answers.Hosts], frozen=True, tag="host list"):
-    """All hosts that were enrolled or declared, with their tunnels."""
+    """Every host that is enrolled, declared or awaited, with its tunnel; and machines that nodes run on."""
 
 
 @rest("viewer")
 class HostEndpoint(AdminRequest[host_answers.Endpoint], frozen=True, tag="host endpoint"):
-    """At which address hosts reach the appliance, where nobody says it: `endpoint`, and `reason`: why that one."""
+    """The address at which hosts reach the appliance if none is given: `endpoint`, and the `reason`."""
 
 
 @rest("operator")
 class HostKit(AdminRequest[host_answers.KitParts], frozen=True, tag="host kit"):
-    """What an enrolled host's kit is made of, without its private key."""
+    """The parts of an enrolled host's kit, without its private key."""
 
     name: str
 
 
-@rest("admin", "DELETE", "/v1/hosts/{name}")
+@rest("admin", "DELETE", "/v1/hosts/{name}", name="revoke_host", of=HOSTS, problems=_NO_HOST)
 class HostRevoke(AdminRequest[host_answers.Revoked], frozen=True, tag="host revoke"):
-    """Let a host in no more, and cut what it has, now."""
+    """Let a host in no more: its certificate, tunnel, registrations and connections end within a second."""
 
-    name: str
+    name: OneHost
     expected: int | None = None
 
 
-@rest("operator", "PUT", "/v1/hosts/{name}/ports")
-class HostPorts(AdminRequest[host_answers.PortsTold], frozen=True, tag="host ports"):
-    """Somebody tried the ROS ports of a host from outside, at `checked` (seconds since the epoch; None: now).
+@rest(
+    "operator", "PUT", "/v1/hosts/{name}/ports", name="tell_host_ports", body=bodies.PortsTold, of=HOSTS,
+    problems=_NO_HOST,
+)  # fmt: skip
+class HostPorts(AdminRequest[host_answers.PortsReport], frozen=True, tag="host ports"):
+    """Tell whether the ROS ports of a host are closed, as `rosrv protect --check` saw it from outside."""
 
-    `name` is an enrolled or declared host's, or an address of a machine that nodes run on.
-    """
-
-    name: str
+    name: Annotated[
+        str, parameter("of a host, or a machine's address", min_length=1, max_length=63, examples=["ocu-1"])
+    ]
     state: Literal["closed", "open", "unknown"]
     open: list[int] = []
-    checked: float | None = None
+    checked: float | None = None  # seconds since the epoch; None: now
     expected: int | None = None
 
 
-@rest("operator", "POST", "/v1/hosts/reload")
+@rest("operator", "POST", "/v1/hosts/reload", name="reload_hosts", of=HOSTS)
 class HostsReload(AdminRequest[host_answers.Reloaded], frozen=True, tag="hosts reload"):
-    """Read `ipsec/hosts.yaml` again."""
+    """Read hosts.yaml again: open and close tunnels as it says. Enrolments and revocations do not change."""
 
     expected: int | None = None
 
@@ -546,10 +641,10 @@ class LogSealed(WaitingRequest[evidence_answers.Sealed], frozen=True, tag="audit
 
 @rest("viewer")
 class EvidenceExported(WaitingRequest[evidence_answers.Sealed], frozen=True, tag="evidence exported"):
-    """Record that a bundle was made whose manifest has this hash, and have that sealed.
+    """Record that a bundle was made whose manifest has this hash, and seal the record.
 
-    It has so many `records`, from `since` until before `until` (nanoseconds since the epoch), and the `recording` of
-    this id.
+    The bundle has this number of `records`, from `since` until before `until` (nanoseconds since the epoch), and the
+    `recording` of this id.
     """
 
     manifest: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
@@ -559,31 +654,29 @@ class EvidenceExported(WaitingRequest[evidence_answers.Sealed], frozen=True, tag
     recording: str = ""
 
 
-@rest("viewer", "GET", "/v1/challenge")
+@rest("viewer", "GET", "/v1/challenge", name="challenge", tag="status")
 class ChallengeWanted(AdminRequest[token_answers.Challenge], frozen=True, tag="challenge"):
     """A challenge: an order that changes something is signed under one, and each is good once."""
 
 
-OPERATIONS = tuple(operation for operations in _OPERATIONS.values() for operation in operations)
-CHANGES = frozenset(
-    operation.request for operation in OPERATIONS if operation.path and operation.method != "GET"
-)
-"""What changes something in the name of a token: control makes it only with the request that asked for it."""
+OPERATIONS = tuple(operation for operations in rows().values() for operation in operations)
+CHANGES = frozenset(operation.request for operation in OPERATIONS if operation.is_change)
+"""Requests that change something in the name of a token: control requires the HTTP request that asked for them."""
 
 ORDERS = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
-"""What changes something over REST, also in the name of a host itself."""
+"""The requests that change something over REST, also in the name of a host itself."""
 
 if TYPE_CHECKING:
     RestRequest = AdminRequest[Any]
     AnyRequest = AdminRequest[Any]
 else:
-    RestRequest = Union[tuple(_OPERATIONS)]  # noqa: UP007  there are as many as there are
-    AnyRequest = Union[(TokenAdd, *(request for request in _OPERATIONS if request is not ChallengeWanted))]
+    RestRequest = Union[tuple(rows())]  # noqa: UP007  there are as many as there are
+    AnyRequest = Union[(TokenAdd, *(request for request in rows() if request is not ChallengeWanted))]
 
 
 def operation_of(request: AdminRequest[Any]) -> Operation | None:
-    """How a request is asked; None: not over REST."""
-    for operation in _OPERATIONS.get(type(request), ()):
+    """Return the row of a request; None: not over REST."""
+    for operation in rows().get(type(request), ()):
         if all(getattr(request, name) == operation.fixed[name] for name in operation.fixed):
             return operation
     return None
@@ -595,10 +688,9 @@ Trouble = Literal["", "request", "refused", "conflict", "unknown", "forbidden", 
 class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
     """The answer: `ok` with a body, or an error with its findings.
 
-    `trouble` says whose fault an error is: `request` (it makes no sense), `refused` (the policy or name given is
-    wrong), `conflict` (another revision is in force than was expected: `tag` is that of the monitors), `unknown` (there
-    is no such thing), `forbidden` (whoever asks may not), `busy` (too much at once), `failed` (the appliance cannot do
-    it now).
+    `trouble` is the kind of an error: `request` (makes no sense), `refused` (the policy or name given is wrong),
+    `conflict` (another revision is in force than expected; `tag` is that of the monitors), `unknown` (no such thing),
+    `forbidden` (not for this client), `busy` (too much at once), `failed` (the appliance cannot do it now).
     """
 
     ok: bool
@@ -609,7 +701,7 @@ class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
     tag: str = ""
 
     def given(self) -> A:
-        """The body of an answer that is `ok`."""
+        """Return the body of an answer that is `ok`."""
         assert self.body is not None  # noqa: S101  it has one
         return self.body
 
@@ -623,11 +715,11 @@ def _decoder(kind: type[AdminRequest[A]]) -> msgspec.json.Decoder[AdminAnswer[A]
 
 
 def answer_to(kind: type[AdminRequest[A]]) -> type[A]:
-    """The struct that answers such a request."""
+    """Return the struct that answers a request."""
     (answer,) = get_args(kind.__orig_bases__[0])  # type: ignore[attr-defined]  # what `typing` keeps of its bases
     return cast(type[A], answer)
 
 
 def decode(document: bytes, request: AdminRequest[A]) -> AdminAnswer[A]:
-    """The answer to a request. Raises `msgspec.MsgspecError` when it is none."""
+    """Decode the answer to a request. Raises `msgspec.MsgspecError`."""
     return _decoder(type(request)).decode(document)

@@ -4,9 +4,9 @@ A frame is a 4-byte big-endian length and that many bytes of MessagePack. Descri
 the first byte of their frame; the kernel never merges two sends that carry descriptors, so a queue in order of
 arrival pairs them again.
 
-The channel owns no loop: it has a `fileno()`, `receive()` to call when readable and `flush()` when writable, so
-the same class serves an asyncio process (`attach`) and the relay's epoll loop. A peer that does not read is
-bounded: past `limit` bytes of backlog `send` raises `ChannelFull` (both ends are ours; that is a defect, not load).
+The channel owns no loop: it has a `fileno()`, `receive()` to call when readable and `flush()` when writable, so the
+same class serves an asyncio process (`attach`) and the relay's epoll loop. If the peer does not read, `send` raises
+`ChannelFullError` beyond `limit` bytes of backlog (both ends are ours: that is a defect, not load).
 """
 
 import os
@@ -21,15 +21,15 @@ import msgspec
 from appliance.channel.messages import Message
 
 if TYPE_CHECKING:
-    import asyncio  # who has no loop (a launcher, the relay) does not wait for it
+    import asyncio  # not loaded by a process without asyncio (a launcher, the relay)
 
 _LENGTH = struct.Struct(">I")
 _RECEIVE_SIZE = 262_144
 _MAX_DESCRIPTORS = 64
-_TOGETHER = 65_536  # bytes of frames that are written at once
+_TOGETHER = 65_536  # bytes of frames to write at once
 _MAX_UNCLAIMED = 65_536
-SOON_SECONDS = 0.005  # what is sent soon waits for company: a wakeup costs more than what it reads
-_MAX_READS = 64  # in one go, so that an end that never stops writing leaves time for others
+SOON_SECONDS = 0.005  # `soon` frames wait to be joined: a wakeup costs more than reading them
+_MAX_READS = 64  # in one go, so that an endless writer leaves time for others
 
 
 class ChannelClosedError(Exception):
@@ -41,12 +41,12 @@ class ChannelFullError(Exception):
 
 
 class Channel:
-    """One end of a link that carries the messages of `union` (a union of `Message` structs)."""
+    """One end of a link for the messages of `union` (a union of `Message` structs)."""
 
     def __init__(
         self, sock: socket.socket, union: Any, *, limit: int = 64 << 20, longest: int = 64 << 20
     ) -> None:
-        """`limit` bounds the backlog of what is sent, `longest` one received message; both in bytes."""
+        """Wrap a socket; `limit` bounds the unsent backlog, `longest` one received message, both in bytes."""
         sock.setblocking(False)
         self._socket = sock
         self._encoder = msgspec.msgpack.Encoder()
@@ -61,7 +61,7 @@ class Channel:
         self._writing = False
 
     def fileno(self) -> int:
-        """The descriptor to wait on."""
+        """Return the descriptor to wait on."""
         return self._socket.fileno()
 
     @property
@@ -70,10 +70,9 @@ class Channel:
         return bool(self._outgoing)
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
-        """Queue a message and write what the socket takes; descriptors are duplicated, the caller keeps his.
+        """Queue a message and write what the socket takes; descriptors are duplicated, the caller keeps its own.
 
-        `soon`: of an attached channel it is written in `SOON_SECONDS`, with all that is sent until then, or before the
-        next that is not.
+        `soon`: an attached channel writes it within `SOON_SECONDS`, together with other messages.
         """
         if len(descriptors) != message.descriptors:
             raise ValueError(f"{type(message).__name__} travels with {message.descriptors} descriptors")
@@ -88,7 +87,7 @@ class Channel:
             self.flush()
         elif not soon:
             self._flush_attached()
-        elif len(self._outgoing) == 1:  # else it is to be written already
+        elif len(self._outgoing) == 1:  # otherwise a write is already scheduled
             self._loop.call_later(SOON_SECONDS, self._flush_attached)
 
     def flush(self) -> None:
@@ -115,7 +114,7 @@ class Channel:
         self._watch_writable()
 
     def _next(self) -> tuple[bytes, list[int]]:
-        """What is to be written next: frames without descriptors together, in the place of the first."""
+        """Return the next bytes to write, with their descriptors; frames without descriptors are joined."""
         frames, size = [], 0
         while self._outgoing and not self._outgoing[0][1] and size < _TOGETHER:
             frames.append(self._outgoing.popleft()[0])
@@ -127,8 +126,8 @@ class Channel:
     def receive(self) -> list[tuple[Any, tuple[int, ...]]]:
         """Read what has arrived: whole messages with their descriptors, which the caller now owns.
 
-        Raises `ChannelClosedError` when the other end is gone, and `msgspec.DecodeError` for a message that is
-        not of this link, is too long, or came without its descriptors: the link is of no use after that.
+        Raises `ChannelClosedError` if the other end is gone, and `msgspec.DecodeError` for a message that is not of
+        this link, is too long, or came without its descriptors: the link is unusable after that.
         """
         closed = False
         for _turn in range(_MAX_READS):
@@ -181,8 +180,8 @@ class Channel:
     ) -> None:
         """Serve this end from an asyncio loop: `received(message, descriptors)` for each, `closed()` once.
 
-        From now on `send` never raises because the other end is gone: `closed()` tells it, in order.
-        What is not of this link closes it: `refused(reason)` is called then, or `closed()` where none is given.
+        From now on `send` never raises because the other end is gone: `closed()` reports it, in order. A message of
+        another link closes this one: `refused(reason)` is called, or `closed()` if `refused` is None.
         """
         self._loop = loop
 
@@ -216,12 +215,12 @@ class Channel:
             self._loop.remove_writer(self.fileno())
 
     def _flush_attached(self) -> None:
-        if not self._outgoing:  # all was written, or the channel closed, meanwhile
+        if not self._outgoing:  # written or closed in the meantime
             return
         try:
             self.flush()
         except ChannelClosedError:
-            # The reader sees the end of the stream as well and reports it, after what is still to be read.
+            # The reader reports the end of the stream too, after the rest of the data.
             self._discard_outgoing()
             if self._socket.fileno() >= 0:
                 self._watch_writable()
@@ -234,7 +233,7 @@ class Channel:
         self._backlog = 0
 
     def close(self) -> None:
-        """Close this end; descriptors that nobody took are closed with it."""
+        """Close this end, and all received descriptors that were not taken."""
         if self._socket.fileno() < 0:
             return
         if self._loop is not None:

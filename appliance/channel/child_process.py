@@ -1,7 +1,7 @@
-"""What every child of the supervisor that serves control has in common: its lifeline, and its link to control.
+"""The common part of the supervisor's children that serve control: lifeline, and link to control.
 
-It answers the supervisor's pings, takes each new link in the place of the one before, closes descriptors it was not
-meant to have, and ends when it is told to or when the supervisor is gone.
+A child answers the supervisor's pings, replaces its link by each new one, closes unexpected descriptors, and ends when
+the supervisor sends `Stop` or is gone.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from appliance.channel.messages import Failed, LinkOpened, Message, Ping, Pong, 
 
 
 class Child:
-    """The two channels; `said(message)` hears control, `linked()` that there is a new link to it."""
+    """The two channels of a child; `said(message)` is called with control's messages, `linked()` after a new link."""
 
     def __init__(
         self,
@@ -40,12 +40,12 @@ class Child:
         self.ended = asyncio.Event()
 
     def attach(self, ready: Ready) -> None:
-        """Begin to listen, and say that this process is in service."""
+        """Begin to listen, and report that this process is in service."""
         self._lifeline.attach(asyncio.get_running_loop(), self._supervisor_said, self.ended.set)
         self._answer(ready)
 
     def tell(self, message: Message) -> bool:
-        """Tell control something; False while there is none, or it reads nothing: it asks again over its next link."""
+        """Send a message to control; return False without one, or if it does not read: its next link asks again."""
         try:
             return self._control.send(message)
         except ChannelFullError:
@@ -53,7 +53,7 @@ class Child:
             return False
 
     def fail(self, reason: str, output: list[str]) -> None:
-        """Tell the supervisor why this process ends, and what the program that it ran printed last."""
+        """Report to the supervisor why this process ends, and the last output of the program that it ran."""
         self._answer(Failed(reason, output))
 
     def close(self) -> None:

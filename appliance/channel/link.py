@@ -1,4 +1,4 @@
-"""This end of a link to a process that may be started again: one channel after the other, and questions over them."""
+"""One end of a link to a process that may be restarted: one channel after the other, and questions over them."""
 
 import asyncio
 import itertools
@@ -10,15 +10,15 @@ from appliance.channel.messages import Message
 
 
 class Link:
-    """Whoever is there now: `heard(message)` gets what it says, and nothing of who was there before.
+    """The link to the present process: `heard(message)` gets its messages, and none of an earlier process.
 
-    `lost(reason)` is called when it is gone and no other has come; the reason is empty unless it said something wrong.
+    `lost(reason)` is called when the process is gone without a successor, with the reason if it sent a wrong message.
     """
 
     def __init__(
         self, heard: Callable[[Any], None], lost: Callable[[str], None] = lambda _reason: None
     ) -> None:
-        self.channel: Channel | None = None  # None: nobody is there
+        self.channel: Channel | None = None  # None: not connected
         self._heard = heard
         self._lost = lost
         self._numbers = itertools.count(1)
@@ -26,11 +26,11 @@ class Link:
 
     @property
     def unanswered(self) -> int:
-        """How many questions wait for their answers."""
+        """Return the number of questions that wait for answers."""
         return len(self._asked)
 
     def attach(self, channel: Channel) -> None:
-        """Somebody is there, in the place of who was before."""
+        """Use a new channel instead of the present one."""
         self.close()
         self.channel = channel
 
@@ -46,16 +46,16 @@ class Link:
         channel.attach(asyncio.get_running_loop(), received, ended, ended)
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> bool:
-        """Tell it something, as `Channel.send`; False when nobody is there. Raises `ChannelFullError`."""
+        """Send a message, as `Channel.send`; return False if there is no other end. Raises `ChannelFullError`."""
         if self.channel is None:
             return False
         self.channel.send(message, descriptors, soon=soon)
         return True
 
     async def ask(self, question: Callable[[int], Message], seconds: float) -> Any:
-        """What `answered` is given for this question, which gets a number.
+        """Send a question with a number, and return its answer.
 
-        Raises `TimeoutError`, `ChannelFullError`, and `ChannelClosedError` when nobody is there or it ended meanwhile.
+        Raises `TimeoutError`, `ChannelFullError`, and `ChannelClosedError` when the process is gone.
         """
         number = next(self._numbers)
         answer = self._asked[number] = asyncio.get_running_loop().create_future()
@@ -68,13 +68,13 @@ class Link:
             del self._asked[number]
 
     def answered(self, number: int, answer: Any) -> None:
-        """This is the answer to the question of that number; nothing if nobody waits for it any more."""
+        """Take the answer to the question with this number, if it is still awaited."""
         future = self._asked.get(number)
         if future is not None and not future.done():
             future.set_result(answer)
 
     def close(self) -> None:
-        """Nobody is there any more; what was asked is not answered."""
+        """Close the channel; open questions fail."""
         if self.channel is None:
             return
         self.channel.close()

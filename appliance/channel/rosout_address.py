@@ -1,7 +1,7 @@
-"""Where the appliance's own node (rosout) is called: what control and the firewall agree on.
+"""The address of the appliance's own node (rosout), for control and the firewall.
 
-It serves its API on every address. Control calls it at one of loopback's that nobody else may connect to, and it
-answers nobody at any other (`appliance/network/firewall/firewall_rules.py`).
+The node serves its API on every address. Control calls it at a loopback address that only control may connect to; the
+firewall blocks it everywhere else (`appliance/network/firewall/firewall_rules.py`).
 """
 
 ADDRESS = "127.87.79.1"

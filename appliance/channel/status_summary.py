@@ -1,4 +1,4 @@
-"""How control's status is read: one answer for health checks, REST, metrics and `rosrv status`. Pure."""
+"""Summaries of control's status, the same for health checks, REST, metrics and `rosrv status`. Pure."""
 
 from collections.abc import Sequence
 
@@ -6,12 +6,12 @@ from appliance.channel.answers.status import ProcessInfo, Status
 
 
 def probe_failed(status: Status) -> bool:
-    """Whether the hidden ROS Master was reached past the appliance; before the probe has run it did not fail."""
+    """Whether the probe reached the hidden ROS master past the appliance; False before it has run."""
     return status.probe not in ("", "passed")
 
 
 def no_relay(presence: str) -> str | None:
-    """What it means that not every relay process is there; None when all are."""
+    """Return the effect of missing relay processes; None if all run."""
     if presence == "connected":
         return None
     if presence == "away":
@@ -20,19 +20,19 @@ def no_relay(presence: str) -> str | None:
 
 
 def unserved(status: Status) -> str | None:
-    """Why nodes are not served now; None when they are."""
+    """Return why nodes are not served now; None if they are."""
     if probe_failed(status):
-        return f"the ROS Master is not hidden: {status.probe}"
+        return f"the ROS master is not hidden: {status.probe}"
     if status.audit.failed and status.audit.on_failure == "deny":
         return f"the audit log cannot be written: {status.audit.failed}"
     relay = no_relay(status.relay)
     if relay is not None:
         return relay
-    return None if status.rosmaster == "reachable" else "the ROS Master is being rebuilt: calls wait"
+    return None if status.rosmaster == "reachable" else "the ROS master is being rebuilt: calls wait"
 
 
 def process_names(processes: Sequence[ProcessInfo]) -> list[str]:
-    """What the processes are called, in their order: by their roles; those of one role are numbered from 0."""
+    """Return the names of the processes, in order: their roles, numbered from 0 if a role has several."""
     roles = [row.role for row in processes]
     return [
         f"{role} {roles[:place].count(role)}" if roles.count(role) > 1 else role

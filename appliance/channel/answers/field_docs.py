@@ -9,7 +9,7 @@ UNIT = "x-epoch"
 
 
 def told(description: str, **bounds: Any) -> msgspec.Meta:
-    """What the contract says of a field, and its bounds."""
+    """Return the contract's description of a field, and its bounds."""
     return msgspec.Meta(description=description, **bounds)
 
 

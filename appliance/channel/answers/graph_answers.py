@@ -19,7 +19,7 @@ class Node(msgspec.Struct, frozen=True):
 
 
 class Flow(msgspec.Struct, frozen=True, kw_only=True):
-    """What went through since RVMaster started, and what goes through now (a second's average)."""
+    """The traffic since RVMaster started, and the present traffic (a second's average)."""
 
     messages: int
     bytes: int

@@ -11,7 +11,7 @@ State = Literal["up", "down", "expired", "revoked", "not wanted", "awaited", "no
 
 
 class PortsSeen(msgspec.Struct, frozen=True):
-    """Whether a machine's ROS ports are closed to all but the appliance, as somebody saw who tried from outside."""
+    """Whether a machine's ROS ports are closed to all but the appliance, as probed from another host."""
 
     state: PortsState
     checked: Annotated[Moment | None, told("null: never")]
@@ -71,7 +71,7 @@ class Hosts(msgspec.Struct, frozen=True):
 
 
 class KitParts(msgspec.Struct, frozen=True, kw_only=True):
-    """What an enrolled host's kit is made of, but for its private key; `kept` was kept with its one-time token.
+    """The contents of an enrolled host's kit, without its private key; `kept` was kept with its one-time token.
 
     `rest_url` is REST's through the tunnel, and `pin` that of the key of its server; empty where the host cannot renew
     its certificate there: `rest_trouble` says why.
@@ -137,8 +137,8 @@ class Revoked(msgspec.Struct, frozen=True):
     taken_back: Annotated[int, told("registrations and grants")]
 
 
-class PortsTold(msgspec.Struct, frozen=True):
-    """What was told of the ports of `name`, a host's name or an address, is known."""
+class PortsReport(msgspec.Struct, frozen=True):
+    """The known port check of `name`, a host's name or an address."""
 
     revision: int
     name: str

@@ -1,4 +1,4 @@
-"""What runs: the program, what it stands on, and what it uses of the kernel."""
+"""The running program, its dependencies, and the kernel features that it uses."""
 
 from typing import Annotated, Literal
 
@@ -8,7 +8,7 @@ from appliance.channel.answers.field_docs import told
 
 
 class Part(msgspec.Struct, frozen=True):
-    """A package that the appliance stands on."""
+    """A package that the appliance depends on."""
 
     kind: Literal["python", "debian"]
     name: str
@@ -17,14 +17,13 @@ class Part(msgspec.Struct, frozen=True):
 
 
 class InUse(msgspec.Struct, frozen=True):
-    """What the running appliance uses of the kernel."""
+    """The kernel features that the running appliance uses."""
 
     firewall: Annotated[str | None, told("the back end; null: this isolation has none")]
     esp: Annotated[Literal["kernel", "user space"] | None, told("where ESP runs; null: no tunnels are open")]
-    walls: Annotated[
-        dict[str, str], told("by process: what limits its calls of the kernel, its files and ports")
-    ]
-    lacks: Annotated[list[str], told("what this kernel lacks of them")]
+    sandbox: Annotated[dict[str, str], told("by process: limits of its system calls, files and ports")]
+    lacks: Annotated[list[str], told("the parts of the sandbox that this kernel lacks")]
+    walls: Annotated[dict[str, str], told("the same as `sandbox`; deprecated")] = {}
 
 
 class Inventory(msgspec.Struct, frozen=True):

@@ -1,4 +1,4 @@
-"""What is measured, in numbers; `appliance.telemetry.metrics` says what each is called."""
+"""The measured values, in numbers; `appliance.telemetry.metrics` has their names."""
 
 import msgspec
 
@@ -14,8 +14,8 @@ class Measures(msgspec.Struct, frozen=True, kw_only=True):
 
     `decisions` has category, outcome and how often; `calls` the time of calls by name; `relayed` messages, bytes and
     dropped messages by topic or service; `delayed` buckets and their sum by topic; `monitors` the kind, the monitor and
-    how often; `margins` the monitor, line and column, whether it held, and the closest approach of the day; `slices`
-    how many a parametric specification has and may have; `limited` the topic, what of it was limited and how often.
+    how often; `slices` how many a parametric specification has and may have; `limited` the topic, what of it was
+    limited and how often.
     """
 
     decisions: list[tuple[str, str, int]]
@@ -29,7 +29,6 @@ class Measures(msgspec.Struct, frozen=True, kw_only=True):
     relayed: dict[str, list[int]]
     delayed: dict[str, list[float]]
     monitors: list[tuple[str, str, int]]
-    margins: list[tuple[str, str, bool, float]]
     slices: dict[str, tuple[int, int]]
     drop_at: dict[str, int]
     change_at: dict[str, int]

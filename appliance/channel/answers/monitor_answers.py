@@ -15,32 +15,6 @@ Tag = Annotated[
 RvState = tuple[int, int, list[tuple[str, str, int, int]]]
 
 
-class Approach(msgspec.Struct, frozen=True):
-    """How near the sides of a comparison of numbers came to each other."""
-
-    time: Annotated[Moment, told("when, to the second: seconds since the epoch")]
-    left: Annotated[float, told("its left side then, in the unit of its specification")]
-    right: Annotated[float, told("its right side, in that unit")]
-    distance: Annotated[float, told("of the sides, in that unit")]
-    threshold_at: Annotated[
-        float | None,
-        told(
-            "where the constant would have to stand to be reached, in that unit; null where neither side is one"
-        ),
-    ]
-
-
-class MonitorMargin(msgspec.Struct, frozen=True):
-    """How close a comparison of numbers came while it was true (`holds`), or while it was not."""
-
-    line: Annotated[int, told("of the specification, from 1")]
-    column: Annotated[int, told("in that line, from 1")]
-    condition: Annotated[str, told("the line of the specification that it stands in")]
-    holds: Annotated[bool, told("what it said then")]
-    since_load: Annotated[Approach, told("since the monitor was loaded or its relay began")]
-    today: Annotated[Approach | None, told("since midnight (UTC); null while it did not come up today")]
-
-
 class MonitorState(msgspec.Struct, frozen=True):
     """A running monitor; counters since it was loaded or its relay began."""
 
@@ -71,9 +45,6 @@ class MonitorState(msgspec.Struct, frozen=True):
         int, told("bindings of its parameters that are monitored now; 0 of one without parameters")
     ] = 0
     slice_limit: Annotated[int, told("at most so many at a time; 0 of one without parameters")] = 0
-    margins: Annotated[
-        list[MonitorMargin], told("of its comparisons of numbers that came up, in the order of the text")
-    ] = []
     why_held: Annotated[str, told("why its state was lost, if it holds its topics for that")] = ""
     shadow: Annotated[
         bool, told("in shadow mode: given copies of messages, to record what it would have done")
@@ -91,7 +62,7 @@ class Monitors(msgspec.Struct, frozen=True):
     who: str
     note: str
     loaded: Moment
-    confirm_by: Annotated[Moment | None, told("when it goes back by itself unless confirmed")]
+    confirm_by: Annotated[Moment | None, told("when it goes back automatically unless confirmed")]
     folder: Annotated[str | None, told("what `reload` reads; null: no folder was given at start")]
     differs_from_folder: bool
     warnings: list[str]
@@ -107,7 +78,9 @@ class Monitors(msgspec.Struct, frozen=True):
 
 
 class Tried(msgspec.Struct, frozen=True):
-    """What a load would do, to the revision in force; `warnings` are lines, `monitors` those that there would be."""
+    """The effect that a load would have on the revision in force; `warnings` are lines, `monitors` the resulting
+    monitors.
+    """
 
     revision: int
     tag: str
@@ -118,8 +91,8 @@ class Tried(msgspec.Struct, frozen=True):
     monitors: list[str]
 
 
-class Replaced(msgspec.Struct, frozen=True):
-    """What a change of the specifications did; `replaced` is the revision before, `warnings` are lines.
+class Replacement(msgspec.Struct, frozen=True):
+    """The effect of a change of the specifications; `replaced` is the revision before, `warnings` are lines.
 
     `moved` are monitors that began in their initial state because another relay process has them now, `began` all that
     did: new ones, edited ones, and those whose messages have another definition. `kept` are files that a reload left in

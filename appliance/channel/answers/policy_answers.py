@@ -1,4 +1,4 @@
-"""The policy: revisions, and what a change of it did."""
+"""The policy: its revisions, and the effect of a change."""
 
 from typing import Annotated
 
@@ -25,14 +25,14 @@ class PolicyRevisionList(msgspec.Struct, frozen=True):
 
 
 class RevisionText(PolicyRevision, frozen=True):
-    """A kept revision with its text, and the signature of the site (empty: it came without one)."""
+    """A kept revision with its text, and the site's signature (empty if unsigned)."""
 
     text: str
     signature: str
 
 
 class PolicyInForce(RevisionText, frozen=True):
-    """The policy in force; `confirm_by` (seconds since the epoch) is when it goes back unless confirmed."""
+    """The policy in force. It rolls back at `confirm_by` (seconds since the epoch) unless confirmed."""
 
     policy_file: Annotated[str, told("what `reload` reads")]
     differs_from_file: bool
@@ -42,10 +42,10 @@ class PolicyInForce(RevisionText, frozen=True):
 
 
 class PolicyKnown(PolicyInForce, frozen=True):
-    """A revision with all by which another text is judged beside it.
+    """A revision, with all data for the comparison with another text.
 
     `robot` are the robot's addresses and networks, `hosts` the addresses of enrolled hosts by name. `cases` are the
-    policy's tests, None where there are none; `cases_error` says why they cannot be read.
+    policy's tests, None where there are none; `cases_error` is the reason if they cannot be read.
     """
 
     robot: list[str]
@@ -56,13 +56,13 @@ class PolicyKnown(PolicyInForce, frozen=True):
 
 
 class Loaded(msgspec.Struct, frozen=True):
-    """A policy came into force, in the place of the revision `replaced`."""
+    """A policy came into force and replaced the revision `replaced`."""
 
     revision: int
     replaced: int
     warnings: list[str]
     revoked: Annotated[int, told("registrations and connections that were taken back")]
-    confirm_by: Annotated[Moment | None, told("when it goes back by itself unless confirmed")]
+    confirm_by: Annotated[Moment | None, told("when it goes back automatically unless confirmed")]
 
 
 class PolicyConfirmed(msgspec.Struct, frozen=True):
@@ -73,7 +73,7 @@ class PolicyConfirmed(msgspec.Struct, frozen=True):
 
 
 class Why(msgspec.Struct, frozen=True, kw_only=True):
-    """Why what a record tells happened; of a refusal also what would have to change in the policy."""
+    """The explanation of a record; for a denial also the change of the policy that would allow it."""
 
     lines: Annotated[
         list[str], told("for people: who, which events and values made it so, at which lines of which files")
@@ -83,7 +83,7 @@ class Why(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Granted(msgspec.Struct, frozen=True, kw_only=True):
-    """The smallest change of the policy in force that grants what a record says was refused. Nothing is changed."""
+    """The smallest change of the policy in force that grants a denied request of a record. Nothing is changed."""
 
     revision: Annotated[int, told("of the policy that it was worked out for")]
     reason: Annotated[str, told("of the record")]

@@ -26,7 +26,7 @@ class Trigger(msgspec.Struct, frozen=True):
 
 
 class RecordedTopic(msgspec.Struct, frozen=True):
-    """What a recording has of one topic of one type."""
+    """The part of a recording with one topic of one type."""
 
     topic: str
     type: str
@@ -89,7 +89,7 @@ class Sender(msgspec.Struct, frozen=True):
 
 
 class RecordedFlow(msgspec.Struct, frozen=True):
-    """When a topic said something: so many messages in each column of the time line."""
+    """The traffic of a topic: the number of messages in each column of the time line."""
 
     topic: str
     type: str
@@ -98,14 +98,16 @@ class RecordedFlow(msgspec.Struct, frozen=True):
 
 
 class EventMarks(msgspec.Struct, frozen=True):
-    """When events of a kind happened: so many in each column of the time line, those that are not listed included."""
+    """The events of a kind: their number in each column of the time line, including those that are not listed."""
 
     kind: EventKind
     counts: Annotated[list[int], told("events in each column, in their order")]
 
 
 class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
-    """What an audit record of that time says; `notice` is what is no trigger: a change by people, for example."""
+    """An event from an audit record of that time; `notice` is an event that is not a trigger, such as a change by
+    people.
+    """
 
     time: NanoMoment
     kind: EventKind

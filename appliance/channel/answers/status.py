@@ -15,16 +15,15 @@ class ProcessInfo(msgspec.Struct, frozen=True):
     pid: int
     since: Annotated[str, told("RFC 3339, UTC, milliseconds")]
     restarts: int
-    walls: Annotated[
+    sandbox: Annotated[
         str,
-        told(
-            "what limits its calls of the kernel, its files and ports; empty: the supervisor, or not told yet"
-        ),
+        told("limits of its system calls, files and ports; empty: the supervisor, or not reported yet"),
     ] = ""
-    lacks: Annotated[list[str], told("what this machine's kernel lacks of them")] = []
+    lacks: Annotated[list[str], told("the parts of the sandbox that this kernel lacks")] = []
     congestion: Annotated[str, told("the TCP congestion control of a relay's connections")] = ""
     failing: Annotated[str, told("why it ends soon after every start; empty: it does not")] = ""
     output: Annotated[list[str], told("the last lines that the program of a failing process printed")] = []
+    walls: Annotated[str, told("the same as `sandbox`; deprecated")] = ""
 
 
 class FirewallRule(msgspec.Struct, frozen=True):
@@ -68,7 +67,7 @@ class PolicyState(msgspec.Struct, frozen=True):
 
 
 class IpsecState(msgspec.Struct, frozen=True):
-    """How the tunnels stand, and what a person should look at."""
+    """The state of the tunnels, and problems that need attention."""
 
     esp: Annotated[Literal["kernel", "user space"] | None, told("where ESP runs; null: no tunnels are open")]
     key_exchange: Annotated[list[str], told("offered and accepted, the best first; empty: not known yet")]
@@ -85,7 +84,7 @@ class IpsecState(msgspec.Struct, frozen=True):
 
 
 class MonitorsState(msgspec.Struct, frozen=True):
-    """The specifications in force, and the names of the monitors that need somebody."""
+    """The specifications in force, and the names of the monitors that need attention."""
 
     revision: int
     tag: str
@@ -97,7 +96,7 @@ class MonitorsState(msgspec.Struct, frozen=True):
     who: str
     differs_from_folder: bool
     confirm_by: Moment | None
-    trials: Annotated[list[str], told("monitors in shadow mode")] = []
+    shadow: Annotated[list[str], told("monitors in shadow mode")] = []
     why_held: Annotated[
         dict[str, str], told("why the state of those was lost that hold their topics for that")
     ] = {}

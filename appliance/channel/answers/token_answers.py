@@ -7,14 +7,15 @@ import msgspec
 from appliance.channel.answers.field_docs import Moment, told
 
 TokenRole = Literal["viewer", "investigator", "operator", "admin"]
-"""Viewers look; investigators also fetch the messages of recordings, which nobody else may; operators take the file's
-policy, or one that was in force before; admins bring new rules into force."""
+"""Viewers read. Only investigators can also fetch the messages of recordings. Operators load the file's policy, or one
+that was in force before. Admins bring new rules into force.
+"""
 
 _RANKS: dict[str, int] = {"viewer": 1, "investigator": 1, "operator": 2, "admin": 3}
 
 
 def may(held: str, least: TokenRole) -> bool:
-    """Whether a token of one role may do what is for another. What is for investigators nobody else may."""
+    """Whether a token of role `held` may do what `least` may. Only investigators have the rights of investigators."""
     return held == least if least == "investigator" else _RANKS[held] >= _RANKS[least]
 
 
@@ -42,7 +43,7 @@ class NewToken(Token, frozen=True, kw_only=True):
 
 
 class Challenge(msgspec.Struct, frozen=True):
-    """What the next order is signed under."""
+    """The challenge under which the next order is signed."""
 
     challenge: str
     seconds: Annotated[float, told("so long it is good, for one order")]

@@ -1,16 +1,16 @@
 """Every message that crosses a process boundary of the appliance, by link.
 
-A message is a frozen struct with a tag of its own name; a link accepts only the messages of its union, so a
-process cannot be told anything that is not written here. A struct that travels with file descriptors says so in
-`descriptors`; they are sent as SCM_RIGHTS with the message and delivered with it.
+A message is a frozen struct with a tag of its own name; a link accepts only the messages of its union, so a process
+cannot receive any other kind of message. A struct that travels with file descriptors has `descriptors`; they are sent
+as SCM_RIGHTS with the message and delivered with it.
 
-Strings from strangers (names, header values) are carried as values and never interpreted on the way.
+Strings from unknown hosts (names, header values) are carried as values and never interpreted on the way.
 
-A message that is written in one of these files is one of `messages`: nothing else is to be listed. But for those of
-the link to the api, which bring every request of operators: only its two ends import `messages.api`.
+Every message that is defined in these files is in `messages`, without another list. The exception is `messages.api`,
+which imports every request of operators: only the two ends of its link import it.
 """
 
-# ruff: noqa: F403  a new message is listed by being written
+# ruff: noqa: F403  so that a new message need not be listed
 from appliance.channel.answers.status import ProcessInfo as ProcessInfo
 from appliance.channel.messages.compiler import *
 from appliance.channel.messages.forwarding import *

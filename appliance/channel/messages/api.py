@@ -1,6 +1,5 @@
-"""The link control <-> api. The api asks with what the client showed; control decides whose asking that is.
-
-What it may ask is the union `RestRequest`, which has no way to make a token.
+"""The link control <-> api. The api passes on the client's request with its credentials, which control verifies. The
+api's requests are the union `RestRequest`, which cannot make a token.
 """
 
 import math
@@ -12,8 +11,8 @@ from appliance.channel.admin import RestRequest
 from appliance.channel.messages.message import Message
 
 
-class Asked(msgspec.Struct, frozen=True):
-    """The HTTP request of a change as it came, of the peer `host`; a header that it did not have is empty."""
+class ClientRequest(msgspec.Struct, frozen=True):
+    """The HTTP request of a change as it came, from the peer `host`; missing headers are empty."""
 
     host: str
     method: str
@@ -25,21 +24,21 @@ class Asked(msgspec.Struct, frozen=True):
 
 
 class RequestMade(Message):
-    """The api passes on what a client asks; `number` pairs it with its answer.
+    """Pass on a client's request; `number` pairs it with its answer.
 
-    `shown` is the token or reading key that came with it, empty where none is needed. A change has `asked`, too. What
-    has not taken effect at `until` (seconds of the monotonic clock, which all processes share) is withdrawn.
+    `shown` is the token or reading key that came with it, empty if none is needed. A change also has `asked`. A request
+    that has not taken effect by `until` (seconds of the monotonic clock, which all processes share) is withdrawn.
     """
 
     number: int
     request: RestRequest
     shown: str = ""
-    asked: Asked | None = None
+    asked: ClientRequest | None = None
     until: float = math.inf
 
 
 class RequestWithdrawn(Message):
-    """The client of the request with this number is gone: what it ordered is withdrawn if it has not taken effect."""
+    """The client of the request with this number is gone: its order is withdrawn if it has not taken effect."""
 
     number: int
 
@@ -52,7 +51,7 @@ class RequestAnswered(Message):
 
 
 class TokenKept(msgspec.Struct, frozen=True):
-    """A token that may be used, without its secret; `expires` is seconds since the epoch.
+    """A usable token, without its secret; `expires` is seconds since the epoch.
 
     `reading` is the hash of its reading key, empty for a token of a version that had none.
     """
@@ -67,13 +66,13 @@ class TokenKept(msgspec.Struct, frozen=True):
 
 
 class TokensStated(Message):
-    """Control tells the api every token that may be used; said at the start of a link and after every change."""
+    """Control lists for the api every usable token, at the start of a link and after every change."""
 
     tokens: list[TokenKept]
 
 
 class RestCalled(Message):
-    """A REST call to be recorded. `who` is the token's name, empty when nobody was recognised.
+    """A REST call to be recorded. `who` is the token's name, empty for an invalid token.
 
     `count` equal calls (of one second at least) are one message; `duration_us` is of the first. `dry`: a dry run.
     """
@@ -90,7 +89,7 @@ class RestCalled(Message):
 
 
 class RestServed(Message):
-    """The api says first by what it is recognised: the pin of its key (`sha256//…`), empty in clear text."""
+    """The api's first message: the pin of its key (`sha256//…`), empty in clear text."""
 
     pin: Annotated[str, msgspec.Meta(pattern="^(sha256//[A-Za-z0-9+/]{43}=)?$")]
 

@@ -1,4 +1,4 @@
-"""The link control <-> compiler: texts of specifications, and what is in them."""
+"""The link control <-> compiler: texts of specifications, and their contents."""
 
 import msgspec
 
@@ -6,13 +6,13 @@ from appliance.channel.messages.message import Message
 
 
 class Contents(msgspec.Struct, frozen=True):
-    """What specifications without errors are: their monitors (name to file), what they listen to and publish.
+    """The contents of specifications without errors: monitors (name to file), topics that they subscribe to and
+    publish.
 
-    `uses` are the other monitors whose variables a monitor uses, `published_by` the topics each file publishes.
-    `types` has the message type of each topic, `texts` the full text of each such type. `certificates` says of each
-    property of a monitor whether its automaton was proved to be what is written. `places` has where each topic is
-    first named (`file:line:column`). Of `compiled` each relay runs its part
-    (`PartsWanted`).
+    `uses` has the other monitors whose variables a monitor uses, `published_by` the topics that each file publishes.
+    `types` has the message type of each topic, `texts` the full text of each such type. `certificates` has for each
+    property of a monitor whether its automaton was proved equal to its formula. `places` has where each topic is first
+    named (`file:line:column`). Each relay runs its part of `compiled` (`PartsWanted`).
     """
 
     monitors: dict[str, str] = {}
@@ -30,7 +30,7 @@ class Contents(msgspec.Struct, frozen=True):
 
 
 class ContentsWanted(Message):
-    """Control asks what is in these files of specifications (name to text), with these definitions of messages.
+    """Control asks for the contents of these specifications (name to text), with these definitions of messages.
 
     A `dry_run` has a smaller budget of processor time than an order.
     """
@@ -42,28 +42,28 @@ class ContentsWanted(Message):
 
 
 class ContentsFound(Message):
-    """They are in order: what is in them."""
+    """The contents of specifications without errors."""
 
     number: int
     contents: Contents
 
 
 class CompilationRefused(Message):
-    """They are not, and all that is wrong with them, as `file:line:column: error: text`; or of parts why not."""
+    """All errors of the specifications, as `file:line:column: error: text`, or why there are no parts."""
 
     number: int
     findings: list[str]
 
 
 class PartNames(msgspec.Struct, frozen=True, array_like=True):
-    """The monitors of one relay, in their order, and which of them are on trial."""
+    """The monitors of one relay, in their order, and which of them are in shadow mode."""
 
     monitors: tuple[str, ...] = ()
-    trials: tuple[str, ...] = ()
+    shadows: tuple[str, ...] = ()
 
 
 class PartsWanted(Message):
-    """Control asks for what each of several relays runs of a set that was compiled (`Contents.compiled`)."""
+    """Control asks for the parts of a compiled set (`Contents.compiled`) that several relays run."""
 
     number: int
     compiled: bytes
@@ -71,7 +71,7 @@ class PartsWanted(Message):
 
 
 class PartsMade(Message):
-    """They are made (`rosmop/sent.py`), in the order of the question."""
+    """The parts (`rosmop/fast/serialization.py`), in the order of the question."""
 
     number: int
     parts: list[bytes]

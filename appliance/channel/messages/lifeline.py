@@ -30,8 +30,8 @@ class Stop(Message):
 class Ready(Message):
     """A child is in service. For control: nodes may connect. `detail` is for status (addresses, ports).
 
-    Control's `detail` has `master` (the URI nodes are told), `revision` (of the policy), `rosout_master` (the URI
-    of the loopback listener for the appliance's own nodes), `inner_port` (of the inner faces) and `token` (the
+    Control's `detail` has `master` (the URI for nodes), `revision` (of the policy), `rosout_master` (the URI of the
+    loopback listener for the appliance's own nodes), `inner_port` (of the master-side endpoints) and `token` (the
     first access token of REST, if it was made at this start).
     """
 
@@ -39,9 +39,9 @@ class Ready(Message):
 
 
 class Failed(Message):
-    """A child cannot serve and says why; the supervisor shows it and stops the appliance, or starts the child again.
+    """A child cannot serve, with the reason; the supervisor shows it, and stops the appliance or restarts the child.
 
-    `output` are the last lines of a program that it ran.
+    `output` is the last lines of a program that it ran.
     """
 
     reason: str
@@ -49,11 +49,12 @@ class Failed(Message):
 
 
 class Walled(Message):
-    """A child's first word: the walls it is in (docs/architecture.md), and what this kernel lacks of them.
+    """The first message of a child: the sandbox it is in (docs/dev/architecture.md), and what this kernel lacks for
+    it.
 
-    `calls` is how its calls of the kernel are limited: "listed" (only those on a list), "usual" (all but those that no
-    process of ours makes) or empty. `landlock` is the ABI of the kernel's Landlock that limits its files and ports;
-    0 for none.
+    `calls` is how its system calls are limited: "listed" (only those on a list), "usual" (all but those that no
+    process of the appliance makes) or empty. `landlock` is the ABI of the kernel's Landlock that limits its files and
+    ports; 0 for none.
     """
 
     calls: str
@@ -70,7 +71,7 @@ class LinkOpened(Message):
 
 
 class SocketKept(Message):
-    """Control gives the supervisor a listening socket to keep over control's death (name is unique)."""
+    """Control gives the supervisor a listening socket, under a unique name, to keep when control dies."""
 
     descriptors: ClassVar[int] = 1
     name: str
@@ -83,16 +84,16 @@ class SocketDropped(Message):
 
 
 class SocketRestored(Message):
-    """Supervisor gives a restarted control one kept socket back, or the api the one it serves (`api`)."""
+    """Supervisor returns a kept socket to a restarted control, or gives the api the one it serves (`api`)."""
 
     descriptors: ClassVar[int] = 1
     name: str
 
 
 class SocketsRestored(Message):
-    """All kept sockets have been given back; sent at every start of control, also when there are none.
+    """All kept sockets have been returned; sent at every start of control, even if there are none.
 
-    `announced`: whoever started the appliance has been told what an earlier control said with `Ready`.
+    `announced`: the caller that started the appliance has received the `Ready` of an earlier control.
     """
 
     count: int
@@ -100,7 +101,7 @@ class SocketsRestored(Message):
 
 
 class Announced(Message):
-    """Whoever started the appliance has been told what control said with `Ready`, the first token included."""
+    """The caller that started the appliance has received control's `Ready`, with the first token."""
 
 
 class ProcessesChanged(Message):
@@ -123,13 +124,13 @@ class FirewallReported(Message):
 
 
 class ProbeFailed(Message):
-    """The ROSMaster port could be reached by another user: control stops serving nodes and says why."""
+    """Another user could reach the port of the ROS master: control stops serving nodes and reports why."""
 
     reason: str
 
 
 class ProbePassed(Message):
-    """The ROSMaster port is hidden (again)."""
+    """The port of the ROS master is hidden (again)."""
 
 
 class PolicyReloadRequested(Message):
@@ -143,18 +144,18 @@ class RouteWanted(Message):
 
 
 class RouteFound(Message):
-    """Supervisor's answer to `RouteWanted`; `address` is None where the peer's own route is the right one."""
+    """Supervisor's answer to `RouteWanted`; `address` is None if the peer's own route is the right one."""
 
     host: str
     address: str | None
 
 
 class EndpointWanted(Message):
-    """Control asks at which address hosts of other networks reach the appliance, for their kits."""
+    """Control asks for the address at which hosts of other networks reach the appliance, for their kits."""
 
 
 class EndpointFound(Message):
-    """Supervisor's answer to `EndpointWanted`: the address and why it is that; None: `reason` says why none."""
+    """Supervisor's answer to `EndpointWanted`: the address (None: there is none), and the reason."""
 
     address: str | None
     reason: str
@@ -167,7 +168,7 @@ class LogHeld(Message):
 
 
 class CompilerWanted(Message):
-    """Control has specifications to be read: the compiler is started if it is not there; it ends by itself."""
+    """Control has specifications to compile: the supervisor starts the compiler if it is not running."""
 
 
 class ApplianceStopRequested(Message):
@@ -177,8 +178,8 @@ class ApplianceStopRequested(Message):
 
 
 class StateGiven(Message):
-    """Supervisor gives a relay a memory for the state of its monitors: its `own`, or one of an earlier life of the
-    appliance, to be read only; those come first.
+    """Supervisor gives a relay a memory for the state of its monitors: first those of earlier lives of the appliance,
+    which it only reads, then its `own`.
 
     `boot` names this start of the machine; `offset` and the machine's monotonic clock are the time of monitors (ns).
     `ended_boot` names the start of the machine in which the appliance last ended in order, at `ended_at` (ns since the

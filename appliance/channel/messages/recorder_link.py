@@ -11,9 +11,9 @@ from appliance.channel.messages.message import Message
 class RingGiven(Message):
     """The supervisor gives relay `index`, and the recorder, the memory in which that relay leaves what it receives.
 
-    It was made at `since` (nanoseconds since the epoch). The relay keeps `seconds` of the topics of which a glob of
-    `topics` fits the name, but none of which one of `never` fits the name or the type. `sums` has the md5sums of the
-    types that a glob of `never` fits, as far as they are known: a topic that claims such a type must have its sum.
+    It was made at `since` (nanoseconds since the epoch). The relay keeps `seconds` of the topics whose name matches a
+    glob of `topics`, except those whose name or type matches one of `never`. `sums` has the known md5sums of types that
+    match a glob of `never`: a topic that claims such a type must have its sum.
     """
 
     descriptors: ClassVar[int] = 1
@@ -26,7 +26,7 @@ class RingGiven(Message):
 
 
 class RecordingsAsked(Message):
-    """Control asks which recordings are kept, and to be told again of those that it has not noted."""
+    """Control asks for the list of recordings, and for another report of those that it has not noted."""
 
 
 class RecordingsStated(Message):
@@ -36,7 +36,7 @@ class RecordingsStated(Message):
 
 
 class RevisionsWanted(Message):
-    """The recorder asks what is in force."""
+    """The recorder asks for the revisions in force."""
 
 
 class RevisionsStated(Message):
@@ -47,7 +47,7 @@ class RevisionsStated(Message):
 
 
 class RecordingClosed(Message):
-    """A recording is whole; told again until control has noted it."""
+    """A recording is complete; repeated until control has noted it."""
 
     recording: Recording
 
@@ -58,7 +58,7 @@ class RecordingNoted(Message):
     id: str
 
 
-class RecordingWanted(Message):
+class RecordingRequested(Message):
     """Control asks for a recording from `before` seconds before now (`trigger`) to `after` seconds after."""
 
     number: int
@@ -67,8 +67,8 @@ class RecordingWanted(Message):
     after: float
 
 
-class RecordingBegun(Message):
-    """What was asked for as `number` is in recording `id`, from `began` to `ends` (ns) or later."""
+class RecordingStarted(Message):
+    """The recording of request `number` is `id`, from `began` to `ends` (ns) or later."""
 
     number: int
     id: str
@@ -85,9 +85,9 @@ class RecordingRemovalWanted(Message):
 
 
 class RecordingRemoved(Message):
-    """A recording is gone: for `who` (then `number` is that of the order), or because of `reason`.
+    """A recording was removed: for `who` (then `number` is that of the order), or because of `reason`.
 
-    Told again until control has noted it.
+    Repeated until control has noted it.
     """
 
     number: int
@@ -97,7 +97,7 @@ class RecordingRemoved(Message):
 
 
 class MemoryWanted(Message):
-    """Control asks for what is in memory of the time from `since` to `until` (ns), to be read and not to be kept."""
+    """Control asks for the data in memory from `since` to `until` (ns), to be read but not kept."""
 
     number: int
     trigger: Trigger
@@ -106,14 +106,14 @@ class MemoryWanted(Message):
 
 
 class MemoryLent(Message):
-    """What was asked for as `number` can be read as `recording`, which goes by itself or for later ones."""
+    """The data of request `number` can be read as `recording`, which expires or makes room for later ones."""
 
     number: int
     recording: Recording
 
 
 class RecordingRefused(Message):
-    """What was asked for as `number` is not done; `unknown`: there is no such recording."""
+    """Request `number` was refused; `unknown`: there is no such recording."""
 
     number: int
     reason: str
@@ -121,7 +121,7 @@ class RecordingRefused(Message):
 
 
 class RecordingMissed(Message):
-    """Something that is a trigger made no recording, and why; told once in a while only.
+    """A trigger made no recording, with the reason; sent only now and then.
 
     `planned` is the recording that the trigger's record promised, if it did.
     """
@@ -133,6 +133,6 @@ class RecordingMissed(Message):
 
 RecorderLink = (
     RecordingsAsked | RecordingsStated | RevisionsWanted | RevisionsStated | RecordingClosed | RecordingNoted
-    | RecordingWanted | RecordingBegun | RecordingRemovalWanted | RecordingRemoved | RecordingRefused | RecordingMissed
-    | MemoryWanted | MemoryLent
+    | RecordingRequested | RecordingStarted | RecordingRemovalWanted | RecordingRemoved | RecordingRefused
+    | RecordingMissed | MemoryWanted | MemoryLent
 )  # fmt: skip

@@ -1,6 +1,6 @@
 """The link control <-> relay. Control states what is wanted; the relay reports what it sees.
 
-`key` is the key of an incarnation. One file, as each link has: who changes a message sees those that it goes with.
+`key` is the key of an incarnation. Each link has one file, so that related messages are changed together.
 """
 
 from typing import Any, ClassVar, Literal
@@ -11,7 +11,7 @@ from appliance.channel.messages.message import Message
 
 
 class StateBegan(Message):
-    """Control restates everything: what is not said again before `StateEnded` is gone."""
+    """Control restates everything: facts that it does not restate before `StateEnded` are withdrawn."""
 
     epoch: int
 
@@ -23,18 +23,18 @@ class StateEnded(Message):
 
 
 class OrdersAsked(Message):
-    """Control asks to be told (`OrdersCarriedOut`) when all that it said before this is carried out."""
+    """Control asks for `OrdersCarriedOut` when all its earlier orders are carried out."""
 
 
 class OrdersCarriedOut(Message):
-    """The relay's answer to `OrdersAsked`: they are answered in order."""
+    """The relay's answer to `OrdersAsked`; several are answered in order."""
 
 
 class NodePlaced(Message):
-    """An incarnation and the listening socket that stands for its TCPROS port.
+    """An incarnation, and the listening socket that replaces its TCPROS port.
 
-    `host` is the address the node is called at, `name` the node's name (its `callerid`). `monitors`: it is the
-    appliance's own publisher; what goes out of its port is what monitors publish.
+    `host` is the address at which the node is called, `name` the node's name (its `callerid`). `monitors`: it is the
+    appliance's own publisher, whose port sends the messages that monitors publish.
     """
 
     descriptors: ClassVar[int] = 1
@@ -51,7 +51,7 @@ class NodeWithdrawn(Message):
 
 
 class FlowLimit(msgspec.Struct, frozen=True, array_like=True):
-    """What may pass in a second: messages, bytes; 0 is without a limit."""
+    """The traffic that may pass in a second: messages, bytes; 0 is unlimited."""
 
     messages: float = 0.0
     bytes: float = 0.0
@@ -63,9 +63,9 @@ UNLIMITED = FlowLimit()
 class PublicationPlaced(Message):
     """The incarnation publishes this topic (type as registered, `*` when unknown).
 
-    `limit` is for all publications of the topic on this host, `together` for all of the topic: hosts share that one
-    equally, each as `counted_as`. Said again, it changes them. `named`: the policy names the node's host, and not only
-    everybody (`*`).
+    `limit` is for all publications of the topic on this host, `together` for all of the topic, which hosts (by
+    `counted_as`) share equally. A second statement changes the limits. `named`: the policy names the node's host, not
+    only all hosts (`*`).
     """
 
     key: str
@@ -78,7 +78,7 @@ class PublicationPlaced(Message):
 
 
 class PublicationWithdrawn(Message):
-    """The incarnation publishes this topic no longer: its connections are cut."""
+    """The incarnation no longer publishes this topic: its connections are cut."""
 
     key: str
     topic: str
@@ -94,16 +94,16 @@ class ServicePlaced(Message):
 
 
 class ServiceWithdrawn(Message):
-    """The incarnation offers this service no longer: its connections are cut."""
+    """The incarnation no longer offers this service: its connections are cut."""
 
     key: str
     service: str
 
 
 class GrantInstalled(Message):
-    """This subscriber (host, caller_id) may have this topic of that incarnation, up to a limit.
+    """This subscriber (host, caller_id) may subscribe to this topic of that incarnation, up to a limit.
 
-    Said again, it changes the limit. `named`: the policy names the host, and not only everybody (`*`).
+    A second statement changes the limit. `named`: the policy names the host, not only all hosts (`*`).
     """
 
     key: str
@@ -115,7 +115,7 @@ class GrantInstalled(Message):
 
 
 class GrantRevoked(Message):
-    """The grant is gone; a connection that stands on it is cut."""
+    """The grant is gone; a connection that uses it is cut."""
 
     key: str
     topic: str
@@ -126,7 +126,7 @@ class GrantRevoked(Message):
 class ClientGranted(Message):
     """This client (host, caller_id) may call this service of that incarnation.
 
-    `named`: the policy names the host, and not only everybody (`*`).
+    `named`: the policy names the host, not only all hosts (`*`).
     """
 
     key: str
@@ -137,7 +137,7 @@ class ClientGranted(Message):
 
 
 class ClientRevoked(Message):
-    """The client may no longer call the service; connections that stand on it are cut."""
+    """The client may no longer call the service; connections that use it are cut."""
 
     key: str
     service: str
@@ -162,7 +162,7 @@ class UpstreamFound(Message):
 
 
 class UpstreamRefused(Message):
-    """Answer to `UpstreamWanted`: the publisher cannot be asked or said no; the relay asks again later."""
+    """Answer to `UpstreamWanted`: the publisher cannot be asked or refused; the relay asks again later."""
 
     key: str
     topic: str
@@ -173,9 +173,9 @@ Violation = Literal["", "limit exceeded", "malformed", "connection refused"]
 
 
 class UpstreamLost(Message):
-    """A connection to a publisher broke or could not be made: control looks at the node at once.
+    """A connection to a publisher broke or could not be made: control checks the node at once.
 
-    `violation` is the event to be recorded if it was cut for what the publisher sent; empty for one that broke.
+    `violation` is the event to record if the relay cut it because of the publisher's data; otherwise empty.
     """
 
     key: str
@@ -193,7 +193,7 @@ class LatchRefused(Message):
 
 
 NO_GRANT = "no grant for"
-"""So begins the reason of a `ConnectionRefused` for want of a grant, and of no other."""
+"""The beginning of the reason of a `ConnectionRefused` without a grant, and of no other."""
 
 
 class ConnectionOpened(Message):
@@ -215,9 +215,9 @@ class ConnectionClosed(Message):
 
 
 class ConnectionRefused(Message):
-    """Somebody connected to a relay port and was refused; `resource` is the topic or service that the header asked for.
+    """A connection to a relay port was refused; `resource` is the topic or service that the header asked for.
 
-    `kind` is "topic" or "service", and empty as `resource` is for a header that names neither.
+    `kind` is "topic" or "service"; both are empty for a header that names neither.
     """
 
     key: str
@@ -226,7 +226,7 @@ class ConnectionRefused(Message):
     host: str
     caller_id: str
     reason: str
-    count: int  # repeated identical refusals are folded
+    count: int  # identical refusals are counted together
 
 
 DELAY_BOUNDS = (0.00005, 0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.1)
@@ -234,10 +234,11 @@ DELAY_BOUNDS = (0.00005, 0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.
 
 
 class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
-    """What went through one relayed topic since the last report.
+    """The traffic of one relayed topic since the last report.
 
-    `delays` counts messages by how long the relay took from receiving them to handing them to the subscribers'
-    sockets: up to each of `DELAY_BOUNDS`, and beyond; empty if none was delivered. `delay_seconds` is their sum.
+    `delays` counts messages by the time from their receipt to the write to the subscribers' sockets: up to each of
+    `DELAY_BOUNDS`, and beyond; empty if none was delivered. `delay_seconds` is their sum. `md5sum` is from the
+    publisher's header; empty while it is not known, and for services.
     """
 
     key: str
@@ -248,12 +249,13 @@ class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
     subscribers: int
     delays: list[int] = msgspec.field(default_factory=list)
     delay_seconds: float = 0.0
+    md5sum: str = ""
 
 
 class LimitedRow(msgspec.Struct, frozen=True, array_like=True):
-    """Messages of a publication that were dropped since the last report, because they were beyond a limit.
+    """Messages of a publication that a limit dropped since the last report.
 
-    `part` says whose limit. `host` and `caller_id` are of the publisher, of a subscriber's limit of the subscriber.
+    `part` is the scope of the limit. `host` and `caller_id` are the publisher's, or for a subscriber's limit its own.
     """
 
     key: str
@@ -266,7 +268,7 @@ class LimitedRow(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MessagesLimited(Message):
-    """What limits of the policy dropped; once a second at most."""
+    """The messages that limits of the policy dropped; at most once a second."""
 
     rows: list[LimitedRow]
 
@@ -274,8 +276,8 @@ class MessagesLimited(Message):
 class TrafficReported(Message):
     """Counters of all relayed topics and services that changed; once a second at most.
 
-    `over`: the seconds that they are of. `unrecorded` connections came and went without a control, beyond those that
-    are told one by one. `memory` has the bytes that all hosts hold now, by what they are.
+    `over` is the seconds that they cover. `unrecorded` counts connections that came and went without a control and are
+    not reported one by one. `memory` has the bytes that all hosts hold now, by kind.
     """
 
     rows: list[TopicTraffic]
@@ -287,13 +289,13 @@ class TrafficReported(Message):
 class SpecificationsStated(Message):
     """Control states the specifications in force: before anything is placed, and at every change.
 
-    `part` is what the compiler made for this relay of its specifications (`rosmop/sent.py`; empty: it has none);
-    `enabled` says of each monitor of this relay whether its events happen. `restarted`: a relay that has none yet
-    takes the place of one that died, so monitors with the modifier `hold` block their topics. So do those in `moved`:
-    they come from another relay, and begin here. `statement` is a number of its own for every statement, which the
-    answer has, too: the same revision may be stated again. `ahead`: what is stated after it is carried out when it is
-    in force (or refused), so that nothing is placed where its monitors are not yet. `trials` are the monitors that are
-    on trial: they are given copies of messages. A parametric specification has at most so many `slices`.
+    `part` is this relay's part of the compiled specifications (`rosmop/fast/serialization.py`; empty: it has none).
+    `enabled` has for each monitor of this relay whether its events happen. With `restarted`, a relay without
+    specifications replaces one that died, so monitors with the modifier `hold` block their topics. So do the monitors
+    in `moved`, which come from another relay and begin here. `statement` numbers the statements and is repeated in the
+    answer, because the same revision may be stated again. With `ahead`, later statements are carried out once this one
+    is in force (or refused), so that nothing is placed before its monitors. The monitors in `shadows` are in shadow
+    mode: they get copies of messages. `slices` is the largest number of slices of a parametric specification.
     """
 
     revision: int
@@ -304,7 +306,7 @@ class SpecificationsStated(Message):
     moved: tuple[str, ...] = ()
     statement: int = 0
     ahead: bool = False
-    trials: tuple[str, ...] = ()
+    shadows: tuple[str, ...] = ()
     slices: int = 100_000
 
 
@@ -323,7 +325,7 @@ class MonitorResumed(Message):
 
 class SpecificationsTaken(Message):
     """The relay has these specifications in force. `began` are the monitors that started in their initial state, `held`
-    those that hold their topics, `because` why, of those that hold them because their state is lost.
+    those that hold their topics, `because` the reasons of those that do so because their state is lost.
     """
 
     revision: int
@@ -334,7 +336,7 @@ class SpecificationsTaken(Message):
 
 
 class SpecificationsRefused(Message):
-    """The relay could not take them: what it had stays in force; without any, everything is blocked."""
+    """The relay could not take the specifications: its present ones stay; without any, everything is blocked."""
 
     revision: int
     findings: list[str]
@@ -367,7 +369,7 @@ class OwnServiceCalled(Message):
 
 
 class OwnServiceAnswered(Message):
-    """What came of a call of the appliance's own service, in words."""
+    """The result of a call of the appliance's own service, in words."""
 
     number: int
     success: bool
@@ -375,7 +377,7 @@ class OwnServiceAnswered(Message):
 
 
 class PublicationRefused(Message):
-    """A publisher (or service) is not carried: its definition is another than the specifications'."""
+    """A publisher (or service) is not carried, because its definition differs from that of the specifications."""
 
     key: str
     resource: str
@@ -383,15 +385,15 @@ class PublicationRefused(Message):
 
 
 class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
-    """Something a monitor did: the first of its kind and second in full, the others as a count.
+    """An action of a monitor: the first of its kind and second in full, the others as a count.
 
-    `kind` is verdict, drop, change, fault, log or publish, behind "trial " what one on trial would have done (or
-    "trial missed": what it was not given); `time` is nanoseconds since the epoch; `before` and
-    `after` are the message, as far as the bound goes (`size` is its whole length). `count` is 0 when told in full,
-    else how many more there were. `monitor` is who did it, of a change the last who did; `changed_by` in the detail
-    names the events of all (in a count: if it was more than one monitor). `host` and `caller_id` are of the node that
-    said the message: publisher, client or server (in a count: empty where several of one host did); empty of what
-    happens by time. `number`, `seq` and `stamp` in the detail say which of its messages it was.
+    `kind` is verdict, drop, change, fault, log or publish. With the prefix "shadow " it is what a monitor in shadow
+    mode would have done ("shadow missed": a message that it did not get); `time` is nanoseconds since the epoch;
+    `before` and `after` are the first bytes of the message (`size` is its whole length). `count` is 0 for an event in
+    full, else the number of further ones. `monitor` is the one that acted, for a change the last one; `changed_by` in
+    the detail names the events of all (in a count: if it was more than one monitor). `host` and `caller_id` are those
+    of the message's sender: publisher, client or server (in a count: empty if there were several of one host); empty
+    for timed events. `number`, `seq` and `stamp` in the detail identify the message.
     """
 
     kind: str
@@ -410,44 +412,20 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MonitorsReported(Message):
-    """What monitors did; batches, a few a second at most. `lost` could not be kept while there was no control."""
+    """Events of monitors; batches, a few a second at most. `lost` is the number that could not be kept without a
+    control.
+    """
 
     events: list[MonitorEvent]
     lost: int = 0
 
 
-class Approach(msgspec.Struct, frozen=True, array_like=True):
-    """The sides of a comparison when they were nearest; `time` is nanoseconds since the epoch, to the second."""
-
-    left: float
-    right: float
-    time: int
-
-    @property
-    def distance(self) -> float:
-        """Of the sides."""
-        return abs(self.left - self.right)
-
-
-class MarginRow(msgspec.Struct, frozen=True, array_like=True):
-    """How close a comparison came while it was true (`holds`) or while it was not: since `load`, and `today` (UTC).
-
-    `threshold` is the side that is a constant, 0 or 1; None if neither is.
-    """
-
-    line: int
-    column: int
-    holds: bool
-    threshold: int | None
-    load: Approach
-    today: Approach | None
-
-
 class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     """The state and counters of one running monitor; counters since it was loaded or the relay started.
 
-    Of one on `trial` drops and changes are what it would have done, since it is; `missed` are messages that it was not
-    given as others would be. A parametric specification has so many `slices` now, and at most `slice_limit`.
+    For a monitor in shadow mode (`shadow`), drops and changes are those that it would have made, and `missed` counts
+    messages that it would have received if it were in force. A parametric specification has `slices` slices now, and at
+    most `slice_limit`.
     """
 
     name: str
@@ -460,9 +438,8 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     drops: int
     changes: int
     faults: int
-    trial: bool = False
+    shadow: bool = False
     missed: int = 0
-    margins: list[MarginRow] = []
     slices: int = 0
     slice_limit: int = 0
 
@@ -474,7 +451,7 @@ class MonitorsCounted(Message):
 
 
 class LookWanted(Message):
-    """Somebody wants to see the next messages of a topic, so many at most; the `latched` one first, or not again."""
+    """An operator wants the next messages of a topic, at most `messages`, with or without the `latched` one first."""
 
     number: int
     topic: str
@@ -483,15 +460,15 @@ class LookWanted(Message):
 
 
 class LookEnded(Message):
-    """The look of this number is over."""
+    """The tap with this number is over."""
 
     number: int
 
 
 class MessageSeen(Message):
-    """A message of a look, as subscribers get it: `time` in nanoseconds since 1970, its type and size in bytes.
+    """A message of a tap, as subscribers get it: `time` in nanoseconds since the epoch, its type, its size in bytes.
 
-    `fields` are shortened where they are long; `why` says why there are none but the first bytes.
+    Long `fields` are shortened; `why` is the reason if there are only the first bytes.
     """
 
     number: int

@@ -23,7 +23,7 @@ class SignatureMade(Message):
 
 
 class SignatureRefused(Message):
-    """The signer will not sign this checkpoint (it does not follow what was signed before) and says why."""
+    """The signer's refusal to sign a checkpoint that does not follow the last signed one, with the reason."""
 
     number: int
     reason: str
@@ -50,14 +50,14 @@ class RemovalApproved(Message):
 
 
 class RemovalRefused(Message):
-    """The removal does not follow from the settings; why. `early`: it will, as time passes."""
+    """The removal does not follow from the settings, with the reason. `early`: it will later."""
 
     number: int
     reason: str
     early: bool = False
 
 
-class AuthorityWanted(Message):
+class AuthorityRequest(Message):
     """Control asks the signer for the certificate of the appliance's authority; `number` pairs all these."""
 
     number: int
@@ -73,8 +73,8 @@ class AuthorityStated(Message):
 class CertificateWanted(Message):
     """Control asks for a certificate in this name for the key of a signing request (PKCS #10, PEM).
 
-    With `proof` it is only made when that is a signature, over the bytes of `request`, by the key of the certificate
-    `former` (PEM) of the same name, which the authority must have made.
+    A `proof` must be a signature over the bytes of `request`, by the key of the certificate `former` (PEM), which the
+    authority made for the same name.
     """
 
     number: int
@@ -95,20 +95,20 @@ class CertificateMade(Message):
 
 
 class CertificateRefused(Message):
-    """The signer makes no certificate for this request and says why."""
+    """The signer's refusal to make a certificate for this request, with the reason."""
 
     number: int
     reason: str
 
 
 class RevokedCertificate(msgspec.Struct, frozen=True):
-    """A serial number in hexadecimal, at most 160 bits, and since when (seconds since the epoch)."""
+    """A serial number in hexadecimal, at most 160 bits, and the time of the revocation (seconds since the epoch)."""
 
     serial: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{1,40}$")]
     moment: Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)]
 
 
-class RevocationsWanted(Message):
+class RevocationsRequest(Message):
     """Control asks for the signed list of exactly these revoked certificates."""
 
     number: int
@@ -124,6 +124,6 @@ class RevocationsMade(Message):
 
 SignerLink = (
     SignatureWanted | SignatureMade | SignatureRefused | RemovalWanted | RemovalApproved | RemovalRefused
-    | AuthorityWanted | AuthorityStated | CertificateWanted | CertificateMade | CertificateRefused | RevocationsWanted
+    | AuthorityRequest | AuthorityStated | CertificateWanted | CertificateMade | CertificateRefused | RevocationsRequest
     | RevocationsMade
 )  # fmt: skip

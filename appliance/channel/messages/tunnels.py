@@ -20,7 +20,7 @@ class TunnelsWanted(Message):
 
 
 class TunnelsEnclosed(Message):
-    """Answer to `TunnelsWanted`: the firewall is in force and where ESP runs; else `reason` says why not."""
+    """Answer to `TunnelsWanted`: the firewall is in force, and where ESP runs; otherwise `reason` says why not."""
 
     esp: Esp | None
     reason: str = ""
@@ -33,7 +33,7 @@ class CertificateNeeded(Message):
 
 
 class CharonStarted(Message):
-    """charon runs, in this version; `key_exchange` are the methods that it is let offer, the best first."""
+    """charon runs, in this version; `key_exchange` has the methods that it may offer, the best first."""
 
     version: str
     key_exchange: list[str]
@@ -48,7 +48,7 @@ class TunnelHost(msgspec.Struct, frozen=True):
 
 
 class TunnelsStated(Message):
-    """All that charon is to have: certificates and the list of revoked ones in PEM, the hosts that may come."""
+    """The data that charon needs: certificates and the list of revoked ones in PEM, the hosts that may come."""
 
     number: int
     esp: Esp
@@ -68,9 +68,9 @@ class TunnelChanged(Message):
 
 
 class TunnelRefused(Message):
-    """Somebody at this real address asked for a tunnel and was refused; with `packets`, that many packets were.
+    """A host at this real address asked for a tunnel and was refused; with `packets`, that many packets were.
 
-    What a packet of a tunnel claims to come from is no more than a claim.
+    The source that a packet of a tunnel claims is not verified.
     """
 
     remote: str
@@ -79,7 +79,7 @@ class TunnelRefused(Message):
 
 
 class TunnelSeen(msgspec.Struct, frozen=True):
-    """A tunnel that stands, for so many seconds; bytes as the appliance counts them."""
+    """An established tunnel, its age in seconds, and its bytes as the appliance counts them."""
 
     name: str
     remote: str
@@ -89,7 +89,7 @@ class TunnelSeen(msgspec.Struct, frozen=True):
 
 
 class TunnelsReported(Message):
-    """All tunnels that stand now; charon has taken the statement with the number `taken`."""
+    """All present tunnels; charon has taken the statement with the number `taken`."""
 
     taken: int
     rows: list[TunnelSeen]

@@ -1,0 +1,194 @@
+"""Bodies that REST takes, by the rows of `channel/admin.py` that name them. An unknown field is an error."""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.host_answers import PortsState
+
+HOST_NAME = r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?$"
+ENDPOINT = r"^[A-Za-z0-9][A-Za-z0-9.:-]{0,252}$"
+PORTS = r"^[0-9]{1,5}(?:-[0-9]{1,5})?$"
+SERVICE = r"^(?:tcp|udp)/[0-9]{1,5}(?:-[0-9]{1,5})?$"
+WHOLE = r"(?!\n)"  # after `$`, which in Python also matches before a last newline
+LONGEST_REQUEST = 16 << 10
+LONGEST_DAYS = 398
+LONGEST_TOKEN_SECONDS = 7 * 86_400
+LONGEST_REVISION = 10**15
+Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
+Signature = Annotated[
+    str,
+    told("of the site, where it asks for one: what `rosrv sign FILE` writes to FILE.sig", max_length=8192),
+]
+MonitorName = Annotated[str, msgspec.Meta(min_length=1, max_length=256)]
+FileName = Annotated[
+    str, msgspec.Meta(max_length=200, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,190}\.rv$" + WHOLE)
+]
+Definition = Annotated[
+    str,
+    msgspec.Meta(max_length=200, pattern=r"^[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*\.(msg|srv)$" + WHOLE),
+]
+FileText = Annotated[str, msgspec.Meta(max_length=1 << 20)]
+Definitions = Annotated[
+    dict[Definition, FileText],
+    told(
+        "definitions of messages and services that ROS does not ship, by `package/Type.msg`", max_length=1000
+    ),
+]
+Note = Annotated[str, told("kept with the revision: why", max_length=200)]
+Signatures = Annotated[
+    dict[MonitorName, Signature], told("by the names of files and definitions", max_length=2000)
+]
+HostName = Annotated[str, told("`host:NAME` in the policy", pattern=HOST_NAME + WHOLE)]
+Endpoint = Annotated[str, msgspec.Meta(pattern=ENDPOINT + WHOLE)]
+Service = Annotated[str, msgspec.Meta(pattern=SERVICE + WHOLE)]
+Address = Annotated[str, msgspec.Meta(max_length=64)]
+Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
+GivenMoment = (
+    Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)] | Annotated[str, msgspec.Meta(max_length=64)]
+)
+Days = Annotated[float, told("until the certificate ends", gt=0, le=LONGEST_DAYS)]
+TokenSeconds = Annotated[float, msgspec.Meta(ge=60, le=LONGEST_TOKEN_SECONDS)]
+SigningRequest = Annotated[str, told("PKCS #10, in PEM", min_length=1, max_length=LONGEST_REQUEST)]
+GivenNanoMoment = Annotated[
+    Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)] | Annotated[str, msgspec.Meta(max_length=64)] | None,
+    told("RFC 3339, or nanoseconds since the epoch"),
+]
+
+
+class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A new policy."""
+
+    text: Text
+    note: Annotated[str, told("kept with the revision: why", max_length=200)] = ""
+    signature: Signature = ""
+
+
+class Rollback(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where to go back to; null: the revision before the present one."""
+
+    revision: Annotated[int, msgspec.Meta(ge=1, le=LONGEST_REVISION)] | None = None
+
+
+class NewSpecifications(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Specifications to add, or to put in the place of those in files of the same name."""
+
+    files: Annotated[
+        dict[FileName, FileText], told("texts by the name of the file", min_length=1, max_length=1000)
+    ]
+    definitions: Definitions = {}
+    note: Note = ""
+    signatures: Signatures = {}
+
+
+class NewText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The new text of the file that contains a monitor."""
+
+    text: Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
+    definitions: Definitions = {}
+    note: Note = ""
+    signature: Signature = ""
+    signatures: Annotated[Signatures, told("of the definitions")] = {}
+
+
+class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The wanted state of a monitor: exactly one of `enabled`, `shadow` and `held` (or `trial`)."""
+
+    enabled: bool | None = None
+    for_seconds: Annotated[
+        Annotated[float, msgspec.Meta(gt=0, le=2_592_000)] | None,
+        told("with `enabled` false: enable it again by itself after this time"),
+    ] = None
+    held: Annotated[bool | None, told("false: let its topics go on")] = None
+    shadow: Annotated[
+        bool | None,
+        told("true: shadow mode, it only records what it would have done; false: from there into force"),
+    ] = None
+    trial: Annotated[bool | None, told("the same as `shadow`; deprecated")] = None
+
+    def __post_init__(self) -> None:
+        """Raises `ValueError`."""
+        if [self.enabled, self.held, self.shadow, self.trial].count(None) != 3 or self.held is True:
+            raise ValueError("one of `enabled` (true or false), `shadow` (true or false) and `held` (false)")
+        if self.for_seconds is not None and self.enabled is not False:
+            raise ValueError("`for_seconds` goes with `enabled`: false")
+
+
+class SwitchMany(Switch, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The same for several monitors at once: all of them, or none when there is an unknown name."""
+
+    names: Annotated[list[MonitorName], msgspec.Meta(min_length=1, max_length=1000)]
+
+
+class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The wanted recording: seconds before and after now (null: as configured), and why."""
+
+    before: Annotated[Annotated[float, msgspec.Meta(ge=0)] | None, told("seconds")] = None
+    after: Annotated[Annotated[float, msgspec.Meta(gt=0)] | None, told("seconds")] = None
+    note: Annotated[str, msgspec.Meta(max_length=300)] = ""
+
+
+class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A span of time: from `since` (null: from the first data) to `until` (null: now)."""
+
+    since: GivenNanoMoment = None
+    until: GivenNanoMoment = None
+
+
+class KitWishes(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The contents of a kit besides the certificate."""
+
+    endpoint: Annotated[
+        Endpoint | None,
+        told(
+            "address or name at which the host reaches the appliance; null: `ipsec.endpoint` of the configuration, else"
+            " the machine's address towards its default route (422 when that cannot be told)"
+        ),
+    ] = None
+    ports: Annotated[
+        str, told("the host's local port range, which its firewall closes", pattern=PORTS + WHOLE)
+    ] = "32768-60999"
+    open: Annotated[
+        list[Service], told("services of the host that stay open, such as tcp/22", max_length=100)
+    ] = []
+
+
+class TokenWishes(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A one-time token for a host, new or enrolled before."""
+
+    address: Annotated[Address | None, told("its virtual address; null: the next free one")] = None
+    days: Days = 90
+    token_seconds: TokenSeconds = 3600
+
+
+class NewHost(TokenWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A host to enrol."""
+
+    name: HostName
+    how: Annotated[
+        Literal["token", "kit"],
+        told(
+            "token: the host makes its own key and brings a one-time token (POST /v1/enrol); kit: an archive with a"
+            " private key in it, to be carried there"
+        ),
+    ] = "token"
+    request: Annotated[
+        SigningRequest | None,
+        told("with how=kit: of a key that the host has; the kit has no private key then"),
+    ] = None
+
+
+class NewKit(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A new certificate for an enrolled host, in a kit; the one before is revoked."""
+
+    days: Days = 90
+    request: SigningRequest | None = None
+
+
+class PortsTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The findings of `rosrv protect --check`."""
+
+    state: PortsState
+    open: Annotated[list[Port], msgspec.Meta(max_length=100)] = []
+    checked: Annotated[GivenMoment | None, told("RFC 3339, or seconds since the epoch; null: now")] = None

@@ -1,0 +1,188 @@
+"""Convert HTTP requests to orders, and orders to HTTP requests, by the table of operations.
+
+The api makes an order from each request. Control derives the order again from the request that the client has signed,
+and carries it out only if both are equal: a compromised api cannot use a proof for another order.
+
+The api may only fill in the fields in `Operation.filled`. All other fields that a request leaves out have the defaults
+in `docs/reference/rest.md`.
+"""
+
+import json
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple, get_origin
+from urllib.parse import parse_qs, quote, unquote, urlencode
+
+import msgspec
+
+from appliance.base.timestamps import parse_date
+from appliance.channel.admin import OPERATIONS, AdminRequest, operation_of
+from appliance.channel.messages.api import ClientRequest
+from appliance.channel.rest_operation import Operation, plain
+
+_TAG = re.compile(r'"([\x21\x23-\x7e]{1,90})"')
+_REVISION = re.compile(r"[0-9]{1,18}")
+_NO = frozenset({"", "0", "false", "off", "no", "f", "n"})
+_SECOND = 1_000_000_000
+
+
+class NoOrderError(ValueError):
+    """The request means no order; the text says why."""
+
+
+class BadTagError(NoOrderError):
+    """`If-Match` has no ETag of what the request changes."""
+
+
+class RestCall(NamedTuple):
+    """A request over REST; `match`: it changes whatever is in force (`If-Match: *`)."""
+
+    method: str
+    target: str
+    body: dict[str, Any] | None
+    match: bool
+
+
+def is_dry_run(query: str) -> bool:
+    """Whether a query asks for a dry run."""
+    return parse_qs(query, keep_blank_values=True).get("dry_run", ["0"])[-1].lower() not in _NO
+
+
+def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
+    """Return the order that a request means, or, for a `dry_run`, would mean. Raises `NoOrderError`."""
+    path, _mark, text = asked.target.partition("?")
+    if is_dry_run(text) is not dry_run:
+        raise NoOrderError("a dry run orders nothing")
+    parts = [unquote(part) for part in path.split("/")]
+    try:
+        query = parse_qs(text, keep_blank_values=True)
+        for operation in OPERATIONS:
+            named = _named(operation.path.split("/"), parts)
+            if operation.method == asked.method and named is not None:
+                order = _order(operation, named, query, asked, dry_run=dry_run)
+                if order is not None:
+                    return order
+    except NoOrderError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise NoOrderError(f"the request makes no sense: {type(error).__name__}") from None
+    raise NoOrderError("no order is given there")
+
+
+def filled_in(order: AdminRequest[Any], given: AdminRequest[Any]) -> AdminRequest[Any]:
+    """Return an order with the fields that the request left to the appliance, as `given` has them."""
+    operation = operation_of(order)
+    if operation is None or type(order) is not type(given):
+        return order
+    left = {name: getattr(given, name) for name in operation.filled if not getattr(order, name)}
+    return msgspec.structs.replace(order, **left)
+
+
+def call_of(order: AdminRequest[Any], operation: Operation) -> RestCall:
+    """Return the request for an order by a row of the table, whatever is in force: the inverse of `meant`."""
+    values = msgspec.structs.asdict(order)
+    path, query = operation.path, []
+    for name, field in operation.fields().items():
+        value = values[field.name]
+        if f"{{{name}}}" in path:
+            (text,) = value if isinstance(value, list) else (value,)
+            path = path.replace(f"{{{name}}}", quote(str(text), safe=""))
+        elif field.name in operation.query and value != field.default:
+            query += [(name, _written(one)) for one in (value if isinstance(value, list) else [value])]
+    body = {**operation.says, **{field.name: values[field.name] for field in operation.in_body()}}
+    target = f"{path}?{urlencode(query)}" if query else path
+    return RestCall(operation.method, target, body or None, operation.is_change and "expected" in values)
+
+
+def _written(value: Any) -> str:
+    return str(int(value)) if isinstance(value, bool) else str(value)
+
+
+def _named(template: list[str], parts: list[str]) -> dict[str, str] | None:
+    """Return the parameters of the path; None if the path is another operation's."""
+    if len(template) != len(parts):
+        return None
+    both = list(zip(template, parts, strict=True))
+    if any(word != part for word, part in both if not word.startswith("{")):
+        return None
+    return {word.strip("{}"): part for word, part in both if word.startswith("{")}
+
+
+def _order(
+    operation: Operation,
+    named: Mapping[str, str],
+    query: Mapping[str, list[str]],
+    asked: ClientRequest,
+    *,
+    dry_run: bool,
+) -> AdminRequest[Any] | None:
+    """Return the order; None if the body is another operation's."""
+    fields: dict[str, Any] = dict(operation.fixed)
+    for name, field in operation.fields().items():
+        if name in named:
+            fields[field.name] = _read(field.type, [named[name]])
+        elif field.name in operation.query and name in query:
+            fields[field.name] = _read(field.type, query[name])
+        elif field.name == "expected" and not (dry_run and not asked.if_match):
+            tag = _tag(operation, asked.if_match)
+            fields["expected"] = int(tag) if tag is not None and plain(field.type) is int else tag
+    in_body = operation.in_body()
+    if in_body or operation.says:
+        body = _body(asked)
+        body |= {name: "" for name in operation.filled if body.get(name) is None}
+        if any(body.get(word, said) != said for word, said in operation.says.items()):
+            return None
+        if any(field.required and body.get(field.name) is None for field in in_body):
+            return None
+        fields |= {field.name: _moment(field, body[field.name]) for field in in_body if field.name in body}
+    order: AdminRequest[Any] = msgspec.convert(fields, operation.request)
+    return order
+
+
+def _read(kind: Any, given: list[str]) -> Any:
+    """Return the value of a parameter; if it is given several times, the last counts."""
+    kind = plain(kind)
+    if get_origin(kind) is list:
+        return given
+    if kind is bool:
+        return given[-1].lower() not in _NO
+    return kind(given[-1]) if kind in (int, float) else given[-1]
+
+
+def _moment(field: msgspec.structs.FieldInfo, value: Any) -> Any:
+    """Return a value of the body; a date for a number is that many seconds, or nanoseconds, since the epoch."""
+    kind = plain(field.type)
+    if not isinstance(value, str) or kind not in (int, float):
+        return value
+    try:
+        moment = parse_date(value)
+    except ValueError:
+        raise NoOrderError(
+            f"body.{field.name}: {value[:80]!r} is not a date: write 2026-03-01T12:00:00Z"
+        ) from None
+    return moment if kind is int else moment / _SECOND
+
+
+def _body(asked: ClientRequest) -> dict[str, Any]:
+    kind = asked.content_type.partition(";")[0].strip().lower()
+    if kind == "text/plain":
+        return {"text": asked.body.decode("utf-8")}
+    body = json.loads(asked.body) if asked.body else {}
+    if not isinstance(body, dict):
+        raise NoOrderError("the body is no object")
+    return body
+
+
+def _tag(operation: Operation, if_match: str) -> str | None:
+    """Return the tag in `If-Match`; None for `*`. Raises `BadTagError`."""
+    assert operation.of is not None  # noqa: S101  a request with `expected` changes something that has an ETag
+    given = if_match.strip()
+    if given == "*":
+        return None
+    found = _TAG.fullmatch(given)
+    numbered = plain(operation.fields()["expected"].type) is int
+    if found is None or (numbered and not _REVISION.fullmatch(found[1])):
+        raise BadTagError(
+            f'{if_match[:80]!r} is not an ETag of {operation.of.where}: give the one that GET answers, as in "7"'
+        )
+    return found[1]

@@ -1,0 +1,149 @@
+"""A row of the table of operations: how clients send one request of `channel/admin.py` over REST.
+
+The api's routes (`api/operation_routes.py`), the command line's calls and control's check (`channel/rest_meaning.py`)
+are all derived from the rows.
+"""
+
+import functools
+import types
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin
+
+import msgspec
+
+from appliance.channel.answers.token_answers import TokenRole
+
+ANSWER_SECONDS = 15.0
+R = TypeVar("R", bound=msgspec.Struct)
+
+
+class RequestParameter(NamedTuple):
+    """The description, bounds and name of a field in the path or the query, as FastAPI takes them."""
+
+    name: str
+    rules: Mapping[str, Any]
+
+
+def parameter(description: str = "", *, name: str = "", **rules: Any) -> RequestParameter:
+    """Annotate a field that is in the path or the query; `name` is its name there, if that differs."""
+    return RequestParameter(name, {**({"description": description} if description else {}), **rules})
+
+
+def parameter_of(kind: Any) -> RequestParameter:
+    """Return the parameter that a field is annotated with; for a list without one, that of its elements."""
+    if get_origin(kind) is Annotated:
+        return next(
+            (one for one in kind.__metadata__ if isinstance(one, RequestParameter)), RequestParameter("", {})
+        )
+    return RequestParameter("", {})
+
+
+def plain(kind: Any) -> Any:
+    """Return a type without its annotation, and without None."""
+    while True:
+        if get_origin(kind) is Annotated:
+            kind = get_args(kind)[0]
+        elif get_origin(kind) in (Union, types.UnionType) and type(None) in get_args(kind):
+            (kind,) = (arm for arm in get_args(kind) if arm is not type(None))
+        else:
+            return kind
+
+
+class Versioned(NamedTuple):
+    """Something with an ETag, which a change must name in `If-Match`.
+
+    `where` is the path that has the ETag, `changed` describes 412 in the contract; a change takes at most `seconds`.
+    """
+
+    what: str
+    where: str
+    changed: str
+    seconds: float = ANSWER_SECONDS
+
+
+@dataclass(frozen=True)
+class Operation:
+    """One way to send a request over REST. Without a `role` it needs no token; without a path it serves other routes.
+
+    A field of the request is in the path, in the query, in `If-Match` (`expected`), or else in the body. As a decorator
+    this adds the row for a request, before the rows of the decorators below it.
+    """
+
+    role: TokenRole | None
+    method: str = ""
+    path: str = ""
+    query: tuple[str, ...] = ()
+    # In the contract. If several operations have one path, the one with a name describes it.
+    name: str = ""
+    words: str = ""
+    tag: str = ""
+    status: int = 200
+    good: str = "OK"
+    problems: Mapping[int, str] = field(default_factory=dict)
+    # The kind of the body, which may also be sent as `text` (text/plain).
+    body: type[msgspec.Struct] | None = None
+    text: str = ""
+    # Further fields of the body, and fields that the operation implies. Both distinguish the operations of one path:
+    # the first match is used.
+    says: Mapping[str, Any] = field(default_factory=dict)
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    # The resource that the request changes or reads.
+    of: Versioned | None = None
+    # The action that operators may try in a dry run; and the action of each field that only admins may set.
+    dry_run: str = ""
+    admin_with: Mapping[str, str] = field(default_factory=dict)
+    # Fields that the appliance fills in when the client leaves them out.
+    filled: tuple[str, ...] = ()
+    seconds: float = 0.0
+    request: Any = None
+
+    def __call__(self, request: type[R]) -> type[R]:
+        """Add the row for a request."""
+        words, tag = self.words or request.__doc__ or "", self.tag or "".join(self.path.split("/")[2:3])
+        of = self.of if self.method != "GET" else None
+        seconds = self.seconds or (of.seconds if of is not None else ANSWER_SECONDS)
+        row = replace(self, request=request, words=words, tag=tag, seconds=seconds)
+        _ROWS[request] = (row, *_ROWS.get(request, ()))
+        return request
+
+    @property
+    def is_change(self) -> bool:
+        """Whether this route changes something."""
+        return bool(self.path) and self.method != "GET"
+
+    def fields(self) -> Mapping[str, msgspec.structs.FieldInfo]:
+        """Return the request's fields, by their names in the path and the query."""
+        return _fields(self.request)
+
+    def in_body(self) -> list[msgspec.structs.FieldInfo]:
+        """Return the fields in the body."""
+        return [
+            one
+            for name, one in self.fields().items()
+            if one.name not in {"expected", *self.query, *self.fixed} and f"{{{name}}}" not in self.path
+        ]
+
+    def least(self, given: Mapping[str, Any], *, dry_run: bool = False) -> tuple[TokenRole, str]:
+        """Return the least role that may send these fields, and the reason if that is not the row's role."""
+        for name, doing in self.admin_with.items():
+            if given.get(name):
+                return "admin", f"{doing} is for admins"
+        if self.dry_run:
+            reason = f"{self.dry_run} is for admins; operators may use dry_run=1"
+            return ("operator", "") if dry_run else ("admin", reason)
+        return self.role or "viewer", ""
+
+
+@functools.cache
+def _fields(request: Any) -> Mapping[str, msgspec.structs.FieldInfo]:
+    return {parameter_of(one.type).name or one.name: one for one in msgspec.structs.fields(request)}
+
+
+_ROWS: dict[type, tuple[Operation, ...]] = {}
+rest = Operation
+
+
+def rows() -> dict[type, tuple[Operation, ...]]:
+    """Return the rows of all requests."""
+    return _ROWS
