@@ -1,1 +1,1 @@
-"""The audit log: one record for everything that happens, in a hash chain with signed checkpoints."""
+"""The audit log: a record of every event, in a hash chain with signed checkpoints."""

@@ -1,10 +1,9 @@
-"""The hash chain: what exactly is hashed. No I/O.
+"""Compute the hash chain. No I/O.
 
 Invariants:
-1. Every column of a stored record goes into its hash, and so does the hash of the record before it. The columns go in
-   by their own hash (`content_hash`), so that an export shows the chain without the records that it leaves out.
-   Version 0.1.0 hashed the columns themselves; its records are right as they are.
-2. The encoding is injective: MessagePack of one array, in which every value carries its type and length.
+1. The hash of a record covers the hash of its columns (`content_hash`) and the hash of the previous record. An export
+   can therefore prove the chain without the records that it omits. Version 0.1.0 hashed the columns directly.
+2. The encoding is injective: a MessagePack array, in which every value has its type and length.
 """
 
 import hashlib
@@ -16,7 +15,7 @@ _encoder = msgspec.msgpack.Encoder()
 
 
 class StoredColumns(NamedTuple):
-    """A record as it is stored: the columns of table `record`, in their order, without the hash."""
+    """The columns of table `record`, in order and without the hash."""
 
     sequence: int
     id: str
@@ -40,28 +39,28 @@ class StoredColumns(NamedTuple):
 
 
 def genesis(log_id: str) -> bytes:
-    """The hash that stands before the first record of a log."""
+    """Return the hash before the first record of a log."""
     return hashlib.sha256(b"rosrv audit log\n" + log_id.encode()).digest()
 
 
 def content_hash(columns: tuple[object, ...]) -> bytes:
-    """The hash of what a stored record (`StoredColumns` values) holds, wherever it stands."""
+    """Return the hash of the values of `StoredColumns`, independent of the preceding records."""
     return hashlib.sha256(_encoder.encode(columns)).digest()
 
 
 def link(previous: bytes, content: bytes) -> bytes:
-    """The hash of the record with this content hash that follows the hash `previous`."""
-    # 65 bytes; what version 0.1.0 hashed is longer.
+    """Return the hash of a record with the content hash `content` that follows the hash `previous`."""
+    # 65 bytes; version 0.1.0 hashed more.
     return hashlib.sha256(previous + b"2" + content).digest()
 
 
 def record_hash(previous: bytes, columns: tuple[object, ...]) -> bytes:
-    """The hash of a stored record (`StoredColumns` values) that follows the hash `previous`."""
+    """Return the hash of a record (values of `StoredColumns`) that follows the hash `previous`."""
     return link(previous, content_hash(columns))
 
 
 def follows(previous: bytes, columns: tuple[object, ...], digest: bytes) -> bool:
-    """Whether `digest` is the hash of this record after the hash `previous`, as this version or 0.1.0 made it."""
+    """Whether `digest` is the hash of this record after `previous`, as this version or 0.1.0 computes it."""
     if record_hash(previous, columns) == digest:
         return True
     return hashlib.sha256(previous + _encoder.encode(columns)).digest() == digest

@@ -1,4 +1,4 @@
-"""What a verification finds, as data that the CLI, REST and the console show alike."""
+"""Results of a verification, as the CLI, REST and the console show them."""
 
 import enum
 from typing import Annotated
@@ -6,8 +6,8 @@ from typing import Annotated
 import msgspec
 
 
-class Kind(enum.StrEnum):
-    """What is wrong."""
+class FindingKind(enum.StrEnum):
+    """The kind of a finding."""
 
     CHANGED = "changed"
     MISSING = "missing"
@@ -29,19 +29,19 @@ class Kind(enum.StrEnum):
 
 
 class LogFinding(msgspec.Struct, frozen=True):
-    """One thing that is wrong; `first` and `last` are sequences of records, or numbers of checkpoints."""
+    """A fault of the log; `first` and `last` are sequences of records, or numbers of checkpoints."""
 
-    kind: Kind
+    kind: FindingKind
     first: int
     last: int
     message: str
 
 
 class Elsewhere(msgspec.Struct, frozen=True, kw_only=True):
-    """What checkpoints kept on another machine prove: how many agree with the chain, and how far.
+    """The comparison with checkpoints kept on another machine.
 
-    `through` is the sequence of the last one that agrees, `time` when it was made (nanoseconds since the epoch);
-    `other_logs` are the ids of logs that the others are of.
+    `checkpoints` is the number that agree with the chain. `through` and `time` are the sequence and time (nanoseconds
+    since the epoch) of the last of them; `other_logs` are the ids of the logs that further checkpoints belong to.
     """
 
     checkpoints: int
@@ -51,14 +51,13 @@ class Elsewhere(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Verification(msgspec.Struct, frozen=True, kw_only=True):
-    """The result: `ok` when nothing is wrong.
+    """The result of a verification; `ok` if nothing is wrong.
 
-    `first` and `last` are the sequences of the first and last record; `records` how many there are; `removed`
-    how many retention removed before them; `signed_through` is the sequence up to which the chain is
-    proven by a signature, `unsealed` how many records come after it; `key` the public key it was held
-    against; `elsewhere` what another machine's checkpoints prove, when they were given. `removal` says what vouches for
-    the removal: "" (nothing was removed), "signed", or "unsigned": by a version of before removals were signed, so that
-    nothing proves that they followed from the settings.
+    `records` is the number of records, from sequence `first` to `last`; retention removed all up to sequence `removed`.
+    Signatures prove the chain up to `signed_through`; `unsealed` records come after it. `key` is the public key that
+    was used. `elsewhere` is the comparison with checkpoints of another machine, if they were given. `removal` is ""
+    (no records were removed), "signed", or "unsigned": nothing proves that the settings required the removal, for
+    example because a version that did not sign removals made it.
     """
 
     ok: bool

@@ -1,8 +1,8 @@
-"""Records as evidence: with each, its place in the chain, as far as a signed checkpoint.
+"""Export records with their proofs: their position in the chain, up to a signed checkpoint.
 
-What is exported proves itself elsewhere, also when a filter left most records out: each record has the hash before it
-and its own, the content hashes of those that follow it and are left out (`then`), up to the next record that is
-exported or to the signed checkpoint (`checkpoint`) that seals it. `export_proof.py` holds that against the public key.
+Each exported record has the previous hash, its own hash, and the content hashes of the following records that the
+filter omits (`then`), up to the next exported record or the signed checkpoint that seals it (`checkpoint`).
+`appliance/evidence` verifies this with the public key alone.
 """
 
 import sqlite3
@@ -16,17 +16,17 @@ from appliance.audit.chain import content_hash, genesis, link
 from appliance.audit.copies import SignedCheckpoint
 from appliance.audit.log_database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.query import Filter
-from appliance.audit.record_format import Entry, as_json
+from appliance.audit.record_format import LogEntry, as_json
 from appliance.audit.search import search
 from appliance.signing.signed_statements import NO_CHECKPOINT
 
 _Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 
 
-class Chain(msgspec.Struct, frozen=True, kw_only=True):
-    """The place of a record in the chain; hashes in hexadecimal.
+class ChainProof(msgspec.Struct, frozen=True, kw_only=True):
+    """The position of a record in the chain; hashes are in hexadecimal.
 
-    `then` is None where what follows cannot be shown without its content: version 0.1.0 wrote it.
+    `then` is None if version 0.1.0 wrote the following records, whose hashes cannot be computed without their content.
     """
 
     previous: _Hash
@@ -35,13 +35,13 @@ class Chain(msgspec.Struct, frozen=True, kw_only=True):
     checkpoint: SignedCheckpoint | None = None
 
 
-def evidence(path: Path, wanted: Filter, page: int = 1000) -> Iterator[tuple[Entry, Chain]]:
-    """All records that `wanted` asks for, oldest first, each with its place; a page in memory at a time.
+def evidence(path: Path, wanted: Filter, page: int = 1000) -> Iterator[tuple[LogEntry, ChainProof]]:
+    """Yield the records that match `wanted` with their proofs, oldest first; one page is in memory at a time.
 
     Raises `LogUnreadableError` and `FilterError`.
     """
     cursor: str | None = "0"
-    waiting: Entry | None = None
+    waiting: LogEntry | None = None
     while cursor is not None:
         entries, cursor = search(path, wanted, cursor, page, newest_first=False)
         if waiting is not None:
@@ -51,17 +51,17 @@ def evidence(path: Path, wanted: Filter, page: int = 1000) -> Iterator[tuple[Ent
         waiting = entries[-1] if entries and not last else None
 
 
-def evidence_line(entry: Entry, chain: Chain) -> str:
-    """One line of NDJSON, without the newline: the record as everywhere, and `chain`."""
+def evidence_line(entry: LogEntry, chain: ChainProof) -> str:
+    """Return one line of NDJSON without the newline: the record, and `chain`."""
     return f'{as_json(entry)[:-1]},"chain":{msgspec.json.encode(chain).decode("ascii")}}}'
 
 
-def _placed(path: Path, entries: list[Entry], *, whole: bool) -> Iterator[tuple[Entry, Chain]]:
-    """The records with their places; the last of them only if nothing follows it (`whole`)."""
+def _placed(path: Path, entries: list[LogEntry], *, whole: bool) -> Iterator[tuple[LogEntry, ChainProof]]:
+    """Yield records with their proofs; with `whole` also the last one, which no further page follows."""
     following = [entry.sequence for entry in entries[1:]] + ([0] if whole else [])
     with reading(path) as connection:
         connection.execute("BEGIN")
-        places = Places(connection)
+        places = ChainReader(connection)
         placed = [
             (entry, places.place(entry.sequence, after))
             for entry, after in zip(entries, following, strict=False)
@@ -74,8 +74,8 @@ def _placed(path: Path, entries: list[Entry], *, whole: bool) -> Iterator[tuple[
         yield entry, chain
 
 
-class Places:
-    """The places of records in one state of a log, asked for at sequences that grow."""
+class ChainReader:
+    """A reader of the proofs of records, in ascending order, from one snapshot of a log."""
 
     def __init__(self, connection: sqlite3.Connection) -> None:
         self._connection = connection
@@ -84,8 +84,8 @@ class Places:
         self._unsealed = False
         self._before: tuple[int, str] = (-1, "")
 
-    def place(self, sequence: int, following: int) -> Chain | None:
-        """The place of a record, as far as the next one that is exported (0: none is); None if it is gone by now."""
+    def place(self, sequence: int, following: int) -> ChainProof | None:
+        """Return the proof of a record, up to the next exported one (`following`, 0: none); None if it was removed."""
         query = "SELECT hash FROM record WHERE sequence = ?"
         row = self._connection.execute(query, (sequence,)).fetchone()
         if row is None:
@@ -96,7 +96,7 @@ class Places:
         upto = ends.sequence if ends else following - 1
         previous = self._previous(sequence)
         self._before = sequence, digest.hex()
-        return Chain(
+        return ChainProof(
             previous=previous,
             hash=digest.hex(),
             then=self._contents(digest, sequence, upto) if upto > sequence else [],
@@ -117,7 +117,7 @@ class Places:
         return str(msgspec.json.decode(row[0])["last_hash"]) if row is not None else NO_CHECKPOINT
 
     def _checkpoint(self, sequence: int) -> SignedCheckpoint | None:
-        """The first signed checkpoint that seals a record."""
+        """Return the first signed checkpoint that seals a record."""
         known = self._sealing
         if self._unsealed or (known is not None and known.sequence >= sequence):
             return None if self._unsealed else known
@@ -131,7 +131,7 @@ class Places:
         return self._sealing
 
     def _contents(self, digest: bytes, after: int, upto: int) -> list[str] | None:
-        """The content hashes of the records after one up to another; None where they do not make the chain."""
+        """Return the content hashes of the records from `after` + 1 to `upto`; None if they do not form the chain."""
         rows = self._connection.execute(
             f"SELECT {COLUMNS}, hash FROM record WHERE sequence > ? AND sequence <= ? ORDER BY sequence",  # noqa: S608  fixed names
             (after, upto),

@@ -1,18 +1,16 @@
-"""A record as columns of the database and back. Strangers' text is kept as it is where it can be stored.
+"""Convert records to columns of the database and back.
 
-Lone surrogates (undecodable bytes), integers beyond 64 bits and objects that are no data cannot be stored in
-SQLite or JSON: they become their escaped or printed form. A record is bounded: texts past `LONGEST_TEXT`
-characters are cut and say how long they were; of details past `LARGEST_DETAIL` bytes the smallest are kept, and the
-names of the others.
+SQLite and JSON cannot store lone surrogates (undecodable bytes), integers beyond 64 bits, and arbitrary objects: these
+are escaped, limited or stored as their `repr`. A text longer than `LONGEST_TEXT` characters is cut and marked with its
+length. If the details exceed `LARGEST_DETAIL` bytes, only the smallest are stored, with the names of the others.
 """
 
-from functools import lru_cache
 from typing import Any
 
 import msgspec
 
 from appliance.audit.chain import StoredColumns
-from appliance.audit.record import SCHEMA_VERSION, Record, RuleReference, Severity
+from appliance.audit.record import SCHEMA_VERSION, AuditRecord, RuleReference, Severity
 
 LARGEST_DETAIL = 65_536
 LONGEST_TEXT = 4_096
@@ -30,15 +28,14 @@ _encoder = msgspec.json.Encoder(order="deterministic")
 _decode_detail = msgspec.json.Decoder(dict[str, Any]).decode
 
 
-def to_columns(record: Record, sequence: int) -> StoredColumns:
-    """The columns of a record that takes the place `sequence`. Never fails, whatever the record holds."""
+def to_columns(record: AuditRecord, sequence: int) -> StoredColumns:
+    """Return the columns of a record with this sequence. Never fails, whatever the record contains."""
     try:
         columns = _columns(record, sequence)
         if (
             isinstance(record.detail, dict)
             and len(columns.detail) <= LARGEST_DETAIL
-            and _of_columns(tuple(map(type, columns)))
-            and (_is_usual(columns) or all(map(_storable, columns)))
+            and all(map(_storable, columns, _KINDS))
         ):
             return columns
     except (AttributeError, TypeError, ValueError, OverflowError, RecursionError):
@@ -46,7 +43,7 @@ def to_columns(record: Record, sequence: int) -> StoredColumns:
     return _columns(plain_record(record), sequence)
 
 
-def _columns(record: Record, sequence: int) -> StoredColumns:
+def _columns(record: AuditRecord, sequence: int) -> StoredColumns:
     rule = record.rule
     section, key, file, line = (None,) * 4 if rule is None else (rule.section, rule.key, rule.file, rule.line)
     return StoredColumns(
@@ -57,42 +54,23 @@ def _columns(record: Record, sequence: int) -> StoredColumns:
     )  # fmt: skip
 
 
-@lru_cache(256)
-def _of_columns(kinds: tuple[type, ...]) -> bool:
-    """Whether values of these types can stand in the columns."""
-    return all(kind in known for kind, known in zip(kinds, _KINDS, strict=True))
-
-
-def _is_usual(columns: StoredColumns) -> bool:
-    """Whether a look at all columns together shows that each is storable: texts are short and ASCII."""
-    texts = "".join(filter(None, (columns.id, columns.reason, *columns[4:14])))
-    line, revision, took = columns.rule_line or 0, columns.revision or 0, columns.duration_us or 0
-    numbers = (columns.sequence, columns.time, line, revision, took)
-    return (
-        len(texts) <= LONGEST_TEXT
-        and texts.isascii()
-        and min(numbers) >= 0
-        and max(numbers) <= _LARGEST_INTEGER
-    )
-
-
-def _storable(value: Any) -> bool:
+def _storable(value: Any, kinds: tuple[type, ...]) -> bool:
+    """Whether a column of these types can store a value unchanged."""
     kind = type(value)
     if kind is str:
-        return len(value) <= LONGEST_TEXT and (
-            value.isascii() or not any("\ud800" <= c <= "\udfff" for c in value)
-        )
-    return kind is not int or -_LARGEST_INTEGER <= value <= _LARGEST_INTEGER
+        short = len(value) <= LONGEST_TEXT and kind in kinds
+        return short and (value.isascii() or not any("\ud800" <= c <= "\udfff" for c in value))
+    return kind in kinds and (kind is not int or -_LARGEST_INTEGER <= value <= _LARGEST_INTEGER)
 
 
-def from_columns(columns: StoredColumns) -> Record:
-    """The record that was stored."""
+def from_columns(columns: StoredColumns) -> AuditRecord:
+    """Return the stored record."""
     rule = None
     if columns.rule is not None:
         rule = RuleReference(
             columns.rule, columns.rule_key or "", columns.rule_file or "", columns.rule_line or 0
         )
-    return Record(
+    return AuditRecord(
         id=columns.id, time=columns.time, event=columns.event, severity=Severity(columns.severity),
         decision=columns.decision, host=columns.host, caller_id=columns.caller_id, category=columns.category,
         resource=columns.resource, rule=rule, revision=columns.revision, reason=columns.reason,
@@ -100,8 +78,8 @@ def from_columns(columns: StoredColumns) -> Record:
     )  # fmt: skip
 
 
-def plain_record(record: Record) -> Record:
-    """The same with everything in a form that can be stored, whatever it holds."""
+def plain_record(record: AuditRecord) -> AuditRecord:
+    """Return the record with all values converted to a storable form."""
     rule = record.rule
     if rule is not None:
         rule = RuleReference(_text(rule.section), _text(rule.key), _text(rule.file), _integer(rule.line) or 0)
@@ -110,19 +88,19 @@ def plain_record(record: Record) -> Record:
         detail = {"value": detail}
     if len(_encoder.encode(detail)) > LARGEST_DETAIL:
         detail = _shortened(detail)
-    return Record(
+    return AuditRecord(
         id=_text(record.id), time=_integer(record.time) or 0, event=_text(record.event),
         severity=record.severity if isinstance(record.severity, Severity) else Severity.NOTICE,
         decision=_optional(record.decision), host=_optional(record.host),
         caller_id=_optional(record.caller_id), category=_optional(record.category),
         resource=_optional(record.resource), rule=rule, revision=_integer(record.revision),
         reason=_text(record.reason), duration_us=_integer(record.duration_us), detail=detail,
-        stranger=record.stranger, folds=record.folds,
+        unknown=record.unknown, folds=record.folds,
     )  # fmt: skip
 
 
 def _shortened(detail: dict[str, Any]) -> dict[str, Any]:
-    """The smallest details, and the names of those that are left out."""
+    """Return the smallest details, and the names of the omitted ones."""
     sizes = {key: len(_encoder.encode({key: value})) for key, value in detail.items()}
     kept, room = {}, LARGEST_DETAIL // 4
     for key in sorted(sizes, key=sizes.__getitem__):

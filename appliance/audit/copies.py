@@ -1,13 +1,13 @@
-"""Checkpoints on their way to another machine, and what its copies prove about the log that is here.
+"""Export signed checkpoints to another machine, and verify the log by these copies.
 
-Who is root on the appliance owns the signer's key and its memory, and can write the whole history anew with right
-signatures throughout. He cannot change what another machine was given before. So:
+Root on the appliance has the signer's key and its memory, and can rewrite the whole history with valid signatures, but
+cannot change copies on another machine. Therefore:
 
-1. A copy carries all that was signed, and the signature; it is proof wherever it lies.
-2. A log agrees with a copy when its chain has, at the copy's sequence, the hash that the copy names.
-3. A copy whose signature does not fit proves nothing and is told; copies of other logs are counted, and if there are
-   no others, the log that is here took the place of the one they are of.
-4. Copies that are all of what is removed from the log prove nothing of what is left, and that is told.
+1. A copy has the complete signed text and the signature, so it can be verified anywhere.
+2. A log agrees with a copy if its chain has the copy's hash at the copy's sequence.
+3. A copy with an invalid signature is a finding. Copies of other logs are listed; if all copies are of other logs, this
+   log replaced theirs, which is a finding.
+4. If all copies are of removed records, that is a finding: they prove nothing about the remaining records.
 """
 
 import json
@@ -18,9 +18,9 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.audit.chain_findings import Elsewhere, Kind, LogFinding
+from appliance.audit.chain_findings import Elsewhere, FindingKind, LogFinding
 from appliance.audit.log_database import LogUnreadableError, reading
-from appliance.audit.signatures import signature_is_right
+from appliance.audit.signatures import signature_is_valid
 from appliance.base.input_files import open_given
 from appliance.signing.signed_statements import Checkpoint, parse_checkpoint
 
@@ -31,14 +31,14 @@ _PARAMETER = re.compile(r' ([a-z]+)="([0-9a-f]*)"')
 
 
 class CopiesUnreadableError(Exception):
-    """The file with checkpoints kept elsewhere is missing, or has none; the message says which."""
+    """A file is unreadable or has no checkpoints."""
 
 
 class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A checkpoint with its signature, as it leaves the machine; hashes, signature and key in hexadecimal.
+    """A checkpoint with its signature, as it is exported; hashes, signature and key are in hexadecimal.
 
-    `time` is nanoseconds since the epoch; `removed` says up to which record the log's beginning is removed, where the
-    checkpoint says so. The names are those of the JSON and of the syslog message.
+    `time` is in nanoseconds since the epoch; `removed` is the last record removed from the log's beginning, if known.
+    JSON and syslog messages use these names.
     """
 
     log: str
@@ -53,22 +53,22 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @classmethod
     def of(cls, text: bytes, signature: bytes, key: bytes) -> "SignedCheckpoint":
-        """The checkpoint with this text. Raises `ValueError` if it is none."""
+        """Parse the text of a checkpoint. Raises `ValueError`."""
         return cls(**parse_checkpoint(text)._asdict(), signature=signature.hex(), key=key.hex())
 
     def text(self) -> bytes:
-        """What was signed."""
+        """Return the signed text."""
         return Checkpoint(
             self.log, self.number, self.sequence, self.hash, self.time, self.previous, self.removed
         ).text()
 
     def as_json(self) -> str:
-        """One line of NDJSON, without the newline."""
+        """Return one line of NDJSON, without the newline."""
         return msgspec.json.encode(self).decode("ascii")
 
 
 def signed_checkpoints(log: Path, after: int = 0, limit: int = 1000) -> list[SignedCheckpoint]:
-    """At most `limit` signed checkpoints of the log with numbers above `after`, in order.
+    """Return at most `limit` signed checkpoints of the log with numbers above `after`, in order.
 
     Raises `LogUnreadableError`.
     """
@@ -85,9 +85,9 @@ def signed_checkpoints(log: Path, after: int = 0, limit: int = 1000) -> list[Sig
 
 
 def read_copies(file: Path) -> list[SignedCheckpoint]:
-    """The checkpoints in a file: NDJSON (`rosrv audit checkpoints`), or what a syslog receiver wrote.
+    """Return the checkpoints in a file: NDJSON (`rosrv audit checkpoints`), or the output of a syslog receiver.
 
-    Other lines are passed over. Raises `CopiesUnreadableError` when there is no checkpoint in it.
+    Other lines are skipped. Raises `CopiesUnreadableError` if there is no checkpoint.
     """
     found = []
     try:
@@ -124,8 +124,8 @@ def _parse(line: str) -> SignedCheckpoint | None:
     return copy
 
 
-class CopiesAudit:
-    """Holds the copies against the chain of the log with the id `log`; `key` is the key they must be signed with."""
+class CopiesVerifier:
+    """The verification of copies by the chain of the log with the id `log`; `key` must have signed them."""
 
     def __init__(self, log: str, key: bytes | None, copies: Iterable[SignedCheckpoint]) -> None:
         copies = list(copies)
@@ -136,10 +136,10 @@ class CopiesAudit:
         self.sequences = {copy.sequence for copy in self._copies}
         self._agreeing: list[SignedCheckpoint] = []
         self.removed: list[int] = []
-        """What copies say of how much is removed."""
+        """The values of `removed` in copies."""
 
     def result(self) -> Elsewhere:
-        """What the copies prove."""
+        """Return the number of agreeing copies, and how far they prove the log."""
         last = self._agreeing[-1] if self._agreeing else None
         return Elsewhere(
             checkpoints=len(self._agreeing),
@@ -151,16 +151,16 @@ class CopiesAudit:
     def check(
         self, chain: dict[int, bytes], removed: int, last: int, stored: dict[int, str]
     ) -> Iterator[LogFinding]:
-        """Compare; `chain` has the hash at each of `sequences` that is there, `removed` is how far retention went.
+        """Yield the findings. `chain` has the hashes at `sequences`; `stored` the log's own checkpoints by number.
 
-        `last` is the sequence of the last record; `stored` the hashes of the log's own checkpoints by number.
+        `removed` and `last` are the sequences of the last removed record and of the last record.
         """
         if not self._copies:
             names = ", ".join(self._others)
             message = (
                 f"the checkpoints kept elsewhere are of log {names}; this one, {self._log}, took its place"
             )
-            yield LogFinding(Kind.LOG_REPLACED, 0, 0, message)
+            yield LogFinding(FindingKind.LOG_REPLACED, 0, 0, message)
         found = list(self._compare(chain, removed, last, stored))
         yield from found
         if self._copies and not self._agreeing and not found:
@@ -168,7 +168,7 @@ class CopiesAudit:
                 f"of {len(self._copies)} checkpoints kept elsewhere none is of what is left of the log, which begins"
                 f" after record {removed}: they prove nothing of it"
             )
-            yield LogFinding(Kind.PROVES_NOTHING, 0, removed, message)
+            yield LogFinding(FindingKind.PROVES_NOTHING, 0, removed, message)
 
     def _compare(
         self, chain: dict[int, bytes], removed: int, last: int, stored: dict[int, str]
@@ -187,7 +187,7 @@ class CopiesAudit:
                     f"records {last + 1} to {copy.sequence} are gone from the end: checkpoint {copy.number},"
                     " kept elsewhere, has sealed them"
                 )
-                yield LogFinding(Kind.TRUNCATED, last + 1, copy.sequence, message)
+                yield LogFinding(FindingKind.TRUNCATED, last + 1, copy.sequence, message)
                 return
             here = chain.get(copy.sequence)
             if here is None:
@@ -199,20 +199,22 @@ class CopiesAudit:
             self._agreeing.append(copy)
             if stored.get(copy.number, copy.text().hex()) != copy.text().hex():
                 message = f"checkpoint {copy.number}: another one than was given to the other machine"
-                yield LogFinding(Kind.CHECKPOINT_CHANGED, copy.number, copy.number, message)
+                yield LogFinding(FindingKind.CHECKPOINT_CHANGED, copy.number, copy.number, message)
 
     def _rewritten(self, copy: SignedCheckpoint, proven: int) -> LogFinding:
         message = (
             f"records {proven + 1} to {copy.sequence} are not those that checkpoint {copy.number}, kept elsewhere,"
-            " sealed: history was written anew, by somebody who could sign"
+            " sealed: history was rewritten, by somebody who could sign"
         )
-        return LogFinding(Kind.REWRITTEN, proven + 1, copy.sequence, message)
+        return LogFinding(FindingKind.REWRITTEN, proven + 1, copy.sequence, message)
 
     def _wrong_signature(self, copy: SignedCheckpoint) -> LogFinding | None:
         name, number = f"checkpoint {copy.number}, kept elsewhere", copy.number
         if self._key is not None and copy.key != self._key.hex():
             message = f"{name}: signed with {copy.key}, expected is {self._key.hex()}"
-            return LogFinding(Kind.WRONG_KEY, number, number, message)
-        if not signature_is_right(bytes.fromhex(copy.key), bytes.fromhex(copy.signature), copy.text()):
-            return LogFinding(Kind.SIGNATURE_WRONG, number, number, f"{name}: its signature does not fit it")
+            return LogFinding(FindingKind.WRONG_KEY, number, number, message)
+        if not signature_is_valid(bytes.fromhex(copy.key), bytes.fromhex(copy.signature), copy.text()):
+            return LogFinding(
+                FindingKind.SIGNATURE_WRONG, number, number, f"{name}: its signature does not fit it"
+            )
         return None

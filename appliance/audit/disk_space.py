@@ -1,4 +1,4 @@
-"""Room on the log's disk: looks now and then, and tells when only the reserve is left."""
+"""Watch the free space on the log's disk."""
 
 import os
 import time
@@ -6,13 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 _LOOK_SECONDS = 0.5
-_AGAIN = 1.25  # of the reserve must be free until there is room again: no alarm for each byte
+_AGAIN = 1.25  # times the reserve must be free before space is no longer scarce, so that alarms do not flap
 
 
-class Room:
-    """The room for the log at `path`, of which the last `reserve` bytes are spared.
+class DiskSpace:
+    """The free space on the disk of the log at `path`; the last `reserve` bytes are the reserve.
 
-    `tell(left)` hears, at each look, how much is left of the reserve; None while there is more than that.
+    Each check calls `tell` with the bytes left of the reserve, or None while more than the reserve is free.
     """
 
     def __init__(self, path: Path, reserve: int, tell: Callable[[int | None], None]) -> None:
@@ -23,7 +23,7 @@ class Room:
         self.left: int | None = None
 
     def look(self) -> bool | None:
-        """Look, if it is time to: True when the room has just become scarce, False when it is there again, else None.
+        """Check the disk if a check is due; return True if space just became scarce, False if that just ended, or None.
 
         Raises `OSError`.
         """
@@ -40,7 +40,7 @@ class Room:
 
     @property
     def scarce(self) -> str | None:
-        """What to say of it while only the reserve is left."""
+        """Return the warning while only the reserve is left, or None."""
         if self.left is None:
             return None
         return (

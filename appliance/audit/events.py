@@ -1,7 +1,7 @@
-"""The stable names of what is recorded: the registry that documentation and search filters are made from.
+"""Define the stable names of all events, for the documentation and for search filters.
 
-A name is never reused for something else and never renamed; a new one is added here with its line of
-description before it is recorded.
+A name is never renamed and never reused for another event. A new name is added here, with its description, before it
+is recorded.
 """
 
 from appliance.audit.record import Severity
@@ -16,7 +16,7 @@ EVENTS: dict[str, str] = {
     "replaced": "A node registered again under its name from the same host: the one before was told to shut down.",
     "takeover": "A node registered under a name that another host holds.",
     "policy loaded": "A policy came into force; `detail` has who, from where, and the hash of its text.",
-    "policy confirmed": "A policy that was loaded on trial was confirmed and stays in force.",
+    "policy confirmed": "A policy that was loaded with commit-confirm was confirmed and stays in force.",
     "policy refused": "A new policy has errors and was refused whole; the last good one stays in force.",
     "host enrolled": "A host got a certificate and its virtual address; `detail` has both and who asked.",
     "host renewed": "A host got a new certificate, and the one before was revoked.",
@@ -26,25 +26,25 @@ EVENTS: dict[str, str] = {
     "host awaited": "A one-time token was made: whoever brings it is enrolled as this host.",
     "host awaited no longer": "A one-time token for enrolment was revoked before it was used.",
     "hosts reloaded": "The file of declared hosts was read again; `detail` has what that opened and closed.",
-    "enrolment refused": "Somebody asked to be enrolled and was refused; `host` is the real address.",
+    "enrolment refused": "An enrolment was refused; `host` is the real address.",
     "renewal refused": "A host asked for a new certificate and was refused.",
-    "ports checked": "Somebody tried the ROS ports of a machine from outside and told how they are; `detail` has who.",
+    "ports checked": "The result of a check of a machine's ROS ports from outside was reported; `detail` has who.",
     "topics moved": "Topics or services are carried by another relay process; `detail` has which, and their monitors.",
     "tunnel up": "The tunnel of an enrolled host is up; `host` is its virtual address, `detail` has the real one.",
     "tunnel moved": "A standing tunnel comes from another real address now; `detail` has both.",
     "tunnel down": "The tunnel of an enrolled host is down; nothing of it is accepted until it is back.",
-    "tunnel refused": "Somebody asked for a tunnel and was refused; `host` is the real address, `reason` says why.",
+    "tunnel refused": "A tunnel was refused; `host` is the real address, `reason` says why.",
     "packets refused": "Packets of tunnels were dropped: sent again, or under another's address (user-space ESP only).",
-    "specifications confirmed": "Specifications that were loaded on trial were confirmed and stay in force.",
+    "specifications confirmed": "Specifications that were loaded with commit-confirm were confirmed and stay in force.",
     "specifications loaded": "Specifications of monitors came into force; `detail` has who, which files changed, and"
     " the hashes of all of them and of what they were compiled to, which is what relays run.",
     "specifications refused": "Specifications have errors and were refused whole; those before stay in force.",
     "monitor enabled": "A monitor was switched on; `detail` has who.",
     "monitor disabled": "A monitor was switched off: messages pass it untouched; `detail` has who, and `until` if"
     " it comes back by itself.",
-    "monitor on trial": "A monitor is in shadow mode: it gets copies of messages, and does nothing; `detail` has who.",
-    "trial observed": "What a monitor in shadow mode would have done; `detail.would` is drop, change, verdict, fault,"
-    " log, publish, or `missed`: what it was not given.",
+    "monitor in shadow mode": "A monitor gets copies of messages and has no effect; `detail` has who.",
+    "shadow observed": "A monitor in shadow mode would have done something: `detail.would` is drop, change, verdict,"
+    " fault, log or publish, or `missed` for a message that it did not get.",
     "monitor resumed": "The topics that a monitor held after a restart go on; `detail` has who.",
     "monitors restarted": "A new relay process: monitors began in their initial state, some hold their topics.",
     "topics held": "A monitor's state was lost, so it holds its topics until an operator resumes it.",
@@ -61,14 +61,14 @@ EVENTS: dict[str, str] = {
     "monitor published": "A monitor published a message; `at` is where the statement stands, `conditions` has what led"
     " there; `handler` the verdict in whose handler it was, with its `why`.",
     "publication refused": "A publisher or service has another definition than the specifications; it is not carried.",
-    "recording ordered": "Somebody had messages recorded; `detail` has who, and the seconds before and after.",
+    "recording ordered": "A recording was ordered; `detail` has who, and the seconds before and after.",
     "recording closed": "The flight recorder has a recording; `detail` has its sha256, and what triggered it.",
-    "recording fetched": "Somebody fetched the messages of a recording; `detail` has who.",
-    "recording read": "Somebody read messages of a recording, decoded; `detail` has who, and of which topics.",
+    "recording fetched": "The messages of a recording were fetched; `detail` has who.",
+    "recording read": "Messages of a recording were read, decoded; `detail` has who, and the topics.",
     "recording removed": "A recording was removed: `detail.who` has by whom; `recorder` to make room, or by age.",
     "recording missed": "A trigger made no recording: `reason` says why (the hour's number, the disk);"
     " `detail.recording` is the one that its record had promised.",
-    "topic looked into": "Somebody has messages of a topic shown; `detail` has who, and the `seconds` it covers.",
+    "topic looked into": "Messages of a topic were shown; `detail` has who, and the `seconds` that the record covers.",
     "rest call": "A REST call was answered; `detail` has who (the token's name), method and status.",
     "evidence exported": "A bundle of evidence was made; `detail` has who, the hash of its manifest and its span.",
     "order refused": "RVMaster refused what was asked over REST: no token, role or proof; `detail.verb` says what.",
@@ -83,7 +83,7 @@ EVENTS: dict[str, str] = {
     "malformed": "A peer sent what is no request, or a publisher what is no header; it was refused: see `reason`.",
     "connection opened": "A subscriber or service client is connected through the relay.",
     "connection closed": "A connection through the relay ended.",
-    "connection refused": "Somebody connected without a grant or with a wrong header, or a publisher refused us.",
+    "connection refused": "A connection had no grant or a wrong header, or a publisher refused the appliance.",
     "limit exceeded": "A peer sent more, larger or faster than the limits allow.",
     "rate limited": "Messages beyond a limit of the policy ([Limits]) were dropped; `rule` has the limit,"
     " `detail.count` how many they were.",
@@ -135,4 +135,4 @@ SEVERITIES: dict[str, Severity] = {
     }.items()
     for name in names
 }  # fmt: skip
-"""How much a person should care, where that is always the same; what records one of the others says it, or is INFO."""
+"""The severity of each event for which it is fixed. For other events, the recording code gives it; default: INFO."""

@@ -1,48 +1,47 @@
-"""Folds repetitions, so that no flood pushes evidence out of the log or fills the disk. No I/O; time is given.
+"""Fold repetitions, so that a flood cannot push evidence out of the log or fill the disk. No I/O, no clock.
 
-What is folded are denials, what peers get wrong, and what passed and only reads, or is of a host that is beyond its
-budget (`Record.folds`). Invariants:
+Denials, errors of peers, allowed reads, and records of a host above its budget are folded (`AuditRecord.folds`).
 
-1. The first of its kind is recorded in full; every repetition is counted in exactly one summary. A record
-   that stands for many, because who reported it had counted them (`count`), is as many repetitions.
-2. Memory is bounded, and shared: kinds of denials are a pool (`AUDIT_KINDS`) in which strangers together have a small
-   share, so nothing that strangers do takes a kind from a host that the policy names. Past its share a host's further
-   denials are one kind of that host, strangers' one kind of all of them. Kinds of what passed are a pool of their own
-   (`AUDIT_READ_KINDS`); past it a decision is recorded in full, because a policy is learned from all of them.
-3. A kind is forgotten when it did not repeat for `seconds`; its next record is in full again.
-4. An allow for the same host, caller and request ends the denials it contradicts, and a denial what passed: their
-   summaries come before it, and it is in full.
-5. What is counted is kept on disk: a kind is told by texts that can be stored (`kinds.keepable`).
-6. What passed only because a policy is on trial (`would deny`) is never folded.
+1. The first record of a kind is written in full; every repetition counts in exactly one summary. A record with a
+   `count` counts that many times.
+2. Memory is limited: the kinds of denials are a pool (`AUDIT_KINDS`), of which all unknown hosts together get a small
+   quota, so they cannot displace hosts that the policy names. Above a host's quota, its further denials are one kind;
+   those of all unknown hosts share one. The kinds of reads are another pool (`AUDIT_READ_KINDS`). Above it, decisions
+   are written in full, because policies are learned from them.
+3. A kind without repetition for `seconds` is forgotten; its next record is written in full.
+4. An allow ends the denials of the same host, caller and request, and a denial ends the allows. Their summaries are
+   written first, then the record in full.
+5. Counts are stored on disk, so the key of a kind has only storable texts (`storable`).
+6. A `would deny` of an audit-only policy is never folded.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from appliance.audit.record import Record
+from appliance.audit.record import AuditRecord
 from appliance.audit.repetition import (
     ALL,
+    ALL_UNKNOWN,
     HOST,
     KIND,
-    STRANGER,
-    STRANGERS,
+    UNKNOWN,
     FoldState,
     Key,
-    keepable,
     kind_of,
     new_state,
+    storable,
     subject,
     summary,
 )
-from appliance.quotas.pool import Bounds, Pool, Standing
+from appliance.quotas.pool import Bounds, Pool, QuotaClass
 from appliance.quotas.table import AUDIT_KINDS, AUDIT_READ_KINDS
 
-_Holder = tuple[str | None, Standing]
+_Holder = tuple[str | None, QuotaClass]
 
 
 @dataclass(frozen=True)
 class FoldSettings:
-    """How repetitions are folded: a summary every `seconds`; 0 records everything in full."""
+    """The settings of folding. A summary is written every `seconds`; 0 writes every record in full."""
 
     seconds: float = 10.0
     kinds: Bounds = AUDIT_KINDS.bounds
@@ -58,7 +57,7 @@ class FoldSettings:
 
 @dataclass(slots=True)
 class _Kind:
-    """A kind that is counted: its state, its place in a pool, and the subject that an answer to the contrary ends."""
+    """A counted kind: its state, its pool and holder, and the subject whose contrary decision ends it."""
 
     state: FoldState
     pool: Pool[_Holder]
@@ -66,64 +65,61 @@ class _Kind:
     subject: Key | None
 
 
-class Folder:
-    """Decides of each record whether it is written in full or counted.
-
-    `make_id` gives the summaries their ids; `now` is seconds of a clock that is never set back.
-    """
+class RecordFolder:
+    """The decision whether each record is written in full or counted. `now` is in monotonic seconds."""
 
     def __init__(self, settings: FoldSettings, make_id: Callable[[], str], clock: Callable[[], int]) -> None:
         self._settings = settings
         self._make_id = make_id
         self._clock = clock
         self._kinds: dict[Key, _Kind] = {}
-        self._coming: dict[Key, Record] = {}
-        """Denials that the owner will offer, by their kind; of each the first, where it was not there yet."""
-        self._coming_as: dict[str, Key] = {}  # by their ids
+        self._coming: dict[Key, AuditRecord] = {}
+        """The first denial of each new kind, before the owner offers it."""
+        self._coming_as: dict[str, Key] = {}  # the keys, by id of the record
         self._due: dict[Key, float] = {}
         self._by_subject: dict[Key, set[Key]] = {}
-        self._denials: Pool[_Holder] = Pool("kinds of denials", settings.kinds, _standing)
-        self._reads: Pool[_Holder] = Pool("kinds of reads", settings.read_kinds, _standing)
+        self._denials: Pool[_Holder] = Pool("kinds of denials", settings.kinds, _quota_class)
+        self._reads: Pool[_Holder] = Pool("kinds of reads", settings.read_kinds, _quota_class)
         self.touched: set[Key] = set()
 
     def __len__(self) -> int:
         return len(self._kinds)
 
     def state(self, key: Key) -> FoldState | None:
-        """What is counted under a key now; None when there is nothing to keep."""
+        """Return the counts of a key, or None."""
         kind = self._kinds.get(key)
         return kind.state if kind is not None and kind.state.count else None
 
-    def in_full(self, record: Record) -> str:
-        """The id of the record in full that a denial repeats; else its own, or none if it is counted among others.
+    def in_full(self, record: AuditRecord) -> str:
+        """Return the id of the record that a denial repeats, else its own; empty if its kind is a collective one.
 
-        By the owner, before it offers the record. What was not offered yet (the log gathers) is remembered, so that a
-        repetition in the same moment finds it.
+        The owner calls this before it offers the record. Denials that are not offered yet are stored, so that an
+        immediate repetition finds them.
         """
         if record.decision != "deny" or not self._settings.seconds:
             return record.id
-        plain = keepable(record)
+        plain = storable(record)
         key = narrow = kind_of(plain)
         if key not in self._coming:
             key, _ = self._denial_key(plain, self._coming_beside(plain))
         kind = self._kinds.get(key)
-        first: Record | FoldState = self._coming.setdefault(key, record) if kind is None else kind.state
+        first: AuditRecord | FoldState = self._coming.setdefault(key, record) if kind is None else kind.state
         if first is record:
             self._coming_as[record.id] = key
             return record.id
         same = key == narrow and (first.caller_id, first.resource) == (record.caller_id, record.resource)
-        known = first.id if isinstance(first, Record) else first.recorded_id
-        return known if same else ""  # what is over, and a kind of a stranger, is of many things
+        known = first.id if isinstance(first, AuditRecord) else first.recorded_id
+        return known if same else ""  # overflow kinds and kinds of unknown hosts are collective
 
-    def _coming_beside(self, record: Record) -> int:
-        """How many kinds will be of the share that a denial is charged to, and are not there yet."""
-        host, standing = _holder(record)
-        strangers = standing is Standing.STRANGER
+    def _coming_beside(self, record: AuditRecord) -> int:
+        """Return the number of new, not yet offered kinds in the quota that a denial is charged to."""
+        host, quota_class = _holder(record)
+        unknown = quota_class is QuotaClass.UNKNOWN
         waiting = list(self._coming.values())  # another thread takes from it
-        return sum(other.stranger if strangers else other.host == host for other in waiting)
+        return sum(other.unknown if unknown else other.host == host for other in waiting)
 
-    def offer(self, record: Record, now: float) -> Iterator[Record]:
-        """The records to write for this one: itself, nothing (counted), or summaries and itself."""
+    def offer(self, record: AuditRecord, now: float) -> Iterator[AuditRecord]:
+        """Yield the records to write: due summaries, then the record itself unless it is only counted."""
         if not self._settings.seconds:
             yield record
             return
@@ -131,16 +127,16 @@ class Folder:
         if not (denial or record.folds or (record.decision == "allow" and self._by_subject)):
             yield record
             return
-        plain = keepable(record)
+        plain = storable(record)
         if denial or record.decision == "allow":
             yield from self._end_contradicted(plain)
         if not (denial or record.folds) or not self._counted(plain, denial=denial, now=now):
             yield record
         key = self._coming_as.pop(record.id, None)
         if key is not None:
-            del self._coming[key]  # from now on its kind is there, or that of its host
+            del self._coming[key]  # now its kind, or its host's kind, exists
 
-    def _counted(self, record: Record, *, denial: bool, now: float) -> bool:
+    def _counted(self, record: AuditRecord, *, denial: bool, now: float) -> bool:
         key, scope = self._denial_key(record) if denial else self._passing_key(record)
         kind = self._kinds.get(key)
         if kind is not None:
@@ -158,34 +154,34 @@ class Folder:
             self._by_subject.setdefault(about, set()).add(key)
         return False
 
-    def _denial_key(self, record: Record, coming: int = 0) -> tuple[Key, str]:
-        """The kind that a denial is counted in, and its scope, when `coming` kinds more are of its share."""
+    def _denial_key(self, record: AuditRecord, coming: int = 0) -> tuple[Key, str]:
+        """Return the key and scope of a denial's kind, given `coming` pending kinds in its quota."""
         key = kind_of(record)
         if key in self._kinds or not self._denials.refusal(_holder(record), 1 + coming):
-            return key, STRANGER if record.stranger else KIND
-        if record.stranger:
-            return (STRANGERS, record.event, record.decision), STRANGERS
+            return key, UNKNOWN if record.unknown else KIND
+        if record.unknown:
+            return (ALL_UNKNOWN, record.event, record.decision), ALL_UNKNOWN
         host = (HOST, record.host, record.event, record.decision)
-        # A host has a line of its own however many kinds others have; there are more hosts than memory, too.
+        # Each host gets its own kind, while the memory for kinds suffices.
         if host in self._kinds or len(self._kinds) < 2 * self._settings.kinds.whole:
             return host, HOST
         return (ALL, record.event, record.decision), ALL
 
-    def _passing_key(self, record: Record) -> tuple[Key, str]:
+    def _passing_key(self, record: AuditRecord) -> tuple[Key, str]:
         key = kind_of(record)
         if key in self._kinds or record.decision is not None or not self._reads.refusal(_holder(record)):
             return key, KIND
         return (HOST, record.host, record.event, record.decision), HOST
 
-    def _end_contradicted(self, record: Record) -> Iterator[Record]:
+    def _end_contradicted(self, record: AuditRecord) -> Iterator[AuditRecord]:
         for key in tuple(self._by_subject.get(subject(record), ())):
             if self._kinds[key].state.decision != record.decision:
                 yield from self._summary(key)
                 self._forget(key)
 
-    def expire(self, now: float) -> Iterator[Record]:
-        """The summaries that are due; kinds that did not repeat are forgotten."""
-        # Due times are in order of insertion: a kind that stays is put back at the end.
+    def expire(self, now: float) -> Iterator[AuditRecord]:
+        """Yield the summaries that are due; forget kinds without repetition."""
+        # Due times are in order of insertion, so a kind that stays is moved to the end.
         while self._due:
             key = next(iter(self._due))
             if self._due[key] > now:
@@ -198,11 +194,11 @@ class Folder:
                 self._forget(key)
 
     def next_due(self) -> float | None:
-        """When `expire` has something to do next."""
+        """Return when `expire` is due next."""
         return next(iter(self._due.values()), None)
 
-    def finish(self) -> Iterator[Record]:
-        """All summaries, at the end."""
+    def finish(self) -> Iterator[AuditRecord]:
+        """Yield all summaries, and forget all kinds."""
         for key in tuple(self._kinds):
             yield from self._summary(key)
             self._forget(key)
@@ -217,18 +213,18 @@ class Folder:
             if not keys:
                 del self._by_subject[kind.subject]
 
-    def _summary(self, key: Key) -> Iterator[Record]:
+    def _summary(self, key: Key) -> Iterator[AuditRecord]:
         state = self._kinds[key].state
         if state.count:
             yield summary(state, self._make_id(), self._clock())
-            state.begin_anew()
+            state.reset()
             self.touched.add(key)
 
 
-def _holder(record: Record) -> _Holder:
-    """Whose share a kind is of; what is nobody's is counted like a named host's."""
-    return record.host, Standing.STRANGER if record.stranger else Standing.NAMED
+def _holder(record: AuditRecord) -> _Holder:
+    """Return the holder to whose quota a kind is charged; records without a host count as those of a named host."""
+    return record.host, QuotaClass.UNKNOWN if record.unknown else QuotaClass.NAMED
 
 
-def _standing(holder: _Holder) -> Standing:
+def _quota_class(holder: _Holder) -> QuotaClass:
     return holder[1]

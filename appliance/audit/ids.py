@@ -1,9 +1,8 @@
-"""Record ids: sortable by time, unique, and growing even when the clock is set back.
+"""Make record ids: sortable by time, unique, and ascending even if the clock is set back.
 
-An id is 20 lower-case hexadecimal characters: nanoseconds since the epoch (16) and four random ones of this
-source, so that ids made by two processes in the same nanosecond differ. The time part never stands still and
-never goes back: with the clock set back it counts on from the last id. Over a restart the last id of the log
-is the floor (`after`), which `AuditLog.ids` sees to.
+An id has 20 lower-case hexadecimal characters: nanoseconds since the epoch (16), and four random ones for each source,
+so that ids of two processes in the same nanosecond differ. The time part always grows: if the clock is set back, it
+counts on from the last id. After a restart it continues after the last id of the log.
 """
 
 import secrets
@@ -16,7 +15,7 @@ _TIME_DIGITS = 16
 
 
 class IdSource:
-    """Makes ids, each greater than the one before and than `after`; safe to use from several threads."""
+    """A source of ids, each greater than the previous id and than `after`; thread-safe."""
 
     def __init__(self, after: str = "", clock: Callable[[], int] = time.time_ns) -> None:
         self._last = int(after[:_TIME_DIGITS], 16) if after else 0
@@ -25,7 +24,7 @@ class IdSource:
         self._lock = threading.Lock()
 
     def next(self) -> str:
-        """The next id."""
+        """Return the next id."""
         with self._lock:
             now = self._clock()
             self._last = now if now > self._last else self._last + 1
@@ -33,11 +32,11 @@ class IdSource:
 
     @property
     def ahead(self) -> float:
-        """By how many seconds the last id is later than the clock, which was set back then; else 0."""
+        """Return by how many seconds the last id is later than the clock (which was set back), or 0."""
         return max(0.0, (self._last - self._clock()) / 1e9)
 
     def raise_floor(self, after: str) -> None:
-        """Make only ids greater than `after` from now on."""
+        """Make the next ids greater than `after`."""
         if after:
             with self._lock:
                 self._last = max(self._last, int(after[:_TIME_DIGITS], 16))

@@ -1,7 +1,7 @@
-"""Who keeps the log from being written: SQLite's locks on its files, as the kernel lists them.
+"""Find the processes that hold SQLite's write locks on the log, in the kernel's list of locks.
 
-Whoever may read an SQLite database may also hold its locks. A reader that is in order never holds those that are looked
-for here. The files themselves are not opened: closing a file gives up every lock that this process has on it.
+Every reader of an SQLite database is able to lock it, but a correct reader never takes the locks searched here. The
+files are not opened, because closing a file releases all locks of this process on it.
 """
 
 from pathlib import Path
@@ -12,9 +12,9 @@ _OF_THE_DATABASE = range(0x40000000, 0x40000002)  # bytes of the database: pendi
 
 
 def holders(log: Path) -> list[int]:
-    """The processes that hold a lock that only a writer of `log` needs; empty where the kernel does not say.
+    """Return the processes that hold a lock which only a writer of `log` needs; empty if the list is not readable.
 
-    -1 stands for a lock that the kernel does not list with a process (one of an open file description).
+    -1 is a lock without a process (an open file description lock).
     """
     bytes_of = {}
     for path, needed in ((log.with_name(f"{log.name}-shm"), _OF_WRITING), (log, _OF_THE_DATABASE)):
@@ -28,7 +28,7 @@ def holders(log: Path) -> list[int]:
         return []
     found = set()
     for line in lines:
-        # `1: POSIX  ADVISORY  READ 4711 fe:00:2190450 120 120`; who waits has `->` behind the number
+        # `1: POSIX  ADVISORY  READ 4711 fe:00:2190450 120 120`; a waiting process has `->` after the number
         words = line.split()
         if len(words) != 8 or words[1] not in {"POSIX", "OFDLCK"}:
             continue

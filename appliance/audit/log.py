@@ -1,12 +1,11 @@
-"""The audit log as its owner sees it: `record` puts a record into a queue, a thread writes it.
+"""Write the audit log: `record` puts a record into a queue, and the log's thread writes it.
 
-Invariants:
-1. `record` never blocks and never raises: it appends to a queue. All else is done by the log's own thread.
-2. Order is kept: what was recorded first has the smaller sequence.
-3. Nothing is dropped silently: while the log cannot be written (`failed`), records wait, up to `queue_limit`;
-   those past it are counted and the count is recorded when writing works again.
-4. Who waits (`wait_durable`) is answered when every record before is on disk (fsync), or with the reason why it is
-   not; a denial that was folded is on disk as a count.
+1. `record` never blocks and never raises: it only appends to a queue.
+2. Records keep their order.
+3. No record is dropped silently. While the log cannot be written (`failed`), up to `queue_limit` records wait; further
+   ones are counted, and the count is recorded later.
+4. `wait_durable` returns when all earlier records are on disk (fsync), or returns why they are not. Folded denials are
+   on disk as a count.
 """
 
 import asyncio
@@ -26,21 +25,20 @@ import msgspec
 import structlog
 
 from appliance.audit.budget import Budget
-from appliance.audit.disk_space import Room
-from appliance.audit.folding import Folder, FoldSettings
-from appliance.audit.housekeeping import WRITE_ERRORS, Checkpoints, Housekeeping
+from appliance.audit.disk_space import DiskSpace
+from appliance.audit.folding import FoldSettings, RecordFolder
+from appliance.audit.housekeeping import WRITE_ERRORS, CheckpointSchedule, Housekeeping
 from appliance.audit.ids import IdSource
 from appliance.audit.lock_holders import holders
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.log_writer import ChainWriter
-from appliance.audit.losses import Lost
-from appliance.audit.record import Record, Severity
+from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.removal import Remover
 from appliance.audit.repetition import summary
 from appliance.audit.retention import Retention
 from appliance.audit.signatures import RemovalSigner, Signatures, Signer
 from appliance.audit.waiters import Waiter, answer
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_RESERVE
 
 Durability = Literal["strict", "batched"]
@@ -53,21 +51,42 @@ _logger = structlog.get_logger()
 
 
 class Lag(NamedTuple):
-    """How far the disk is behind: records that wait, and seconds since nothing waited."""
+    """The number of waiting records, and the seconds since the queue was last empty."""
 
     records: int
     seconds: float
 
 
+class _LossCounter:
+    """A counter of records that did not fit into the queue; thread-safe."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._first = self._last = 0
+        self._lock = threading.Lock()
+
+    def add(self, record: AuditRecord) -> None:
+        with self._lock:
+            self._first = self._first if self.count else record.time
+            self._last = record.time
+            self.count += 1
+
+    def take(self) -> dict[str, Any]:
+        """Return the detail of the record about the losses, and reset the counter."""
+        with self._lock:
+            detail = {"count": self.count, "first_time": self._first, "last_time": self._last}
+            self.count = 0
+            return detail
+
+
 class AuditLog:
     """The log at `path`, open for writing.
 
-    `durability` says when writing starts: `strict` at once (group commit), `batched` after 20 ms; both
-    fsync. A checkpoint is made every `checkpoint_every` records or `checkpoint_seconds`, whichever is first,
-    and `signer(number, text)` is called for it *on the log's thread*; the owner answers with `signed` or
-    `refused`. `removals(number, checkpoint, newest)` asks for the signature over a removal, in the same way; the answer
-    is `removal_approved` or `removal_refused`. `held_by(processes)` is told, on that thread too, which processes keep
-    the log locked. `budget` says what hosts owe for their records; below `reserve` bytes on the disk that is less.
+    `durability`: `strict` writes at once (group commit), `batched` after 20 ms; both fsync. A checkpoint is made every
+    `checkpoint_every` records or `checkpoint_seconds`. The log's thread then calls `signer(number, text)`, and the
+    owner answers with `signed` or `refused`. Likewise, `removals(number, checkpoint, newest)` requests the signature of
+    a removal; the answer is `removal_approved` or `removal_refused`. `held_by` is called with the processes that lock
+    the log. `budget` has the debts of hosts, with smaller bounds below `reserve` free bytes.
     """
 
     def __init__(
@@ -84,7 +103,7 @@ class AuditLog:
         budget: Budget | None = None,
         reserve: int = AUDIT_RESERVE.bounds.whole,
         queue_limit: int = 100_000,
-        held_by: Callable[[list[int]], None] = lambda processes: None,  # noqa: ARG005  nobody asks
+        held_by: Callable[[list[int]], None] = lambda processes: None,  # noqa: ARG005  ignored
         clock: Callable[[], int] = time.time_ns,
     ) -> None:
         self.path = path
@@ -93,16 +112,16 @@ class AuditLog:
         self._clock = clock
         self._queue_limit = queue_limit
         self._held_by = held_by
-        self.budget = budget or Budget(lambda _host: Standing.NAMED)
-        self._room = Room(path, reserve, self.budget.room)
-        self._folder = Folder(fold or FoldSettings(), self.ids.next, clock)
+        self.budget = budget or Budget(lambda _host: QuotaClass.NAMED)
+        self._room = DiskSpace(path, reserve, self.budget.room)
+        self._folder = RecordFolder(fold or FoldSettings(), self.ids.next, clock)
         self._signatures = Signatures(path, signer)
-        self._queue: deque[Record | Waiter | Callable[[], None]] = deque()
-        self._held: list[Record] = []
-        self._house = Housekeeping(
+        self._queue: deque[AuditRecord | Waiter | Callable[[], None]] = deque()
+        self._held: list[AuditRecord] = []
+        self.housekeeping = Housekeeping(
             path,
             self._signatures,
-            Checkpoints(checkpoint_every, checkpoint_seconds),
+            CheckpointSchedule(checkpoint_every, checkpoint_seconds),
             Remover(
                 retention or Retention(),
                 self._signatures,
@@ -119,7 +138,7 @@ class AuditLog:
         self._failed: str | None = "the log is being opened"
         self._failed_since = 0
         self._caught_up = self._written_at = time.monotonic()
-        self._lost = Lost()
+        self._lost = _LossCounter()
         self._idle = False
         self._ended = False
         self._counts_recovered = False
@@ -129,19 +148,19 @@ class AuditLog:
         self._hurry = threading.Event()
         self._stopping = threading.Event()
         self._opened = threading.Event()
-        said_with_logs = contextvars.copy_context()  # which process this is
+        log_context = contextvars.copy_context()  # the name of this process
         self._thread = threading.Thread(
-            target=said_with_logs.run, args=(self._run,), name="audit log", daemon=True
+            target=log_context.run, args=(self._run,), name="audit log", daemon=True
         )
         self._thread.start()
         self._opened.wait()
 
     # --- for the owner, from any thread ---------------------------------------------------------------------
 
-    def record(self, record: Record) -> str:
-        """Take a record into the log; the id by which it is found there: its own, that of the one it repeats, or none.
+    def record(self, record: AuditRecord) -> str:
+        """Queue a record; return its id, the id of the record that it repeats, or "" if it counts in a collective kind.
 
-        Its `detail` must not be changed afterwards.
+        The caller must not change `detail` afterwards.
         """
         if self._is_full:
             self._lost.add(record)
@@ -156,7 +175,7 @@ class AuditLog:
         return len(self._queue) + len(self._held) >= self._queue_limit
 
     async def wait_durable(self) -> str | None:
-        """Wait until all that was recorded so far is on disk; the reason when it cannot be written."""
+        """Wait until all records so far are on disk; return the reason if they cannot be written."""
         loop = asyncio.get_running_loop()
         future: asyncio.Future[str | None] = loop.create_future()
         self._put(Waiter(loop, future))
@@ -165,54 +184,54 @@ class AuditLog:
         return await future
 
     async def wait_signed(self) -> str | None:
-        """Wait until a signed checkpoint, made now, seals all that was recorded; the reason when it is refused."""
+        """Wait until a signed checkpoint seals all records so far; return the reason if its signature is refused."""
         loop = asyncio.get_running_loop()
         future: asyncio.Future[str | None] = loop.create_future()
-        self._put(partial(self._house.seal_now, Waiter(loop, future)))
+        self._put(partial(self.housekeeping.seal_now, Waiter(loop, future)))
         self._hurry.set()
         return await future
 
     @property
     def failed(self) -> str | None:
-        """Why the log cannot be written now; None when it can."""
+        """Return why the log cannot be written now, or None."""
         return self._failed
 
     @property
     def degraded(self) -> str | None:
-        """Why checkpoints, the full-text index or retention are behind, or room is scarce; None when all is well."""
-        return self._house.degraded or self._room.scarce
+        """Return why checkpoints, index or retention are behind, or that the disk is nearly full; None otherwise."""
+        return self.housekeeping.degraded or self._room.scarce
 
     @property
     def lag(self) -> Lag:
-        """How far the disk is behind."""
+        """Return how far writing to the disk is behind."""
         waiting = len(self._queue) + len(self._held)
         return Lag(waiting, time.monotonic() - self._caught_up if waiting else 0.0)
 
     def signed(self, number: int, signature: bytes, public_key: bytes) -> None:
-        """The signer's answer: kept if it is right and made with the pinned key, else recorded as refused."""
-        keep = partial(self._house.keep_signature, number, signature, public_key)
-        self._put(partial(self._house.attempt, keep))
+        """Store the signer's signature if it is valid and made with the pinned key; otherwise record it as refused."""
+        keep = partial(self.housekeeping.keep_signature, number, signature, public_key)
+        self._put(partial(self.housekeeping.attempt, keep))
 
     def refused(self, number: int, reason: str) -> None:
-        """The signer refused a checkpoint: recorded as an alarm."""
-        self._put(partial(self._house.refused, number, reason))
+        """Record as an alarm that the signer refused a checkpoint."""
+        self._put(partial(self.housekeeping.refused, number, reason))
 
     def removal_approved(self, number: int, text: bytes, signature: bytes, public_key: bytes) -> None:
-        """The signer signed the removal of the records up to a checkpoint."""
-        remove = partial(self._house.removal_approved, number, text, signature, public_key)
-        self._put(partial(self._house.attempt, remove))
+        """Remove the records up to a checkpoint, if the signer's signature of that removal is valid."""
+        remove = partial(self.housekeeping.removal_approved, number, text, signature, public_key)
+        self._put(partial(self.housekeeping.attempt, remove))
 
     def removal_refused(self, number: int, reason: str, *, early: bool = False) -> None:
-        """The signer does not sign a removal (`early`: not yet); it is asked again later."""
-        self._put(partial(self._house.remover.refused, number, reason, early=early))
+        """Repeat the request later, because the signer refused a removal (`early`: for now)."""
+        self._put(partial(self.housekeeping.remover.refused, number, reason, early=early))
 
     def request_signatures(self) -> None:
-        """The signer is (back) in service: ask it for every checkpoint that is not signed yet."""
-        self._put(partial(self._house.attempt, self._house.ask_signatures))
-        self._put(self._house.remover.ask_again)
+        """Request all missing signatures, because the signer is in service (again)."""
+        self._put(partial(self.housekeeping.attempt, self.housekeeping.ask_signatures))
+        self._put(self.housekeeping.remover.ask_again)
 
     def close(self, seconds: float = _CLOSE_SECONDS) -> str | None:
-        """Write what waits, make a last checkpoint and close; the reason when that did not succeed in time."""
+        """Write waiting records, make a last checkpoint and close; return the reason for a failure or timeout."""
         self._stopping.set()
         self._hurry.set()
         self._wake.set()
@@ -221,10 +240,10 @@ class AuditLog:
             return f"{self.path}: still being written after {seconds:g} s"
         return self._unwritten
 
-    def _put(self, item: Record | Waiter | Callable[[], None]) -> None:
-        """What is to be written, somebody who waits, or what the log's thread is to do."""
+    def _put(self, item: AuditRecord | Waiter | Callable[[], None]) -> None:
+        """Queue a record, a waiter, or a call for the log's thread."""
         self._queue.append(item)
-        # The writer sets `_idle` before it looks at the queue a last time: it sees the item or we see idle.
+        # The thread sets `_idle` before it checks the queue once more: it sees the item, or this call sees `_idle`.
         if self._idle:
             self._idle = False
             self._wake.set()
@@ -237,7 +256,7 @@ class AuditLog:
         try:
             self._serve()
         except BaseException as error:
-            # A defect of ours: the owner must see that nothing is recorded any more, and deny.
+            # A defect: the owner must see that records are no longer written, and deny requests.
             self._unwritten = self._failed = f"{self.path}: writing ended: {type(error).__name__}: {error}"
             raise
         finally:
@@ -262,16 +281,16 @@ class AuditLog:
             self._turn()
         self._turn()
         self._held.extend(self._folder.finish())
-        self._house.unsealed += len(self._held)
-        if self._attempt(self._write) and self._house.unsealed:
-            self._house.attempt(self._house.seal)
+        self.housekeeping.unsealed += len(self._held)
+        if self._attempt(self._write) and self.housekeeping.unsealed:
+            self.housekeeping.attempt(self.housekeeping.seal)
         self._answer_waiting()
         self._unwritten = self._failed
         if self._writer is not None:
             self._writer.close()
 
     def _turn(self) -> None:
-        """Take what is queued, write it, and do what is due."""
+        """Write the queued records, and do the work that is due."""
         while True:
             more = self._drain()
             now = time.monotonic()
@@ -281,10 +300,10 @@ class AuditLog:
             self._look_for_room()
             written = self._attempt(self._write)
             self._answer_waiting()
-            self._house.after_batch(written=written)
+            self.housekeeping.after_batch(written=written)
             if not more or not written:
                 break
-        self._house.at_rest(quiet_since=self._written_at, busy=lambda: bool(self._queue))
+        self.housekeeping.at_rest(quiet_since=self._written_at, busy=lambda: bool(self._queue))
 
     def _wait(self) -> None:
         if self._failed is not None:
@@ -306,20 +325,20 @@ class AuditLog:
         now = time.monotonic()
         due = self._folder.next_due()
         waits = [_IDLE_SECONDS] if due is None else [_IDLE_SECONDS, due - now]
-        house = self._house.next_due(now)
+        house = self.housekeeping.next_due(now)
         if house is not None:
             waits.append(house)
         return max(0.001, min(waits))
 
     def _drain(self) -> bool:
-        """Move what is queued to where it is handled; whether more is left."""
+        """Handle a batch of the queue; return whether more is left."""
         now = time.monotonic()
         queue, offer = self._queue, self._folder.offer
         for _ in range(_LARGEST_BATCH):
             if not queue:
                 return False
             item = queue.popleft()
-            if isinstance(item, Record):
+            if isinstance(item, AuditRecord):
                 written = list(offer(item, now))
                 self._held.extend(written)
                 if not written or written[-1] is not item:
@@ -331,7 +350,7 @@ class AuditLog:
         return bool(queue)
 
     def _look_for_room(self) -> None:
-        with contextlib.suppress(OSError):  # a folder that is gone is told by what writes there
+        with contextlib.suppress(OSError):  # the writer reports a missing folder
             scarce = self._room.look()
             if scarce is not None:
                 severity, left = (Severity.ALARM if scarce else Severity.NOTICE), self._room.left
@@ -340,7 +359,7 @@ class AuditLog:
                 self._held.append(self._own(event, severity, self._room.scarce or "", {"left": left}))
 
     def _attempt(self, action: Callable[[], None]) -> bool:
-        """Do something with the database; whether it succeeded. A failure closes it until the next try."""
+        """Run an action on the database; return whether it succeeded. A failure closes it until the next try."""
         try:
             if self._writer is None and action != self._open:
                 self._open()
@@ -353,7 +372,7 @@ class AuditLog:
     def _fail(self, error: Exception) -> None:
         reason = str(error)
         if isinstance(error, sqlite3.OperationalError) and "locked" in reason:
-            # With ours still open, ours are in the list as well.
+            # Our own connection is still open, so this process is in the list.
             others = [pid for pid in holders(self.path) if pid != os.getpid()]
             if others:
                 reason = f"{reason} by process {', '.join(map(str, others))}"
@@ -363,7 +382,7 @@ class AuditLog:
             self._failed_since = self._clock()
             _logger.error("the audit log cannot be written", reason=self._failed)
         if self._writer is not None:
-            writer, self._writer, self._house.writer = self._writer, None, None
+            writer, self._writer, self.housekeeping.writer = self._writer, None, None
             with contextlib.suppress(sqlite3.Error):
                 writer.close()
 
@@ -377,7 +396,7 @@ class AuditLog:
             self._held.insert(
                 0, self._own("log begun", Severity.ALARM if earlier else Severity.NOTICE, "", detail)
             )
-        # Only what an earlier process left; what this one counts stands there as well and is still being counted.
+        # Recover only the counts of an earlier process; later the table has this process's counts.
         left = [] if self._counts_recovered else writer.open_folds()
         if left:
             writer.close_folds(
@@ -387,7 +406,7 @@ class AuditLog:
         self._continued = (writer.log_id, writer.sequence)
         if not self._failed_since:
             self._failed = None
-        self._house.opened(writer)
+        self.housekeeping.opened(writer)
 
     def _write(self) -> None:
         writer = self._writer
@@ -403,7 +422,7 @@ class AuditLog:
             self._continued = (writer.log_id, writer.sequence)
             del self._held[: len(batch)]
             self._folder.touched.difference_update(touched)
-            self._house.unsealed += len(batch) + len(report)
+            self.housekeeping.unsealed += len(batch) + len(report)
             self._caught_up = self._written_at = time.monotonic()
             if self._failed_since:
                 _logger.warning("the audit log is written again")
@@ -413,7 +432,7 @@ class AuditLog:
                     self._own("records lost", Severity.ALARM, "the queue was full", self._lost.take())
                 )
 
-    def _report_of_failure(self) -> list[Record]:
+    def _report_of_failure(self) -> list[AuditRecord]:
         if not self._failed_since:
             return []
         detail = {"since": self._failed_since, "until": self._clock()}
@@ -424,8 +443,8 @@ class AuditLog:
         waiting, self._waiting = self._waiting, []
         answer(waiting, result)
 
-    def _own(self, event: str, severity: Severity, reason: str, detail: dict[str, Any]) -> Record:
-        return Record(
+    def _own(self, event: str, severity: Severity, reason: str, detail: dict[str, Any]) -> AuditRecord:
+        return AuditRecord(
             id=self.ids.next(),
             time=self._clock(),
             event=event,

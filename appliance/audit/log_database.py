@@ -1,7 +1,7 @@
-"""The database file of the log: its tables, how it is made, opened for writing, and opened for reading.
+"""Create the log's database file, and open it for writing or reading.
 
-A new log is made beside its place and moved there complete, so a file that is empty, cut or of another kind
-is never a log in the making: it is an error that is told, and the file is left as it is.
+A new log is made under a temporary name and linked when complete. An empty, cut or foreign file is therefore never an
+unfinished log: it is reported as an error and left unchanged.
 """
 
 import os
@@ -17,7 +17,7 @@ from appliance.base.atomic_files import name_to_make
 
 APPLICATION_ID = 0x52565541  # "RVUA"
 LAYOUT_VERSION = 2
-_EARLIER = 1  # the same tables; its records have hashes that version 0.1.0 made, and it cannot read ours
+_EARLIER = 1  # version 0.1.0: same tables, different hashes
 _BUSY_SECONDS = 5.0
 
 TABLES = (
@@ -53,14 +53,11 @@ TEXT_OF_RECORD = (
 
 
 class LogUnreadableError(Exception):
-    """The log is missing, damaged or not a log; the message says which file and what to do."""
+    """A log file is missing, damaged or foreign; the message has the remedy."""
 
 
 def create(path: Path, begun: int) -> None:
-    """Make a new, empty log at `path`; `begun` is nanoseconds since the epoch.
-
-    Its group may read it (0640), and what SQLite puts beside it: who that is, if anybody, is for the folder to say.
-    """
+    """Create an empty log at `path`, readable by the group of its folder; `begun` is nanoseconds since the epoch."""
     making = name_to_make(path)
     descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
     os.fchmod(descriptor, 0o640)
@@ -79,14 +76,14 @@ def create(path: Path, begun: int) -> None:
             connection.execute("COMMIT")
         finally:
             connection.close()
-        # link() does not replace: a log that appeared meanwhile stays.
+        # Unlike rename(), link() does not replace a log that another process has created.
         os.link(making, path)
     finally:
         making.unlink()
 
 
 def open_for_writing(path: Path) -> sqlite3.Connection:
-    """Open an existing log for its writer. Raises `LogUnreadableError`, or `sqlite3.Error` from below."""
+    """Open an existing log for its writer. Raises `LogUnreadableError` and `sqlite3.Error`."""
     connection = sqlite3.connect(
         _uri(path, "rw"),
         uri=True,
@@ -111,7 +108,7 @@ def _prepare_writing(connection: sqlite3.Connection) -> None:
 
 
 def open_for_reading(path: Path) -> sqlite3.Connection:
-    """Open a log for reading, while it is written or not. Raises `LogUnreadableError`."""
+    """Open a log for reading, even while it is written. Raises `LogUnreadableError` and `sqlite3.Error`."""
     if not path.parent.is_dir():
         raise LogUnreadableError(f"{path.parent}: no such directory; is the state directory right (--state)?")
     try:
@@ -125,7 +122,7 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
         raise LogUnreadableError(f"{path}: permission denied; run as root or as the log's owner")
     mode = "ro"
     if not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-shm").exists():
-        mode = "ro&immutable=1"  # a copy on a medium that cannot be written has nobody who changes it
+        mode = "ro&immutable=1"  # a copy on a read-only medium does not change
     connection = sqlite3.connect(_uri(path, mode), uri=True, isolation_level=None, timeout=_BUSY_SECONDS,
                                  check_same_thread=False)  # fmt: skip
     return _checked(connection, path, lambda _: None)
@@ -133,7 +130,7 @@ def open_for_reading(path: Path) -> sqlite3.Connection:
 
 @contextmanager
 def reading(path: Path, advice: str = "; run 'rosrv audit verify'") -> Iterator[sqlite3.Connection]:
-    """A log that is open for reading in the block. Raises `LogUnreadableError`, also for what cannot be read there."""
+    """Open a log for reading in a `with` block. Raises `LogUnreadableError`, also for SQLite's errors in the block."""
     try:
         with closing(open_for_reading(path)) as connection:
             yield connection

@@ -1,9 +1,8 @@
-"""Appends records to the database and extends the chain. Used by one thread, in one process.
+"""Append records to the database and extend the chain, on one thread of one process.
 
-Invariants:
-1. The head (sequence and hash) moves only after the commit that wrote it.
-2. One writer: a lock on `<log>.lock` is held as long as the log is open.
-3. The file is the same one all the time: removed or replaced under us, writing stops with an error.
+1. The head (sequence and hash) changes only after the commit that wrote it.
+2. There is one writer: it holds a lock on `<log>.lock`.
+3. If the file is removed or replaced, writing stops with an error.
 """
 
 import contextlib
@@ -20,14 +19,13 @@ from appliance.audit import log_database
 from appliance.audit.chain import StoredColumns, follows, genesis, record_hash
 from appliance.audit.columns import to_columns
 from appliance.audit.log_database import LogUnreadableError
-from appliance.audit.record import Record
+from appliance.audit.record import AuditRecord
 from appliance.audit.repetition import FoldState
 from appliance.audit.retention import as_kept
 from appliance.signing.signed_statements import NO_CHECKPOINT, Checkpoint, checkpoint_hash, parse_checkpoint
 
-# Rows of one INSERT. The GIL is released and retaken once per statement, not once per row: next to a busy
-# event loop every retake may wait a whole switch interval (5 ms), so a row per statement is 200 rows a
-# second.
+# Rows of one INSERT. Each statement releases and takes the GIL. Beside a busy event loop, taking it may need 5 ms (the
+# switch interval), so one row per statement would be 200 rows a second.
 _ROWS_PER_INSERT = 64
 _WIDTH = len(StoredColumns._fields) + 1
 _ROW = "(" + ", ".join("?" * _WIDTH) + ")"
@@ -43,12 +41,12 @@ def _insert(rows: int) -> str:
     return "INSERT INTO record VALUES " + ", ".join([_ROW] * rows)  # noqa: S608  only question marks
 
 
-_AHEAD_STEPS = 20  # so many checkpoints, in steps, that were made while the clock was ahead are looked past
+_AHEAD_STEPS = 20  # the most steps of checkpoints that are skipped because the clock was ahead
 _INSERTS = {rows: _insert(rows) for rows in (_ROWS_PER_INSERT, 8, 1)}
 
 
 class RemovedRange(NamedTuple):
-    """Records that retention removes, and the hashes that chain and checkpoints go on from."""
+    """The records that retention removes, and the hashes after which chain and checkpoints continue."""
 
     first_sequence: int
     last_sequence: int
@@ -60,10 +58,10 @@ class RemovedRange(NamedTuple):
 
 
 class ChainWriter:
-    """The open database of a log, and the head of its chain."""
+    """The open database of a log and the head of its chain."""
 
     def __init__(self, path: Path, begun: int, continued: tuple[str, int] | None = None) -> None:
-        """Open the log at `path`, or make it unless it is one to be `continued` (its id and last sequence).
+        """Open the log at `path`; create a missing one unless a log is `continued` (its id and last sequence).
 
         Raises `LogUnreadableError`, `sqlite3.Error` or `OSError`.
         """
@@ -98,7 +96,7 @@ class ChainWriter:
         rows.reverse()
         self.sequence, self.hash, self.last_id = 0, genesis(self.log_id), ""
         for number, row in enumerate(rows):
-            known = number > 0 or row[0] == 1  # what it follows
+            known = number > 0 or row[0] == 1  # the previous hash is known
             if known and (row[0] != self.sequence + 1 or not follows(self.hash, row[:-1], row[-1])):
                 raise LogUnreadableError(
                     f"{self.path}: record {row[0]} does not fit the chain, so the log was changed; run"
@@ -115,8 +113,10 @@ class ChainWriter:
             self.checkpoint_number, self.checkpoint_sequence = last[0], last[1]
             self._checkpoint_hash = checkpoint_hash(last[2])
 
-    def append(self, records: Sequence[Record], folds: Iterable[tuple[bytes, FoldState | None]] = ()) -> None:
-        """Write records and what is counted but not yet summarised, in one transaction, to the disk."""
+    def append(
+        self, records: Sequence[AuditRecord], folds: Iterable[tuple[bytes, FoldState | None]] = ()
+    ) -> None:
+        """Write records and the counts of folded records to disk in one transaction."""
         self._check_file()
         with self._transaction() as execute:
             sequence, digest, last_id = self._insert(records)
@@ -129,7 +129,7 @@ class ChainWriter:
                     )
         self.sequence, self.hash, self.last_id = sequence, digest, last_id
 
-    def _insert(self, records: Sequence[Record]) -> tuple[int, bytes, str]:
+    def _insert(self, records: Sequence[AuditRecord]) -> tuple[int, bytes, str]:
         sequence, digest, last_id = self.sequence, self.hash, self.last_id
         position, remaining = 0, len(records)
         while remaining:
@@ -148,7 +148,7 @@ class ChainWriter:
         return sequence, digest, last_id
 
     def seal(self, time: int) -> tuple[Checkpoint, bytes]:
-        """Make the next checkpoint, over everything written so far."""
+        """Make the next checkpoint, of all records written so far; return it and its text."""
         checkpoint = Checkpoint(
             self.log_id,
             self.checkpoint_number + 1,
@@ -169,39 +169,39 @@ class ChainWriter:
         return checkpoint, text
 
     def unsigned(self, limit: int) -> list[tuple[int, bytes]]:
-        """Number and text of checkpoints that wait for their signature, oldest first."""
+        """Return number and text of at most `limit` unsigned checkpoints, oldest first."""
         query = "SELECT number, text FROM checkpoint WHERE signature IS NULL ORDER BY number LIMIT ?"
         return self._connection.execute(query, (limit,)).fetchall()
 
     def checkpoint_text(self, number: int) -> bytes | None:
-        """The text of a checkpoint."""
+        """Return the text of a checkpoint, or None."""
         row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()
         return None if row is None else bytes(row[0])
 
     def keep_signature(self, number: int, signature: bytes, public_key: bytes) -> None:
-        """Store a checkpoint's signature, once."""
+        """Store a checkpoint's signature, unless it already has one."""
         self._connection.execute(
             "UPDATE checkpoint SET signature = ?, public_key = ? WHERE number = ? AND signature IS NULL",
             (signature, public_key, number),
         )
 
     def open_folds(self) -> list[FoldState]:
-        """What was counted and not summarised when the log was last closed by a crash."""
+        """Return the counts that a crash left without a summary."""
         rows = self._connection.execute("SELECT state FROM open_fold").fetchall()
         return [msgspec.json.decode(state, type=FoldState) for (state,) in rows]
 
-    def close_folds(self, summaries: Sequence[Record]) -> None:
-        """Write the summaries of `open_folds` in place of them."""
+    def close_folds(self, summaries: Sequence[AuditRecord]) -> None:
+        """Replace the counts of `open_folds` by their summaries."""
         keys = [key for (key,) in self._connection.execute("SELECT key FROM open_fold")]
         self.append(summaries, [(key, None) for key in keys])
 
     @property
     def text_lag(self) -> int:
-        """How many records are not in the full-text index yet; a search reads these one by one."""
+        """Return the number of records that are not in the full-text index yet; every text search reads them all."""
         return int(self.sequence - self._text_through)
 
     def index_text(self, rows: int = _TEXT_ROWS) -> bool:
-        """Enter some more records into the full-text index; whether there is more to enter."""
+        """Add some records to the full-text index; return whether more are left."""
         through = self._text_through
         if through >= self.sequence:
             return False
@@ -218,7 +218,7 @@ class ChainWriter:
         return bool(end < self.sequence)
 
     def size(self) -> int:
-        """How many bytes the records take on disk."""
+        """Return the bytes of the database that are in use."""
         (pages,) = self._connection.execute("PRAGMA page_count").fetchone()
         (free,) = self._connection.execute("PRAGMA freelist_count").fetchone()
         (page_size,) = self._connection.execute("PRAGMA page_size").fetchone()
@@ -227,10 +227,10 @@ class ChainWriter:
     def removable(
         self, step: int, *, signed: bool, between: tuple[int, int] | None = None
     ) -> RemovedRange | None:
-        """The oldest records: up to a (signed) checkpoint, about `step` of them.
+        """Return the range of about `step` oldest records that ends at a (signed) checkpoint, or None.
 
-        None `between` these times goes: of so long ago, and now. Those of later were made while the clock was ahead:
-        they go with what comes after them. The last checkpoint stays, for the next one follows from it.
+        With `between` (an age limit, and now) it ends at a checkpoint before the limit. Checkpoints later than now,
+        made while the clock was ahead, are removed with the following ones. The last checkpoint always stays.
         """
         first = self._first_sequence()
         condition = "AND signature IS NOT NULL" if signed else ""
@@ -263,13 +263,13 @@ class ChainWriter:
         return int(self._connection.execute(query, (self.sequence + 1,)).fetchone()[0])
 
     def newest_signed(self) -> bytes:
-        """The text of the last signed checkpoint; empty where there is none."""
+        """Return the text of the last signed checkpoint; empty if there is none."""
         query = "SELECT text FROM checkpoint WHERE signature IS NOT NULL ORDER BY number DESC LIMIT 1"
         row = self._connection.execute(query).fetchone()
         return b"" if row is None else bytes(row[0])
 
-    def evidence(self, gone: RemovedRange) -> list[Record]:
-        """Of the records that go, those that are denials or alarms, each with its place in `detail.kept`."""
+    def evidence(self, gone: RemovedRange) -> list[AuditRecord]:
+        """Return the denials and alarms among the records to remove, each with its position in `detail.kept`."""
         rows = self._connection.execute(
             f"SELECT {log_database.COLUMNS}, hash FROM record WHERE sequence <= ? AND"  # noqa: S608  fixed names
             " (decision = 'deny' OR severity = 'alarm') ORDER BY sequence",
@@ -277,8 +277,8 @@ class ChainWriter:
         )
         return [as_kept(StoredColumns(*row[:-1]), row[-1]) for row in rows]
 
-    def remove(self, gone: RemovedRange, report: Record, kept: Sequence[Record] = ()) -> None:
-        """Remove records and their checkpoints, and append the record that says so and those that are kept, at once."""
+    def remove(self, gone: RemovedRange, report: AuditRecord, kept: Sequence[AuditRecord] = ()) -> None:
+        """In one transaction, remove records and their checkpoints, and append the report and the kept records."""
         self._check_file()
         with self._transaction() as execute:
             sequence, digest, last_id = self._insert([report, *kept])
@@ -301,7 +301,7 @@ class ChainWriter:
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[Callable[..., sqlite3.Cursor]]:
-        """What is executed in the block is committed at its end, or not at all."""
+        """Commit the statements of the block at its end, or roll back."""
         execute = self._connection.execute
         execute("BEGIN IMMEDIATE")
         try:
@@ -313,7 +313,7 @@ class ChainWriter:
             raise
 
     def close(self) -> None:
-        """Close the database and let another writer have it."""
+        """Close the database and release the lock."""
         try:
             self._connection.close()
         finally:

@@ -1,7 +1,7 @@
-"""What is searched for, as SQL. No I/O.
+"""Translate filters to SQL. No I/O.
 
-A condition knows the index that answers it alone; `search` measures which of them is the most selective
-and walks that one. Values are always bound, never part of the statement.
+Each condition names the index that can answer it; `search` uses the most selective index. Values are always bound as
+parameters, never part of the statement.
 """
 
 from typing import NamedTuple
@@ -17,17 +17,17 @@ _TRIGRAM = 3
 
 
 class FilterError(ValueError):
-    """A filter that cannot be used; the message says which part and why."""
+    """A filter is invalid; the message has the part and the reason."""
 
 
 class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a record must be to be found; what is None or empty is not asked.
+    """The properties of the records to find; None or empty: any.
 
-    `since` (inclusive) and `until` (exclusive) are nanoseconds since the epoch; `severity` is the least one;
-    `host`, `caller_id`, `resource`, `category` and `event` are exact, or globs when they contain `*`, `?`
-    or `[`; `rule` is a glob for the rule's section or its key; `text` is found anywhere in names, reason and
-    details, regardless of case; `who` is a glob for the name of the token (or `operator`) that asked.
-    `without_looks` leaves out REST calls that were allowed and only looked (GET, HEAD).
+    `since` (inclusive) and `until` (exclusive) are nanoseconds since the epoch; `severity` is the minimum. `host`,
+    `caller_id`, `resource`, `category` and `event` are exact, or globs if they contain `*`, `?` or `[`; `rule` is a
+    glob for the rule's section or key. `text` is searched in names, reason and details, ignoring case. `who` is a glob
+    for the name of the token (or `operator`) that made the request. `without_looks` omits allowed REST calls that only
+    read (GET, HEAD).
     """
 
     decision: tuple[str, ...] = ()
@@ -45,16 +45,16 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     without_looks: bool = False
 
 
-# A detail that somebody spoilt is nobody's.
+# Records with a damaged detail have no author.
 _WHO = "CASE WHEN json_valid(CAST(detail AS TEXT)) THEN json_extract(CAST(detail AS TEXT), '$.who') END"
-# A look's method stands in its details, also of counted ones. Quotes that a client writes are escaped there.
+# A read has its method in its details, even if it was only counted. Quotes from a client are escaped there.
 _NO_LOOK = """NOT (
     category IS NOT NULL AND category = 'rest' AND decision IS NOT NULL AND decision = 'allow' AND (
         CAST(detail AS TEXT) LIKE '%"method":"GET"%' OR CAST(detail AS TEXT) LIKE '%"method":"HEAD"%'))"""
 
 
 class Condition(NamedTuple):
-    """A piece of a WHERE clause, its values, and the index that answers it alone (if there is one)."""
+    """A part of a WHERE clause, its values, and the index that can answer it."""
 
     sql: str
     values: tuple[object, ...]
@@ -62,7 +62,7 @@ class Condition(NamedTuple):
 
 
 def conditions(wanted: Filter) -> list[Condition]:
-    """The conditions of a filter, except for its text. Raises `FilterError`."""
+    """Return the conditions of a filter without its text. Raises `FilterError`."""
     found: list[Condition] = []
     if wanted.decision:
         marks = ", ".join("?" * len(wanted.decision))
@@ -117,13 +117,13 @@ def _checked(name: str, value: str) -> str:
 
 
 def text_condition(text: str) -> Condition:
-    """The exact check of a text, row by row."""
+    """Return the condition that searches a text in each row."""
     escaped = _checked("text", text).replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_")
     return Condition(f"({TEXT_OF_RECORD}) LIKE ? ESCAPE '\\'", (f"%{escaped}%",))
 
 
 def text_match(text: str) -> str | None:
-    """The full-text expression for candidates of a text; None when it is too short for the index."""
+    """Return the full-text expression that finds candidates for a text; None if it is too short for the index."""
     if len(text) < _TRIGRAM or "\0" in text:
         return None
     trigrams = {text[start : start + _TRIGRAM] for start in range(len(text) - _TRIGRAM + 1)}

@@ -1,7 +1,6 @@
-"""One record of the audit log: the documented schema, the same in the CLI, REST and the export.
+"""The record of the audit log: schema version 1, as documented for the CLI, REST and exports.
 
-Schema version 1. A record is made where the thing happens, gets its `sequence` and its place in the hash
-chain when the log takes it, and is never changed afterwards.
+The log assigns its `sequence` and its position in the hash chain. A written record never changes.
 """
 
 import enum
@@ -13,7 +12,7 @@ SCHEMA_VERSION = 1
 
 
 class Severity(enum.StrEnum):
-    """How much a person should care."""
+    """The importance of a record for an operator, ascending."""
 
     DEBUG = "debug"
     INFO = "info"
@@ -31,15 +30,15 @@ class RuleReference(msgspec.Struct, frozen=True):
     line: int
 
 
-class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """What happened, who did it, and what was decided by which rule.
+class AuditRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """An event with its author, or a decision with its rule.
 
-    `id` is sortable (time first) and unique; `time` is nanoseconds since the epoch, UTC; `decision` is
-    `allow`, `deny`, `would deny` or None; `host` is the peer's address; `duration_us` is microseconds from
-    the request's arrival to the decision; `detail` holds the fields of this event.
+    `id` is sortable (time first) and unique; `time` is in nanoseconds since the epoch, UTC; `decision` is `allow`,
+    `deny`, `would deny` or None; `host` is the peer's address; `duration_us` is the time from the request's arrival to
+    the decision in microseconds; `detail` has the fields specific to this event.
 
-    Two are for the log alone and not stored: `stranger`: no rule of the policy names `host`; `folds`: it passed, and
-    its repetitions are counted, because it only reads.
+    Two fields are for the log only and not stored. `unknown`: no rule of the policy names `host`. `folds`: repetitions
+    are only counted: this is an allowed read, or the host is over its quota.
     """
 
     id: str
@@ -56,5 +55,5 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     reason: str = ""
     duration_us: int | None = None
     detail: dict[str, Any] = {}
-    stranger: bool = False
+    unknown: bool = False
     folds: bool = False

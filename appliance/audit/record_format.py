@@ -1,8 +1,7 @@
-"""What leaves the log: a record as the documented JSON object, strangers' text made fit for a terminal.
+"""Format records as the documented JSON object, and untrusted text for a terminal.
 
-JSON is ASCII only. Text for people has every character escaped that a terminal could act on or that could
-make a name look like another one by order of writing: control characters, escape sequences, bidirectional
-marks.
+JSON is ASCII only. Text for people has all characters escaped that a terminal could interpret or that could disguise a
+name: control characters, escape sequences, bidirectional marks.
 """
 
 import json
@@ -14,8 +13,8 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec.structs import asdict
 
-from appliance.audit.record import SCHEMA_VERSION, Record, RuleReference
-from appliance.audit.timestamps import parse_moment
+from appliance.audit.record import SCHEMA_VERSION, AuditRecord, RuleReference
+from appliance.base.timestamps import parse_timestamp
 
 _SECOND = 1_000_000_000
 _NOT_THE_RECORDS = ("schema", "sequence", "chain")
@@ -26,19 +25,19 @@ _OF_THE_RECORD = (
 
 
 _CONTENTS = ("before", "after", "before_fields", "after_fields", "conditions", "values", "why", "binding")
-"""What messages said, in the detail of a monitor's record: as bytes, as fields, and what was compared of them."""
+"""The fields of `detail` in a monitor's record that have contents of messages: bytes, fields, compared values."""
 _BOUND = re.compile(r"(property \d+ of \S+ \(\w+\)|: \d+ \w+) with \w+ = .*", re.DOTALL)
 
 
-class Entry(NamedTuple):
-    """A record of the log with its sequence."""
+class LogEntry(NamedTuple):
+    """A record with its sequence."""
 
     sequence: int
-    record: Record
+    record: AuditRecord
 
 
 def rfc3339(time: int) -> str:
-    """Nanoseconds since the epoch as RFC 3339 in UTC, nine digits of a second."""
+    """Format nanoseconds since the epoch as RFC 3339 in UTC with nine decimals, or `@…ns` if out of range."""
     seconds, fraction = divmod(time, _SECOND)
     try:
         moment = datetime.fromtimestamp(seconds, UTC)
@@ -47,8 +46,8 @@ def rfc3339(time: int) -> str:
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{fraction:09d}Z"
 
 
-def without_contents(entry: Entry) -> Entry:
-    """The record without what messages said, which `detail.withheld` names then: for who may not read messages."""
+def without_contents(entry: LogEntry) -> LogEntry:
+    """Return the record without contents of messages, for roles that may not read them, and list them in `withheld`."""
     detail = entry.record.detail
     if "monitor" not in detail:
         return entry
@@ -64,11 +63,11 @@ def without_contents(entry: Entry) -> Entry:
     record = msgspec.structs.replace(
         entry.record, reason=plain["reason"], detail=kept | {"withheld": withheld}
     )
-    return Entry(entry.sequence, record)
+    return LogEntry(entry.sequence, record)
 
 
 def without_binding(text: str, detail: Mapping[str, Any]) -> str:
-    """What a monitor's record says of a verdict, without the values of parameters, which messages said."""
+    """Return a monitor's text about a verdict without the values of parameters, which come from messages."""
     found = _BOUND.search(text)
     if found is None:
         return text
@@ -76,8 +75,8 @@ def without_binding(text: str, detail: Mapping[str, Any]) -> str:
     return text[: found.end(1)] + category
 
 
-def as_object(entry: Entry) -> dict[str, Any]:
-    """The documented JSON object of a record; `decision` is absent where nothing was decided."""
+def as_object(entry: LogEntry) -> dict[str, Any]:
+    """Return the documented JSON object of a record; `decision` is absent if nothing was decided."""
     record = entry.record
     fields = {name: getattr(record, name) for name in _OF_THE_RECORD}
     if record.decision is None:
@@ -91,23 +90,23 @@ def as_object(entry: Entry) -> dict[str, Any]:
     return head | fields | {"severity": record.severity.value, "rule": record.rule and asdict(record.rule)}
 
 
-def entry_of(fields: Any) -> Entry:
-    """A record from its documented JSON object. Raises `ValueError`, `KeyError` and `TypeError` for anything else."""
+def entry_of(fields: Any) -> LogEntry:
+    """Parse the documented JSON object. Raises `ValueError`, `KeyError` and `TypeError`."""
     if not isinstance(fields, dict):
         raise TypeError("not an object")
     own = {name: value for name, value in fields.items() if name not in _NOT_THE_RECORDS}
     time = str(fields["time"])
-    own["time"] = int(time[1:-2]) if time.startswith("@") else parse_moment(time, 0)
-    return Entry(int(fields["sequence"]), msgspec.convert(own, Record))
+    own["time"] = int(time[1:-2]) if time.startswith("@") else parse_timestamp(time, 0)
+    return LogEntry(int(fields["sequence"]), msgspec.convert(own, AuditRecord))
 
 
-def as_json(entry: Entry) -> str:
-    """One line of NDJSON, without the newline; ASCII only."""
+def as_json(entry: LogEntry) -> str:
+    """Return one line of NDJSON, without the newline; ASCII only."""
     return json.dumps(as_object(entry), separators=(",", ":"))
 
 
-def fields_of(entry: Entry) -> dict[str, str | None]:
-    """What names a record and says what it is about, as text; None is what it has not."""
+def fields_of(entry: LogEntry) -> dict[str, str | None]:
+    """Return the fields that identify a record, as text; missing fields are None."""
     record = entry.record
     return {
         "sequence": str(entry.sequence),
@@ -125,12 +124,12 @@ def fields_of(entry: Entry) -> dict[str, str | None]:
 
 
 def rule_text(rule: RuleReference | None) -> str | None:
-    """A rule and where it stands, as one word of a line; None for none."""
+    """Return a rule with its file and line, or None."""
     return None if rule is None else f"[{rule.section}] {rule.key} {rule.file}:{rule.line}"
 
 
 def printable(text: str) -> str:
-    """Text that no terminal acts on: what is not printable is written as an escape, a backslash as two."""
+    """Escape unprintable characters, and double backslashes."""
     if text.isprintable() and "\\" not in text:
         return text
     return "".join(_escape(character) for character in text)

@@ -1,7 +1,7 @@
-"""Removes old records, a step at a time; where there is a signer, each step when it has signed the removal.
+"""Remove old records step by step; with a signer, the signer must sign the removal before each step.
 
-Invariants: nothing goes without a record that says so, in one transaction; of a log that is signed nothing goes without
-the signer's signature over exactly what goes. What the signer refuses is tried again later (`unremoved` says why).
+Every removal is recorded in the same transaction. Records of a signed log are removed only with the signer's signature
+over exactly these records. A refused removal is tried again later (`unremoved` has the reason).
 """
 
 import time
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from appliance.audit.log_writer import ChainWriter, RemovedRange
-from appliance.audit.record import Record
+from appliance.audit.record import AuditRecord
 from appliance.audit.retention import Retention, worth_keeping
 from appliance.audit.signatures import RemovalSigner, Signatures
 from appliance.signing.signed_statements import Removal, limit_of_removal
@@ -30,10 +30,7 @@ class _Wanted(NamedTuple):
 
 
 class Remover:
-    """Removes by `retention`; `approve(number, checkpoint, newest)` asks the signer. Used on the log's thread.
-
-    `report(reason, detail)` makes the record of a removal.
-    """
+    """The retention of a log, on the log's thread; `approve` requests a signature, `report` makes the record."""
 
     def __init__(
         self,
@@ -42,7 +39,7 @@ class Remover:
         approve: RemovalSigner | None,
         *,
         clock: Callable[[], int],
-        report: Callable[[str, dict[str, object]], Record],
+        report: Callable[[str, dict[str, object]], AuditRecord],
     ) -> None:
         self._retention = retention
         self._signatures = signatures
@@ -55,7 +52,7 @@ class Remover:
         self.unremoved: str | None = None
 
     def step(self, writer: ChainWriter) -> bool:
-        """Remove one step, or ask the signer for it, if records must go; whether some went."""
+        """Remove one step of records, or request the signature for it; return whether records were removed."""
         now = time.monotonic()
         self.due = now + _LOOK_SECONDS
         if now < self._refused or (self._wanted is not None and now - self._asked < _ANSWER_SECONDS):
@@ -76,15 +73,15 @@ class Remover:
         return False
 
     def ask_again(self) -> None:
-        """The signer is (back) in service: what was asked before may be lost."""
+        """Forget earlier requests, which may be lost, because the signer is in service (again)."""
         self._wanted, self._aged, self._refused, self.due = None, 0.0, 0.0, 0.0
 
     def sealed(self) -> None:
-        """There is a new checkpoint: the one before it may go now, if it is old."""
+        """Search for old records again: after a new checkpoint, the previous one may be removed."""
         self._aged = self.due = 0.0
 
     def approved(self, writer: ChainWriter, number: int, text: bytes, signature: bytes, key: bytes) -> bool:
-        """The signer's answer: what it signed goes, if that is what was asked for. Whether records went."""
+        """Remove the records if the signer signed exactly the requested removal; return whether they were removed."""
         wanted, self._wanted = self._wanted, None
         if wanted is None or wanted.gone.last_checkpoint != number:
             return False
@@ -102,7 +99,7 @@ class Remover:
         return True
 
     def refused(self, number: int, reason: str, *, early: bool = False) -> None:
-        """The signer does not sign this removal now; by age too `early`, which is no trouble: our clock is ahead."""
+        """Try again later. `early`: by the signer's clock the records are not old enough yet, which is normal."""
         wanted = self._wanted
         if wanted is not None and wanted.gone.last_checkpoint == number:
             self._wanted = None

@@ -1,14 +1,12 @@
-"""Kinds of folded records: what makes two records repetitions of each other, and the record that stands for many.
+"""Define the kinds of folded records: the key that repetitions share, and the summary of a kind.
 
-No text of a peer's choice makes kinds without end:
+Texts from peers cannot create an unlimited number of kinds:
 
-1. A kind of a host that the policy names is told by event, decision, rule, what was asked of what, and the reason: of a
-   decision, all of it, for it is ours; of what a peer got wrong the plain words, for numbers, names and what is quoted
-   are the peer's. A host has so many kinds, and takes none from another.
-2. A kind of a stranger is told by address, event, decision, call, and the plain words of the reason. All strangers
-   together have a few.
-3. What is over is one kind of its host, or one of all strangers. Reasons, callers and resources are counted by name,
-   the first of each; the rest is counted together.
+1. The key of a named host's kind has event, decision, rule, request, and reason. The reason of a decision is our own
+   text. From a peer's error only the plain words are used, because the peer chooses numbers, names and quotations.
+2. The key of an unknown host's kind has address, event, decision, call, and the plain words of the reason.
+3. Above the quota there is one kind per host, and one for all unknown hosts. These count the first few reasons, callers
+   and resources by name, and the rest together.
 """
 
 from typing import Any
@@ -16,22 +14,24 @@ from typing import Any
 import msgspec
 
 from appliance.audit.columns import plain_record
-from appliance.audit.record import Record, RuleReference, Severity
+from appliance.audit.record import AuditRecord, RuleReference, Severity
 
 Key = tuple[str | int | None, ...]
-KIND, STRANGER, HOST, STRANGERS, ALL = "kind", "stranger", "host", "strangers", "all"
-"""The scopes: what the records of a kind have in common. `STRANGERS` and `ALL` are of many hosts."""
+KIND, UNKNOWN, HOST, ALL_UNKNOWN, ALL = "kind", "unknown host", "host", "unknown hosts", "all"
+"""The scopes of kinds; `ALL_UNKNOWN` and `ALL` are of many hosts."""
 
-OTHERS = "(others)"  # no name of ROS, and no address, has a bracket
+_SCOPES_OF_0_1 = {"stranger": UNKNOWN, "strangers": ALL_UNKNOWN}
+
+OTHERS = "(others)"  # no ROS name or address has a bracket
 _NAMES = 8
 _LONGEST_NAME = 256
 _LONGEST_KEY = 1024
 ABOUT = ("call", "key", "node", "subgraph", "method", "status", "who", "monitor", "topics")
-"""What a call was about, in `detail`."""
+"""The fields of `detail` that identify a request."""
 
 
 class FoldState(msgspec.Struct, kw_only=True):
-    """The repetitions of one kind that are counted and not yet summarised; kept on disk against a crash."""
+    """The counted repetitions of one kind; stored on disk to survive a crash."""
 
     scope: str
     event: str
@@ -54,8 +54,11 @@ class FoldState(msgspec.Struct, kw_only=True):
     tallies: dict[str, dict[str, int]] = {}
     folds: bool = False
 
-    def count_in(self, record: Record) -> None:
-        """One repetition more; it may stand for several."""
+    def __post_init__(self) -> None:
+        self.scope = _SCOPES_OF_0_1.get(self.scope, self.scope)
+
+    def count_in(self, record: AuditRecord) -> None:
+        """Count a repetition."""
         if not self.count:
             self.first_id, self.first_time = record.id, record.time
         number = _stands_for(record)
@@ -75,14 +78,14 @@ class FoldState(msgspec.Struct, kw_only=True):
             key = key if key in counts or len(counts) < _NAMES else OTHERS
             counts[key] = counts.get(key, 0) + number
 
-    def begin_anew(self) -> None:
-        """What was counted is summarised."""
+    def reset(self) -> None:
+        """Start again at zero, after a summary."""
         self.count = 0
         self.tallies = {}
 
 
-def new_state(record: Record, scope: str) -> FoldState:
-    """The state of a kind that begins with this record, which is written in full."""
+def new_state(record: AuditRecord, scope: str) -> FoldState:
+    """Return the state of a kind that begins with this record."""
     about = {name: str(record.detail[name])[:_LONGEST_KEY] for name in ABOUT if name in record.detail}
     return FoldState(
         scope=scope, event=record.event, severity=record.severity, decision=record.decision, host=record.host,
@@ -92,17 +95,17 @@ def new_state(record: Record, scope: str) -> FoldState:
     )  # fmt: skip
 
 
-def subject(record: Record) -> Key:
-    """Who asked what of what: what an answer of the other sort contradicts."""
+def subject(record: AuditRecord) -> Key:
+    """Return the key of a request; a contrary decision with the same key ends a kind."""
     about = tuple(str(record.detail.get(name)) for name in ABOUT)
     return (record.host, record.caller_id, record.category, record.resource, *about)
 
 
-def kind_of(record: Record) -> Key:
-    """The key of the narrowest kind that a record is of."""
-    if record.stranger:
+def kind_of(record: AuditRecord) -> Key:
+    """Return the key of the narrowest kind of a record."""
+    if record.unknown:
         asked = (str(record.detail.get(name)) for name in ("call", "method", "status"))
-        return (STRANGER, record.host, record.event, record.decision, *asked, _plain_words(record.reason))
+        return (UNKNOWN, record.host, record.event, record.decision, *asked, _plain_words(record.reason))
     rule = record.rule
     where: Key = () if rule is None else (rule.section, rule.key, rule.file, rule.line)
     return (
@@ -119,8 +122,8 @@ def _plain_words(reason: str) -> str:
     return " ".join(word for word in reason[:_LONGEST_KEY].split() if word.isascii() and word.isalpha())
 
 
-def keepable(record: Record) -> Record:
-    """The record, in a form of which key and state can be stored."""
+def storable(record: AuditRecord) -> AuditRecord:
+    """Return the record, converted if its key and state would not be storable."""
     rule = record.rule
     texts = [record.host, record.caller_id, record.category, record.resource, record.reason, record.event]
     texts += [str(record.detail[name]) for name in ABOUT if name in record.detail]
@@ -134,8 +137,8 @@ def keepable(record: Record) -> Record:
     return record
 
 
-def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = False) -> Record:
-    """The record that stands for the repetitions counted in `state`."""
+def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = False) -> AuditRecord:
+    """Return the summary of the repetitions counted in `state`."""
     detail: dict[str, Any] = {
         "count": state.count, "of": state.event, "scope": state.scope, "recorded_id": state.recorded_id,
         "first_id": state.first_id, "last_id": state.last_id,
@@ -148,17 +151,17 @@ def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = Fa
         detail["recovered"] = True
     passed = state.folds
     what = "further records of a host beyond its share" if passed else "further denials of many kinds"
-    return Record(
+    return AuditRecord(
         id=record_id, time=time, event="repetitions folded" if passed else "denials folded", severity=state.severity,
-        decision=state.decision, host=None if state.scope in (STRANGERS, ALL) else state.host,
+        decision=state.decision, host=None if state.scope in (ALL_UNKNOWN, ALL) else state.host,
         caller_id=state.caller_id if exact else None, category=state.category if exact else None,
         resource=state.resource if exact else None, rule=state.rule if exact else None, revision=state.revision,
         reason=state.reason if exact else f"{state.count} {what}", duration_us=None, detail=detail,
-        stranger=state.scope in (STRANGER, STRANGERS),
+        unknown=state.scope in (UNKNOWN, ALL_UNKNOWN),
     )  # fmt: skip
 
 
-def _stands_for(record: Record) -> int:
-    """How many denials this record is: its reporter may have counted repetitions itself (`count`)."""
+def _stands_for(record: AuditRecord) -> int:
+    """Return `detail.count` of a record whose reporter already counted repetitions, else 1."""
     count = record.detail.get("count")
     return count if type(count) is int and count > 0 else 1

@@ -1,12 +1,11 @@
-"""Which old records may go, and which of them are written again. No I/O.
+"""Choose the old records to remove, and those of them to write again. No I/O.
 
-Records go oldest first, in steps that do not hold up writing, each as far as a checkpoint seals them; where there is a
-signer, one that it signed, and with its signature over the removal. Every step is itself a record, `records removed`,
-with the hash that the chain goes on from.
+The oldest records are removed first, in short steps, each up to a (signed) checkpoint. Every step is recorded as
+`records removed`, with the hash after which the chain continues.
 
-For their age all records go. For the size of the log, reads go first and denials and alarms last: of what a step
-removes, these are written again at the end of the log, with their id and time; at most half of what goes, so that the
-log does shrink, and the hosts in turn, so that no flood of one host's pushes another's out.
+An age limit removes all older records. A size limit keeps denials and alarms longer: they are written again at the end
+of the log, with their id and time. At most half of a step is kept, so the log shrinks. Hosts take turns, so a flood
+from one host cannot displace the records of another.
 """
 
 from collections import OrderedDict
@@ -17,15 +16,15 @@ import msgspec
 
 from appliance.audit.chain import StoredColumns
 from appliance.audit.columns import from_columns
-from appliance.audit.record import Record, Severity
+from appliance.audit.record import AuditRecord, Severity
 
-_OF_STRANGERS = "(strangers)"
+_UNKNOWN_HOSTS = "(unknown hosts)"
 _DAY = 86_400_000_000_000
 
 
 @dataclass(frozen=True)
 class Retention:
-    """Keep records for `days` (None: for ever) and the log below `size` bytes (None: any)."""
+    """The limits of a log: records are kept for `days` (None: always), and its size below `size` bytes (None: any)."""
 
     days: float | None = None
     size: int | None = None
@@ -35,18 +34,18 @@ class Retention:
             raise ValueError("retention needs more than 0 days and at least 1 MiB")
 
     def excess(self, size: int) -> str | None:
-        """Why the oldest records must go from a log of `size` bytes; None when it is not too large."""
+        """Return why a log of `size` bytes is too large, or None."""
         if self.size is None or size <= self.size:
             return None
         return f"the log was larger than {self.size} bytes"
 
     def oldest_kept(self, now: int) -> int:
-        """Records before this time (nanoseconds since the epoch) are too old."""
+        """Return the age limit in nanoseconds since the epoch; 0 without one."""
         return 0 if self.days is None else now - int(self.days * _DAY)
 
 
-def as_kept(columns: StoredColumns, digest: bytes) -> Record:
-    """A record that is written again: as it was, with its first place in the log and its hash there."""
+def as_kept(columns: StoredColumns, digest: bytes) -> AuditRecord:
+    """Return a record to write again, with its original sequence and hash in `detail.kept`."""
     record = from_columns(columns)
     if "kept" in record.detail:
         return record
@@ -54,15 +53,15 @@ def as_kept(columns: StoredColumns, digest: bytes) -> Record:
     return msgspec.structs.replace(record, detail=record.detail | {"kept": place})
 
 
-def worth_keeping(evidence: Sequence[Record], removed: int) -> list[Record]:
-    """Of the denials and alarms among so many `removed` records those that are written again, in their order.
+def worth_keeping(evidence: Sequence[AuditRecord], removed: int) -> list[AuditRecord]:
+    """Return the records of `evidence` to write again, in order, when `removed` records are removed.
 
-    Hosts take turns, and all strangers together are one; of one host's, alarms come before denials and those before
-    summaries, the oldest first.
+    Hosts take turns; all unknown hosts together count as one. For each host, alarms are chosen first, then denials,
+    then summaries, each oldest first.
     """
-    waiting: OrderedDict[str, list[Record]] = OrderedDict()
+    waiting: OrderedDict[str, list[AuditRecord]] = OrderedDict()
     for record in sorted(evidence, key=_rank):
-        who = _OF_STRANGERS if record.detail.get("stranger") else str(record.host)
+        who = _UNKNOWN_HOSTS if record.detail.get("stranger") else str(record.host)
         waiting.setdefault(who, []).append(record)
     chosen: set[str] = set()
     while waiting and len(chosen) < removed // 2:
@@ -73,7 +72,7 @@ def worth_keeping(evidence: Sequence[Record], removed: int) -> list[Record]:
     return [record for record in evidence if record.id in chosen]
 
 
-def _rank(record: Record) -> int:
+def _rank(record: AuditRecord) -> int:
     if record.severity is Severity.ALARM:
         return 0
     return 2 if record.event == "denials folded" else 1

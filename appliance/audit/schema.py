@@ -1,4 +1,4 @@
-"""The documented form of a record as a JSON schema."""
+"""The JSON schema of a record."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ FIELDS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 def json_schema() -> dict[str, Any]:
-    """The JSON schema (2020-12) of a record as CLI, REST and export give it."""
+    """Return the JSON schema (2020-12) of a record."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"ROSRV audit record, version {SCHEMA_VERSION}",

@@ -1,7 +1,7 @@
-"""Reads the log: search with paging, one record with its neighbours, following, export.
+"""Read the log: search with paging, show a record with its neighbours, follow, export.
 
-Works while the appliance writes and while it is stopped; takes no lock that the writer waits for. A text is
-looked up in the full-text index as far as the writer has got with it, and by reading the records after that.
+Reading works whether or not the appliance runs, and never blocks the writer. Texts are searched in the full-text index,
+and in the records that are not indexed yet.
 """
 
 import sqlite3
@@ -17,34 +17,34 @@ from appliance.audit.columns import from_columns
 from appliance.audit.ids import ID_LENGTH
 from appliance.audit.log_database import COLUMNS, LogUnreadableError, open_for_reading
 from appliance.audit.query import Condition, Filter, FilterError, conditions, text_condition, text_match
-from appliance.audit.record_format import Entry
+from appliance.audit.record_format import LogEntry
 
 LARGEST_PAGE = 10_000
 _SELECTIVE = 20_000
 _Found = TypeVar("_Found")
 
 
-class Page(NamedTuple):
-    """Records found, and the cursor for the next page; None when there are no more."""
+class SearchPage(NamedTuple):
+    """The found records, and the cursor of the next page; None at the end."""
 
-    entries: list[Entry]
+    entries: list[LogEntry]
     cursor: str | None
 
 
-class Shown(NamedTuple):
-    """One record, and the records of the same host or caller before and after it, in order."""
+class RecordInContext(NamedTuple):
+    """A record, and the records of the same host or caller before and after it, in order."""
 
-    entry: Entry
-    before: list[Entry]
-    after: list[Entry]
+    entry: LogEntry
+    before: list[LogEntry]
+    after: list[LogEntry]
 
 
 def search(
     path: Path, wanted: Filter, cursor: str | None = None, limit: int = 100, *, newest_first: bool = True
-) -> Page:
-    """A page of at most `limit` records that `wanted` asks for.
+) -> SearchPage:
+    """Return a page of at most `limit` records that match `wanted`.
 
-    `cursor` is the one of the page before. Raises `LogUnreadableError` and `FilterError`.
+    `cursor` is from the previous page. Raises `LogUnreadableError` and `FilterError`.
     """
     if not 1 <= limit <= LARGEST_PAGE:
         raise FilterError(f"limit: not within 1 and {LARGEST_PAGE}")
@@ -52,10 +52,10 @@ def search(
     return _reading(path, lambda connection: _page(connection, wanted, walk, limit))
 
 
-def show(path: Path, record_id: str, neighbours: int = 5) -> Shown | None:
-    """The record with this id (or sequence), with its neighbours; None when there is none."""
+def show(path: Path, record_id: str, neighbours: int = 5) -> RecordInContext | None:
+    """Return the record with this id (or sequence) and its neighbours, or None."""
 
-    def find(connection: sqlite3.Connection) -> Shown | None:
+    def find(connection: sqlite3.Connection) -> RecordInContext | None:
         column = "id" if len(record_id) == ID_LENGTH else "sequence"
         if column == "sequence" and not (record_id.isascii() and record_id.isdecimal()):
             return None
@@ -63,7 +63,7 @@ def show(path: Path, record_id: str, neighbours: int = 5) -> Shown | None:
         found = _fetch(connection, f"WHERE {column} = ? LIMIT 1", (value,))
         if not found:
             return None
-        return Shown(
+        return RecordInContext(
             found[0],
             _neighbours(connection, found[0], neighbours, newest_first=True)[::-1],
             _neighbours(connection, found[0], neighbours, newest_first=False),
@@ -72,8 +72,8 @@ def show(path: Path, record_id: str, neighbours: int = 5) -> Shown | None:
     return _reading(path, find)
 
 
-def export(path: Path, wanted: Filter, page: int = 1000) -> Iterator[Entry]:
-    """All records that `wanted` asks for, oldest first, a page in memory at a time."""
+def export(path: Path, wanted: Filter, page: int = 1000) -> Iterator[LogEntry]:
+    """Yield all records that match `wanted`, oldest first; one page is in memory at a time."""
     cursor: str | None = "0"
     while cursor is not None:
         entries, cursor = search(path, wanted, cursor, page, newest_first=False)
@@ -81,12 +81,12 @@ def export(path: Path, wanted: Filter, page: int = 1000) -> Iterator[Entry]:
 
 
 def last_sequence(path: Path) -> int:
-    """The sequence of the last record; 0 when there is none."""
+    """Return the sequence of the last record; 0 if there is none."""
     return _reading(path, _last_sequence)
 
 
 class Follower:
-    """What is recorded from now on. Each `poll` gives the records since the last one, oldest first."""
+    """A follower of the log: each `poll` returns the records since the previous one, oldest first."""
 
     def __init__(self, path: Path, wanted: Filter, after: int | None = None) -> None:
         """Begin after the sequence `after`, or at the end of the log."""
@@ -96,11 +96,11 @@ class Follower:
 
     @property
     def position(self) -> int:
-        """The sequence after which the next poll begins."""
+        """Return the sequence after which the next poll begins."""
         return self._after
 
-    def poll(self, limit: int = 1000) -> list[Entry]:
-        """The next records, at most `limit`; empty when nothing was recorded."""
+    def poll(self, limit: int = 1000) -> list[LogEntry]:
+        """Return the next records, at most `limit`."""
         head = _reading(self._path, _last_sequence)
         if head <= self._after:
             self._after = min(self._after, head)
@@ -113,7 +113,7 @@ class Follower:
 
 
 class _Walk(NamedTuple):
-    """Where a page begins (exclusive) and in which direction it goes."""
+    """The start of a page (exclusive), and its direction."""
 
     start: int | None
     newest_first: bool
@@ -152,7 +152,7 @@ def _last_sequence(connection: sqlite3.Connection) -> int:
     return int(last)
 
 
-def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: int) -> Page:
+def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: int) -> SearchPage:
     found = conditions(wanted)
     index = _most_selective(connection, found)
     if wanted.text:
@@ -163,12 +163,12 @@ def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: in
     else:
         entries = _select_by_text(connection, found, words, walk, limit + 1)
     if len(entries) <= limit:
-        return Page(entries, None)
-    return Page(entries[:limit], str(entries[limit - 1].sequence))
+        return SearchPage(entries, None)
+    return SearchPage(entries[:limit], str(entries[limit - 1].sequence))
 
 
 def _most_selective(connection: sqlite3.Connection, found: list[Condition]) -> str | None:
-    """The index with the fewest candidates; None when each has so many that walking the log is quick."""
+    """Return the index with the fewest candidates; None if all have at least `_SELECTIVE`: a scan is then quick."""
     best, fewest = None, _SELECTIVE
     for condition in found:
         if condition.answered_by is not None:
@@ -184,7 +184,7 @@ def _most_selective(connection: sqlite3.Connection, found: list[Condition]) -> s
 
 def _select(
     connection: sqlite3.Connection, found: list[Condition], index: str | None, walk: _Walk, limit: int
-) -> list[Entry]:
+) -> list[LogEntry]:
     hint = "NOT INDEXED" if index is None else f"INDEXED BY {index}"
     tail = f"ORDER BY sequence {walk.order} LIMIT ?"
     return _fetch(connection, f"{hint} {_where(found)} {tail}", (*_values(found), limit))
@@ -192,9 +192,9 @@ def _select(
 
 def _select_by_text(
     connection: sqlite3.Connection, found: list[Condition], words: str, walk: _Walk, limit: int
-) -> list[Entry]:
+) -> list[LogEntry]:
     (through,) = connection.execute("SELECT through FROM indexed").fetchone()
-    entries: list[Entry] = []
+    entries: list[LogEntry] = []
     for indexed in (False, True) if walk.newest_first else (True, False):
         left = limit - len(entries)
         if left and indexed:
@@ -207,7 +207,7 @@ def _select_by_text(
 
 def _candidates(
     connection: sqlite3.Connection, found: list[Condition], words: str, walk: _Walk, limit: int
-) -> list[Entry]:
+) -> list[LogEntry]:
     matching = [Condition("words MATCH ?", (words,)), *walk.condition("words.rowid"), *found]
     return _fetch(
         connection,
@@ -218,10 +218,10 @@ def _candidates(
 
 
 def _neighbours(
-    connection: sqlite3.Connection, entry: Entry, count: int, *, newest_first: bool
-) -> list[Entry]:
+    connection: sqlite3.Connection, entry: LogEntry, count: int, *, newest_first: bool
+) -> list[LogEntry]:
     walk = _Walk(entry.sequence, newest_first)
-    near: dict[int, Entry] = {}
+    near: dict[int, LogEntry] = {}
     for column in ("host", "caller_id"):
         value = getattr(entry.record, column)
         if value is not None:
@@ -240,7 +240,7 @@ def _values(found: list[Condition]) -> tuple[object, ...]:
 
 def _fetch(
     connection: sqlite3.Connection, tail: str, values: tuple[object, ...], table: str = "record"
-) -> list[Entry]:
+) -> list[LogEntry]:
     rows = connection.execute(f"SELECT {COLUMNS} FROM {table} {tail}", values)  # noqa: S608  fixed names
     stored = (StoredColumns(*row) for row in rows)
-    return [Entry(columns.sequence, from_columns(columns)) for columns in stored]
+    return [LogEntry(columns.sequence, from_columns(columns)) for columns in stored]

@@ -1,10 +1,9 @@
-"""Signatures of checkpoints: which are asked for, and whether what comes back may be kept.
+"""Request signatures of checkpoints, and store the valid ones.
 
-Invariants:
-1. A signature is kept only if it is right for the checkpoint's text and made with the pinned key.
-2. The key of the first right signature is pinned in `<log>.pub` (PEM) and never replaced by the program.
-3. A checkpoint stays unsigned as long as the signer is away and is asked for again (`ask`), oldest first, a
-   bounded number at a time.
+1. A signature is stored only if it is valid for the checkpoint's text and made with the pinned key.
+2. The key of the first valid signature is pinned in `<log>.pub` (PEM); the program never replaces it.
+3. While the signer is not in service, checkpoints stay unsigned. Their signatures are requested later (`ask`), oldest
+   first, a limited number at a time.
 """
 
 from collections.abc import Callable
@@ -24,16 +23,16 @@ ASKED_AT_ONCE = 64
 
 
 class KeyUnreadableError(Exception):
-    """A public key file is missing or is no Ed25519 key in PEM."""
+    """A public key file is missing or is not an Ed25519 key in PEM."""
 
 
 def pinned_key_path(log: Path) -> Path:
-    """Where the public key of a log is pinned."""
+    """Return the path of a log's pinned public key."""
     return log.with_name(log.stem + ".pub")
 
 
 def read_public_key(path: Path) -> bytes:
-    """The raw Ed25519 public key (32 bytes) in a PEM file. Raises `KeyUnreadableError`."""
+    """Return the raw Ed25519 public key (32 bytes) in a PEM file. Raises `KeyUnreadableError`."""
     try:
         key = load_pem_public_key(read_given(path))
     except OSError as error:
@@ -45,8 +44,8 @@ def read_public_key(path: Path) -> bytes:
     return key.public_bytes_raw()
 
 
-def signature_is_right(public_key: bytes, signature: bytes, text: bytes) -> bool:
-    """Whether `signature` over `text` was made with the private half of `public_key`."""
+def signature_is_valid(public_key: bytes, signature: bytes, text: bytes) -> bool:
+    """Whether the private key of `public_key` signed `text`."""
     try:
         Ed25519PublicKey.from_public_bytes(public_key).verify(signature, text)
     except (InvalidSignature, ValueError):
@@ -55,7 +54,7 @@ def signature_is_right(public_key: bytes, signature: bytes, text: bytes) -> bool
 
 
 class Signatures:
-    """Asks the signer for signatures and keeps those that are right."""
+    """The signatures of a log: requests to the signer, and its valid answers."""
 
     def __init__(self, log: Path, signer: Signer | None) -> None:
         self._pin = pinned_key_path(log)
@@ -70,18 +69,18 @@ class Signatures:
 
     @property
     def key_was_pinned(self) -> bool:
-        """Whether a log in this place has ever been signed."""
+        """Whether a log at this path was ever signed."""
         return self._pin.exists()
 
     def sealed(self, number: int, text: bytes) -> None:
-        """A checkpoint was made: ask for its signature, unless others have to be asked for before."""
-        # The signer signs in order only, so once one had to wait all that follow wait until `ask`.
+        """Request the signature of a new checkpoint, unless others must be requested first."""
+        # The signer signs in order: once a checkpoint waits, all later ones wait until `ask`.
         self._waiting = self._waiting or len(self._asked) >= ASKED_AT_ONCE
         if not self._waiting:
             self._ask(number, text)
 
     def ask(self, writer: ChainWriter) -> None:
-        """The signer is (back) in service, or is asked once more: ask for what is still unsigned."""
+        """Request the oldest missing signatures again: the signer is in service, or an answer may be lost."""
         self._asked.clear()
         self._waiting = False
         if self._signer is not None:
@@ -97,7 +96,7 @@ class Signatures:
         self._signer(number, text)
 
     def keep(self, writer: ChainWriter, number: int, signature: bytes, public_key: bytes) -> str | None:
-        """Keep a signature; the reason when it is refused."""
+        """Store a valid signature and pin the first key; return the reason if the signature is invalid."""
         self._asked.discard(number)
         text = writer.checkpoint_text(number)
         if text is None:
@@ -106,15 +105,15 @@ class Signatures:
         if wrong is not None:
             return wrong
         if not self._pin.exists():
-            _pin_key(self._pin, public_key)
+            write_public_key(self._pin, public_key)
         writer.keep_signature(number, signature, public_key)
         if not self._asked and self._waiting:
             self.ask(writer)
         return None
 
     def wrong(self, what: str, text: bytes, signature: bytes, public_key: bytes) -> str | None:
-        """What is wrong with a signature: it does not fit, or is not made with the pinned key; None if nothing is."""
-        if not signature_is_right(public_key, signature, text):
+        """Return why a signature is invalid or not made with the pinned key, or None."""
+        if not signature_is_valid(public_key, signature, text):
             return f"the signature of {what} is wrong"
         if not self._pin.exists():
             return None
@@ -127,7 +126,8 @@ class Signatures:
         return None
 
 
-def _pin_key(path: Path, public_key: bytes) -> None:
+def write_public_key(path: Path, public_key: bytes) -> None:
+    """Write a raw Ed25519 public key to a PEM file, replacing an existing one. Raises `OSError`."""
     key = Ed25519PublicKey.from_public_bytes(public_key)
     text = key.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
     write_whole(path, text, 0o644)

@@ -1,12 +1,11 @@
-"""Proves that a log is complete and unchanged, or says which records are not, and how.
+"""Verify that a log is complete and unchanged, or report which records are not, and how.
 
-The chain is walked once from the first record kept to the last. Where a record does not follow from the one
-before it, the records around it are tried in other places to tell a change from a removal, an insertion or a
-reordering. The checkpoints are then held against the chain, the key, and what the signer remembers.
+The chain is walked once from the first record to the last. If a record does not follow from the previous one, the
+following records are tried in other positions, to distinguish a change, a removal, an insertion and a reordering. Then
+the checkpoints are checked by the chain, the key, and the signer's memory.
 
-What no reading of the log can show: that records after the last signed checkpoint were cut off or written
-anew. `Verification.unsealed` says how many records that concerns. What root can forge (a history that is signed anew,
-the signer's memory with it) only checkpoints kept on another machine can show.
+The log alone cannot show that records after the last signed checkpoint were cut off or rewritten; `unsealed` is the
+number of these records. Root can rewrite both log and memory, which only checkpoints on another machine reveal.
 """
 
 import re
@@ -19,18 +18,18 @@ import msgspec
 
 from appliance.audit import log_database
 from appliance.audit.chain import StoredColumns, follows, genesis
-from appliance.audit.chain_findings import Elsewhere, Kind, LogFinding, Verification
-from appliance.audit.checkpoints import CheckpointAudit, Remembered, checkpoint_rows, read_remembered
-from appliance.audit.copies import CopiesAudit, SignedCheckpoint
+from appliance.audit.chain_findings import Elsewhere, FindingKind, LogFinding, Verification
+from appliance.audit.checkpoints import CheckpointVerifier, SignerMemory, checkpoint_rows, read_signer_memory
+from appliance.audit.copies import CopiesVerifier, SignedCheckpoint
 from appliance.audit.log_database import reading
-from appliance.audit.signatures import pinned_key_path, read_public_key, signature_is_right
+from appliance.audit.signatures import pinned_key_path, read_public_key, signature_is_valid
 from appliance.signing.signed_statements import NO_CHECKPOINT, Removal
 
 _WINDOW = 64
 _TOLD_EVERY = 5000
 _MOST_FINDINGS = 1000
 _EVENT, _DETAIL = StoredColumns._fields.index("event"), StoredColumns._fields.index("detail")
-# By how many places a record may have been renumbered.
+# The distances by which a record may have been renumbered.
 _DISTANCES = tuple(distance for step in range(1, 1000) for distance in (step, -step))
 _WORDS_TABLES = ("words_data", "words_idx", "words_docsize", "words_config")
 _LOG_ID = re.compile("[0-9a-f]{32}")
@@ -42,7 +41,7 @@ _NOT_AS_WRITTEN = (msgspec.MsgspecError, TypeError, ValueError, RecursionError, 
 
 
 class _Removal(msgspec.Struct, frozen=True):
-    """What the detail of a `records removed` record must be for the chain to begin after it."""
+    """The detail of a `records removed` record, which has the hashes after which the chain continues."""
 
     first_sequence: _Count
     last_sequence: _Count
@@ -55,17 +54,17 @@ class _Removal(msgspec.Struct, frozen=True):
     signature: str = ""
 
     def is_signed(self, log: str, key: bytes) -> bool:
-        """Whether the signer with this key has signed exactly this removal."""
+        """Whether the signer with this key signed exactly this removal."""
         checkpoint, sequence = self.last_checkpoint, self.last_sequence
         gone = Removal(log, checkpoint, sequence, self.last_hash, self.last_checkpoint_hash, self.limit)
         try:
-            return signature_is_right(key, bytes.fromhex(self.signature), gone.text())
+            return signature_is_valid(key, bytes.fromhex(self.signature), gone.text())
         except ValueError:
             return False
 
 
 class _Reported(msgspec.Struct, frozen=True):
-    """What the detail of a `checkpoint` record must be."""
+    """The required detail of a `checkpoint` record."""
 
     number: _Count
     hash: str
@@ -78,21 +77,19 @@ def verify(
     copies: Sequence[SignedCheckpoint] | None = None,
     progress: Callable[[int], None] = lambda _sequence: None,
 ) -> Verification:
-    """Check the log at `path` from end to end.
+    """Verify the log at `path` from end to end. Raises `LogUnreadableError` and `KeyUnreadableError`.
 
-    `public_key` (raw, 32 bytes) is the key the checkpoints must be signed with; by default the one pinned
-    beside the log. `signer` is the signer's directory, whose memory the checkpoints are held against. `copies` are
-    checkpoints that were kept on another machine, which the chain is held against as well. `progress` is told now and
-    then the sequence that was looked at last. Raises `LogUnreadableError` if there is no log, and
-    `KeyUnreadableError` if the pinned key is no key.
+    `public_key` (raw, 32 bytes) must have signed the checkpoints; default: the key pinned beside the log. `signer` is
+    the directory with the signer's memory. `copies` are checkpoints from another machine. `progress` is called with
+    the sequence from time to time.
     """
     if public_key is None and pinned_key_path(path).exists():
         public_key = read_public_key(pinned_key_path(path))
     with reading(path, advice="") as connection:
         connection.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
         log = _log_id(connection)
-        # Before the log is: what is signed while it is read is in neither, or in the log only.
-        remembered = None if signer is None else read_remembered(signer, log)
+        # Read the memory before the log, so that a checkpoint signed in between is at most in the log.
+        remembered = None if signer is None else read_signer_memory(signer, log)
         connection.execute("BEGIN")
         verifier = _Verifier(connection, log, public_key, remembered, copies=copies, progress=progress)
         return verifier.run()
@@ -105,7 +102,7 @@ class _Row(NamedTuple):
     detail: bytes
 
     def follows(self, previous: bytes, sequence: int) -> bool:
-        """Whether this is the record that was written as `sequence` after the hash `previous`."""
+        """Whether this record was written as `sequence` after the hash `previous`."""
         try:
             return follows(previous, (sequence, *self.columns[1:]), self.hash)
         except UnicodeEncodeError:  # bytes that no writer stored
@@ -113,7 +110,7 @@ class _Row(NamedTuple):
 
 
 def _row(row: tuple[object, ...]) -> _Row:
-    """A record; tables that were made anew may hold any type in any column."""
+    """Check the types of a row: replaced tables may have any type in any column."""
     sequence, digest, detail = row[0], row[-1], row[_DETAIL]
     if not (isinstance(sequence, int) and isinstance(digest, bytes) and isinstance(detail, bytes)):
         raise sqlite3.DataError("a column has a value of another type than a log's tables hold")
@@ -121,24 +118,24 @@ def _row(row: tuple[object, ...]) -> _Row:
 
 
 def _log_id(connection: sqlite3.Connection) -> str:
-    """The id of the log; empty if the file does not have exactly one that is well formed."""
+    """Return the id of the log; empty unless there is exactly one, well formed."""
     try:
         rows = connection.execute("SELECT id FROM log LIMIT 2").fetchall()
     except sqlite3.DatabaseError:
-        return ""  # no such table: told with the structure; what cannot be read at all fails there
+        return ""  # no such table: `_check_structure` reports it
     found = rows[0][0] if len(rows) == 1 else None
     return found if isinstance(found, str) and _LOG_ID.fullmatch(found) else ""
 
 
 class _Verifier:
-    """One walk over one log."""
+    """The verification of one log in one walk."""
 
     def __init__(
         self,
         connection: sqlite3.Connection,
         log: str,
         key: bytes | None,
-        remembered: Remembered | None,
+        remembered: SignerMemory | None,
         *,
         copies: Sequence[SignedCheckpoint] | None,
         progress: Callable[[int], None],
@@ -148,8 +145,8 @@ class _Verifier:
         self._key = key
         self._log = log
         self._remembered = remembered
-        self._checkpoints = CheckpointAudit(self._log, key, remembered)
-        self._copies = None if copies is None else CopiesAudit(self._log, key, copies)
+        self._checkpoints = CheckpointVerifier(self._log, key, remembered)
+        self._copies = None if copies is None else CopiesVerifier(self._log, key, copies)
         self._findings: list[LogFinding] = []
         self._further: LogFinding | None = None
         self._untold = 0
@@ -168,7 +165,7 @@ class _Verifier:
             sequences = self._connection.execute("SELECT sequence FROM checkpoint")
             self._sealed = {sequence: b"" for (sequence,) in sequences}
         except sqlite3.DatabaseError:
-            self._sealed = {}  # told where the checkpoints are checked
+            self._sealed = {}  # `_check_checkpoints` reports it
         if self._copies is not None:
             self._sealed |= dict.fromkeys(self._copies.sequences, b"")
         self._walk(removed)
@@ -197,20 +194,20 @@ class _Verifier:
         try:
             stored = {row[0]: row[2].hex() for row in checkpoint_rows(self._connection)}
         except sqlite3.DatabaseError:
-            stored = {}  # which is reported where the checkpoints themselves are checked
+            stored = {}  # `_check_checkpoints` reports it
         self._findings += self._copies.check(chain, gone, last, stored)
         return self._copies.result()
 
     def _check_removal(self, removed: _Removal | None) -> str:
-        """Whether the signer signed that the log's beginning goes.
+        """Return "signed", "unsigned", or "" without a removal.
 
-        If it did not, the removal is unfounded, unless it was made before removals were signed: then each checkpoint
-        that says how much is removed was made after it.
+        A removal without a signature is unfounded, unless a version that did not sign removals made it: then no signed
+        statement has a smaller `removed`.
         """
         if removed is None:
             return ""
         if self._key is None:
-            return "unsigned"  # nor is anything else
+            return "unsigned"  # without a key, no signature can be checked
         if removed.is_signed(self._log, self._key):
             return "signed"
         said = self._checkpoints.removed + (self._copies.removed if self._copies else [])
@@ -221,10 +218,10 @@ class _Verifier:
                 "said to have been removed for their age or the log's size, and the signer did not sign that: nothing"
                 " shows that they had to go"
             )
-            self._find(Kind.REMOVAL_UNFOUNDED, 1, removed.last_sequence, message)
+            self._find(FindingKind.REMOVAL_UNFOUNDED, 1, removed.last_sequence, message)
         return "unsigned"
 
-    def _find(self, kind: Kind, first: int, last: int, message: str) -> None:
+    def _find(self, kind: FindingKind, first: int, last: int, message: str) -> None:
         if len(self._findings) < _MOST_FINDINGS:
             name = f"record {first}" if first == last else f"records {first} to {last}"
             self._findings.append(LogFinding(kind, first, last, f"{name}: {message}"))
@@ -253,11 +250,11 @@ class _Verifier:
             self._structure(str(error))
 
     def _structure(self, message: str) -> None:
-        message = message.encode("utf-8", "backslashreplace").decode()  # bytes that were no text
-        self._findings.append(LogFinding(Kind.STRUCTURE, 0, 0, f"database: {message}"))
+        message = message.encode("utf-8", "backslashreplace").decode()  # bytes that were not text
+        self._findings.append(LogFinding(FindingKind.STRUCTURE, 0, 0, f"database: {message}"))
 
     def _last_removal(self) -> _Removal | None:
-        """What retention removed last; its record is part of the chain that is walked."""
+        """Return the last removal by retention; the walk verifies its record."""
         query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
         try:
             row = self._connection.execute(query).fetchone()
@@ -279,33 +276,33 @@ class _Verifier:
                 previous = self._step(row, previous)
         except sqlite3.DatabaseError as error:
             after = self.last + 1
-            self._find(Kind.UNREADABLE, after, after, f"it and what follows cannot be read: {error}")
+            self._find(FindingKind.UNREADABLE, after, after, f"it and what follows cannot be read: {error}")
 
     def _step(self, row: _Row, previous: bytes) -> bytes:
-        """Check one record; gives the hash that the next one must follow."""
+        """Check one record; return the hash that the next one must follow."""
         sequence, expected = row.sequence, self.last + 1
         if sequence < expected:
-            self._find(Kind.INSERTED, sequence, sequence, "stands before the first record of the log")
+            self._find(FindingKind.INSERTED, sequence, sequence, "stands before the first record of the log")
             return previous
         self.last = sequence
         if sequence <= self._explained:
             return previous
         if sequence > expected:
-            self._find(Kind.MISSING, expected, sequence - 1, "removed from the log")
+            self._find(FindingKind.MISSING, expected, sequence - 1, "removed from the log")
         elif not row.follows(previous, sequence - self._shift):
             return self._explain(row, previous)
         self._note(row, sequence - self._shift)
         return row.hash
 
     def _note(self, row: _Row, place: int) -> None:
-        """Remember what the checkpoints are held against."""
+        """Store the hash of a sealed record, and the number in a `checkpoint` record."""
         if place in self._sealed:
             self._sealed[place] = row.hash
         if row.columns[_EVENT] == "checkpoint":
             try:
                 self._reported.add(msgspec.json.decode(row.detail, type=_Reported).number)
             except _NOT_AS_WRITTEN:
-                return  # not as the writer wrote it: found when its hash is checked
+                return  # a changed record, which the check of its hash reports
 
     def _rows(self, after: int = -(1 << 63), limit: int = -1) -> Iterator[_Row]:
         rows = self._connection.execute(
@@ -316,7 +313,12 @@ class _Verifier:
         return map(_row, rows)
 
     def _explain(self, row: _Row, previous: bytes) -> bytes:
-        """Say what happened at a record that does not follow; gives the hash to go on from."""
+        """Find out why a record does not follow; return the hash to continue from.
+
+        Each search takes milliseconds. None is made after `_MOST_FINDINGS`, so that a forged log cannot take hours.
+        """
+        if len(self._findings) >= _MOST_FINDINGS:
+            return self._changed(row, row.sequence - self._shift)
         ahead = list(self._rows(row.sequence, _WINDOW))
         place = row.sequence - self._shift
         order = _original_order([row, *ahead], previous, place)
@@ -325,11 +327,13 @@ class _Verifier:
         first = order[0].sequence
         if len(order) > 1 and max(written.sequence for written in order) == row.sequence + len(order) - 1:
             self._explained = row.sequence + len(order) - 1
-            self._find(Kind.REORDERED, row.sequence, self._explained, "not in the order they were written in")
+            self._find(
+                FindingKind.REORDERED, row.sequence, self._explained, "not in the order they were written in"
+            )
             for offset, written in enumerate(order):
                 self._note(written, place + offset)
             return order[-1].hash
-        self._find(Kind.INSERTED, row.sequence, first - 1, "inserted; what follows was renumbered")
+        self._find(FindingKind.INSERTED, row.sequence, first - 1, "inserted; what follows was renumbered")
         self._explained = first - 1
         self._shift += first - row.sequence
         return previous
@@ -340,19 +344,25 @@ class _Verifier:
             if following is not None and following.follows(row.hash, place + 1 + distance):
                 if distance > 0:
                     self._find(
-                        Kind.MISSING, place, place + distance - 1, "removed; what follows was renumbered"
+                        FindingKind.MISSING,
+                        place,
+                        place + distance - 1,
+                        "removed; what follows was renumbered",
                     )
                 else:
                     message = "inserted with a hash of its own; what follows was renumbered"
-                    self._find(Kind.INSERTED, row.sequence + distance, row.sequence - 1, message)
+                    self._find(FindingKind.INSERTED, row.sequence + distance, row.sequence - 1, message)
                 self._shift -= distance
                 self._note(row, place + distance)
                 return row.hash
+        return self._changed(row, place)
+
+    def _changed(self, row: _Row, place: int) -> bytes:
         message = (
             "does not have the content it was written with"
             f" (or record {row.sequence - 1} was replaced by one with a hash of its own)"
         )
-        self._find(Kind.CHANGED, row.sequence, row.sequence, message)
+        self._find(FindingKind.CHANGED, row.sequence, row.sequence, message)
         self._note(row, place)
         return row.hash
 
@@ -371,13 +381,13 @@ class _Verifier:
         for number in sorted(self._reported):
             if number > audit.last_number:
                 message = f"checkpoint {number}: the chain has its record, but it was removed"
-                self._findings.append(LogFinding(Kind.CHECKPOINT_MISSING, number, number, message))
+                self._findings.append(LogFinding(FindingKind.CHECKPOINT_MISSING, number, number, message))
 
 
 def _original_order(rows: list[_Row], previous: bytes, place: int) -> list[_Row]:
-    """The records of `rows` in the order they were written from `place` on.
+    """Return the records of `rows` in their original order from sequence `place` on.
 
-    As far as it can be told: up to where they fill their places again (a reordering), or to the end.
+    The result ends where these records fill the same positions (a reordering), or where no next record is found.
     """
     order: list[_Row] = []
     left = list(rows)

@@ -1,4 +1,4 @@
-"""Who waits until everything recorded so far is on disk, and the answer: on disk, or why not."""
+"""Answer coroutines that wait until all records so far are on disk."""
 
 import asyncio
 import contextlib
@@ -8,16 +8,16 @@ from typing import NamedTuple
 
 
 class Waiter(NamedTuple):
-    """A future of somebody's event loop."""
+    """A future and its event loop."""
 
     loop: asyncio.AbstractEventLoop
     future: asyncio.Future[str | None]
 
 
 def answer(waiting: Iterable[Waiter], result: str | None) -> None:
-    """Answer all of them; those of one event loop with one call into it."""
+    """Answer all waiters, with one call for each run of waiters of the same event loop."""
     for loop, group in itertools.groupby(waiting, lambda waiter: waiter.loop):
-        # A closed loop raises RuntimeError: nobody waits any more.
+        # A closed loop raises RuntimeError; its coroutines no longer wait.
         with contextlib.suppress(RuntimeError):
             loop.call_soon_threadsafe(_settle, [waiter.future for waiter in group], result)
 

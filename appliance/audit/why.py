@@ -1,14 +1,14 @@
-"""Why what a record tells happened, in a few lines for people: who, which events, which values, which line."""
+"""Explain a record in a few lines: author, events, values, location in the specification."""
 
 from collections.abc import Iterator
 
-from appliance.audit.record import Record
+from appliance.audit.record import AuditRecord
 from appliance.audit.record_format import rule_text
 from rosmop.run.why_text import lines_of_why, list_of, mapping_of
 
 
-def lines_of(record: Record) -> Iterator[str]:
-    """The lines; strangers' text is in them as it is."""
+def lines_of(record: AuditRecord) -> Iterator[str]:
+    """Yield the lines of the explanation; the caller must escape untrusted text in them."""
     detail = record.detail
     yield record.reason or record.event
     sent = [f"{name} {detail[name]}" for name in ("number", "seq") if name in detail]

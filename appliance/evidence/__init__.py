@@ -1,1 +1,1 @@
-"""Evidence bundles: what happened in a span of time in one file that proves itself elsewhere."""
+"""Evidence bundles: the audit records of a span of time in one file that can be verified anywhere."""

@@ -1,13 +1,13 @@
-"""A bundle of evidence: what the log has of a span of time, what was in force, and what proves it, as one ZIP file.
+"""Make an evidence bundle: one ZIP file with the records of a span of time, the policies and monitors, and the proof.
 
 Invariants:
-1. Everything under the manifest is the same, byte for byte, whenever the same span is exported: the members are made
-   twice, once for their hashes and once to be written, and a difference ends the export.
-2. The manifest has the hash of every member. The audit record of the export has the manifest's, and is sealed by a
-   signed checkpoint before the first byte is given out. `proof.json` is that record: the one member that no hash is of.
-3. Records are given as they are stored, so that `verify.py` makes their hashes without our code.
-4. A run has every record between its ends. Records whose time is out of their order (the clock was set back, retention
-   wrote them again) make runs of their own when they are far from the others.
+1. The members that the manifest lists are generated twice, once for their hashes and once to be written. A difference
+   ends the export.
+2. The manifest has the hash of every member. The audit record of the export has the hash of the manifest, and a signed
+   checkpoint seals that record before the first byte is sent. The record is `proof.json`, which the manifest omits.
+3. Records are exported as they are stored, so `verify.py` computes their hashes without the appliance's code.
+4. A run has every record between its ends. Records out of order by time (the clock was set back, or retention wrote
+   them again) become separate runs when they are far from the others.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from appliance.audit.chain import StoredColumns
-from appliance.audit.chain_proofs import Places
+from appliance.audit.chain_proofs import ChainProof, ChainReader
 from appliance.audit.log_database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.signatures import pinned_key_path
 from appliance.channel.admin import (
@@ -50,7 +50,7 @@ Ask = Callable[[AdminRequest[Any]], AdminAnswer[Any]]
 Member = tuple[str, Iterable[bytes]]
 _PAGE = 500
 _APART = 1000  # records between two runs
-_MOMENT = (1980, 1, 1, 0, 0, 0)  # of every member, the first that a ZIP file can have
+_MOMENT = (1980, 1, 1, 0, 0, 0)  # the time of every member: the earliest that a ZIP file can store
 _POLICY, _SPECIFICATIONS = "policy loaded", "specifications loaded"
 _LOAD = "SELECT event, revision, detail FROM record WHERE sequence = ?"
 _LOADS = "SELECT sequence FROM record INDEXED BY record_event WHERE sequence BETWEEN ? AND ? AND event = ?"
@@ -60,41 +60,41 @@ _LAST_LOAD = "SELECT max(sequence) FROM record INDEXED BY record_event WHERE eve
 
 
 class BundleError(Exception):
-    """There is no bundle; the text says why, `trouble` whose fault it is."""
+    """A bundle cannot be made; the message has the reason, `trouble` its kind."""
 
     def __init__(self, text: str, trouble: Trouble) -> None:
         super().__init__(text)
         self.trouble = trouble
 
 
-class Span(NamedTuple):
-    """From `since` until before `until`, nanoseconds since the epoch."""
+class TimeSpan(NamedTuple):
+    """A span from `since` up to, but not including, `until`, in nanoseconds since the epoch."""
 
     since: int
     until: int
 
 
-class Kept(NamedTuple):
-    """The recording of this id, in the folder of all recordings."""
+class RecordingSelection(NamedTuple):
+    """A recording, by its id and the folder of all recordings."""
 
     id: str
     folder: Path
 
 
-def export(log: Path, wanted: Span | Kept, ask: Ask) -> Iterator[bytes]:
-    """The bytes of a bundle; when this returns it is sealed and recorded. `ask` asks the running appliance.
+def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask) -> Iterator[bytes]:
+    """Return the bytes of a bundle; its export is recorded and sealed when this returns. `ask` queries the appliance.
 
-    Of a recording it has the messages, and everything of its time.
-    Raises `BundleError` and `LogUnreadableError`, both also while it is given out.
+    The bundle of a recording has its messages and all records of its time. Raises `BundleError` and
+    `LogUnreadableError`, also during the iteration.
     """
     recording: Recording | None = None
     bag = Path()
-    if isinstance(wanted, Kept):
+    if isinstance(wanted, RecordingSelection):
         recording = _given(ask(RecordingFetch(wanted.id)))
         bag = wanted.folder / wanted.id / "recording.bag"
-        wanted = Span(recording.began, recording.ended + 1)
+        wanted = TimeSpan(recording.began, recording.ended + 1)
     _given(ask(LogSealed()))
-    span = Span(wanted.since, min(wanted.until, time.time_ns()))
+    span = TimeSpan(wanted.since, min(wanted.until, time.time_ns()))
     bundle = _Bundle(log, span, ask, recording, bag)
     manifest = bundle.manifest()
     text = json.dumps(manifest, indent=1).encode() + b"\n"
@@ -108,7 +108,7 @@ def export(log: Path, wanted: Span | Kept, ask: Ask) -> Iterator[bytes]:
 class _Bundle:
     """The members of a bundle."""
 
-    def __init__(self, log: Path, span: Span, ask: Ask, recording: Recording | None, bag: Path) -> None:
+    def __init__(self, log: Path, span: TimeSpan, ask: Ask, recording: Recording | None, bag: Path) -> None:
         self._log, self._span, self._ask, self._recording, self._bag = log, span, ask, recording, bag
         with reading(log) as connection:
             connection.execute("BEGIN")
@@ -116,7 +116,7 @@ class _Bundle:
         self.count = sum(last - first + 1 for first, last in self._runs)
 
     def _find(self, execute: Callable[..., sqlite3.Cursor]) -> None:
-        """Which records, policies and specifications belong to it."""
+        """Find the records, policies and specifications of the bundle."""
         (self._id,) = execute("SELECT id FROM log").fetchone()
         (sealed,) = execute("SELECT max(sequence) FROM checkpoint WHERE signature IS NOT NULL").fetchone()
         found = execute(
@@ -158,7 +158,7 @@ class _Bundle:
         self._alone = sorted(loads | there)
 
     def manifest(self) -> dict[str, Any]:
-        """The hashes of all members, made by making them, and what there should be and is not."""
+        """Return the manifest: hashes and sizes of all members, and the names of the missing ones."""
         manifest: dict[str, Any] = {
             "format": FORMAT, "log": self._id, "since": self._span.since, "until": self._span.until,
             "recording": self._recording.id if self._recording else "", "runs": self._runs, "missing": [],
@@ -173,7 +173,7 @@ class _Bundle:
         return manifest
 
     def checked(self, manifest: dict[str, Any]) -> Iterator[Member]:
-        """The members once more. Raises `BundleError` where they are others than before."""
+        """Yield the members again. Raises `BundleError` if they have changed."""
         left = dict(manifest["members"])
         for name, pieces in self.members({**manifest, "missing": []}):
             digest = hashlib.sha256()
@@ -184,7 +184,7 @@ class _Bundle:
             raise BundleError(f"{', '.join(left)} went while it was exported: export again", "failed")
 
     def members(self, manifest: dict[str, Any]) -> Iterator[Member]:
-        """All members, one after the other; what is missing is noted in the manifest."""
+        """Yield all members; add the names of missing ones to the manifest."""
         yield "verify.py", [VERIFIER.read_bytes()]
         yield "audit.pub", [pinned_key_path(self._log).read_bytes()]
         for revision in sorted(self._policies):
@@ -229,7 +229,7 @@ def _given(answer: AdminAnswer[A]) -> A:
 
 
 def _runs(sequences: list[int]) -> list[tuple[int, int]]:
-    """First and last of the sequences that stand near each other."""
+    """Return the first and last sequence of each run; a gap of more than `_APART` begins a new run."""
     runs: list[tuple[int, int]] = []
     for sequence in sequences:
         if runs and sequence - runs[-1][1] <= _APART:
@@ -259,7 +259,7 @@ def _noted(pieces: Iterable[bytes], note: Callable[[bytes], object]) -> Iterator
 
 
 def _records(log: Path, sequences: Iterable[int]) -> Iterator[bytes]:
-    """Records as they are stored, each with its place in the chain: a line of NDJSON each, a page in memory at a time.
+    """Yield records as they are stored, a page at a time: one NDJSON line each, with its position in the chain.
 
     Raises `LogUnreadableError`.
     """
@@ -268,12 +268,12 @@ def _records(log: Path, sequences: Iterable[int]) -> Iterator[bytes]:
     while page := list(itertools.islice(pairs, _PAGE)):
         with reading(log) as connection:
             connection.execute("BEGIN")
-            places = Places(connection)
+            places = ChainReader(connection)
             lines = [_line(connection, places, *pair) for pair in page]
         yield b"".join(lines)
 
 
-def _line(connection: sqlite3.Connection, places: Places, sequence: int, following: int) -> bytes:
+def _line(connection: sqlite3.Connection, places: ChainReader, sequence: int, following: int) -> bytes:
     query = f"SELECT {COLUMNS} FROM record WHERE sequence = ?"  # noqa: S608  fixed names
     row = connection.execute(query, (sequence,)).fetchone()
     chain = places.place(sequence, following)
@@ -281,13 +281,17 @@ def _line(connection: sqlite3.Connection, places: Places, sequence: int, followi
         raise LogUnreadableError(
             f"record {sequence} was removed by retention while it was exported: export again"
         )
-    stored = StoredColumns(*row)._asdict()
-    stored["detail"] = row[-1].decode("utf-8", "surrogateescape")
+    return stored_line(StoredColumns(*row), chain)
+
+
+def stored_line(columns: StoredColumns, chain: ChainProof) -> bytes:
+    """Return a record as it is stored, with its position in the chain, as a line of NDJSON."""
+    stored = columns._asdict() | {"detail": columns.detail.decode("utf-8", "surrogateescape")}
     return json.dumps({**stored, "chain": msgspec.to_builtins(chain)}, separators=(",", ":")).encode() + b"\n"
 
 
 def _proof(log: Path, record: str) -> bytes:
-    """The record of the export, as far as the checkpoint that seals it."""
+    """Return the line of the export's record; its chain leads to the checkpoint that seals it."""
     with reading(log) as connection:
         (sequence,) = connection.execute(
             "SELECT max(sequence) FROM record WHERE id = ?", (record,)
@@ -296,22 +300,20 @@ def _proof(log: Path, record: str) -> bytes:
 
 
 class _Pipe(io.RawIOBase):
-    """Takes what is written, until it is taken out."""
+    """A buffer for the ZIP writer; `take` empties it."""
 
     def __init__(self) -> None:
         self._held = bytearray()
 
     def writable(self) -> bool:
-        """It is."""
         return True
 
     def write(self, data: Any) -> int:
-        """Hold it."""
         self._held += data
         return len(data)
 
     def take(self) -> bytes:
-        """What was written since."""
+        """Return the bytes written since the last call."""
         taken = bytes(self._held)
         self._held.clear()
         return taken

@@ -1,20 +1,21 @@
 #!/usr/bin/env python3
-"""Holds a bundle of evidence of a ROSRV appliance against what the appliance signed, and names what differs.
+"""Verify an evidence bundle of a ROSRV appliance by the appliance's signatures, and list the differences.
 
     python3 verify.py [BUNDLE.zip, or its folder] [--key audit.pub] [--checkpoints copies.ndjson]
 
-It takes Python 3.8 or newer and the command `openssl` (3.0 or newer). Exit status 0: right; 1: not; 2: not a bundle.
+It needs Python 3.8 or newer and the command `openssl` (3.0 or newer). Exit status 0: valid; 1: not valid; 2: not a
+bundle.
 
-1. manifest.json has the SHA-256 of every member but proof.json, and there is no other member, nor a byte in a ZIP file
-   that is no member's and that the format does not ask for.
+1. manifest.json has the SHA-256 of every other member except proof.json. The bundle has no further members, and a ZIP
+   file has no bytes outside the members except those that the format requires.
 2. proof.json is the audit record of this export, and has the SHA-256 of manifest.json.
-3. Every audit record has the hash of the one before, up to a checkpoint that the appliance's key signed. A run of
-   records is complete, and the records beside it are of another time.
-4. Policies, specifications and the recording have the hashes that the log has of them.
+3. Every audit record has the hash of the record before it, up to a checkpoint that the appliance's key signed. A run of
+   records is complete, and the records next to it are outside the time of the bundle.
+4. Policies, specifications and the recording have the hashes that are stored in the log.
 
-All of it rests on the key: give one that was kept elsewhere with --key. Whoever is root on the appliance can sign what
-he likes; checkpoints that another machine got before (--checkpoints) show it. A bundle can have a changed copy of this
-program in it: take it from an appliance (`rosrv evidence verifier`).
+All of it depends on the key: use --key with a copy that was kept elsewhere. Root on the appliance can sign anything;
+checkpoints that another machine received earlier (--checkpoints) reveal that. A bundle can contain a changed copy of
+this program: take it from an appliance (`rosrv evidence verifier`).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from __future__ import annotations
 import sys
 
 if __name__ == "__main__" and not (sys.flags.isolated or getattr(sys.flags, "safe_path", False)):
-    del sys.path[0]  # the folder that this lies in: who filled it may have put a json.py there
+    del sys.path[0]  # the folder of this file, which may contain a foreign json.py
 
 import argparse
 import hashlib
@@ -46,13 +47,14 @@ COLUMNS = (
     "sequence", "id", "time", "version", "event", "severity", "decision", "host", "caller_id", "category", "resource",
     "rule", "rule_key", "rule_file", "rule_line", "revision", "reason", "duration_us",
 )  # fmt: skip
-MOST = 16 << 20  # bytes of a member that is read at once, or of a line
-# The members of a ZIP file unpack to no more bytes than this, and this for each byte of the file. Records hold hashes,
-# which do not pack: even with the longest text in each, they pack to more than a 256th.
+MOST = 16 << 20  # bytes of a member that is read in one piece, or of a line
+# The members of a ZIP file may unpack to UNPACKED bytes plus PER_BYTE for each byte of the file. Records have hashes,
+# which cannot be compressed: even with the longest texts they shrink to no less than 1/256.
 UNPACKED, PER_BYTE = 1 << 30, 256
 CHAIN = {"previous", "hash", "then", "checkpoint"}
 SEALED = ("log", "number", "sequence", "hash", "time", "previous", "removed")
-# Of a ZIP file: an entry of the directory, the header of a member, the end; what the appliance writes where it is free.
+# Parts of a ZIP file: an entry of the directory, the header of a member, the end. FREE: the appliance's values of the
+# fields that a packer may choose.
 ENTRY, HEADER, END = map(struct.Struct, ("<4s4B4H3L5H2L", "<4s2B4H3L2H", "<4s4H2LH"))
 FREE, LARGE = (3, 0, 0, 33, 0, 0, 0o644 << 16), 0xFFFFFFFF
 Opener = Callable[[str], Any]
@@ -63,7 +65,7 @@ def sha256(data: bytes) -> bytes:
 
 
 def printable(text: str) -> str:
-    """Without what a terminal would obey: a bundle may have anything in the place of a number."""
+    """Escape characters that a terminal would interpret: a bundle may have any text in place of a number."""
     return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)
 
 
@@ -75,7 +77,7 @@ def unhexed(text: str) -> bytes:
 
 
 def packed(value: Any) -> bytes:
-    """A column of a record in MessagePack: what the appliance hashed."""
+    """Return a column of a record in MessagePack, the bytes that the appliance hashed."""
     if value is None:
         return b"\xc0"
     if isinstance(value, int):
@@ -92,14 +94,14 @@ def packed(value: Any) -> bytes:
 
 
 def extra(*sizes: int) -> bytes:
-    """The extra field for sizes that a header has no room for."""
+    """Return the extra field for sizes that do not fit into a header."""
     return struct.pack(f"<2H{len(sizes)}Q", 1, 8 * len(sizes), *sizes)
 
 
 def ends(file: Any, size: int, unpacked: int) -> bool:
-    """Return whether the compressed text that begins here has `size` bytes, and zeros in the bits that are left over.
+    """Whether the compressed data that begins here has `size` bytes, with zeros in the unused bits of the last byte.
 
-    It unpacks to `unpacked` bytes; what unpacks to more is not read to its end.
+    Reading stops when more than `unpacked` bytes were unpacked.
     """
     unpacker = zlib.decompressobj(-15)
     while size > 1 and not unpacker.eof and unpacked >= 0:
@@ -113,11 +115,11 @@ def ends(file: Any, size: int, unpacked: int) -> bool:
 
 
 def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
-    """What a ZIP file has that is no member's; empty where another program packed it, which is free in some bytes."""
+    """Yield a finding for bytes of a ZIP file outside its members, and "" if another program packed it."""
     file: Any = archive.fp
     file.seek(archive.start_dir)
     directory, at, begin, members = file.read(MOST), 0, 0, archive.infolist()
-    free: set[Any] = {FREE}  # what packers write as they like
+    free: set[Any] = {FREE}  # the fields that each packer chooses
     for info in members:
         name, where, packed, size = info.filename, info.header_offset, info.compress_size, info.file_size
         entry = ENTRY.unpack_from(directory, begin)
@@ -143,7 +145,7 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
             yield f"{name!a}: has an extra field"
         at = file.tell() + packed
         if not (ends(file, packed, size) if info.compress_type else packed == size):
-            yield f"{name!a}: something stands behind it"
+            yield f"{name!a}: there are bytes behind it"
         file.seek(at)
         forms = ("<4sLQQ", "<4s3L") if max(packed, size) < LARGE else ("<4sLQQ",)
         sealed, after = (
@@ -164,7 +166,7 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
 
 
 def regular(path: Path, follow: bool = True) -> Any:
-    """Open a regular file. A named pipe or a device could keep its reader waiting for ever: OSError."""
+    """Open a regular file. Raise OSError for pipes and devices, which could block their reader forever."""
     flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
     descriptor = os.open(path, flags | (0 if follow else getattr(os, "O_NOFOLLOW", 0)))
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -183,7 +185,7 @@ def require_bounded(archive: zipfile.ZipFile, size: int) -> None:
 
 
 def opened(place: Path) -> tuple[list[str], Opener, Iterator[str]]:
-    """Return the names in a ZIP file or a folder, what opens one, and what is beside them."""
+    """Return the names in a ZIP file or a folder, a function that opens a member, and the bytes outside the members."""
     if not place.is_dir():
         with regular(place) as file:
             size = os.fstat(file.fileno()).st_size
@@ -197,11 +199,11 @@ def opened(place: Path) -> tuple[list[str], Opener, Iterator[str]]:
 
 
 class Runs:
-    """The runs of records in a bundle: numbers of first and last records, each after the one before."""
+    """The runs of records in a bundle, in ascending order, each given by its first and last record."""
 
     def __init__(self, pairs: list[list[int]]) -> None:
         edges = [-1, *(edge for first, last in pairs for edge in (first, last))]
-        # Two runs have a record between them.
+        # At least one record is between two runs.
         steps = (here - before for before, here in zip(edges, edges[1:]))  # noqa: RUF007  Python 3.8
         if any(step < (2, 0)[number % 2] for number, step in enumerate(steps)):
             raise ValueError("the runs of manifest.json are not in their order")
@@ -210,13 +212,13 @@ class Runs:
         self.beside = {edge: False for first, last in pairs for edge in (first - 1, last + 1)}
 
     def meet(self, first: int, last: int) -> bool:
-        """Return whether one of these records is in a run."""
+        """Whether one of these records is in a run."""
         after = bisect_left(self.last, first)
         return after < len(self.last) and self.first[after] <= last
 
 
 class Verifier:
-    """What is wrong with a bundle (`findings`), and what it does not prove (`notes`)."""
+    """The verification of a bundle: its faults (`findings`), and the claims that it does not prove (`notes`)."""
 
     def __init__(
         self, place: Path, key: Path | None, folder: Path, copies: dict[int, dict[str, Any]]
@@ -231,12 +233,12 @@ class Verifier:
         self.notes: list[str] = []
         self.manifest: dict[str, Any] = {}
         self.sums: dict[str, str] = {}  # of the members
-        self.loads: dict[str, Any] = {}  # what came into force, and the hash that the log has of it
-        self.revisions: set[int | None] = set()  # of the policies that decided
+        self.loads: dict[str, Any] = {}  # the hash in the log of each loaded file or folder
+        self.revisions: set[int | None] = set()  # revisions of the policies that decided
         self.checkpoints = self.agreeing = 0
 
     def run(self) -> None:
-        """Look at everything; what cannot be read is a finding as well."""
+        """Check everything; a member that cannot be read is also a finding."""
         looks = {
             "the ZIP file": self.look_beside, "manifest.json": self.look_at_members, "proof.json": self.look_at_proof,
             "records.ndjson": self.look_at_records, "what the log has the hashes of": self.look_at_texts,
@@ -244,7 +246,7 @@ class Verifier:
         for what, look in looks.items():
             try:
                 look()
-            except Exception as error:  # whatever somebody wrote into it
+            except Exception as error:  # the file may contain anything
                 self.findings.append(f"{what}: cannot be read: {type(error).__name__} {error}")
 
     def read(self, name: str) -> bytes:
@@ -255,13 +257,13 @@ class Verifier:
         return data
 
     def look_beside(self) -> None:
-        """Rule 1, of what is no member's."""
+        """Check rule 1: no bytes outside the members."""
         for found in self.foreign:
             self.findings += [f"the ZIP file: {found}"] if found else []
             self.notes += [] if found else ["times and attributes in the ZIP file: another program packed it"]
 
     def look_at_members(self) -> None:
-        """Rule 1."""
+        """Check rule 1: the hashes of the members."""
         self.manifest = json.loads(self.read("manifest.json"))
         members = self.manifest["members"]
         if self.manifest["format"] != FORMAT or {*self.manifest} != FIELDS:
@@ -286,7 +288,7 @@ class Verifier:
                 self.findings.append(f"{name!a}: was changed")
 
     def look_at_proof(self) -> None:
-        """Rule 2."""
+        """Check rule 2: the proof."""
         (record,) = self.records("proof.json")
         if record["event"] != "evidence exported":
             self.findings.append("proof.json: is not the record of an export")
@@ -294,7 +296,7 @@ class Verifier:
             self.findings.append("manifest.json: is not the one that the log has the hash of")
 
     def look_at_records(self) -> None:
-        """Rule 3."""
+        """Check rule 3: the chain of records."""
         since, until = self.manifest["since"], self.manifest["until"]
         runs = Runs(self.manifest["runs"])
         beside, missing = runs.beside, runs.missing
@@ -317,7 +319,7 @@ class Verifier:
             self.notes.append(f"that record {last} was the last of this time: the log ended there")
 
     def note_hash(self, event: str, revision: int, detail: dict[str, Any]) -> None:
-        """What a record has the hash of."""
+        """Store the hash that a record has of a policy, of specifications or of the recording."""
         if event == "policy loaded":
             self.loads[f"policies/{revision}.ini"] = detail.get("sha256")
         elif event == "specifications loaded":
@@ -326,7 +328,7 @@ class Verifier:
             self.loads["recording/recording.bag"] = detail["sha256"]
 
     def look_at_texts(self) -> None:
-        """Rule 4."""
+        """Check rule 4: policies, specifications and the recording."""
         missing = {*self.manifest["missing"]}
         folders: dict[str, list[str]] = defaultdict(list)
         for name in sorted(self.sums):
@@ -347,8 +349,8 @@ class Verifier:
             self.notes.append("which specifications were in force: the log has no record of a load")
 
     def records(self, name: str, runs: Runs | None = None) -> Iterator[dict[str, Any]]:
-        """Yield the records of a member, each after it was compared with the chain."""
-        # How far the chain leads, its hash there, and the first record that no checkpoint seals yet.
+        """Yield the records of a member, each after its check against the chain."""
+        # The last sequence of the chain, the hash there, and the first record that no checkpoint seals yet.
         place, digest, begin = 0, b"", 0
         with self.open(name) as lines:
             for line in iter(lambda: lines.readline(MOST), b""):
@@ -362,7 +364,7 @@ class Verifier:
                     map(packed, [*(record[column] for column in COLUMNS), detail])
                 )
                 before, own = unhexed(chain["previous"]), unhexed(chain["hash"])
-                # The second is how version 0.1.0 made it.
+                # Version 0.1.0 computed the second form.
                 if own not in (sha256(before + b"2" + sha256(columns)), sha256(before + columns)):
                     self.findings.append(f"record {sequence}: was changed")
                 follows = sequence == place + 1 and before == digest
@@ -384,7 +386,7 @@ class Verifier:
             self.findings.append(f"{name}: no signed checkpoint seals what begins with record {begin}")
 
     def look_at_checkpoint(self, checkpoint: dict[str, Any], sequence: int, digest: str) -> None:
-        """Whether the key signed it, it seals these records, and it is the one that another machine has."""
+        """Check that the key signed it, that it seals these records, and that it equals the copy from elsewhere."""
         number = checkpoint["number"]
         sealed = checkpoint["log"], checkpoint["sequence"], checkpoint["hash"]
         if sealed != (self.manifest["log"], sequence, digest):
@@ -418,7 +420,7 @@ def kept_copies(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def main(arguments: list[str]) -> int:
-    """Say what is found; the exit status."""
+    """Print the findings; return the exit status."""
     parser = argparse.ArgumentParser(description="Proves a bundle of evidence of a ROSRV appliance.")
     parser.add_argument(
         "bundle", nargs="?", type=Path, default=Path(__file__).parent, help="ZIP file or folder"

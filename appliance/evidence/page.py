@@ -1,4 +1,4 @@
-"""The page of a bundle for people: what it has, what happened, how it is proved. The same input gives the same page."""
+"""The HTML page of a bundle: contents, events, how to verify it. The same input gives the same page."""
 
 import html
 import json
@@ -42,7 +42,7 @@ bundle can change those in it. It names what was changed or is missing.</p>
 
 
 class Page:
-    """Collects what the page shows while the records go by."""
+    """The page of a bundle; it collects its rows while the records are written."""
 
     def __init__(self, recording: Recording | None) -> None:
         self._recording = recording
@@ -51,7 +51,7 @@ class Page:
         self._left_out = 0
 
     def add(self, lines: bytes) -> None:
-        """Records of the bundle, as it has them."""
+        """Add records of the bundle."""
         for line in lines.splitlines():
             self._add(json.loads(line))
 
@@ -70,7 +70,7 @@ class Page:
         self._rows.append(f'<tr class="{kind}"><td class="time">{rfc3339(record["time"])}{shown}\n')
 
     def html(self, manifest: dict[str, Any]) -> bytes:
-        """The page; `manifest` has all members but this one."""
+        """Return the page; `manifest` has all members except the page."""
         runs = ", ".join(f"{first} to {last}" for first, last in manifest["runs"])
         facts = {
             "span": f"{rfc3339(manifest['since'])} to {rfc3339(manifest['until'])}",
@@ -103,7 +103,7 @@ class Page:
 
 
 def _recorded(recording: Recording | None) -> Iterator[str]:
-    """What was said: the recording's topics, and why it was made."""
+    """Yield the triggers of the recording and its topics."""
     if recording is None:
         return
     yield f'<h2>What was said</h2>\n<p>Recording {recording.id}, <a href="recording/recording.bag">a bag</a>\n'
@@ -122,10 +122,10 @@ def _recorded(recording: Recording | None) -> Iterator[str]:
 
 
 def _who(detail: str) -> str:
-    """The token that asked, where one did."""
+    """Return the name of the token in the details of a record, or an empty string."""
     try:
         found = json.loads(detail).get("who")
-    except ValueError:  # somebody spoilt it
+    except ValueError:  # the record was damaged
         return ""
     return str(found) if found else ""
 
