@@ -1,1 +1,1 @@
-"""The state directory in one file, and back."""
+"""Back up and restore the state directory as one file."""

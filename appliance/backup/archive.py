@@ -1,13 +1,11 @@
-"""An archive that is to be put back: whole, and with nothing in it that `back_up` does not write.
+"""Check that an archive is complete and contains only entries that `back_up` writes, before it is restored.
 
 Invariants:
 
-1. The whole file is read before anything is believed, so the checksum at its end is compared: what was damaged on a
-   worn-out stick is refused, not put back.
-2. It unpacks to no more than there is room for, and holds memory for no more than `MOST_FILES` headers: plain ones of
-   regular files. No header says something about the next one (sparse, pax, long names), so what is checked here is
-   what is extracted.
-3. Every name is one that a backup has, once.
+1. The whole file is read and its checksum compared before any entry is used, so a damaged archive is rejected.
+2. It unpacks to at most the free space and has at most `MOST_FILES` entries, all of them regular files. Headers that
+   modify the next entry (sparse, pax, long names) are rejected, so exactly the checked entries are extracted.
+3. Every name is valid for a backup and occurs once.
 """
 
 import gzip
@@ -25,11 +23,11 @@ _PIECE = 1 << 20
 
 
 class _StrangeEntryError(Exception):
-    """A header that no backup has."""
+    """An entry has a header type that backups never contain."""
 
 
 class _PlainEntry(tarfile.TarInfo):
-    """An entry read by its one header; any other is refused before what it announces is read."""
+    """The entry of a regular file; any other type is rejected before its data is read."""
 
     @classmethod
     def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:
@@ -41,9 +39,9 @@ class _PlainEntry(tarfile.TarInfo):
 
 @contextmanager
 def checked_archive(file: Path, room: int) -> Iterator[tuple[tarfile.TarFile, list[tarfile.TarInfo]]]:
-    """The archive and its entries, which may be extracted; they unpack to `room` bytes at most.
+    """Check an archive, limited to `room` unpacked bytes; yield it, open, with its entries.
 
-    Raises `BackupError`, also for what cannot be read within.
+    Raises `BackupError`, also for read errors inside the `with` block.
     """
     try:
         with open_given(file) as raw:
@@ -88,7 +86,7 @@ def _entries(file: Path, archive: tarfile.TarFile) -> list[tarfile.TarInfo]:
     for name in folders & entries.keys():
         raise _strange(file, name)
     if AUDIT_LOG not in entries:
-        raise BackupError(f"{file} has no audit log: it is no backup of an appliance")
+        raise BackupError(f"{file} has no audit log: it is not a backup of an appliance")
     return list(entries.values())
 
 

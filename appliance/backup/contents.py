@@ -1,7 +1,7 @@
-"""What is in a backup, by its name and size: the same rule for who takes one and for who puts one back.
+"""Decide by name and size which files a backup has: one rule for making and restoring it.
 
-A part of the state directory belongs to a process that may have fallen to a stranger. A name that a terminal would
-interpret, or a file without end, is therefore nobody's to keep: it is told.
+A part of the state directory belongs to a process that may be compromised. File names with control characters and
+oversized files are therefore reported and not backed up.
 """
 
 from pathlib import PurePosixPath
@@ -9,35 +9,36 @@ from pathlib import PurePosixPath
 from appliance.supervisor.roles import ROLES
 
 AUDIT_LOG = "control/audit.db"
-LARGEST = 1 << 30  # bytes of a file that is no database
-MOST_FILES = 10_000  # some twenty are usual
-_LONGEST_NAME = 100  # bytes: what an archive holds without a further header
-_DATABASES = "control/"  # the only part that has any
-# Of a running appliance only, or made anew at the next start. `.ahead`: what the copied database does not have yet.
+LARGEST = 1 << 30  # bytes of a file that is not a database
+MOST_FILES = 10_000  # a usual backup has about twenty
+_LONGEST_NAME = 100  # bytes that fit into a tar header without an extension
+_DATABASES = "control/"  # the only part with databases
+# Files that exist only while the appliance runs, or that the next start makes again. `.ahead`: statements that the
+# copied database does not have yet.
 _PASSING = ("-wal", "-shm", ".lock", ".ahead", ".new", ".sock", ".pid", "strongswan.conf")
-_LEFT_OUT = {"rosmaster", "rosout", "recordings"}  # logs of ROS, and what messages said
+_LEFT_OUT = {"rosmaster", "rosout", "recordings"}  # logs of ROS, recorded messages
 KEPT_PARTS = frozenset(role.part for role in ROLES) - _LEFT_OUT
-"""The folders of a state directory that a backup has."""
+"""The folders of a state directory that are backed up."""
 
 
 class BackupError(Exception):
-    """A backup cannot be made or put back; the text says what is in the way, and what to do."""
+    """A backup cannot be made or restored; the message has the reason and the remedy."""
 
 
 def is_passing(name: str) -> bool:
-    """Whether the file is of a running appliance only."""
+    """Whether the file is not backed up because a start makes it again."""
     return name.endswith(_PASSING)
 
 
 def is_database(name: str) -> bool:
-    """Whether it is a database: copied by SQLite, of any size."""
+    """Whether the file is a database, which SQLite copies and whose size is not limited."""
     return name.startswith(_DATABASES) and name.endswith(".db")
 
 
 def trouble_with(name: str, size: int) -> str:
-    """Why no backup has a file of a part with this name and size in bytes; empty when it may have it."""
+    """Return why a file of this name and size (bytes) cannot be in a backup; empty if it can."""
     if not name.isprintable():
-        return "has a name that is no text"
+        return "has a name that is not text"
     if len(name.encode()) > _LONGEST_NAME:
         return f"has a name of more than {_LONGEST_NAME} bytes"
     if size < 0 or (size > LARGEST and not is_database(name)):
@@ -46,7 +47,7 @@ def trouble_with(name: str, size: int) -> str:
 
 
 def belongs(name: str, parts: frozenset[str]) -> bool:
-    """Whether a name in an archive is that of a file which is kept, below one of `parts`."""
+    """Whether a name in an archive is the name of a backed-up file below one of `parts`."""
     path = PurePosixPath(name)
     below = len(path.parts) > 1 and path.parts[0] in parts and ".." not in path.parts
     return below and str(path) == name and not is_passing(name)

@@ -1,13 +1,13 @@
-"""The state directory in one file, taken while the appliance runs or not (put back: `restore.py`).
+"""Write the state directory to one file, whether or not the appliance runs (`restore.py` restores it).
 
 Invariants:
 
-1. A database is copied by SQLite itself, as of one moment; nothing of a running appliance is waited for or stopped.
-2. What the signer remembers is taken back to the checkpoints that the copy of the log has, so that a restored log can
-   be signed on. (It is taken after the log, so it has all of them.)
-3. The file has keys in it: only its owner may read it. Nothing is written over, and nothing unfinished is left.
-4. Root reads in folders of users whose processes may have fallen to a stranger: with root's rights a link is never
-   followed, and a file that is not the user's own is an error.
+1. SQLite copies each database as a consistent snapshot; a running appliance need not stop or wait.
+2. The log is copied first. The signer's memory is then cut to the checkpoints in that copy, so that a restored log can
+   be continued.
+3. The file contains keys: only its owner may read it. Existing files are not overwritten; an unfinished one is removed.
+4. Root reads in folders of users whose processes may be compromised. With root's rights, links are not followed, and a
+   file that belongs to another user is an error.
 """
 
 import errno
@@ -18,7 +18,7 @@ import tarfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import BinaryIO
@@ -33,20 +33,19 @@ from appliance.backup.contents import (
     is_passing,
     trouble_with,
 )
-from appliance.backup.database_copy import copy_database
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored
 
 _PIECE = 1 << 20
 _HEADER, _HASH = 8, 32  # bytes, of the signer's memory
-_FORMAT = tarfile.GNU_FORMAT  # a large database has its size in the one header
+_FORMAT = tarfile.GNU_FORMAT  # its single header also has room for the size of a large database
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe is not waited for
-_ADVICE = "run this as root with the capability DAC_OVERRIDE (in a container: docs/upgrade-and-backup.md)"
+_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a pipe does not block
+_ADVICE = "run this as root with the capability DAC_OVERRIDE (in a container: docs/operating.md)"
 
 
 def back_up(state: Path, file: Path) -> list[str]:
-    """Write the state directory to `file` (a tar archive, mode 0600); the names of what is in it.
+    """Write the state directory to `file` (a tar archive, mode 0600); return the names in it.
 
     Raises `BackupError`.
     """
@@ -55,7 +54,9 @@ def back_up(state: Path, file: Path) -> list[str]:
     except StartError as error:
         raise BackupError(str(error)) from None
     if not (state / AUDIT_LOG).exists():
-        raise BackupError(f"{state} has no audit log: it is no state directory of an appliance (--state)")
+        raise BackupError(
+            f"{state} has no audit log: it is not the state directory of an appliance (--state)"
+        )
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     except FileExistsError:
@@ -71,7 +72,7 @@ def back_up(state: Path, file: Path) -> list[str]:
             archive.close()
             raw.flush()
             os.fsync(raw.fileno())
-    except BaseException as error:  # Ctrl-C, too
+    except BaseException as error:  # also Ctrl-C
         file.unlink()
         if isinstance(error, (OSError, sqlite3.Error)):
             reason = f"{error}; {_ADVICE}"
@@ -116,9 +117,9 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
 
 
 def _files(state: Path) -> Iterator[tuple[str, int]]:
-    """What is kept, by name, open for reading: the log first, for the signer's memory is cut to it.
+    """Yield name and open descriptor of each file to back up: the log first, because the signer's memory is cut to it.
 
-    The others are looked for when it is copied: the key that its signatures need is there by then.
+    The others are listed after the log is copied: the key that its signatures need exists by then.
     """
     log = opened(state, AUDIT_LOG) if (state / AUDIT_LOG).exists() else None
     if log is not None:
@@ -142,7 +143,7 @@ def _files(state: Path) -> Iterator[tuple[str, int]]:
 
 
 def _names(state: Path, part: str) -> Iterator[str]:
-    # A folder that cannot be looked into is an error: a backup without the keys would be none.
+    # An unreadable folder is an error: a backup without the keys would be useless.
     for folder, folders, names in os.walk(state / part, onerror=_raise):
         folders.sort()
         for name in sorted(names):
@@ -151,7 +152,7 @@ def _names(state: Path, part: str) -> Iterator[str]:
 
 
 def opened(state: Path, name: str) -> int | None:
-    """A file of a part, None for what is no regular file; no link is followed on the way."""
+    """Open a file without following links; None if it is not a regular file. Raises `BackupError` for a wrong owner."""
     part, *folders, last = PurePosixPath(name).parts
     here = os.open(state / part, _FOLDER)
     owner = os.fstat(here).st_uid
@@ -203,8 +204,50 @@ def _last_checkpoint(log: Path) -> dict[str, int]:
 
 
 def _as_far_as(memory: bytes, number: int | None) -> bytes:
-    """The signer's memory of a log without what it signed since; all of it for a log that is not the copied one."""
+    """Return the signer's memory up to checkpoint `number`; all of it if that is None (another log)."""
     if number is None or len(memory) < _HEADER:
         return memory
     first = int.from_bytes(memory[:_HEADER], "big")
     return memory[: _HEADER + max(0, number - first + 1) * _HASH]
+
+
+_BUSY_SECONDS = 30
+
+
+def copy_database(path: Path, owner: os.stat_result, copy: Path) -> None:
+    """Copy the database at `path` to the new file `copy`; `owner` is the status of the database file, read just before.
+
+    SQLite opens the database and its write-ahead log by name. The owner of the folder could put a link there, so root
+    reads with only the owner's rights.
+
+    Raises `BackupError`, `OSError`, `sqlite3.Error`.
+    """
+    with closing(sqlite3.connect(copy)) as target:
+        target.execute("PRAGMA journal_mode = OFF")  # the owner cannot create a file beside the copy
+        with _rights_of(owner):
+            if not os.access(path, os.R_OK, effective_ids=True):
+                raise BackupError(
+                    f"{path} cannot be read by user id {owner.st_uid}, whose it is: every folder above it must let"
+                    " that user pass, and it must be a file of that user's own"
+                )
+            uri = f"{path.absolute().as_uri()}?mode=ro"
+            with closing(sqlite3.connect(uri, uri=True, timeout=_BUSY_SECONDS)) as source:
+                source.backup(target)
+
+
+@contextmanager
+def _rights_of(owner: os.stat_result) -> Iterator[None]:
+    """Replace root's rights by those of `owner` in the `with` block; do nothing if this process is not root."""
+    if os.geteuid() != 0 or owner.st_uid == 0:
+        yield
+        return
+    group, groups = os.getegid(), os.getgroups()
+    os.setgroups([])
+    try:
+        os.setegid(owner.st_gid)
+        os.seteuid(owner.st_uid)
+        yield
+    finally:
+        os.seteuid(0)
+        os.setegid(group)
+        os.setgroups(groups)

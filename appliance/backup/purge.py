@@ -1,7 +1,7 @@
-"""The end of a state directory: all of it is removed; small files (keys, tokens, certificates) are written over first.
+"""Remove a state directory; small files (keys, tokens, certificates) are overwritten first.
 
-What a file system or a disk keeps of a file that was written over (a journal's copies, spare blocks of a flash) nobody
-can reach from here: where that matters the disk itself is encrypted, and its key destroyed.
+Copies of an overwritten file in a journal or in spare blocks of flash memory remain. Where that matters, encrypt the
+disk and destroy its key.
 """
 
 import os
@@ -14,13 +14,13 @@ from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import StateDirectory, foreign
 
 _SMALL = 64 << 10
-"""Bytes up to which a file is written over."""
+"""The size in bytes up to which a file is overwritten."""
 
 
 def purge(state: Path) -> tuple[int, int]:
-    """Remove a state directory that no appliance uses: how many files there were, and how many were written over.
+    """Remove an unused state directory; return the numbers of all files and of overwritten files.
 
-    Raises `BackupError` where there is none, where an appliance uses it, or where something cannot be removed.
+    Raises `BackupError` if it does not exist, if an appliance uses it, or if a file cannot be removed.
     """
     state = state.absolute()
     try:
@@ -36,7 +36,7 @@ def purge(state: Path) -> tuple[int, int]:
         raise BackupError(f"{state}: {error.strerror}") from error
     try:
         counts = _write_over(state)
-        # With the lock still held, no appliance begins in the middle.
+        # The lock is still held, so no appliance can start in between.
         for entry in state.iterdir():
             if entry.is_dir() and not entry.is_symlink():
                 shutil.rmtree(entry)
@@ -54,7 +54,7 @@ def purge(state: Path) -> tuple[int, int]:
 
 
 def _write_over(state: Path) -> tuple[int, int]:
-    """No link is followed, and of a file with another name nothing is written: it is not only ours."""
+    """Overwrite all small files except symbolic and hard links; return the numbers of all and of overwritten files."""
     files = written = 0
     for _folder, _folders, names, at in os.fwalk(state, follow_symlinks=False):
         for name in names:

@@ -1,12 +1,11 @@
-"""A state directory made of a backup.
+"""Restore a state directory from a backup.
 
 Invariants:
 
-1. Nothing is written over, and nothing is written before the archive was checked to its end (`backup_archive`).
-2. A restore that did not come to its end is never taken for an appliance's state: what it made is taken away, and
-   where that was not possible (a kill, a power cut) the mark that it set first is still there, which `rosrv up`
-   refuses. The mark goes when everything is on the disk.
-3. What is in a folder is given away before the folder: its user could put a link in the place of what is in it.
+1. Existing files are not overwritten, and writing starts only after the whole archive was checked (`archive.py`).
+2. An incomplete restore never becomes an appliance's state: its files are removed. After a kill or a power cut its mark
+   remains, and `rosrv up` rejects the directory. The mark is removed when everything is on the disk.
+3. The files in a folder get their owner before the folder does; otherwise that user could replace them by links.
 """
 
 import os
@@ -22,15 +21,15 @@ from appliance.supervisor.restore_mark import set_mark
 from appliance.supervisor.roles import ROLES
 from appliance.supervisor.users import account_of
 
-_LOCK = "lock"  # by it `StateDirectory` knows an appliance's directory, also where root may not look into its parts
+_LOCK = "lock"  # identifies the directory to `StateDirectory`, also where root cannot read its parts
 _OF_THE_DISK = "lost+found"
-_SPARE = 64 << 20  # bytes of a disk that are left for others
+_SPARE = 64 << 20  # bytes of the disk that stay free
 
 
 def restore(file: Path, state: Path) -> list[str]:
-    """Make the state directory `state` of a backup, for `rosrv up --state` there; the names of what is in it.
+    """Restore a backup to `state`, ready for `rosrv up --state`; return the restored names.
 
-    As root each part is given to its user. Raises `BackupError`.
+    As root, also set the owner of each part. Raises `BackupError`.
     """
     with checked_archive(file, _room_in(state)) as (archive, entries), _marked(state):
         for entry in entries:
@@ -42,9 +41,9 @@ def restore(file: Path, state: Path) -> list[str]:
 
 
 def _room_in(state: Path) -> int:
-    """Bytes for which there is room on the disk of an empty folder, or of one that is not there yet.
+    """Return the bytes that may be restored to an empty folder, or to one that does not exist yet.
 
-    Raises `BackupError`.
+    Raises `BackupError`, also for a folder that is not empty.
     """
     try:
         if os.path.lexists(state) and any(entry.name != _OF_THE_DISK for entry in state.iterdir()):
@@ -52,7 +51,7 @@ def _room_in(state: Path) -> int:
         here = state.absolute()
         while not os.path.lexists(here):
             here = here.parent
-        disk = os.statvfs(f"{here}/.")  # which only a folder has
+        disk = os.statvfs(f"{here}/.")  # `/.` fails for a file
     except OSError as error:
         raise BackupError(f"{state}: {error.strerror}; name another --state") from error
     return disk.f_bavail * disk.f_frsize - _SPARE
@@ -60,7 +59,7 @@ def _room_in(state: Path) -> int:
 
 @contextmanager
 def _marked(state: Path) -> Iterator[None]:
-    """The mark while it is being restored; on any error nothing of what was made is left."""
+    """Make the folder, and keep a mark in it during the restore; on any error remove everything that was made."""
     is_new = not state.exists()
     state.mkdir(mode=0o711, parents=True, exist_ok=True)
     state.chmod(0o711)
@@ -93,7 +92,7 @@ def _extract(archive: tarfile.TarFile, entry: tarfile.TarInfo, state: Path) -> N
 
 
 def _hand_over(state: Path) -> None:
-    """Give each part to its role's user; the files in it that others may read, to the group that may."""
+    """Set the owner of each part to its role's user, and the group of its files to the role that may read them."""
     for role in (role for role in ROLES if role.part in KEPT_PARTS):
         account = account_of(role.user)
         group = account.gid if role.readable_by is None else account_of(role.readable_by).gid

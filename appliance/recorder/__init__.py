@@ -1,1 +1,1 @@
-"""The flight recorder: what the relays carried last, in memory that outlives them, and recordings made of it."""
+"""The flight recorder: the latest messages, in memory that outlives the relays, and recordings of them."""

@@ -1,7 +1,7 @@
-"""Reads bags that the recorder wrote: by their index, so that of a large bag only what is asked for is read.
+"""Read bags of the recorder by their index, so that only the needed parts of a large bag are read.
 
-Times are nanoseconds since the epoch. The order of messages is that of their places: by time, then by where they stand
-in the file. What is no whole bag of the recorder is a `ValueError`.
+Times are nanoseconds since the epoch. Messages are ordered by time, then by their position in the file. A file that is
+not a complete bag of the recorder raises `ValueError`.
 """
 
 import heapq
@@ -25,12 +25,12 @@ from appliance.recorder.bag_writer import (
 )
 
 _SECOND = 1_000_000_000
-_PLACE = re.compile(r"\d{6,20}-\d{1,12}-\d{1,12}", re.ASCII)  # no date, of no calendar
+_PLACE = re.compile(r"\d{6,20}-\d{1,12}-\d{1,12}", re.ASCII)  # cannot be mistaken for a date
 _U32, _U64, _STAMP = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<II")
 
 
-class Place(NamedTuple):
-    """Where a message is: its time, the place of its chunk in the file, and its own in the chunk."""
+class MessagePosition(NamedTuple):
+    """The position of a message: its time, its chunk's offset in the file, and its own offset in the chunk."""
 
     time: int
     chunk: int
@@ -38,7 +38,7 @@ class Place(NamedTuple):
 
     @classmethod
     def parsed(cls, text: str) -> Self | None:
-        """From its text (`str`); None when it is none."""
+        """Parse the text (`str`) of a position; None if it is malformed."""
         return cls(*map(int, text.split("-"))) if _PLACE.fullmatch(text) else None
 
     def __str__(self) -> str:
@@ -46,7 +46,7 @@ class Place(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """A chunk: the times of its first and last message, and its place in the file."""
+    """A chunk: the times of its first and last message, and its offset in the file."""
 
     first: int
     last: int
@@ -54,14 +54,14 @@ class Chunk(NamedTuple):
 
 
 class BagReader:
-    """What a bag has: the headers of its `connections` by number, and its `chunks` by their first times."""
+    """An open bag: the headers of its `connections` by number, and its `chunks` in the order of their first times."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self.connections: dict[int, Mapping[str, str]] = {}
         self.chunks: list[Chunk] = []
         if file.read(len(MAGIC)) != MAGIC:
-            raise ValueError("this is no bag of format 2.0")
+            raise ValueError("this is not a bag of format 2.0")
         head = read_fields(file)
         self._end = _U64.unpack(head["index_pos"])[0]
         if head["op"] != BAG or not self._end:
@@ -81,15 +81,15 @@ class BagReader:
     @classmethod
     @contextmanager
     def of(cls, path: Path) -> Iterator[Self]:
-        """The bag in a file. Raises `OSError` and `ValueError`, also while it is read."""
+        """Open a bag. Raises `OSError` and `ValueError`, also in the block, while the bag is read."""
         with path.open("rb") as file:
             try:
                 yield cls(file)
             except (struct.error, LookupError) as error:
-                raise ValueError(f"this is no bag that the recorder wrote: {error!r}") from None
+                raise ValueError(f"this is not a bag that the recorder wrote: {error!r}") from None
 
     def index(self, chunk: Chunk) -> Iterator[tuple[int, bytes]]:
-        """The entries of a chunk (`INDEX_ENTRY`: seconds, nanoseconds, offset) by the number of their connection."""
+        """Yield each connection's number and its entries in a chunk (`INDEX_ENTRY`: seconds, nanoseconds, offset)."""
         self._file.seek(chunk.place)
         if read_fields(self._file)["op"] != CHUNK:
             raise ValueError("a chunk is not where the index has it")
@@ -103,16 +103,16 @@ class BagReader:
             yield _U32.unpack(fields["conn"])[0], data
             self._file.seek(after)
 
-    def places(self, chunk: Chunk, connections: Collection[int]) -> Iterator[tuple[Place, int]]:
-        """Where the messages of these connections are in a chunk, each with its connection."""
+    def places(self, chunk: Chunk, connections: Collection[int]) -> Iterator[tuple[MessagePosition, int]]:
+        """Yield the positions of these connections' messages in a chunk, each with its connection."""
         for number, entries in self.index(chunk):
             if number in connections:
                 for seconds, nanoseconds, offset in INDEX_ENTRY.iter_unpack(entries):
-                    yield Place(seconds * _SECOND + nanoseconds, chunk.place, offset), number
+                    yield MessagePosition(seconds * _SECOND + nanoseconds, chunk.place, offset), number
 
-    def messages(self, connections: Collection[int], since: int = 0) -> Iterator[tuple[Place, int]]:
-        """Where the messages of these connections are from a time on, in their order."""
-        waiting: list[tuple[Place, int]] = []
+    def messages(self, connections: Collection[int], since: int = 0) -> Iterator[tuple[MessagePosition, int]]:
+        """Yield the positions of these connections' messages from a time on, in order, each with its connection."""
+        waiting: list[tuple[MessagePosition, int]] = []
         for chunk in (chunk for chunk in self.chunks if chunk.last >= since):
             while waiting and waiting[0][0].time < chunk.first:
                 yield heapq.heappop(waiting)
@@ -122,9 +122,11 @@ class BagReader:
         while waiting:
             yield heapq.heappop(waiting)
 
-    def before(self, place: Place, connections: Collection[int], most: int) -> list[tuple[Place, int]]:
-        """The last messages of these connections before a place, in their order."""
-        found: list[tuple[Place, int]] = []
+    def before(
+        self, place: MessagePosition, connections: Collection[int], most: int
+    ) -> list[tuple[MessagePosition, int]]:
+        """Return at most `most` messages of these connections before a position, the last ones, in order."""
+        found: list[tuple[MessagePosition, int]] = []
         for chunk in sorted(self.chunks, key=lambda chunk: -chunk.last):
             if len(found) == most and chunk.last < found[-1][0].time:
                 break
@@ -133,8 +135,8 @@ class BagReader:
                 found = heapq.nlargest(most, [*found, *earlier])
         return found[::-1]
 
-    def body(self, place: Place, most: int) -> tuple[int, bytes]:
-        """How many bytes a message has, and the first of them."""
+    def body(self, place: MessagePosition, most: int) -> tuple[int, bytes]:
+        """Return the size of a message, and at most `most` of its first bytes."""
         self._file.seek(place.chunk)
         read_fields(self._file)
         self._file.seek(4 + place.offset, 1)

@@ -1,9 +1,8 @@
-"""Writes bags of ROS 1 (format 2.0) in pieces, so that what a fallen writer began is finished by the next.
+"""Write ROS 1 bags (format 2.0) in pieces; after a crash another writer can finish the bag.
 
-`rosbags` writes no field of its own into the header of a connection (which host sent it), and cannot go on with a bag
-that another process began; this can. Chunks are not compressed; each is followed by its index. What `close` needs to
-know of them it reads back from the file, so all there is to keep between two lives is how long the file was, and the
-connections. Format: http://wiki.ros.org/Bags/Format/2.0.
+`rosbags` can neither write an extra field (the host) into a connection's header nor continue a bag. Chunks are not
+compressed, and their indexes follow them. `close` reads the rest from the file, so a writer keeps only the file's
+length and its connections. Format: http://wiki.ros.org/Bags/Format/2.0.
 """
 
 import os
@@ -23,7 +22,7 @@ _COUNT = struct.Struct("<II")
 _BILLION = 1_000_000_000
 
 
-class Message(NamedTuple):
+class BagMessage(NamedTuple):
     """A message of a connection; `time` is nanoseconds since the epoch."""
 
     connection: int
@@ -32,28 +31,28 @@ class Message(NamedTuple):
 
 
 class BagWriter:
-    """Writes the bag at `path`, after the first `size` bytes of what is there already (0: anew)."""
+    """A writer of the bag at `path`, after its first `size` bytes (0: a new bag)."""
 
     def __init__(self, path: Path, connections: Mapping[int, Mapping[str, str]], size: int = 0) -> None:
-        """`connections` are the headers of those that the first `size` bytes have."""
+        """Open the bag, and cut it after `size` bytes. `connections` are the headers of the connections so far."""
         self._connections = dict(connections)
         self._file: BinaryIO = path.open("r+b" if size and path.exists() else "w+b")
         whole = self._whole(size)
         self.lost = whole < size
-        """Whether some of these bytes are not there: after a power cut."""
+        """Whether some of the first `size` bytes are missing or damaged, as after a power cut."""
         self._file.truncate(whole)
         self._file.seek(whole)
         if not whole:
             self._file.write(MAGIC + _bag_header(0, 0, 0))
 
     def connect(self, header: Mapping[str, str]) -> int:
-        """Begin a connection with this header (topic, type, md5sum, message_definition, callerid, …); its number."""
+        """Begin a connection with this header (topic, type, md5sum, …); return its number."""
         number = len(self._connections)
         self._connections[number] = dict(header)
         return number
 
-    def write(self, messages: Iterable[Message]) -> int:
-        """Write these as one chunk; how long the file is now. No message, no chunk."""
+    def write(self, messages: Iterable[BagMessage]) -> int:
+        """Write messages as one chunk, if there are any; return the length of the file."""
         chunk, index = bytearray(), dict[int, list[bytes]]()
         first, last = 1 << 63, 0
         for message in messages:
@@ -75,12 +74,12 @@ class BagWriter:
         return self._file.tell()
 
     def leave(self) -> None:
-        """End without an index: another writer may go on, after what had been written; a full disk takes no more."""
+        """Close without an index, so that another writer can continue."""
         with suppress(OSError):
             self._file.close()
 
     def close(self) -> None:
-        """Write the index of the whole, and end."""
+        """Write the index and close."""
         with self._file:
             end = self._file.tell()
             infos = self._chunk_infos(end)
@@ -101,7 +100,7 @@ class BagWriter:
         )
 
     def _whole(self, size: int) -> int:
-        """How many of the first bytes are chunks with all their indexes."""
+        """Return how many of the first `size` bytes are chunks with all their indexes."""
         whole, at, there = 0, _FIRST, self._file.seek(0, os.SEEK_END)
         try:
             for place, fields, length in self._records(min(size, there)):
@@ -113,7 +112,7 @@ class BagWriter:
         return size if at == size <= there else whole
 
     def _records(self, end: int) -> Iterator[tuple[int, dict[str, bytes], int]]:
-        """The place of each record, its fields, and the length of its data, which begins where the file stands."""
+        """Yield the position of each record, its fields, and the length of its data, which follows."""
         at = _FIRST
         while at < end:
             self._file.seek(at)
@@ -124,7 +123,7 @@ class BagWriter:
             at = following
 
     def _chunk_infos(self, end: int) -> list[bytes]:
-        """A record for each chunk: where it is, its time, and how many messages of which connection it has."""
+        """Return a record for each chunk: its position, its times, and its number of messages by connection."""
         chunks: list[tuple[int, list[tuple[int, int]], list[tuple[int, int]]]] = []
         for at, fields, size in self._records(end):
             if fields["op"] == CHUNK:
@@ -133,7 +132,7 @@ class BagWriter:
                 times = [(entry[0], entry[1]) for entry in INDEX_ENTRY.iter_unpack(self._file.read(size))]
                 chunks[-1][1].append((_U32.unpack(fields["conn"])[0], len(times)))
                 chunks[-1][2].extend((min(times), max(times)))
-        # `rosbag info` takes the beginning from the first and the end from the last.
+        # `rosbag info` reads the start from the first record and the end from the last.
         last = max((max(times) for _place, _counts, times in chunks), default=None)
         chunks.sort(key=lambda chunk: (max(chunk[2]) == last, min(chunk[2])))
         return [
@@ -153,13 +152,13 @@ class BagWriter:
 
 
 def read_fields(file: BinaryIO) -> dict[str, bytes]:
-    """The fields of the record that begins where the file stands; what follows is the length of its data."""
+    """Read the fields of the record at the file's position; the length of its data follows there."""
     data = file.read(_U32.unpack(file.read(4))[0])
     return fields_of(data)
 
 
 def fields_of(data: bytes) -> dict[str, bytes]:
-    """The fields of a header: of a record, or of a connection."""
+    """Parse the fields in the header of a record or a connection."""
     fields, at = {}, 0
     while at < len(data):
         end = at + 4 + _U32.unpack_from(data, at)[0]
@@ -170,7 +169,7 @@ def fields_of(data: bytes) -> dict[str, bytes]:
 
 
 def _bag_header(index: int, connections: int, chunks: int) -> bytes:
-    """The first record, padded to its fixed size."""
+    """Return the first record, padded to its fixed size."""
     fields = {"op": BAG, "index_pos": _U64.pack(index)}
     fields |= {"conn_count": _U32.pack(connections), "chunk_count": _U32.pack(chunks)}
     padding = _HEAD_SIZE - len(_record(fields, b""))

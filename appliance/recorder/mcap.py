@@ -1,7 +1,7 @@
-"""A bag as MCAP, piece by piece, for tools that read no bags. Format: https://mcap.dev/spec.
+"""Convert a bag to MCAP, piece by piece, for tools that cannot read bags. Format: https://mcap.dev/spec.
 
-`rosbags` writes MCAP of ROS 2 only. Messages stay the bytes that they are (profile `ros1`), in the order of their
-times, in chunks that are not compressed; each has its index, and the summary at the end has them all.
+`rosbags` writes MCAP for ROS 2 only. Messages are copied unchanged (profile `ros1`), ordered by time, in uncompressed
+chunks with indexes; the summary at the end lists all chunks.
 """
 
 import struct
@@ -21,9 +21,9 @@ _OF_SENDER = ("md5sum", "callerid", "host", "latching")
 
 
 def as_mcap(bag: Path) -> Iterator[bytes]:
-    """The pieces of the MCAP file, of a bag that is open from now on, so that it may be removed meanwhile.
+    """Yield the pieces of an MCAP file with a bag's messages; the bag may be removed meanwhile.
 
-    Raises `OSError`, and `ValueError` for no good bag, both also while it is read.
+    Raises `OSError`, and `ValueError` for an invalid bag, both also during the iteration.
     """
     opened = ExitStack()
     return _pieces(opened, opened.enter_context(BagReader.of(bag)))
@@ -44,7 +44,7 @@ def _pieces(opened: ExitStack, reader: BagReader) -> Iterator[bytes]:
 
 
 class _Writer:
-    """Collects a chunk, and what the summary says; `position` is where the next piece begins."""
+    """A buffer for the present chunk and the summary; `position` is the offset of the next piece."""
 
     def __init__(self, connections: Mapping[int, Mapping[str, str]]) -> None:
         self._connections = connections
@@ -59,7 +59,7 @@ class _Writer:
         self._times: tuple[int, int] = (0, 0)
 
     def add(self, connection: int, time: int, data: bytes) -> None:
-        """A message; before the first of its connection comes what describes it."""
+        """Add a message; the first of a connection follows the description of the connection."""
         channel = self._numbers.get(connection) or self._describe(connection)
         self._index.setdefault(channel, []).append((time, len(self.chunk)))
         head = struct.pack("<HIQQ", channel, self._counts[channel] & 0xFFFFFFFF, time, time)
@@ -88,7 +88,7 @@ class _Writer:
         self._described.append(description)
 
     def close_chunk(self) -> bytes:
-        """The chunk and its indexes; empty where there is no message."""
+        """Return the chunk and its indexes; empty if it has no messages."""
         if not self._index:
             return b""
         times = [time for entries in self._index.values() for time, _offset in entries]
@@ -115,7 +115,7 @@ class _Writer:
         return chunk + bytes(indexes)
 
     def summary(self) -> bytes:
-        """The end of the file."""
+        """Return the end of the file."""
         end = _record(_DATA_END, struct.pack("<I", 0))
         start = self.position + len(end)
         statistics = struct.pack(

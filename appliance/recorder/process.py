@@ -1,18 +1,15 @@
-"""The recorder as a process of the appliance: lifeline, link to control, and a thread that works.
+"""Run the recorder process: its lifeline, its link to control, and a thread that does the work.
 
-It has no network, reads the memory of the relays and the audit log, and writes recordings. It outlives control: what it
-has to tell waits on the shelf.
+It has no network, reads the memory of the relays and the audit log, and writes recordings. It outlives control: its
+reports wait in the recording store.
 """
 
 import asyncio
-import contextvars
 import mmap
 import os
 import socket
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from appliance.base.age_clock import AgeClock
 from appliance.channel import messages
@@ -20,10 +17,9 @@ from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.recorder.recorder import Recorder
-from appliance.recorder.recording_store import Shelf
+from appliance.recorder.recording_store import RecordingStore
 
 _DAY = 86_400.0
-_T = TypeVar("_T")
 
 
 def main(lifeline_fd: int, config: Path) -> None:
@@ -32,7 +28,7 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class _Process:
-    """The parts of the process and the wires between them."""
+    """The parts of the process and their connections."""
 
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
         self._settings = settings
@@ -49,23 +45,22 @@ class _Process:
         self._wake = asyncio.Event()
 
     async def run(self) -> None:
-        """Work from start to end."""
+        """Record until the supervisor stops the process."""
         self._child.attach(messages.Ready())
         ended = asyncio.ensure_future(self._child.ended.wait())
         recorder: Recorder | None = None
-        with ThreadPoolExecutor(1) as worker:
-            while not ended.done():
-                if len(self._rings) == self._settings.relays:
-                    if recorder is None:
-                        recorder = await _in(worker, self._make_recorder)
-                    said, self._said = self._said, []
-                    for message in await _in(worker, recorder.step, said):
-                        self._child.tell(message)
-                woken = asyncio.ensure_future(self._wake.wait())
-                pause = recorder.pause if recorder is not None else None
-                await asyncio.wait((ended, woken), timeout=pause, return_when=asyncio.FIRST_COMPLETED)
-                woken.cancel()
-                self._wake.clear()
+        while not ended.done():
+            if len(self._rings) == self._settings.relays:
+                if recorder is None:
+                    recorder = await asyncio.to_thread(self._make_recorder)
+                said, self._said = self._said, []
+                for message in await asyncio.to_thread(recorder.step, said):
+                    self._child.tell(message)
+            woken = asyncio.ensure_future(self._wake.wait())
+            pause = recorder.pause if recorder is not None else None
+            await asyncio.wait((ended, woken), timeout=pause, return_when=asyncio.FIRST_COMPLETED)
+            woken.cancel()
+            self._wake.clear()
         if recorder is not None:
             recorder.close()
 
@@ -73,7 +68,7 @@ class _Process:
         settings, rules = self._settings, self._settings.recorder
         return Recorder(
             rules,
-            Shelf(
+            RecordingStore(
                 Path.cwd(),
                 disk=int(rules.disk),
                 seconds=None if rules.days is None else rules.days * _DAY,
@@ -94,9 +89,3 @@ class _Process:
         self._memory = max(self._memory, given.since)
         os.close(descriptor)
         self._wake.set()
-
-
-async def _in(worker: ThreadPoolExecutor, work: Callable[..., _T], *arguments: Any) -> _T:
-    """What work in the thread returns; it logs as this process does."""
-    context = contextvars.copy_context()
-    return await asyncio.get_running_loop().run_in_executor(worker, lambda: context.run(work, *arguments))

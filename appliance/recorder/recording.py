@@ -1,13 +1,10 @@
-"""A recording while it is made: from the memory of the relays to a bag, a step at a time.
+"""Write a recording from the memory of the relays to a bag, step by step.
 
-Invariants:
-
-1. After each step the bag's length and all that is needed to go on stand in `progress`, which is replaced whole. A new
-   life of the recorder cuts the bag there and goes on: the memory still has what was not written.
-2. What is missing is said: by topic where the numbers of messages have a gap, in words where nobody can count it.
-3. A bag has no more than `largest` bytes, the decisions of its time not counted in.
-4. The headers of its connections have no more than `_MOST_HEADERS` bytes: publishers choose them, and they stand in
-   `progress`, and again at the bag's end.
+1. After each step the bag's length and all that is needed to continue are in `progress`, which is replaced atomically.
+   A new recorder cuts the bag there and continues: the memory still has what was not written.
+2. Missing messages are reported: by topic if the numbers of messages have a gap, else in words.
+3. A bag has at most `largest` bytes, not counting the audit records.
+4. The headers of its connections have at most `_MOST_HEADERS` bytes, since publishers choose them.
 """
 
 import hashlib
@@ -19,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from appliance.audit.record import Severity
-from appliance.audit.record_format import Entry, as_json
+from appliance.audit.record_format import LogEntry, as_json
 from appliance.base.atomic_files import write_whole
 from appliance.channel.answers.recording_answers import (
     OPERATORS,
@@ -29,11 +26,11 @@ from appliance.channel.answers.recording_answers import (
     Trigger,
 )
 from appliance.channel.messages import RevisionsStated
-from appliance.recorder.bag_writer import BagWriter, Message
-from appliance.recorder.never import NAMED
+from appliance.recorder.bag_writer import BagMessage, BagWriter
+from appliance.recorder.excluded_topics import NAMED
 from appliance.recorder.recording_store import ABOUT, BAG, PROGRESS
 from appliance.recorder.ring import LEFT_OUT
-from appliance.recorder.ring_reader import MOST_MESSAGES, Found, Place, RingReader
+from appliance.recorder.ring_reader import MOST_MESSAGES, ReadPosition, RingReader, StreamFrames
 from roswire.log_message import ERROR, INFO, TYPE, WARN, log_message
 from roswire.standard import standard_definitions
 
@@ -47,8 +44,8 @@ _LENGTH = struct.Struct("<I")
 _LEVELS = {Severity.WARNING: WARN, Severity.ALARM: ERROR}
 
 
-class Counted(msgspec.Struct):
-    """What was written of one topic of one type."""
+class TopicCount(msgspec.Struct):
+    """The messages of one topic with one type: written and missed ones."""
 
     topic: str
     type: str
@@ -59,11 +56,11 @@ class Counted(msgspec.Struct):
 
 
 class Progress(msgspec.Struct):
-    """How far a recording is; times are nanoseconds since the epoch.
+    """The progress of a recording; times are nanoseconds since the epoch.
 
-    `memory` is when the rings were made. `size` is the length of the bag, `connections` their headers. Of each ring:
-    how far each stream was read (`places`), which message of it comes next (`following`), and how much of it was not
-    there when the recording began.
+    `memory` is the time when the rings were created. `size` is the length of the bag, `connections` are the headers in
+    it. For each ring, `places` has the position in each stream, `following` the number of its next message, and
+    `not_there` the counts of messages and streams that the ring had lost when the recording began.
     """
 
     id: str
@@ -73,37 +70,37 @@ class Progress(msgspec.Struct):
     triggers: list[Trigger]
     size: int = 0
     connections: list[dict[str, str]] = []
-    places: list[dict[int, Place]] = []
+    places: list[dict[int, ReadPosition]] = []
     following: list[dict[int, int]] = []
     not_there: list[tuple[int, int]] = []
-    topics: list[Counted] = []
+    topics: list[TopicCount] = []
     torn: list[str] = []
     unconnected: int = 0
     """Messages of connections beyond `_MOST_HEADERS`."""
     why_not: str = ""
-    """Why it ended before its time."""
+    """Why the recording ended early, or is incomplete."""
     charged_to: str = OPERATORS
     hold: int = 0
-    """A trigger prolongs it to so long after itself (nanoseconds)."""
+    """The time after a trigger (nanoseconds) to which it extends the recording."""
     latest: int = 0
-    """Nothing prolongs it beyond."""
+    """The latest possible end."""
     left_out: list[LeftOutTopic] = []
     claims: int = 0
-    """Topics that were left out because of what their publishers say."""
+    """The number of topics that were left out because of their publishers' claims."""
 
 
 def load_progress(folder: Path) -> Progress:
-    """How far the recording in `folder` is. Raises `OSError` and `msgspec.MsgspecError`."""
+    """Return the progress of the recording in `folder`. Raises `OSError` and `msgspec.MsgspecError`."""
     return msgspec.msgpack.decode((folder / PROGRESS).read_bytes(), type=Progress)
 
 
 class RecordingInProgress:
-    """The recording that is made in `folder` of what is in `rings`; goes on after what `progress` says."""
+    """A recording of `rings` that is written to `folder` and continues at `progress`."""
 
     def __init__(
         self, folder: Path, progress: Progress, rings: Sequence[memoryview], *, largest: int
     ) -> None:
-        """Raises `OSError`."""
+        """Open or create the bag. Raises `OSError`."""
         folder.mkdir(mode=0o750, exist_ok=True)
         folder.chmod(0o750)
         self.progress = progress
@@ -123,7 +120,7 @@ class RecordingInProgress:
             progress.not_there = [reader.not_there for reader in self._readers]
 
     def step(self) -> None:
-        """Write what has come, up to the recording's end. Raises `OSError`."""
+        """Write the new messages up to the recording's end. Raises `OSError`."""
         progress = self.progress
         for number, reader in enumerate(self._readers):
             for found in reader.read(progress.began, progress.ends):
@@ -133,7 +130,7 @@ class RecordingInProgress:
         new.write_bytes(msgspec.msgpack.encode(progress))
         new.replace(self._folder / PROGRESS)
 
-    def _take(self, found: Found, following: dict[int, int]) -> None:
+    def _take(self, found: StreamFrames, following: dict[int, int]) -> None:
         progress, header = self.progress, found.header
         if LEFT_OUT in header:
             self._leave_out(header, seen=bool(found.batches))
@@ -148,9 +145,9 @@ class RecordingInProgress:
         connection = self._connection(header)
         row = self._topics.get(kind := (header["topic"], header["type"], header["md5sum"]))
         if row is None:
-            row = self._topics[kind] = Counted(*kind)
+            row = self._topics[kind] = TopicCount(*kind)
             progress.topics.append(row)
-        waiting: list[Message] = []
+        waiting: list[BagMessage] = []
         size = 0
         for batch in found.batches:
             gap = max(0, batch.first - following.get(found.stream, batch.first))
@@ -161,7 +158,7 @@ class RecordingInProgress:
                 row.missed += len(batch.frames)
                 continue
             for frame in batch.frames:
-                waiting.append(Message(connection, batch.time, frame))
+                waiting.append(BagMessage(connection, batch.time, frame))
                 size += len(frame)
             row.messages += len(batch.frames)
             if size > _CHUNK:
@@ -171,7 +168,7 @@ class RecordingInProgress:
         row.bytes += size
 
     def _leave_out(self, header: dict[str, str], *, seen: bool) -> None:
-        """Note once that this publisher's messages are not recorded, if there were any."""
+        """Note once that a publisher's messages are not recorded, if it sent any."""
         progress = self.progress
         row = LeftOutTopic(header["topic"], header["type"], header.get("host", ""), header[LEFT_OUT])
         if seen and row not in self._left_out:
@@ -181,7 +178,7 @@ class RecordingInProgress:
                 progress.left_out.append(row)
 
     def _connection(self, header: dict[str, str]) -> int:
-        """The number of a connection: a publisher that comes again with the same header has the same."""
+        """Return the number of a connection; a publisher with the same header gets the same number."""
         number = self._numbers.get(_key(header))
         if number is None:
             number = self._numbers[_key(header)] = self._bag.connect(header)
@@ -190,14 +187,11 @@ class RecordingInProgress:
         return number
 
     def leave(self) -> None:
-        """Go on no more; what is on the disk stays as it is."""
+        """Stop, and keep the files for the next recorder."""
         self._bag.leave()
 
-    def finish(self, records: Iterable[Entry], revisions: RevisionsStated) -> Recording:
-        """End the bag with the audit records of its time, and describe it: all of it is on disk then.
-
-        Raises `OSError`.
-        """
+    def finish(self, records: Iterable[LogEntry], revisions: RevisionsStated) -> Recording:
+        """Close the bag with its audit records, write the description to disk and return it. Raises `OSError`."""
         progress = self.progress
         self._write_records(records)
         self._bag.close()
@@ -227,7 +221,7 @@ class RecordingInProgress:
         return recording
 
     def _missing(self) -> str:
-        """What is not in the bag, in words; empty when nothing is missing."""
+        """Return which messages are missing in the bag, and why; empty if it is complete."""
         progress = self.progress
         reasons = [progress.why_not] if progress.why_not else []
         missed = sum(row.missed for row in progress.topics)
@@ -252,8 +246,8 @@ class RecordingInProgress:
                 reasons.append(f"{refused_now - refused_before} connections had no room in recorder.memory")
         return "; ".join(reasons)
 
-    def _write_records(self, records: Iterable[Entry]) -> None:
-        """What was decided in that time, as JSON and as lines that rqt_console shows, beside the messages."""
+    def _write_records(self, records: Iterable[LogEntry]) -> None:
+        """Write audit records, each as JSON and as a log message for rqt_console."""
         definitions = standard_definitions()
         numbers = {
             topic: self._connection({
@@ -266,18 +260,18 @@ class RecordingInProgress:
             })
             for topic, kind in ((RECORDS, "std_msgs/String"), (LOG, TYPE))
         }  # fmt: skip
-        waiting: list[Message] = []
+        waiting: list[BagMessage] = []
         for entry in records:
             record = entry.record
             line = as_json(entry).encode()
-            waiting.append(Message(numbers[RECORDS], record.time, _LENGTH.pack(len(line)) + line))
+            waiting.append(BagMessage(numbers[RECORDS], record.time, _LENGTH.pack(len(line)) + line))
             text = f"{record.event}: {record.reason}" if record.reason else record.event
             level = _LEVELS.get(record.severity, INFO)
             file, function = record.resource or "", record.caller_id or ""
             said = log_message(
                 entry.sequence, record.time, level, "/rosrv", text, file=file, function=function
             )
-            waiting.append(Message(numbers[LOG], record.time, said))
+            waiting.append(BagMessage(numbers[LOG], record.time, said))
             if len(waiting) >= _CHUNK >> 9:
                 self._bag.write(waiting)
                 waiting = []

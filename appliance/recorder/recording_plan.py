@@ -1,18 +1,18 @@
-"""Which recording an act begins or prolongs, and whose it is. No I/O; time is given, in nanoseconds since the epoch.
+"""Plan which recording an act begins or extends, and who is charged. No I/O; times are nanoseconds since the epoch.
 
-Control makes the plan when it makes the audit record of the act, so the record says which recording has it, or why
-there is none; the recorder reads the log and carries the plan out. Recordings are charged to the host whose act
-triggered them: to `ROBOT`, to a host or network as the policy names it, to `UNKNOWN` for all other hosts together, to
-`OPERATORS` for orders, to `APPLIANCE` for what no host did (a timer of a monitor).
+Control plans when it makes the audit record of the act, so the record names the recording or the reason for none. The
+recorder reads the log and carries out the plan. A recording is charged to the cause of its first trigger: `ROBOT`, a
+host or network as the policy names it, `UNKNOWN` for all other hosts together, `OPERATORS` for orders, `APPLIANCE` for
+an act without a host (a timer of a monitor).
 
 Invariants:
 
-1. Each host has one recording that is open at most; the robot, operators and the appliance have one together (`lane`).
-   An act in its time prolongs it, up to `longest`.
-2. Each may begin `per_hour` recordings an hour by each kind of trigger, and has no part in those of another.
-3. Recordings of one host do not overlap. The next one that would begins where the last one ended, and holds on for as
-   long as the memory goes back: acts that recur are in one recording after the first.
-4. Hosts but the robot's have `_MOST_AT_ONCE` open recordings together.
+1. Each host has at most one open recording; the robot, operators and the appliance share one (`recording_owner`). An
+   act in its time extends it, up to `longest`.
+2. Each host may begin `per_hour` recordings an hour by each kind of trigger.
+3. Recordings of one host do not overlap, except for an order's. A recording that would overlap begins at the end of the
+   last one and lasts for the length of the memory after an act, so recurring acts after the first share one recording.
+4. All other hosts together have at most `_MOST_AT_ONCE` open recordings.
 """
 
 from collections import deque
@@ -25,23 +25,23 @@ from appliance.configuration.settings import RecorderRules
 from appliance.recorder.triggers import kinds_of
 
 KEPT = frozenset({ROBOT, OPERATORS})
-"""Recordings charged to these make room for no other host's."""
+"""Recordings charged to these are never removed for another host's recording."""
 
 _OURS = KEPT | {APPLIANCE}
 _MOST_AT_ONCE = 2
 _SECOND = 1_000_000_000
 _HOUR = 3600 * _SECOND
-_MOST_HOSTS = 4096  # of which it is remembered when their last recording ended
+_MOST_HOSTS = 4096  # whose last recording's end is remembered
 
 
-def lane(charged_to: str) -> str:
-    """In whose open recording an act is that is charged so: hosts have nothing to do with those of others."""
+def recording_owner(charged_to: str) -> str:
+    """Return the owner of the open recording for an act; the robot, operators and the appliance are one owner."""
     return ROBOT if charged_to in _OURS else charged_to
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
-    """The time of a recording: an act prolongs it to `hold` after itself, and never beyond `latest`."""
+class RecordingSpan:
+    """The period of a recording; an act extends it to `hold` after the act, never beyond `latest`."""
 
     began: int
     ends: int
@@ -49,30 +49,30 @@ class Span:
     latest: int
 
     def prolonged(self, now: int) -> int:
-        """When it ends after an act now."""
+        """Return the end after an act at `now`."""
         return max(self.ends, min(now + self.hold, self.latest))
 
 
 def span(
     rules: RecorderRules, now: int, ended: int, before: float | None = None, after: float | None = None
-) -> Span:
-    """The time of a recording that begins because of an act now; the last one of the same host ended at `ended`.
+) -> RecordingSpan:
+    """Return the period of a recording for an act at `now`; the host's last recording ended at `ended`.
 
-    `before` and `after` are the seconds of an order, which is carried out as it is.
+    `before` and `after` are the seconds of an order; an order's period may overlap the last recording.
     """
     began = now - int((rules.before if before is None else before) * _SECOND)
     hold = int((rules.after if after is None else after) * _SECOND)
     if before is None and began < ended <= now:
         began, hold = ended, max(hold, int(rules.before * _SECOND))
     latest = began + int(rules.longest * _SECOND)
-    return Span(began, min(now + hold, latest), hold, latest)
+    return RecordingSpan(began, min(now + hold, latest), hold, latest)
 
 
 class HourlyLimit:
-    """Each host may begin `most` recordings an hour by each kind of trigger: a flood of one hides no other."""
+    """A limit of `most` recordings an hour for each host and kind of trigger."""
 
     def __init__(self, most: int, kept: Iterable[Recording]) -> None:
-        """`kept` are the recordings that there are: another process grants no new hour."""
+        """Count the recordings in `kept`, so that a restart does not reset the limit."""
         self._most = most
         self._begun: dict[tuple[str, str], deque[int]] = {}
         for recording in kept:
@@ -80,7 +80,7 @@ class HourlyLimit:
                 self._begun.setdefault((recording.charged_to, trigger.what), deque()).append(trigger.time)
 
     def take(self, charged_to: str, what: TriggerKind, now: int) -> bool:
-        """Whether a recording may begin now; then it counts."""
+        """Count a recording that begins now; return False if the limit does not permit it."""
         for key, begun in list(self._begun.items()) if len(self._begun) > _MOST_HOSTS else []:
             if begun[-1] + _HOUR <= now:
                 del self._begun[key]
@@ -93,14 +93,14 @@ class HourlyLimit:
         return True
 
     def refusal(self, charged_to: str) -> str:
-        """Why `take` returned False, in words."""
+        """Return why `take` returned False."""
         return f"{charged_to} has begun its {self._most} recordings of this kind in this hour (recorder.per_hour)"
 
 
 class RecordingPlan:
-    """Says for each audit record that is a trigger which recording has it, or why there is none.
+    """The plan: for each audit record that is a trigger, its recording or the reason for none.
 
-    `charged_to(host)` is the name by which recordings of a host's acts are charged; `new_id` makes ids of recordings.
+    `charged_to(host)` returns who is charged for a host's acts; `new_id` returns an id for a recording.
     """
 
     def __init__(
@@ -110,14 +110,14 @@ class RecordingPlan:
         self.charged_to = charged_to
         self._new_id = new_id
         self._limit = HourlyLimit(rules.per_hour, ())
-        self._open: dict[str, tuple[str, Span]] = {}
+        self._open: dict[str, tuple[str, RecordingSpan]] = {}
         self._ended: dict[str, int] = {}
         self._obstacle = ("", 0)
 
     def detail(
         self, event: str, decision: str | None, severity: Severity, host: str | None, now: int
     ) -> dict[str, str]:
-        """What the record of this event says of recordings; empty when it is no trigger."""
+        """Return the fields about recordings for an event's audit record; empty if it is not a trigger."""
         wanted = [kind for kind in kinds_of(event, decision, severity) if kind in self._rules.triggers]
         if not wanted:
             return {}
@@ -132,8 +132,8 @@ class RecordingPlan:
         )
 
     def _take(self, what: TriggerKind, charged_to: str, now: int) -> tuple[str, str]:
-        """The recording that has an act of this host, or why there is none."""
-        own = lane(charged_to)
+        """Return the id of an act's recording, or an empty id and the reason."""
+        own = recording_owner(charged_to)
         found = self._open.get(own)
         if found is not None and found[1].began <= now <= found[1].ends:
             recording_id, open_span = found
@@ -151,34 +151,34 @@ class RecordingPlan:
         self._open[own] = self._new_id(), span(self._rules, now, ended)
         return self._open[own][0], ""
 
-    # --- what the recorder says ---
+    # --- messages of the recorder ---
 
     def stated(self, recordings: Iterable[Recording]) -> None:
-        """These are kept: they count, also after another start of control."""
+        """Take the kept recordings into account, also after a restart of control."""
         kept = list(recordings)
         self._limit = HourlyLimit(self._rules.per_hour, kept)
         for recording in kept:
             self.closed(recording)
 
     def opened(self, charged_to: str, recording_id: str, began: int, ends: int) -> None:
-        """The recorder has begun or prolonged this one because of an order or a call."""
+        """Note a recording that the recorder began or extended for an order or a call."""
         latest = began + int(self._rules.longest * _SECOND)
-        self._open[lane(charged_to)] = (
+        self._open[recording_owner(charged_to)] = (
             recording_id,
-            Span(began, ends, int(self._rules.after * _SECOND), latest),
+            RecordingSpan(began, ends, int(self._rules.after * _SECOND), latest),
         )
 
     def closed(self, recording: Recording) -> None:
-        """This one is over."""
-        own = lane(recording.charged_to)
+        """Note the end of a recording."""
+        own = recording_owner(recording.charged_to)
         self._close(own, recording.id)
         self._ended[own] = max(recording.ended, self._ended.pop(own, 0))
         if len(self._ended) > _MOST_HOSTS:
             del self._ended[next(iter(self._ended))]
 
     def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:
-        """The recorder could not make this one; the same is said of what happens within a minute."""
-        self._close(lane(charged_to), recording_id)
+        """Note a recording that the recorder could not make; acts of the next minute get the same reason."""
+        self._close(recording_owner(charged_to), recording_id)
         self._obstacle = why, now + 60 * _SECOND
 
     def _close(self, own: str, recording_id: str) -> None:

@@ -1,23 +1,21 @@
-"""The recordings that are kept: `ID/recording.bag` and `ID/recording.json`, and what was begun as `.ID.part/`.
+"""Keep recordings (`ID/recording.bag` and `ID/recording.json`) and unfinished ones (`.ID.part/`).
 
-What is removed is `.ID.gone/` until the audit log has that, without its bag; `.ID.rest/` is nothing any more.
+A removed recording is `.ID.gone/`, without its bag, until the audit log has its removal; `.ID.rest/` is garbage.
 
 Invariants:
 
-1. A folder with the name of a recording is whole: it gets that name when all that is in it is on disk.
-2. All of them together never have more than `disk` bytes: room for the largest is made before one is begun. A host but
-   the robot's makes room from its own where it would have more than a quarter of it; all of these together have three
-   quarters at most. One of theirs never takes the place of one of the robot's or of operators', who need not have less
-   than half of the disk because of others. Of those that make room the oldest goes, of the kind of trigger that has
-   most. So it is with the number of recordings, and where their descriptions have more than `_MOST_DESCRIBED` bytes:
-   control is told of all of them in one message.
-3. `noted` in a folder says that the audit log has the recording; what was not noted is told again.
-4. `lent` in a folder says that it is no recording that is kept: there are `MOST_LENT` at most, of which the oldest goes
-   with the next, but not while who asked for it may be about to open it (`_OPENING_SECONDS`), and a recorder that
-   begins removes them, also where the one before fell while one was made. They are not counted: beside what `disk`
-   says there may be as many recordings' shares for `LENT_SECONDS`.
-5. Whenever the recorder falls, a recording is there, or it is gone and that is told: of a folder that has the name of a
-   recording nothing is removed; it loses its name first, at once.
+1. A folder is renamed to the id of its recording when everything in it is on disk, so such a folder is complete.
+2. All recordings together never exceed `disk` bytes: before one begins, room for the largest is made. Hosts other than
+   the robot have at most a quarter of the disk each, and three quarters together. Their recordings never replace those
+   of the robot or of operators, for whom half of the disk is always available. The oldest recording of the kind of
+   trigger with the most bytes is removed first. The number of recordings, and the bytes of their descriptions
+   (`_MOST_DESCRIBED`), are also limited, because control gets all descriptions in one message.
+3. `noted` in a folder marks a recording that is in the audit log; others are reported again.
+4. `lent` in a folder marks a temporary recording, which does not count in `disk`. There are at most `MOST_TEMPORARY`,
+   each for up to `TEMPORARY_SECONDS`; another one replaces the oldest, unless that is so new that its reader may not
+   have opened it yet (`_OPENING_SECONDS`). A new recorder removes all of them.
+5. Whenever the recorder dies, a recording either exists, or its removal is reported: the folder is renamed atomically
+   before anything in it is removed.
 """
 
 import re
@@ -35,11 +33,11 @@ from appliance.recorder.recording_plan import KEPT
 
 BAG, ABOUT, PROGRESS = "recording.bag", "recording.json", "progress"
 MOST_KEPT = 500
-LENT_SECONDS = 600
-MOST_LENT = 4
+TEMPORARY_SECONDS = 600
+MOST_TEMPORARY = 4
 _OPENING_SECONDS = 30
 _MOST_DESCRIBED = 32 << 20
-_NOTED, _LENT, _REMOVED, _SINCE = "noted", "lent", "removed", "since"
+_NOTED, _TEMPORARY, _REMOVED, _SINCE = "noted", "lent", "removed", "since"
 _ID = re.compile(r"[0-9a-f]{20}")
 _PART, _GONE, _REST = (re.compile(rf"\.([0-9a-f]{{20}})\.{kind}") for kind in ("part", "gone", "rest"))
 _LARGEST = 8  # the part of `disk` that one recording may have
@@ -47,21 +45,21 @@ _SECOND = 1_000_000_000
 _log = structlog.get_logger()
 
 
-class Shelf:
-    """The recordings in `folder`. They have `disk` bytes together, and go after `seconds` (None: never) of `clock`."""
+class RecordingStore:
+    """The recordings in `folder`: at most `disk` bytes, each removed after `seconds` of `clock` (None: never)."""
 
     def __init__(self, folder: Path, *, disk: int, seconds: float | None, clock: Callable[[], int]) -> None:
         self._folder = folder
         self._disk = disk
         self._seconds = seconds
         self._clock = clock
-        for mark in folder.glob(f"*/{_LENT}"):
+        for mark in folder.glob(f"*/{_TEMPORARY}"):
             self._discard(mark.parent)
         for rest in self._named(_REST):
             shutil.rmtree(rest)
         for gone in self._named(_GONE):
             (gone / BAG).unlink(missing_ok=True)
-        self._lent: list[Recording] = []
+        self._temporary: list[Recording] = []
         self.recordings = sorted(self._read(), key=lambda recording: recording.id)
         self._described = {found.id: self._length(found) for found in self.recordings}
         self._since = {found.id: self._kept_since(found) for found in self.recordings}
@@ -75,7 +73,7 @@ class Shelf:
                     _log.error("a recording cannot be read", recording=path.name, error=str(error))
 
     def _kept_since(self, recording: Recording) -> int:
-        """When it was kept, by the clock of ages; where that was not written, its end."""
+        """Return when a recording was stored, by the age clock; if unknown, its end."""
         with suppress(OSError, ValueError):
             return int((self._folder / recording.id / _SINCE).read_bytes())
         return recording.ended
@@ -85,40 +83,40 @@ class Shelf:
 
     @property
     def largest(self) -> int:
-        """Bytes that one recording may have."""
+        """Return the bytes that one recording may have."""
         return self._disk // _LARGEST
 
     @property
     def free(self) -> int:
-        """Bytes that are free on the disk."""
+        """Return the free bytes on the disk."""
         return shutil.disk_usage(self._folder).free
 
     def part(self, recording_id: str) -> Path:
-        """The folder in which a recording is made."""
+        """Return the folder in which a recording is made."""
         return self._folder / f".{recording_id}.part"
 
     def parts(self) -> list[Path]:
-        """Those that were begun and not finished, the oldest first."""
+        """Return the folders of unfinished recordings, the oldest first."""
         return self._named(_PART)
 
     def _named(self, kind: re.Pattern[str]) -> list[Path]:
         return sorted(path for path in self._folder.iterdir() if kind.fullmatch(path.name))
 
     def _discard(self, folder: Path) -> None:
-        """Nothing of it is there any more, or nothing of it counts. Raises `OSError`."""
+        """Remove a folder without a trace in the log. Raises `OSError`."""
         rest = self._folder / f".{folder.name.strip('.')[:20]}.rest"
         folder.rename(rest)
         shutil.rmtree(rest)
 
     def discard_part(self, recording_id: str) -> None:
-        """Take away what was begun of a recording, if anything was."""
+        """Remove an unfinished recording, if there is one."""
         with suppress(OSError):
             self._discard(self.part(recording_id))
 
     def keep(self, recording: Recording) -> None:
-        """A recording is whole, and all of it on disk; only what has no name yet needs `progress`."""
+        """Store a finished recording, which is completely on disk."""
         kept = self._folder / recording.id
-        with suppress(OSError):  # a full disk: then it is kept by its end
+        with suppress(OSError):  # a full disk: its age then counts from its end
             (self.part(recording.id) / _SINCE).write_bytes(b"%d" % self._clock())
         self.part(recording.id).rename(kept)
         (kept / PROGRESS).unlink(missing_ok=True)
@@ -126,40 +124,39 @@ class Shelf:
         self.recordings.append(recording)
         self._described[recording.id] = self._length(recording)
 
-    def mark_lent(self, recording_id: str) -> None:
-        """What is made in its folder is not to be kept. Raises `OSError`."""
+    def mark_temporary(self, recording_id: str) -> None:
+        """Mark a recording as temporary before it is made. Raises `OSError`."""
         self.part(recording_id).mkdir(mode=0o750, exist_ok=True)
-        (self.part(recording_id) / _LENT).touch()
+        (self.part(recording_id) / _TEMPORARY).touch()
 
-    def can_lend(self, now: int) -> bool:
-        """Make room for one that is not kept; False while all that there may be are about to be opened.
+    def has_temporary_room(self, now: int) -> bool:
+        """Make room for a temporary recording; return False if all are too new to remove. Raises `OSError`."""
+        self._expire(now, MOST_TEMPORARY - 1, _OPENING_SECONDS)
+        return len(self._temporary) < MOST_TEMPORARY
 
-        Raises `OSError`.
-        """
-        self._take_back(now, MOST_LENT - 1, _OPENING_SECONDS)
-        return len(self._lent) < MOST_LENT
-
-    def lend(self, recording: Recording) -> None:
-        """One that is not kept can be read for `LENT_SECONDS`, or until others need its place. Raises `OSError`."""
+    def publish_temporary(self, recording: Recording) -> None:
+        """Publish a temporary recording for `TEMPORARY_SECONDS`, or until another replaces it. Raises `OSError`."""
         self.part(recording.id).rename(self._folder / recording.id)
-        self._lent.append(recording)
+        self._temporary.append(recording)
 
-    def _take_back(self, now: int, most: int, seconds: float) -> None:
-        """Of those that were lent longer ago the oldest go, until there are so many."""
-        while len(self._lent) > most and abs(now - self._lent[0].triggers[0].time) > seconds * _SECOND:
-            self._discard(self._folder / self._lent[0].id)
-            del self._lent[0]
+    def _expire(self, now: int, most: int, seconds: float) -> None:
+        """Remove the oldest temporary recordings until `most` are left; keep those younger than `seconds`."""
+        while (
+            len(self._temporary) > most and abs(now - self._temporary[0].triggers[0].time) > seconds * _SECOND
+        ):
+            self._discard(self._folder / self._temporary[0].id)
+            del self._temporary[0]
 
     def find(self, recording_id: str) -> Recording | None:
-        """The recording of this id; None when there is none."""
+        """Return the recording with this id; None if there is none."""
         return next((found for found in self.recordings if found.id == recording_id), None)
 
     def knows(self, recording_id: str) -> bool:
-        """Whether there is a recording of this id, or was one that was removed a moment ago."""
+        """Whether a recording with this id is stored, or its removal is not in the audit log yet."""
         return self.find(recording_id) is not None or self._gone(recording_id).exists()
 
     def remove(self, recording: Recording, who: str, reason: str) -> None:
-        """Take a recording away, for somebody or for a reason. Raises `OSError`."""
+        """Remove a recording; `who` and `reason` are stored for the audit log. Raises `OSError`."""
         kept, gone = self._folder / recording.id, self._gone(recording.id)
         with suppress(OSError):  # a full disk, which is when recordings have to go
             (kept / _REMOVED).write_bytes(msgspec.json.encode((who, reason)))
@@ -172,7 +169,7 @@ class Shelf:
         return self._folder / f".{recording_id}.gone"
 
     def removed(self) -> Iterator[tuple[Recording, str, str]]:
-        """Those that were removed, for whom and why, and of which it is not known whether the audit log has that."""
+        """Yield recordings whose removal may not be in the audit log yet, with who removed them and why."""
         for folder in self._named(_GONE):
             try:
                 recording = msgspec.json.decode((folder / ABOUT).read_bytes(), type=Recording)
@@ -184,22 +181,22 @@ class Shelf:
             yield recording, who, reason
 
     def note(self, recording_id: str) -> None:
-        """The audit log has it: that there is this recording, or that it was removed. Raises `OSError`."""
+        """Note that a recording, or its removal, is in the audit log. Raises `OSError`."""
         if self.find(recording_id) is not None:
             (self._folder / recording_id / _NOTED).touch()
         elif self._gone(recording_id).exists():
             self._discard(self._gone(recording_id))
 
     def unnoted(self) -> list[Recording]:
-        """Those of which it is not known whether the audit log has them."""
+        """Return the recordings that may not be in the audit log yet."""
         return [found for found in self.recordings if not (self._folder / found.id / _NOTED).exists()]
 
     def outdated(self, now: int) -> Iterator[tuple[Recording, str]]:
-        """What is too old now (nanoseconds since the epoch), and why; to be removed before the next is asked for.
+        """Yield recordings that are too old, and the reason; the caller removes each. Remove old temporary ones.
 
-        What was lent for long enough goes, too. Raises `OSError`.
+        `now` is nanoseconds since the epoch. Raises `OSError`.
         """
-        self._take_back(now, 0, LENT_SECONDS)
+        self._expire(now, 0, TEMPORARY_SECONDS)
         while self._seconds is not None and self.recordings:
             oldest = self.recordings[0]
             if self._since[oldest.id] + int(self._seconds * 1e9) > self._clock():
@@ -207,9 +204,10 @@ class Shelf:
             yield oldest, "it is older than recorder.days"
 
     def in_the_way(self, charged_to: str, making: Sequence[str] = ()) -> tuple[Recording | None, str]:
-        """The next recording to remove so that one of this host can be made, and why; an empty reason: there is room.
+        """Return the next recording to remove for a new one of this host, and the reason.
 
-        None with a reason: no other is to make room. `making` are the hosts whose recordings are being made now.
+        None with a reason: no recording may be removed; None without one: there is room. `making` are the hosts of the
+        recordings in progress.
         """
         held = self._sizes(lambda found: found.charged_to)
         held.update({name: number * self.largest for name, number in Counter((*making, charged_to)).items()})
@@ -233,7 +231,7 @@ class Shelf:
         return (self._oldest(own), why) if own and charged_to in KEPT else (None, why)
 
     def _oldest(self, charged_to: Collection[str]) -> Recording:
-        """Of these hosts' recordings the oldest of the kind of trigger that has most."""
+        """Return these hosts' oldest recording of the kind of trigger with the most bytes."""
         kinds = self._sizes(lambda found: _kind(found) if found.charged_to in charged_to else "")
         del kinds[""]
         fullest = max(kinds, key=lambda kind: kinds[kind])

@@ -1,29 +1,28 @@
-"""The memory in which a relay leaves what it has received last; it survives the relay, and the recorder reads it.
+"""Share memory with the latest messages of a relay; it survives the relay, and the recorder reads it.
 
-The supervisor holds the memory; one relay writes (`RingWriter`), one recorder reads (`RingReader`). It is made of
+The supervisor holds the memory; one relay writes (`RingWriter`), one recorder reads (`RingReader`). It consists of
 blocks of one size. The connection to a publisher is a *stream*: a chain of header blocks (its TCPROS header, with the
-definition of the type) and a chain of data blocks, numbered from 0. Records stand in the data chain one after another,
-over the ends of blocks: time, number of the first frame, how many frames, and the frames as they came.
+definition of the type) and a chain of data blocks, each numbered from 0. The data chain is a sequence of records, which
+may span blocks: number of frames, their bytes, time, number of the first frame, and the frames.
 
 Invariants:
 
-1. What a block holds counts only up to `used` in its row of the table, one word that is stored after the data; a row
-   counts only while `birth`, another word, is not 0, and that is stored last. So a writer that is killed at any
-   instruction leaves whole records, and one torn record at most, at the end of a chain, which nobody reads.
-2. A block that is taken for something new gets `birth` 0 first. Who reads copies the block and looks at the row again:
-   if `birth` has changed, there is no such block.
-3. While there are free blocks everybody may have them. When there are none, what is too old goes first; then a topic
-   or a host that has its share loses its own oldest block; for the others one of those gives up its oldest that are
-   beyond theirs, and if nobody is, the oldest of all goes. So a flood pushes out itself. The block that a stream is
-   filling counts as new while it says something, however seldom.
-4. The reader believes nothing that it reads: sizes come from the memory's own size, and every number is bounded by it.
-5. Header blocks stay while their stream is open or has data; they take a quarter of the memory at most, those of a host
-   a quarter of its share. Streams that are closed make room, the oldest first. A stream that finds no room for its
-   header is not recorded, and counted (`REFUSED`), as are the messages of a record beyond the share of its topic
-   (`MISSED`).
+1. A block is valid up to `used` in its row of the table, a word that is stored after the data. A row is valid while
+   `birth`, another word, is not 0; it is stored last. So a writer that is killed at any instruction leaves complete
+   records, and at most one torn record at the end of a chain, which is not read.
+2. A block that is reused first gets `birth` 0. A reader copies the block, then reads `birth` again; if it has changed,
+   the copy is discarded.
+3. While blocks are free, every stream may take them. When none is free, this block is reused: the oldest, if it is too
+   old; else the oldest of the writing topic or host, if that has its quota; else the oldest of a topic or host that
+   exceeds its quota; else the oldest of all. So a flood replaces itself. The block that an active stream is filling
+   counts as new.
+4. The reader trusts nothing: it derives all sizes from the memory's own size, and bounds every number by it.
+5. Header blocks stay while their stream is open or has data. They take at most a quarter of the memory, and those of a
+   host a quarter of its quota. Closed streams make room, the oldest first. A stream whose header has no room is counted
+   (`REFUSED`) and not recorded. Messages of a record larger than its topic's quota are counted (`MISSED`).
 
-`used` and `birth` are aligned words of 64 bits. Where the processor may show stores in another order (ARM), a reader is
-told of a record's data by its next look at the latest, and it looks at what is some milliseconds old.
+`used` and `birth` are aligned words of 64 bits. If the processor reorders stores (ARM), a reader sees a record's data
+at its next check at the latest; it reads data that is some milliseconds old.
 """
 
 import struct
@@ -36,11 +35,10 @@ from typing import NamedTuple
 from roswire.tcpros import encode_header
 
 SMALLEST = 1 << 20
-"""No ring is smaller than so many bytes."""
+"""The smallest size of a ring in bytes."""
 
 LEFT_OUT = "left_out"
-"""The field of a stream's header that says why its messages are not recorded; publishers' fields of that name are not
-passed on."""
+"""The field of a stream's header with the reason why its messages are not recorded; a publisher cannot set it."""
 
 HEADER, DATA = 1, 2
 RECORD = struct.Struct("<IIQQQ")  # mark, frames, bytes of the frames, time, number of the first frame
@@ -54,13 +52,13 @@ _COUNTERS = 4096  # bytes before the table
 _WORDS = 8  # of a row
 _ROW = struct.Struct("=QQQIIQ24x")  # birth, stream, number, kind, begins, used
 MISSED, REFUSED = 0, 1  # words of the counters
-_LONG = 4  # blocks; a record beyond begins with one, so that it does not depend on a block that is much older
+_LONG = 4  # blocks; a longer record begins with a new block, so that it does not depend on a much older one
 _MOST_NUMBER = 1 << 62
 _MOST_HEADERS = 4  # a quarter
 
 
 class Geometry(NamedTuple):
-    """Where things are in a ring; `data` is where the first block begins."""
+    """The layout of a ring: bytes of a block, number of blocks, offset of the first block."""
 
     block: int
     blocks: int
@@ -68,7 +66,7 @@ class Geometry(NamedTuple):
 
 
 def geometry(size: int) -> Geometry:
-    """How a memory of so many bytes is divided. Raises `ValueError` for one that is too small."""
+    """Return the layout of a ring of this size. Raises `ValueError` if it is too small."""
     if size < SMALLEST:
         raise ValueError(f"a ring of {size} bytes is too small: {SMALLEST} at least")
     block = _SMALLEST_BLOCK
@@ -78,8 +76,8 @@ def geometry(size: int) -> Geometry:
     return Geometry(block, blocks, size - blocks * block)
 
 
-class Row(NamedTuple):
-    """What the table says of a block."""
+class BlockRow(NamedTuple):
+    """The table's entry for a block."""
 
     birth: int
     stream: int
@@ -90,7 +88,7 @@ class Row(NamedTuple):
 
     @property
     def sound(self) -> bool:
-        """Whether a writer can have written it: the numbers of a fallen one must not end up beyond a word."""
+        """Whether the row is in use and plausible: a compromised writer's numbers must not exceed a word."""
         return (
             0 < self.birth < _MOST_NUMBER
             and 0 < self.stream < _MOST_NUMBER
@@ -101,7 +99,7 @@ class Row(NamedTuple):
 
 @dataclass(eq=False, slots=True)
 class _Share:
-    """The data blocks of a topic or a host, the oldest first; how many header blocks and streams it has."""
+    """The data blocks of a topic or host, the oldest first, and its numbers of header blocks and streams."""
 
     most: int
     blocks: OrderedDict[int, None] = field(default_factory=OrderedDict)
@@ -111,41 +109,41 @@ class _Share:
 
 @dataclass(eq=False, slots=True)
 class _Chain:
-    """The blocks of one stream, and whom they count for."""
+    """The blocks of one stream, and the topic and host whose quotas they use."""
 
     shares: tuple[_Share, ...] = ()
     names: tuple[str, str] = ("", "")
     headers: list[int] = field(default_factory=list)
     data: int = 0
-    writer: "Stream | None" = None
+    writer: "RingStream | None" = None
 
 
 def words_of(memory: memoryview) -> memoryview:
-    """The memory as words of 64 bits, each of which is loaded and stored at once."""
+    """Return the memory as words of 64 bits, which are loaded and stored atomically."""
     return memory[: len(memory) // 8 * 8].cast("Q")
 
 
-def rows(memory: memoryview) -> list[tuple[int, Row]]:
-    """The table as it is now: each block with its row."""
+def rows(memory: memoryview) -> list[tuple[int, BlockRow]]:
+    """Return a copy of the table: each block's number with its row."""
     table = bytes(memory[_COUNTERS : _COUNTERS + geometry(len(memory)).blocks * _ROW.size])
-    return [(block, Row._make(row)) for block, row in enumerate(_ROW.iter_unpack(table))]
+    return [(block, BlockRow._make(row)) for block, row in enumerate(_ROW.iter_unpack(table))]
 
 
 def birth_at(block: int) -> int:
-    """Which word says when a block was taken."""
+    """Return the index of the word with a block's `birth`."""
     return _COUNTERS // 8 + block * _WORDS
 
 
 def used_at(block: int) -> int:
-    """Which word says how much of a block counts."""
+    """Return the index of the word with a block's `used`."""
     return birth_at(block) + 4
 
 
-class Stream:
-    """What one connection to a publisher leaves in the ring, until it is closed."""
+class RingStream:
+    """The open stream of one connection to a publisher."""
 
     keeps = True
-    """Whether it keeps what it is given to write."""
+    """Whether it stores what is written to it."""
 
     __slots__ = ("_chain", "_end", "_number", "_place", "_ring", "_stream", "_used", "block", "written")
 
@@ -155,12 +153,12 @@ class Stream:
         self._chain = chain
         self._number = 0
         self.block = -1
-        self.written = 0  # when
-        self._place = self._end = 0  # in the memory
-        self._used = 0  # the word
+        self.written = 0  # the time
+        self._place = self._end = 0  # offsets in the memory
+        self._used = 0  # the index of the block's word
 
     def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
-        """Leave these frames, `first` the number of the first one; `judged`: when monitors were given them, or 0."""
+        """Append frames; `first` is the number of the first one, `judged` the time when monitors got them, or 0."""
         ring = self._ring
         size = len(frames)
         now = self.written = ring.clock(judged)
@@ -177,15 +175,15 @@ class Stream:
             self._append(memoryview(RECORD.pack(MARK, messages, size, now, first)), frames)
 
     def close(self) -> None:
-        """Nothing more comes: its blocks stay until others need them."""
+        """End the stream; its blocks stay until others need them."""
         self._ring.close_chain(self._stream, self._chain)
 
     def lose_block(self) -> None:
-        """The block that is being filled has been taken: the next record begins another."""
+        """Begin a new block with the next record, because the present one is reused."""
         self.block, self._place, self._end = -1, 0, 0
 
     def _append(self, head: memoryview, frames: memoryview) -> None:
-        """A record over the end of a block."""
+        """Append a record that does not fit into the present block."""
         ring = self._ring
         left = len(head) + len(frames)
         if left > _LONG * ring.block and self._place + _PAD.size <= self._end:
@@ -218,10 +216,10 @@ class Stream:
 
 
 class RingWriter:
-    """Writes into `memory` (shared, writable), after whoever wrote there before.
+    """The writer of `memory` (shared, writable); it keeps the data of earlier writers.
 
-    `topic_share` and `host_share` are the parts of the memory that one topic and one host may keep when others need it;
-    what is older than `seconds` goes first.
+    `topic_share` and `host_share` are the parts of the memory that one topic and one host may keep when others need it.
+    Blocks older than `seconds` are reused first.
     """
 
     def __init__(
@@ -245,7 +243,7 @@ class RingWriter:
         self._topics: dict[str, _Share] = {}
         self._hosts: dict[str, _Share] = {}
         self._chains: dict[int, _Chain] = {}
-        # Data blocks, the oldest first: of which stream, and since when.
+        # Data blocks, the oldest first, each with its stream and time.
         self._order: OrderedDict[int, tuple[int, int]] = OrderedDict()
         self._beyond: dict[_Share, None] = {}
         self._headers = 0
@@ -253,8 +251,8 @@ class RingWriter:
         self._birth = self._last_stream = 0
         self._inherit()
 
-    def open(self, topic: str, host: str, header: Mapping[str, str]) -> Stream | None:
-        """Begin a stream; None when there is no room for its header."""
+    def open(self, topic: str, host: str, header: Mapping[str, str]) -> RingStream | None:
+        """Begin a stream; return None if its header has no room."""
         text = memoryview(encode_header({**header, "topic": topic, "host": host}))
         needed = -(-len(text) // self.block)
         shares = tuple(
@@ -279,15 +277,15 @@ class RingWriter:
             place = self.geometry.data + block * self.block
             self.memory[place : place + len(part)] = part
             self.words[used_at(block)] = len(part)
-        chain.writer = Stream(self, self._last_stream, chain)
+        chain.writer = RingStream(self, self._last_stream, chain)
         return chain.writer
 
     def count(self, counter: int, by: int) -> None:
-        """Count what is not there."""
+        """Add to a counter of data that is not stored (`MISSED`, `REFUSED`)."""
         self.words[counter] = (self.words[counter] + by) % (1 << 64)
 
     def take(self, stream: int, number: int, kind: int, begins: int, chain: _Chain, *, now: int) -> int:
-        """A block for a stream: a free one, or the oldest of its topic or host if that has its share, or of all."""
+        """Give a stream a block, reused if none is free (invariant 3), and return it."""
         if not self._free:
             self._give_up(chain, now - self._keep)
         block = self._free.pop()
@@ -308,13 +306,13 @@ class RingWriter:
         return block
 
     def close_chain(self, stream: int, chain: _Chain) -> None:
-        """A stream ends."""
+        """End a stream."""
         chain.writer = None
         if not chain.data:
             self._forget(stream, chain)
 
     def _give_up(self, chain: _Chain, old: int) -> None:
-        """Make a block free; what is from before `old` is too old."""
+        """Free a block for this stream by invariant 3; blocks from before `old` are too old."""
         oldest = self._oldest(old)
         if self._order[oldest][1] >= old or self._in_use(oldest, old):
             full = (share for share in chain.shares if len(share.blocks) >= share.most)
@@ -323,12 +321,12 @@ class RingWriter:
         self._push_out(oldest)
 
     def _in_use(self, block: int, old: int) -> bool:
-        """Whether a stream fills this block, and has done so lately: one that says little has all it said there."""
+        """Whether a stream is filling this block and has written lately: a slow stream may have all its data there."""
         writer = self._chains[self._order[block][0]].writer
         return writer is not None and writer.block == block and writer.written >= old
 
     def _oldest(self, old: int) -> int:
-        """The oldest block; those that are being filled count as new."""
+        """Return the oldest block; blocks that are being filled count as new."""
         for _ in range(len(self._order)):
             block = next(iter(self._order))
             if not self._in_use(block, old):
@@ -351,7 +349,7 @@ class RingWriter:
             loser.writer.lose_block()
 
     def _room_for_header(self, needed: int, host: _Share) -> bool:
-        """Whether there is room in all and in the host's part, or can be where closed streams are pushed out."""
+        """Whether a header has room in the ring and in the host's part; frees closed streams if needed."""
 
         def crowded(*, of_host: bool) -> bool:
             has, whole = (
@@ -389,7 +387,7 @@ class RingWriter:
         self._free.append(block)
 
     def _inherit(self) -> None:
-        """Take over what an earlier writer left: its streams are closed, its blocks are the oldest."""
+        """Take over an earlier writer's blocks as the oldest, and its streams as closed."""
         left = sorted((row, block) for block, row in rows(self.memory) if row.sound)
         with_data = {row.stream for row, _block in left if row.kind == DATA}
         for row, block in left:

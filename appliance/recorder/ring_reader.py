@@ -1,4 +1,4 @@
-"""Reads what relays left in a ring, and believes nothing of it: a fallen relay can spoil its own messages, no more."""
+"""Read a ring without trusting it: a compromised relay can only spoil its own messages."""
 
 import struct
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from appliance.recorder.ring import (
     PAD,
     RECORD,
     REFUSED,
-    Row,
+    BlockRow,
     birth_at,
     geometry,
     rows,
@@ -28,50 +28,50 @@ _LONGEST_HEADER = 256 << 10
 _NEEDED = frozenset({"topic", "type", "md5sum", "message_definition", "callerid", "host"})
 _LONGEST_TYPE = 256
 MOST_MESSAGES = 1 << 53
-"""No stream has so many."""
+"""More messages than any stream has."""
 
-_Blocks = dict[int, tuple[int, Row]]
+_Blocks = dict[int, tuple[int, BlockRow]]
 """The blocks of a chain by their number, each with its row."""
 
 
-class Place(NamedTuple):
-    """How far a stream was read: block of its chain, and byte in it."""
+class ReadPosition(NamedTuple):
+    """The position up to which a stream was read: a block of its chain, and a byte in it."""
 
     number: int
     offset: int
 
 
-class Batch(NamedTuple):
-    """Frames that came at once, without their lengths; `time` is nanoseconds since the epoch, `first` from 1."""
+class RecordedFrames(NamedTuple):
+    """Frames of one batch, without their lengths; `time` is nanoseconds since the epoch, `first` from 1."""
 
     time: int
     first: int
     frames: list[memoryview]
 
 
-class Found(NamedTuple):
-    """What is new of a stream. `torn`: something before or between was pushed out, or is damaged."""
+class StreamFrames(NamedTuple):
+    """The new frames of a stream. `torn`: frames before or between them were overwritten or are damaged."""
 
     stream: int
     header: dict[str, str]
-    batches: list[Batch]
+    batches: list[RecordedFrames]
     torn: bool
 
 
 @dataclass(slots=True)
 class _Run:
-    """Blocks of a chain that follow each other, and what they hold."""
+    """Consecutive blocks of a chain, and their data."""
 
     number: int
     begins: int
     data: bytearray
-    broken: bool  # something before it is not there
+    broken: bool  # data before it is missing
 
 
 class RingReader:
-    """Reads one ring; `places` is how far each stream was read."""
+    """A reader of one ring; `places` are the positions up to which the streams were read."""
 
-    def __init__(self, memory: memoryview, places: dict[int, Place] | None = None) -> None:
+    def __init__(self, memory: memoryview, places: dict[int, ReadPosition] | None = None) -> None:
         self._memory = memory
         self._words = words_of(memory)
         self._geometry = geometry(len(memory))
@@ -79,14 +79,14 @@ class RingReader:
 
     @property
     def not_there(self) -> tuple[int, int]:
-        """Messages that were too long, and streams that were refused, since the ring was made."""
+        """Return the numbers of messages that were too long, and of streams without room, since the ring exists."""
         return self._words[MISSED], self._words[REFUSED]
 
-    def read(self, since: int, until: int) -> Iterator[Found]:
-        """What has come since the last call, of the time between these two (nanoseconds since the epoch).
+    def read(self, since: int, until: int) -> Iterator[StreamFrames]:
+        """Yield the messages since the last call that were received from `since` to `until`.
 
-        What is later is for a later call: it may have come while this one reads. Where something earlier follows it,
-        the clock was set back, and it is left out.
+        Times are nanoseconds since the epoch. Later messages are left to a later call, because they may arrive during
+        this one. A later message that an earlier one follows is left out: the clock was set back.
         """
         headers: dict[int, _Blocks] = {}
         data: dict[int, _Blocks] = {}
@@ -100,7 +100,7 @@ class RingReader:
             if header is not None:
                 batches, torn = self._new(stream, blocks, since, until)
                 if batches or torn:
-                    yield Found(stream, header, batches, torn)
+                    yield StreamFrames(stream, header, batches, torn)
 
     def _header(self, blocks: _Blocks) -> dict[str, str] | None:
         text = bytearray()
@@ -115,18 +115,18 @@ class RingReader:
             return None
         return _readable(header) if header.keys() >= _NEEDED else None
 
-    def _copy(self, block: int, row: Row) -> bytes | None:
-        """The part of a block that counts; None if it has been taken for something else meanwhile.
+    def _copy(self, block: int, row: BlockRow) -> bytes | None:
+        """Return the used part of a block; None if the block was reused.
 
-        As it is now, not as it was when the table was copied: where the next block was there already, this one may have
-        been copied before it was full.
+        The present `used` counts, not the one in the copied table: the block may have been filled, and the next one
+        begun, while the table was copied.
         """
         start = self._geometry.data + block * self._geometry.block
         part = bytes(self._memory[start : start + min(self._words[used_at(block)], self._geometry.block)])
         return part if self._words[birth_at(block)] == row.birth else None
 
-    def _runs(self, blocks: _Blocks, place: Place | None) -> Iterator[_Run]:
-        """What is to be read, from `place` on; blocks that do not follow each other begin a run each."""
+    def _runs(self, blocks: _Blocks, place: ReadPosition | None) -> Iterator[_Run]:
+        """Yield the runs to read from `place` on; a missing block begins a new run."""
         run: _Run | None = None
         broken = False
         for number in sorted(blocks):
@@ -143,19 +143,19 @@ class RingReader:
             if part is not None and run is None:
                 broken = broken or number != (0 if place is None else place.number)
                 if broken and row.begins == NONE_BEGINS:
-                    continue  # the middle of a record whose beginning is not there
+                    continue  # the middle of a record whose start is missing
                 run = _Run(number, row.begins, bytearray(), broken)
             if part is not None and run is not None:
                 run.data += part
         if run is not None:
             yield run
 
-    def _new(self, stream: int, blocks: _Blocks, since: int, until: int) -> tuple[list[Batch], bool]:
-        batches: list[Batch] = []
+    def _new(self, stream: int, blocks: _Blocks, since: int, until: int) -> tuple[list[RecordedFrames], bool]:
+        batches: list[RecordedFrames] = []
         place, torn = self.places.get(stream), False
         for run in self._runs(blocks, place):
             at = done = run.begins if run.broken else 0 if place is None else place.offset
-            # Until the first record says whether what is missing is of the time asked for
+            # Only the first record's time shows whether the missing data is of the requested period.
             in_doubt = run.broken
             view = memoryview(bytes(run.data))
             while at + _LENGTH.size <= len(view):
@@ -166,7 +166,7 @@ class RingReader:
                     break
                 mark, messages, size, time, first = RECORD.unpack_from(view, at)
                 if mark != MARK or first > MOST_MESSAGES:
-                    torn, done = True, len(view)  # nobody knows where the next record begins
+                    torn, done = True, len(view)  # the start of the next record is unknown
                     break
                 torn, in_doubt = torn or (in_doubt and time >= since), False
                 end = at + RECORD.size + size
@@ -181,15 +181,15 @@ class RingReader:
                     if frames is None:
                         torn = True
                     else:
-                        batches.append(Batch(time, first, frames))
+                        batches.append(RecordedFrames(time, first, frames))
             torn = torn or in_doubt
             blocks_read, offset = divmod(done, self._geometry.block)
-            self.places[stream] = Place(run.number + blocks_read, offset)
+            self.places[stream] = ReadPosition(run.number + blocks_read, offset)
         return batches, torn
 
 
 def _readable(header: dict[str, str]) -> dict[str, str]:
-    """The header so that tools read a bag with it: a definition's comments may have any bytes, fields any text."""
+    """Return the header with its bytes replaced by text that tools can read."""
     definition = header["message_definition"].encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     plain = {name: header[name][:_LONGEST_TYPE] for name in ("type", "md5sum")}
     if "latching" in header:
@@ -198,7 +198,7 @@ def _readable(header: dict[str, str]) -> dict[str, str]:
 
 
 def _frames(view: memoryview, messages: int) -> list[memoryview] | None:
-    """The messages of a record; None where their lengths do not fill it."""
+    """Return the messages of a record; None if their lengths do not match it."""
     found: list[memoryview] = []
     at = 0
     while at + _LENGTH.size <= len(view) and len(found) < messages:

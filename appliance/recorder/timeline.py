@@ -1,10 +1,10 @@
-"""A recording on a time line, and its messages around a moment: what people ask after an incident.
+"""Compute a recording's time line, and its messages around a time, for the analysis of an incident.
 
-Both are bounded, however large the recording is: a time line has so many columns, topics and events, and says what it
-leaves out; of messages so many are read. Messages are read within the bounds of `ros/message_view.py`.
+Columns, topics, events and messages are limited in number, however large the recording is. Omissions are reported.
+Messages are read within the bounds of `roswire/message_view.py`.
 
-What happened is read from the bag as well, from the audit records that the recorder has written into it: retention may
-have removed them from the log since. A publisher of the same topic has a host in its header; the recorder has none.
+Events come from the audit records in the bag: retention may have removed them from the log since. A publisher's header
+has a host; the recorder's own has none.
 """
 
 from collections import defaultdict
@@ -28,7 +28,7 @@ from appliance.channel.answers.recording_answers import (
     Sender,
     Timeline,
 )
-from appliance.recorder.bag_reader import BagReader, Place
+from appliance.recorder.bag_reader import BagReader, MessagePosition
 from appliance.recorder.bag_writer import INDEX_ENTRY
 from appliance.recorder.recording import LOG, RECORDS
 from appliance.recorder.triggers import kinds_of
@@ -38,14 +38,14 @@ COLUMNS, MOST_COLUMNS = 200, 1000
 NEIGHBOURS, MOST_NEIGHBOURS = 5, 25
 MOST_TOPICS = 300
 MOST_EVENTS = 500
-_MOST_BYTES = 1 << 20  # of a message: what is read for people ends long before
+_MOST_BYTES = 1 << 20  # of a message; people are shown much less
 _LONGEST_RECORD = 1 << 22
 _SECOND = 1_000_000_000
 _NOTABLE = (Severity.NOTICE, Severity.WARNING, Severity.ALARM)
 
 
 class _Said(msgspec.Struct):
-    """What is taken from an audit record."""
+    """The fields of an audit record that are used here."""
 
     id: str
     event: str
@@ -66,13 +66,13 @@ class _Columns:
         self._width = (until - since) // number + 1
 
     def count(self, times: Iterable[int], counts: list[int]) -> None:
-        """Count each in its column; what is outside counts nowhere."""
+        """Count each time in its column; ignore times outside."""
         for time in times:
             if self.since <= time <= self.until:
                 counts[(time - self.since) // self._width] += 1
 
     def only(self, first: int, last: int) -> int | None:
-        """The column that has all from `first` to `last`; None when there is no such."""
+        """Return the column that contains both `first` and `last`; None if there is none."""
         if first < self.since or last > self.until:
             return None
         column = (first - self.since) // self._width
@@ -86,14 +86,14 @@ def timeline(
     until: int | None = None,
     columns: int = COLUMNS,
 ) -> Timeline:
-    """The time line from `since` to `until` (nanoseconds since the epoch; None: the recording's own ends).
+    """Return the time line from `since` to `until` (nanoseconds since the epoch; None: the recording's ends).
 
-    Raises `OSError`, and `ValueError` where there is no such time in it or the bag is no good.
+    Raises `OSError`, and `ValueError` if the recording has no such time or the bag is invalid.
     """
     start = recording.began if since is None else max(since, recording.began)
     end = recording.ended if until is None else min(until, recording.ended)
     if start >= end:
-        raise ValueError("that is no part of the recording's time")
+        raise ValueError("that is not within the recording's time")
     wanted = _Columns(start, end, columns)
     with BagReader.of(bag) as reader:
         flows, counts = _flows(reader, wanted), defaultdict[str, list[int]](lambda: [0] * columns)
@@ -118,7 +118,7 @@ def timeline(
 
 
 def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
-    """When each topic said something."""
+    """Return the number of messages on each topic in each column."""
     flows: dict[tuple[str, str], RecordedFlow] = {}
     of: dict[int, RecordedFlow] = {}
     for number in _of_nodes(reader):
@@ -143,7 +143,7 @@ def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
 
 
 def _events(reader: BagReader, since: int, until: int) -> Iterator[RecordedEvent]:
-    """What happened in that time, in its order."""
+    """Yield the events of a period, in order."""
     records = {
         number
         for number, header in reader.connections.items()
@@ -171,10 +171,10 @@ def _events(reader: BagReader, since: int, until: int) -> Iterator[RecordedEvent
 
 
 def _kind(said: _Said) -> EventKind | None:
-    """What a record is on the time line; None: nothing that people look for there."""
+    """Return the kind of a record on the time line; None if it is not shown."""
     kinds = kinds_of(said.event, said.decision, said.severity)
     if kinds:
-        return kinds[0]  # type: ignore[return-value]  # those of records are both
+        return kinds[0]  # type: ignore[return-value]  # a record's kinds of trigger are kinds of event
     if said.decision == "would deny":
         return "denial"
     return "notice" if said.severity in _NOTABLE else None
@@ -183,15 +183,15 @@ def _kind(said: _Said) -> EventKind | None:
 def messages_around(
     recording: Recording,
     bag: Path,
-    at: int | Place,
+    at: int | MessagePosition,
     topics: Collection[str] = (),
     neighbours: int = NEIGHBOURS,
 ) -> RecordedMessages:
-    """So many messages before a moment, and then one more than that from it on; at a place, beginning with its message.
+    """Return at most `neighbours` messages before a time or position, and one more than that from it on.
 
-    `topics`: of these alone; empty: of all. Raises `OSError`, and `ValueError` when the bag is no good.
+    `topics`: only these; empty: all. Raises `OSError`, and `ValueError` if the bag is invalid.
     """
-    place = at if isinstance(at, Place) else Place(at, 0, 0)
+    place = at if isinstance(at, MessagePosition) else MessagePosition(at, 0, 0)
     with BagReader.of(bag) as reader:
         wanted = {
             number
@@ -224,7 +224,7 @@ def messages_around(
 
 
 def _of_nodes(reader: BagReader) -> Iterator[int]:
-    """The connections of publishers: all but those that the recorder itself wrote."""
+    """Yield the connections of publishers, without those of the recorder itself."""
     for number, header in reader.connections.items():
         if header["topic"] not in (RECORDS, LOG) or "host" in header:
             yield number

@@ -1,12 +1,12 @@
-"""Which audit records are reasons to record messages.
+"""Decide which audit records trigger a recording.
 
-The recorder reads the audit log as any reviewer does. So a trigger is always something that the log proves, and none is
-missed while control dies and comes back.
+The recorder reads the audit log like a reviewer. So the log proves each trigger, and none is missed while control
+restarts.
 """
 
 from collections.abc import Collection
 
-from appliance.audit.record import Record, Severity
+from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.record_format import without_binding
 from appliance.channel.answers.recording_answers import APPLIANCE, Trigger, TriggerKind
 
@@ -20,7 +20,7 @@ _LONGEST_TEXT = 300
 
 
 def kinds_of(event: str, decision: str | None, severity: Severity) -> list[TriggerKind]:
-    """What a record may trigger as; empty when it is no trigger."""
+    """Return the kinds of trigger that apply to a record."""
     kinds: list[TriggerKind] = [_BY_EVENT[event]] if event in _BY_EVENT else []
     if decision == "deny":
         kinds.append("denial")
@@ -29,8 +29,8 @@ def kinds_of(event: str, decision: str | None, severity: Severity) -> list[Trigg
     return kinds
 
 
-def trigger_of(record: Record, wanted: Collection[TriggerKind]) -> Trigger | None:
-    """The record as a trigger of one of the kinds that are wanted; None when it is none."""
+def trigger_of(record: AuditRecord, wanted: Collection[TriggerKind]) -> Trigger | None:
+    """Return the record as a trigger of a wanted kind; None if it is not one."""
     for what in kinds_of(record.event, record.decision, record.severity):
         if what in wanted:
             reason = without_binding(record.reason, record.detail)

@@ -1,8 +1,8 @@
-"""Which topics are never recorded, and by whose word: `recorder.never` has globs of topics and of types.
+"""Exclude topics from recordings by the globs of topics and types in `recorder.never`.
 
-The name of a topic is what the policy decided. Its type is a claim of the publisher: where the definition of a type is
-known, the md5sum in the publisher's header must be that of the type. A topic with another md5sum is recorded. A claim
-that fits may still be false, so a recording without such a topic says by whose word it was left out.
+The policy checks a topic's name, but its type is a claim of the publisher. If the type's definition is known and the
+md5sum in the publisher's header differs, the topic is recorded. A matching claim may still be false, so a recording
+lists which topics were left out because of a publisher's claim.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -17,11 +17,11 @@ _SHIPPED = {
     "audio_common_msgs/AudioData": "f43a8e1b362b75baa741461b46adc7e0",
     "audio_common_msgs/AudioDataStamped": "3cdd84a06846af0dca4d0434908f9d96",
 }
-"""The types that `never` has unless it is given."""
+"""The md5sums of the types in the default of `never`."""
 
 
 def known_sums(never: Collection[str]) -> dict[str, str]:
-    """The md5sums of the types with known definitions that a glob of `never` fits."""
+    """Return the md5sums of the types that a glob of `never` matches, if their definitions are known."""
     if all(glob in _SHIPPED or glob.startswith("/") for glob in never):
         return {name: md5sum for name, md5sum in _SHIPPED.items() if name in never}
     from roswire.standard import standard_definitions  # noqa: PLC0415  only where it is configured
@@ -34,7 +34,7 @@ def known_sums(never: Collection[str]) -> dict[str, str]:
 def left_out_because(
     never: Collection[str], sums: Mapping[str, str], topic: str, header: Mapping[str, str]
 ) -> str:
-    """Why a publisher's messages are not recorded, in words; empty when they are."""
+    """Return why a publisher's messages are not recorded; empty if they are."""
     if fits(never, topic):
         return NAMED
     name = header.get("type", "")
@@ -46,5 +46,5 @@ def left_out_because(
 
 
 def fits(globs: Iterable[str], name: str) -> bool:
-    """Whether any of these globs fits a name."""
+    """Whether one of the globs matches a name."""
     return any(fnmatchcase(name, glob) for glob in globs)
