@@ -1,4 +1,4 @@
-"""The words for what somebody does: `publish /scan`, `call /reset`; in tests and on the CLI."""
+"""The words for actions: `publish /scan`, `call /reset`; in tests and on the CLI."""
 
 import ipaddress
 
@@ -16,11 +16,11 @@ VERBS = {"use-node" if category is Category.NODE else category.value: category f
 
 
 class BadWordError(ValueError):
-    """A host or an action that means nothing; the message says why and what to write."""
+    """An invalid host or action; the message says why and what to write."""
 
 
 def parse_action(text: str) -> tuple[Category, str]:
-    """The category and resource of `VERB NAME`; raises `BadWordError`."""
+    """Return the category and resource of `VERB NAME`; raises `BadWordError`."""
     verb, _, name = text.strip().partition(" ")
     category = VERBS.get(verb)
     if category is None:
@@ -30,7 +30,7 @@ def parse_action(text: str) -> tuple[Category, str]:
 
 
 def check_resource(category: Category, name: str) -> str:
-    """The resource unchanged; raises `BadWordError` unless a request of the category can have it."""
+    """Return the resource unchanged; raises `BadWordError` unless a request of the category can have it."""
     if category is Category.COMMAND:
         if ALIASES.get(name, name) not in COMMANDS:
             elsewhere = DECIDED_ELSEWHERE.get(name)
@@ -42,7 +42,7 @@ def check_resource(category: Category, name: str) -> str:
 
 
 def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
-    """The addresses that an address, `robot` or `host:NAME` is under this policy; raises `BadWordError`."""
+    """Return the addresses of an address, `robot` or `host:NAME` under this policy; raises `BadWordError`."""
     if text == "robot":
         if not policy.robot:
             raise BadWordError("it is not said which address robot is")
@@ -60,5 +60,5 @@ def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
 
 
 def _first(network: Network) -> Address:
-    """An address of the network that a machine can have."""
+    """Return the first address of the network that a machine can have."""
     return network[1] if network.num_addresses > 2 else network[0]

@@ -1,4 +1,4 @@
-"""The cases beside a policy, `FILE.tests.yaml`: who, does what, allow or deny. docs/policy.md has the format.
+"""The test cases beside a policy, `FILE.tests.yaml`: hosts, actions, and whether they are allowed or denied.
 
     given:
       robot: 192.168.1.10
@@ -9,7 +9,7 @@
         allow: [publish /landshark_control/trigger]
         deny: [command shutdown]
 
-The cases are judged by the policy compiled with what is `given`, so that they hold wherever it is deployed.
+The policy is compiled with the `given` addresses, so that the cases hold wherever it is deployed (docs/policy.md).
 """
 
 import ipaddress
@@ -24,7 +24,7 @@ from appliance.policy.host_sets import canonical_address
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
-from appliance.policy.policy_findings import Finding, Findings, Severity, quoted
+from appliance.policy.policy_findings import Findings, FindingSeverity, PolicyFinding, quoted
 from appliance.policy.rights import decide, needs_node, rights_of
 from roswire.names import is_global_name
 
@@ -48,7 +48,7 @@ class CaseResult:
 
     @property
     def passed(self) -> bool:
-        """Whether the rules say what the case expects; audit-only mode counts as the denial it stands for."""
+        """Whether the rules decide as the case expects; a request that only audit-only mode passes counts as denied."""
         return (self.decision.allowed and not self.decision.would_deny) == self.expected
 
     def __str__(self) -> str:
@@ -56,17 +56,17 @@ class CaseResult:
         return f"{self.file}:{self.line}:{self.column}: {self.finding.text}"
 
     @property
-    def finding(self) -> Finding:
-        """What is wrong, if it did not pass."""
+    def finding(self) -> PolicyFinding:
+        """Return the failure of a check that did not pass."""
         expected = "allow" if self.expected else "deny"
         text = f"expected {expected}: {self.decision.reason}"
-        return Finding(self.file, self.line, self.column, Severity.ERROR, text)
+        return PolicyFinding(self.file, self.line, self.column, FindingSeverity.ERROR, text)
 
 
 def run_cases(policy: Policy, text: str, file: str) -> list[CaseResult]:
-    """Judge every case in `text` (named `file` in results); `PolicyError` with all mistakes in it.
+    """Judge every case in `text` (named `file` in results). Raises `PolicyError` with all mistakes in it.
 
-    A file without a single case is a mistake: it would pass whatever the policy says.
+    A file without any case is a mistake: it would pass under every policy.
     """
     findings = Findings(file)
     reader = _CaseReader(policy, findings)
@@ -95,7 +95,7 @@ def _compose(text: str, findings: Findings) -> _Node | None:
 
 
 class _CaseReader:
-    """Walks the composed YAML and keeps the place of everything in it."""
+    """A reader of the composed YAML, in which every node has its place."""
 
     def __init__(self, policy: Policy, findings: Findings) -> None:
         self._policy = policy
@@ -112,7 +112,7 @@ class _CaseReader:
             yield from self._case(case)
 
     def _give(self, node: _Node) -> None:
-        """Compile the policy again with the addresses that are given."""
+        """Compile the policy again with the given addresses."""
         given = self._mapping(node, "given", ("robot", "hosts"))
         robot: list[Address] = list(self._addresses(given["robot"][1])) if "robot" in given else []
         hosts: dict[str, Address] = {}
@@ -183,7 +183,7 @@ class _CaseReader:
     # --- YAML with places ---
 
     def _mapping(self, node: _Node, what: str, keys: tuple[str, ...] | None) -> _Pairs:
-        """The pairs of a mapping by key; unknown and repeated keys are errors. `keys` None: any."""
+        """Return the pairs of a mapping by key; unknown and repeated keys are errors. `keys` None: any."""
         pairs: _Pairs = {}
         if not isinstance(node, yaml.MappingNode):
             expected = f" with {', '.join(keys)}" if keys else ""

@@ -1,73 +1,103 @@
-"""Every call that `[Commands]` may grant, and why some calls are not among them.
+"""The policy's table of calls: one row each, from which `[Commands]`, rights and dry runs are derived.
 
-A call that is not here is unknown and denied, `default` or not.
+A call without a row is unknown and denied, `default` or not.
 """
 
-COMMANDS = frozenset(
-    {
-        # Master API, reading
-        "lookupNode",
-        "lookupService",
-        "getSystemState",
-        "getPublishedTopics",
-        "getTopicTypes",
-        "getUri",
-        "getPid",
-        # parameters
-        "getParam",
-        "setParam",
-        "hasParam",
-        "deleteParam",
-        "searchParam",
-        "getParamNames",
-        "subscribeParam",
-        "unsubscribeParam",
-        # node API
-        "getBusInfo",
-        "getBusStats",
-        "getMasterUri",
-        "getSubscriptions",
-        "getPublications",
-        "getName",
-        "shutdown",
-        # introspection of the XML-RPC server
-        "listMethods",
-        "methodHelp",
-        "methodSignature",
-        # RVMaster's own
-        "getMonitors",
-        "monitorControl",
-        "getRVState",
-        "shutdownMaster",
-    }
+from typing import NamedTuple
+
+from appliance.policy.model import Category
+
+_PUBLISHERS, _SUBSCRIBERS, _SERVICES = (
+    f"[Nodes] and [{name}]" for name in ("Publishers", "Subscribers", "Services")
 )
 
-NAMED_ONLY = frozenset({"getRVState", "shutdownMaster"})
-"""Granted by their own key only, never by `default`: they end the appliance or tell what it hides."""
 
-STARTING_COMMANDS = {
-    "getParam": "rospy and roscpp read /use_sim_time with it when they start",
-    "hasParam": "roscpp looks for /use_sim_time with it when it starts",
-}
-"""What an unmodified rospy or roscpp node calls while it starts, and for what."""
+class PolicyCall(NamedTuple):
+    """One call, by its name in the policy.
 
-ALIASES = {
-    "system.listMethods": "listMethods",
-    "system.methodHelp": "methodHelp",
-    "system.methodSignature": "methodSignature",
-}
-"""Names on the wire of calls that the policy knows by a shorter one."""
+    category      what it is decided and recorded as
+    elsewhere     the sections that decide it, if `[Commands]` does not
+    touches       how it touches the parameter that it is about
+    node          it makes a node part of the graph, or takes it out, so that `[Nodes]` decides as well
+    gives         the thing that the caller has from it, until that is taken back
+    silent        the answer says nothing about the parameter's value
+    named_only    granted by its own key only, never by `default`: it ends the appliance or reveals hidden data
+    at_start      why an unmodified rospy or roscpp node makes it while it starts
+    wire          the longer name that it has on the wire
+    """
 
-DECIDED_ELSEWHERE = {
-    "registerPublisher": "[Nodes] and [Publishers]",
-    "unregisterPublisher": "[Nodes] and [Publishers]",
-    "registerSubscriber": "[Nodes] and [Subscribers]",
-    "unregisterSubscriber": "[Nodes] and [Subscribers]",
-    "registerService": "[Nodes] and [Services]",
-    "unregisterService": "[Nodes] and [Services]",
-    "requestTopic": "[Nodes] and [Subscribers]",
-    "system.multicall": "the rules of each of its parts",
-    "publisherUpdate": "nobody: only the master sends it",
-    "paramUpdate": "nobody: only the master sends it",
+    category: Category = Category.COMMAND
+    elsewhere: str = ""
+    touches: Category | None = None
+    node: bool = False
+    gives: str = ""
+    silent: bool = False
+    named_only: bool = False
+    at_start: str = ""
+    wire: str = ""
+
+
+_COMMAND = PolicyCall()
+CALLS: dict[str, PolicyCall] = {
+    # Master API: the graph
+    "registerPublisher": PolicyCall(Category.PUBLISH, _PUBLISHERS, node=True, gives="publication"),
+    "unregisterPublisher": PolicyCall(Category.PUBLISH, _PUBLISHERS, node=True),
+    "registerSubscriber": PolicyCall(Category.SUBSCRIBE, _SUBSCRIBERS, node=True, gives="subscription"),
+    "unregisterSubscriber": PolicyCall(Category.SUBSCRIBE, _SUBSCRIBERS, node=True),
+    "registerService": PolicyCall(Category.OFFER, _SERVICES, node=True, gives="service"),
+    "unregisterService": PolicyCall(Category.OFFER, _SERVICES, node=True),
+    "lookupService": PolicyCall(Category.CALL, gives="call"),
+    "lookupNode": _COMMAND,
+    "getSystemState": _COMMAND,
+    "getPublishedTopics": _COMMAND,
+    "getTopicTypes": _COMMAND,
+    "getUri": _COMMAND,
+    "getPid": _COMMAND,
+    # parameters
+    "getParam": PolicyCall(
+        touches=Category.READ, at_start="rospy and roscpp read /use_sim_time with it when they start"
+    ),
+    "setParam": PolicyCall(touches=Category.WRITE),
+    "hasParam": PolicyCall(
+        touches=Category.READ, at_start="roscpp looks for /use_sim_time with it when it starts"
+    ),
+    "deleteParam": PolicyCall(touches=Category.WRITE),
+    "searchParam": _COMMAND,
+    "getParamNames": _COMMAND,
+    "subscribeParam": PolicyCall(touches=Category.READ, node=True, gives="parameter"),
+    "unsubscribeParam": PolicyCall(touches=Category.READ, node=True, silent=True),
+    # node API; a node that asks for a topic has subscribed to it
+    "requestTopic": PolicyCall(Category.SUBSCRIBE, _SUBSCRIBERS, node=True, gives="subscription"),
+    "getBusInfo": _COMMAND,
+    "getBusStats": _COMMAND,
+    "getMasterUri": _COMMAND,
+    "getSubscriptions": _COMMAND,
+    "getPublications": _COMMAND,
+    "getName": _COMMAND,
+    "shutdown": _COMMAND,
+    "publisherUpdate": PolicyCall(elsewhere="nobody: only the master sends it"),
+    "paramUpdate": PolicyCall(elsewhere="nobody: only the master sends it"),
+    # the XML-RPC server
+    "system.multicall": PolicyCall(elsewhere="the rules of each of its parts"),
+    "listMethods": PolicyCall(wire="system.listMethods"),
+    "methodHelp": PolicyCall(wire="system.methodHelp"),
+    "methodSignature": PolicyCall(wire="system.methodSignature"),
+    # RVMaster's own
+    "getMonitors": _COMMAND,
+    "monitorControl": _COMMAND,
+    "getRVState": PolicyCall(named_only=True),
+    "shutdownMaster": PolicyCall(named_only=True),
 }
-"""Calls that `[Commands]` does not decide, and what does."""
+
+COMMANDS = frozenset(name for name, call in CALLS.items() if not call.elsewhere)
+"""Every call that `[Commands]` may grant."""
+
+NAMED_ONLY = frozenset(name for name, call in CALLS.items() if call.named_only)
+DECIDED_ELSEWHERE = {name: call.elsewhere for name, call in CALLS.items() if call.elsewhere}
+ALIASES = {call.wire: name for name, call in CALLS.items() if call.wire}
+"""The policy's names of calls by their longer names on the wire."""
+
+
+def policy_call(name: str) -> PolicyCall:
+    """Return the row of a call; an unknown call is a command."""
+    return CALLS.get(name, _COMMAND)

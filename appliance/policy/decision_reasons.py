@@ -1,4 +1,4 @@
-"""Why a request is decided as it is: the rule that decides, how it means the host, the rules that lost."""
+"""Explain a decision: the rule that decides, how it includes the host, and the overruled rules."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from appliance.policy import commands
 from appliance.policy.model import Category, Decision, Request, Rule, told_of
 from appliance.policy.policy import CompiledRule, Policy
-from appliance.policy.rate_limits import NO_LIMIT, Part
+from appliance.policy.rate_limits import NO_LIMIT, LimitScope
 from appliance.policy.rights import Right, decide_right, rights_of
 from appliance.policy.sections import PARAMETERS
 
 
 @dataclass(frozen=True, slots=True)
-class LostRule:
-    """A rule that matches the resource and does not decide, and why; `grants` is what it would have said."""
+class OverruledRule:
+    """A rule that matches the resource and does not decide, with the reason; `grants`: it grants the request."""
 
     rule: Rule
     grants: bool
@@ -21,24 +21,24 @@ class LostRule:
 
 
 @dataclass(frozen=True, slots=True)
-class Explanation:
+class DecisionExplanation:
     """The decision on one category of a request.
 
-    `through` are the words of the deciding rule's value that mean the host (empty for a denial). `also` explains what
-    else the request needs (`policy/rights`); `allowed` is the answer to the whole call.
-    `namespace` is the denial of a parameter that is allowed, should it hold other parameters: that is known when
-    the call comes. `told` is what the host is told of a denial, by `[Options] tell`.
+    `through` are the words of the deciding rule's value that include the host (empty for a denial). `also` explains the
+    other rights that the request needs (`policy/rights`); `allowed` is the answer to the whole call. `namespace` is the
+    denial of an allowed parameter in case it holds others, which is only known when the call comes. `told` is the text
+    of a denial for the host, by `[Options] tell`.
     """
 
     request: Request
     decision: Decision
     through: tuple[str, ...]
-    lost: tuple[LostRule, ...]
-    also: "tuple[Explanation, ...]" = ()
+    lost: tuple[OverruledRule, ...]
+    also: "tuple[DecisionExplanation, ...]" = ()
     namespace: Decision | None = None
     told: str | None = None
     limit: str = ""
-    """How much of what is allowed may pass, and by which line of `[Limits]`."""
+    """The limit on what is allowed, and its line of `[Limits]`."""
 
     @property
     def allowed(self) -> bool:
@@ -46,26 +46,26 @@ class Explanation:
         return self.decision.allowed and all(other.allowed for other in self.also)
 
     @property
-    def node(self) -> "Explanation | None":
-        """The `[Nodes]` right, where the request needs that too."""
+    def node(self) -> "DecisionExplanation | None":
+        """Return the `[Nodes]` right, where the request needs that too."""
         return self._also(Category.NODE)
 
     @property
-    def command(self) -> "Explanation | None":
-        """The `[Commands]` right, where the request needs that too."""
+    def command(self) -> "DecisionExplanation | None":
+        """Return the `[Commands]` right, where the request needs that too."""
         return self._also(Category.COMMAND)
 
-    def _also(self, category: Category) -> "Explanation | None":
+    def _also(self, category: Category) -> "DecisionExplanation | None":
         return next((other for other in self.also if other.request.category is category), None)
 
 
-def explain(policy: Policy, request: Request) -> Explanation:
+def explain(policy: Policy, request: Request) -> DecisionExplanation:
     """Explain each right that the request needs; the name must be resolved, as for `decide`."""
     first, *others = (_explain(policy, right) for right in rights_of(request))
     return replace(first, also=tuple(others))
 
 
-def _explain(policy: Policy, right: Right) -> Explanation:
+def _explain(policy: Policy, right: Right) -> DecisionExplanation:
     request = right.request
     parameter = request.category in PARAMETERS
     decision = decide_right(policy, right)
@@ -74,7 +74,7 @@ def _explain(policy: Policy, right: Right) -> Explanation:
     winner = next((rule for rule in matching if rule.rule == decision.rule), None)
     through = winner.granted_through(atoms) if winner is not None else ()
     lost = tuple(
-        LostRule(rule.rule, rule.grants(atoms), _why(rule, decision))
+        OverruledRule(rule.rule, rule.grants(atoms), _why(rule, decision))
         for rule in matching
         if rule is not winner
     )
@@ -83,11 +83,11 @@ def _explain(policy: Policy, right: Right) -> Explanation:
         namespace = None
     told = None if decision.allowed else told_of(decision, policy.tell)
     limit = _limit(policy, request) if decision.allowed else ""
-    return Explanation(request, decision, through, lost, (), namespace, told, limit)
+    return DecisionExplanation(request, decision, through, lost, (), namespace, told, limit)
 
 
-def render(explanation: Explanation) -> Iterator[str]:
-    """The explanation as lines of text for a person."""
+def render(explanation: DecisionExplanation) -> Iterator[str]:
+    """Yield the explanation as lines of text for a person."""
     yield from _render_one(explanation)
     for other in explanation.also:
         if other.request.category is Category.NODE:
@@ -99,7 +99,7 @@ def render(explanation: Explanation) -> Iterator[str]:
         yield f"together: {'allowed' if explanation.allowed else 'denied'}"
 
 
-def _render_one(explanation: Explanation) -> Iterator[str]:
+def _render_one(explanation: DecisionExplanation) -> Iterator[str]:
     decision = explanation.decision
     verdict = "allowed" if decision.allowed else "denied"
     yield f"{'would be denied (audit-only: passes)' if decision.would_deny else verdict}: {decision.reason}"
@@ -119,7 +119,7 @@ def _render_one(explanation: Explanation) -> Iterator[str]:
 def _limit(policy: Policy, request: Request) -> str:
     rule, rate = policy.limit_rule(request.resource), policy.limit_on(request)
     publishes = request.category is Category.PUBLISH
-    together = policy.limit(Part.TOPIC, request.resource) if publishes else NO_LIMIT
+    together = policy.limit(LimitScope.TOPIC, request.resource) if publishes else NO_LIMIT
     parts = [f"{rate} for all its nodes together" if publishes else str(rate)] if rate else []
     if together:
         parts.append(f"{together} for all publishers together, in equal parts for hosts that want more")
@@ -127,7 +127,7 @@ def _limit(policy: Policy, request: Request) -> str:
 
 
 def _matching(policy: Policy, request: Request) -> list[CompiledRule]:
-    """Every rule that speaks of the resource, the most specific first, `default` last."""
+    """Return every rule that matches the resource, the most specific first, `default` last."""
     command = request.category is Category.COMMAND
     name = commands.ALIASES.get(request.resource, request.resource) if command else request.resource
     rules = policy.rules(request.category)

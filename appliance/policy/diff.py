@@ -1,4 +1,4 @@
-"""What would be decided or limited differently by another policy: the question before every reload."""
+"""Find the decisions and limits that another policy would change, before a reload."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -10,30 +10,30 @@ from appliance.policy.rights import decide, rights_of
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One request that the two policies decide differently; `count` says how often it was given."""
+    """One request that the two policies decide or limit differently; `count` is how often it was given."""
 
     request: Request
     old: Decision
     new: Decision
     count: int
     limited: int = 0
-    """Below 0 if the answer is the same and the new policy lets less of it pass, above if it lets more."""
+    """Below 0 if both policies allow it and the new one lets less of it pass, above 0 if it lets more pass."""
 
     @property
     def granted(self) -> bool:
-        """Whether the new policy gives what the old one denied, or more of it."""
+        """Whether the new policy grants what the old one denied, or lets more of it pass."""
         return _answer(self.new) > _answer(self.old) or self.limited > 0
 
     @property
     def word(self) -> str:
-        """What the new policy does: granted, denied, limited, or limited less."""
+        """Return the change: granted, denied, limited, or limited less."""
         if self.limited:
             return "limited" if self.limited < 0 else "limited less"
         return "granted" if self.granted else "denied"
 
 
 def diff(old: Policy, new: Policy, requests: Iterable[Request]) -> list[Difference]:
-    """The requests, each once, that `new` decides differently, in the order they were first seen.
+    """Return each request that `new` decides or limits differently, in the order they were first seen.
 
     A request that passes only because of audit-only mode differs from one that a rule grants.
     """

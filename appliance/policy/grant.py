@@ -1,8 +1,8 @@
-"""The smallest change of a policy's text that grants what was refused. Pure.
+"""The smallest change of a policy's text that grants a denied request. Pure.
 
-One line for each right that is missing: where the section has the very key, the host is added to it; else a line for
-that key is added, with everybody whom the deciding rule names, so that nobody loses or gains anything but this host.
-Comments, order and blanks of the text stay.
+Each missing right changes one line. If the section has the exact key, the host is added to it. Otherwise a line for
+that key is added, with all hosts of the deciding rule, so that only this host's rights change. Comments, order and
+blanks of the text stay.
 """
 
 import difflib
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from appliance.policy.ini_reader import Entry, SectionText, Word, read
-from appliance.policy.judgement import Known, judge
+from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.keys import levels
 from appliance.policy.model import Address, Category, Request, Rule
 from appliance.policy.policy import Policy
@@ -21,16 +21,16 @@ from appliance.policy.policy_settings import TAKEOVERS
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
 from appliance.policy.sections import BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
 
-_MOST_LINES = 8  # that one grant changes
+_MOST_LINES = 8  # that one grant may change
 
 
 class UngrantableError(Exception):
-    """No line of a policy grants it; the text says why."""
+    """No line of a policy can grant the request; the text says why."""
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """A request that was decided, and all that it needs; `takeover`: a name, too, that another host has."""
+class DecidedRequest:
+    """A decided request and its rights; with `takeover`, it also needs a name that another host has."""
 
     request: Request
     rights: list[Right]
@@ -39,30 +39,30 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """A text that grants what was asked, and the rule for each right that it adds; as before if none is missing."""
+    """A policy text that grants the request, and the rule for each right that it adds (none: the text is unchanged)."""
 
     text: str
     added: tuple[str, ...]
 
-    def findings(self, file: str, known: Known) -> list[str]:
-        """Why the text would be refused: the test cases beside the policy that it fails."""
+    def findings(self, file: str, known: PolicyContext) -> list[str]:
+        """Return the failed test cases, because of which the text would be rejected."""
         try:
-            unsigned = replace(known, site_keys=())  # what is being written cannot be signed yet
+            unsigned = replace(known, site_keys=())  # a text that is being written cannot be signed yet
             judge(self.text, file, unsigned).accepted()
         except PolicyError as error:
             return [str(finding) for finding in error.findings]
         return []
 
     def diff(self, before: str, file: str) -> list[str]:
-        """What changed, as a unified diff."""
+        """Return the change, as a unified diff."""
         old, new = before.splitlines(), self.text.splitlines()
         return list(difflib.unified_diff(old, new, file, f"{file} (granted)", lineterm=""))
 
 
-def grant(text: str, file: str, known: Known, asked: Asked) -> Grant:
-    """The smallest change of a policy that grants all that was asked to the host that asked.
+def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> Grant:
+    """Return the smallest change of a policy that grants the host everything that it asked for.
 
-    Raises `UngrantableError`, and `PolicyError` where the text is no policy as it is.
+    Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy.
     """
     word = _word(text, known, asked.request.host)
     policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
@@ -77,7 +77,7 @@ def grant(text: str, file: str, known: Known, asked: Asked) -> Grant:
         added.append(line)
         try:
             policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
-        except PolicyError:  # the line would be none: there is no such call, or no key for it
+        except PolicyError:  # the line would be invalid: there is no such call, or no key for it
             raise UngrantableError(f"no line of a policy grants it: {reason}") from None
     if asked.takeover and policy.takeover != TAKEOVERS[-1]:
         text, line = _with_takeover(text)
@@ -92,8 +92,8 @@ def _granted(policy: Policy, right: Right) -> bool:
     return decision.allowed and not decision.would_deny
 
 
-def _word(text: str, known: Known, host: Address) -> str:
-    """What to call the host: a name of its own where there is one, else its address."""
+def _word(text: str, known: PolicyContext, host: Address) -> str:
+    """Return the word for the host: its own name if it has one, else its address."""
     enrolled = next((name for name, address in known.hosts.items() if address == host), None)
     if enrolled is not None:
         return f"host:{enrolled}"
@@ -112,25 +112,25 @@ def _sections(text: str) -> list[SectionText]:
 
 
 def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, str]:
-    """The text with one line more or one word more, and that line."""
+    """Return the text with one more line or word, and that line."""
     request = right.request
     rule, key = decide_right(policy, right).rule, request.resource
     name = BY_CATEGORY[request.category].name
     section = next((section for section in _sections(text) if section.name.text == name), None)
     itself = policy.decide(request)
     if itself.allowed and not itself.would_deny:
-        key = _below(request.resource, rule)  # what is refused is there
+        key = _below(request.resource, rule)  # the denial is below
         if section is not None and word in _holders(section, f"{request.category} {key}"):
-            # A pattern for other names as well (/*/max) refuses it still, until all that is below has a rule.
+            # A pattern that also matches other names (/*/max) denies it until everything below has a rule.
             table = policy.tables[request.category]
             above = table.tree.inherited(request.resource) or table.default
             rule, key = above.rule if above is not None else None, _below(request.resource, None)
         if key == _below(request.resource, None) and itself.rule not in (None, rule):
-            # The key /arm/** speaks of /arm as well: that keeps by a key of its own whom it has.
+            # The key /arm/** also matches /arm, which keeps its hosts by its own key.
             own = f"{request.category} {request.resource}"
             if section is not None and _entry(section, own) is None:
                 rule, key = itself.rule, request.resource
-    elif key == "/":  # which is no key of a rule
+    elif key == "/":  # not a valid key of a rule
         key = "/**"
     written = f"{request.category} {key}" if request.category in PARAMETERS else key
     entry = None if section is None else _entry(section, written)
@@ -141,7 +141,7 @@ def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, s
 
 
 def _below(name: str, rule: Rule | None) -> str:
-    """What a rule (`write /*/max`) says of what is below a parameter: a key of its own there, or all that has none."""
+    """Return the key for what is below a parameter: by the rule's own key (`write /*/max`), or `/**` without one."""
     of_rule = rule.key.split(" ", 1)[-1] if rule is not None else DEFAULT
     own = of_rule[1:].split("/")[len(levels(name)) :] if of_rule != DEFAULT else []
     return "/".join([name.rstrip("/"), *(own or ["**"])])
@@ -186,26 +186,28 @@ def _with_line(text: str, section: SectionText | None, name: str, line: str) -> 
             lines.pop()
         return "\n".join([*lines, end, f"[{name}]{end}", f"{line}{end}", ""]), f"[{name}] {line}"
     last = section.entries[-1].key.line if section.entries else section.name.line
-    # `default` is what people write last: before it, where it is.
+    # `default` is usually the last line: add the line before it.
     if section.entries and section.entries[-1].key.text.endswith(DEFAULT):
         last -= 1
     return "\n".join([*lines[:last], f"{line}{end}", *lines[last:]]), line
 
 
-def asked(host: str, caller_id: str, category: str, resource: str, detail: Mapping[str, object]) -> Asked:
-    """What a record of a decision was about. Raises `UngrantableError` for another record."""
+def asked(
+    host: str, caller_id: str, category: str, resource: str, detail: Mapping[str, object]
+) -> DecidedRequest:
+    """Return the request of a recorded decision. Raises `UngrantableError` for other records."""
     try:
         request = Request(ipaddress.ip_address(host), caller_id, Category(category), resource)
     except ValueError:
-        raise UngrantableError("it is no record of a decision about a host's call") from None
+        raise UngrantableError("it is not a record of a decision about a host's call") from None
     call, key = str(detail.get("call", resource)), detail.get("key")
     if request.category is not Category.COMMAND:
-        return Asked(request, rights_of(request))
+        return DecidedRequest(request, rights_of(request))
     rights = rights_of_call(request, call, str(key) if key is not None else None)
     category, _, needed = str(detail.get("needs", "")).partition(" ")
-    # What the call was about held other parameters, or stood in its way: only the record knows.
+    # The other parameters that the call contained, or that blocked it: only the record has them.
     if category in PARAMETERS:
         right = replace(request, category=Category(category), resource=needed.removesuffix("/**") or "/")
         namespace = needed.endswith("/**")
         rights.append(Right(right, namespace=namespace, alone=not namespace))
-    return Asked(request, rights)
+    return DecidedRequest(request, rights)

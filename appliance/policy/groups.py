@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from appliance.base.validation_messages import meant
-from appliance.policy.host_sets import EVERYONE, Atom, HostTable, Network, canonical_network
+from appliance.policy.host_sets import EVERYONE, Atom, HostSets, Network, canonical_network
 from appliance.policy.ini_reader import Entry, SectionText, Word
 from appliance.policy.model import Address
 from appliance.policy.policy_findings import Findings, quoted
@@ -19,8 +19,8 @@ _SHOWN_LIMIT = 80
 
 
 @dataclass(slots=True)
-class Group:
-    """One line of `[Groups]`; `used` says whether a rule or another group names it."""
+class HostGroup:
+    """One line of `[Groups]`; `used`: a rule or another group names it."""
 
     atom: Atom
     word: Word | None
@@ -28,18 +28,18 @@ class Group:
     used: bool = False
 
 
-class Groups:
-    """The groups of one file; `read(words)` is what a value means, with every mistake in it noted."""
+class HostGroups:
+    """The groups of one file; `read(words)` returns the hosts of a value and notes every mistake in it."""
 
     def __init__(
         self,
-        table: HostTable,
+        table: HostSets,
         findings: Findings,
         hosts: Mapping[str, Address],
         robot: Collection[Address | Network],
     ) -> None:
         self.robot = tuple(_as_network(member) for member in robot)
-        self.groups: dict[str, Group] = {ROBOT: Group(table.group(), None, used=True)}
+        self.groups: dict[str, HostGroup] = {ROBOT: HostGroup(table.group(), None, used=True)}
         self._table = table
         self._findings = findings
         self._hosts = hosts
@@ -49,7 +49,7 @@ class Groups:
         table.put((table.network(network) for network in self.robot), self.groups[ROBOT].atom)
 
     def define(self, section: SectionText | None) -> None:
-        """Read `[Groups]`: groups may name groups that stand below them."""
+        """Read `[Groups]`: groups may name groups that are defined below them."""
         if section is None:
             return
         for entry in section.entries:
@@ -73,10 +73,10 @@ class Groups:
             text = f"{quoted(word.text)} is not a group name: letters, digits and _ . - after a letter"
             self._findings.error(word.line, word.column, text)
         else:
-            self.groups[word.text] = Group(self._table.group(), word, entry.values)
+            self.groups[word.text] = HostGroup(self._table.group(), word, entry.values)
 
     def read(self, words: Iterable[Word]) -> tuple[tuple[str, Atom], ...]:
-        """The words of a value with their atoms; nonsense is an error, a repetition a warning."""
+        """Return the words of a value with their atoms; an invalid word is an error, a repetition a warning."""
         atoms: dict[Atom, str] = {}
         for word in words:
             if self._findings.full:
@@ -130,7 +130,7 @@ class Groups:
         return network
 
     def _robot_instead(self) -> str:
-        """Where loopback is the appliance, and what to write for the robot's own nodes."""
+        """Return the hint to write `robot` for the robot's own nodes where loopback is the appliance."""
         if not self.robot:
             return "(unless isolation is none): write robot if you mean the nodes of its machine"
         robot = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)
@@ -180,7 +180,7 @@ class Groups:
             self._findings.error(word.line, word.column, text)
 
     def shown(self, words: Iterable[Word]) -> str:
-        """A value for a person: groups with few addresses are spelled out."""
+        """Return a value for a person: groups with few addresses are spelled out."""
         parts: list[str] = []
         length = 0
         for word in words:
@@ -218,7 +218,7 @@ def _as_network(member: Address | Network) -> Network:
 
 
 def _address_fault(text: str) -> str:
-    """Why a text that looks like an address or a network is none."""
+    """Return why a text that looks like an address or a network is not one."""
     address, slash, _ = text.partition("/")
     if "%" in text:
         return f"{quoted(text)} has a zone: write the address alone"

@@ -1,11 +1,11 @@
-"""Which hosts a rule means: networks, groups, and a prefix tree that knows which of them hold an address.
+"""The hosts of a rule: networks, groups, and a prefix tree that finds those which contain an address.
 
-Every network and every group is a number (an *atom*). A rule keeps the atoms of its value; a host has the
-atoms of all networks that contain it and of all groups that contain those. A rule means a host when they
-share an atom, so neither memory nor time multiplies rules by group sizes.
+Every network and every group is a number (an *atom*). A rule has the atoms of its value; a host has the atoms of all
+networks that contain it and of all groups that contain those. A rule includes a host if they share an atom, so memory
+and time do not grow with rules times group sizes.
 
 Invariants:
-1. An IPv4 address that arrives mapped into IPv6 (::ffff:a.b.c.d) is the IPv4 address.
+1. An IPv4 address that is mapped into IPv6 (::ffff:a.b.c.d) equals the IPv4 address.
 2. Atoms of a host are computed once and kept for at most `_KEPT_HOSTS` hosts.
 """
 
@@ -26,14 +26,14 @@ _BITS = {4: 32, 6: 128}
 
 
 def canonical_address(address: Address) -> Address:
-    """The IPv4 address of an IPv4-mapped IPv6 address; any other address as it is."""
+    """Return the IPv4 address of an IPv4-mapped IPv6 address; any other address as it is."""
     if isinstance(address, ipaddress.IPv6Address):
         return address.ipv4_mapped or address
     return address
 
 
 def canonical_network(network: Network) -> Network:
-    """The IPv4 network of a network within ::ffff:0:0/96; any other network as it is."""
+    """Return the IPv4 network of a network within ::ffff:0:0/96; any other network as it is."""
     if isinstance(network, ipaddress.IPv6Network) and network.prefixlen >= 96:
         mapped = network.network_address.ipv4_mapped
         if mapped is not None:
@@ -41,8 +41,8 @@ def canonical_network(network: Network) -> Network:
     return network
 
 
-class HostTable:
-    """Networks and groups of one policy; built once, then only asked."""
+class HostSets:
+    """The networks and groups of one policy; built once, then only queried."""
 
     __slots__ = ("_lengths", "_named", "_networks", "_parents", "_tables", "kept")
 
@@ -56,7 +56,7 @@ class HostTable:
         self._named: dict[Address, tuple[Network, str, bool]] = {}
 
     def network(self, network: Network) -> Atom:
-        """The atom of a network, made when it is new."""
+        """Return the atom of a network; a new network gets one."""
         network = canonical_network(network)
         atom = self._networks.get(network)
         if atom is None:
@@ -72,7 +72,7 @@ class HostTable:
         return atom
 
     def group(self) -> Atom:
-        """A new atom."""
+        """Return a new atom."""
         self._parents.append([])
         return len(self._parents) - 1
 
@@ -82,11 +82,11 @@ class HostTable:
             self._parents[member].append(group)
 
     def parents(self, atom: Atom) -> list[Atom]:
-        """The groups that contain the atom directly."""
+        """Return the groups that contain the atom directly."""
         return self._parents[atom]
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
-        """Every atom that holds the address; `EVERYONE` always among them."""
+        """Return every atom that contains the address, always including `EVERYONE`."""
         key = (address.version, int(address))
         kept = self.kept.get(key)
         if kept is None:
@@ -105,15 +105,15 @@ class HostTable:
         return self.above(waiting)
 
     def narrowest(self, address: Address) -> Network:
-        """The smallest network of the policy that holds the address; the address alone where none does."""
+        """Return the smallest network of the policy that contains the address; the address alone if none does."""
         return self._named_as(address)[0]
 
     def alike(self, address: Address) -> str:
-        """The same as text: of all addresses that the policy names as one network."""
+        """Return `narrowest` as text, the same for all addresses that the policy names as one network."""
         return self._named_as(address)[1]
 
     def names(self, address: Address) -> bool:
-        """Whether the policy names the address or a network that holds it; `*` names nobody in particular."""
+        """Whether the policy names the address or a network that contains it; `*` does not count."""
         return self._named_as(address)[2]
 
     def _named_as(self, address: Address) -> tuple[Network, str, bool]:
@@ -135,7 +135,7 @@ class HostTable:
         return ipaddress.ip_network((number >> shift << shift if shift else number, bits - shift))
 
     def above(self, atoms: Iterable[Atom]) -> frozenset[Atom]:
-        """The atoms and every group that contains one of them, at any depth."""
+        """Return the atoms and every group that contains one of them, at any depth."""
         waiting = list(atoms)
         found = set(waiting)
         while waiting:
@@ -146,5 +146,5 @@ class HostTable:
         return frozenset(found)
 
     def networks(self) -> dict[Network, Atom]:
-        """Every network of the policy and its atom."""
+        """Return every network of the policy and its atom."""
         return dict(self._networks)

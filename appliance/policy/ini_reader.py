@@ -1,8 +1,8 @@
 """Read INI text and keep the place of every word.
 
-Sections `[Name]`, entries `key = value`, comments from `#` or `;` to the end of the line, nothing else: no
-continuation lines, no interpolation, no quotes. What a section or a key means is not known here. (The readers
-at hand, configparser among them, keep no columns, and a policy is refused with the place of each error.)
+The text has sections `[Name]`, entries `key = value`, and comments from `#` or `;` to the end of the line: no
+continuation lines, no interpolation, no quotes. The reader does not know what a section or key means. (Other readers,
+such as configparser, do not report columns, which every error of a policy has.)
 """
 
 import re
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from appliance.policy.policy_findings import Findings, quoted
 
 MAXIMUM_CHARACTERS = 2 * 1024 * 1024
-"""The longest policy that is read; one of 10,000 rules has about 600,000 characters."""
+"""Characters of the longest policy; one with 10,000 rules has about 600,000."""
 
 _WORD = re.compile(r"[^\s,]+", re.ASCII)
 _COMMENT = re.compile(r"[#;]")
@@ -29,7 +29,7 @@ class Word:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line `key = value value …`; the words of the value were separated by blanks or commas."""
+    """One line `key = value value …`; blanks or commas separate the words of the value."""
 
     key: Word
     values: tuple[Word, ...]
@@ -44,7 +44,7 @@ class SectionText:
 
 
 def read(text: str, findings: Findings) -> list[SectionText]:
-    """The sections in the order of the file; what cannot be read is noted in `findings` and left out."""
+    """Return the sections in the order of the file; unreadable lines are noted in `findings` and left out."""
     if len(text) > MAXIMUM_CHARACTERS:
         findings.error(1, 1, f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
         return []
@@ -81,7 +81,7 @@ def _begin_section(line: str, number: int, sections: list[SectionText], findings
     elif rest.strip():
         column = start + 1 + len(inside) + 1 + len(rest) - len(rest.lstrip()) + 1
         findings.error(number, column, f"unexpected text after the section: {quoted(rest.strip())}")
-    # The section counts even so: its entries are then judged in the right place, not as strays.
+    # The section still counts, so that its entries are judged in the right place.
     sections.append(SectionText(Word(name, number, start + 1)))
 
 

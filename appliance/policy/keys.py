@@ -2,7 +2,7 @@
 
     /arm/*        one level below /arm
     /arm/**       any depth below /arm, and /arm itself; /** is everything
-    /arm*         names of one level that begin so: /arm, /arm2, but not /arm/joint
+    /arm*         names of one level that begin with /arm: /arm, /arm2, but not /arm/joint
     /*/state      a star at the end of any level stands for the rest of that level
 
 The most specific key that matches decides, alone: an exact name beats a pattern, a longer literal beginning
@@ -20,12 +20,12 @@ Step = tuple[str, bool]
 
 
 class BadKeyError(ValueError):
-    """The text is no key; the message says why and what to write instead."""
+    """A text that is not a key, with the reason and the correct form."""
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A parsed key: its text, its levels, and whether everything below them is meant too (`/**`)."""
+    """A parsed key: its text, its levels, and whether it includes everything below them (`/**`)."""
 
     text: str
     steps: tuple[Step, ...]
@@ -33,7 +33,7 @@ class Key:
 
     @property
     def literal(self) -> str:
-        """The text up to the first star."""
+        """Return the text up to the first star."""
         return self.text.partition("*")[0]
 
     @property
@@ -43,16 +43,16 @@ class Key:
 
     @property
     def specificity(self) -> tuple[bool, int, bool]:
-        """Of two keys that match a name, the one with the greater specificity decides."""
+        """Return the rank of the key: if two keys match a name, the one with the greater specificity decides."""
         return (self.exact, len(self.literal), not self.subtree)
 
     @property
     def inner_star(self) -> bool:
-        """Whether a star stands before the end (`/*/state`, `/arm*/**`): only such keys can tie."""
+        """Whether there is a star before the end (`/*/state`, `/arm*/**`); only such keys can tie."""
         return any(star for _, star in (self.steps if self.subtree else self.steps[:-1]))
 
     def matches(self, name: str) -> bool:
-        """Whether this key speaks of the name (a resolved ROS name)."""
+        """Whether this key matches a resolved ROS name."""
         if self.exact:
             return name == self.text
         parts = levels(name)
@@ -64,7 +64,7 @@ class Key:
         )
 
     def ties_with(self, other: "Key") -> bool:
-        """Whether the keys are equally specific and some name is matched by both."""
+        """Whether the keys are equally specific and some name matches both."""
         if self.specificity != other.specificity:
             return False
         if len(self.steps) != len(other.steps) and not self.subtree:
@@ -73,19 +73,19 @@ class Key:
 
 
 def _compatible(one: Step, other: Step) -> bool:
-    """Whether some level of a name fits both."""
+    """Whether some level of a name matches both."""
     (text, star), (other_text, other_star) = one, other
     fits = star and other_text.startswith(text)
     return fits or (other_star and text.startswith(other_text)) or text == other_text
 
 
 def levels(name: str) -> list[str]:
-    """The levels of a resolved name; `/` has none."""
+    """Return the levels of a resolved name; `/` has none."""
     return name[1:].split("/") if name != "/" else []
 
 
 def parse_key(text: str, *, parameter: bool = False) -> Key:
-    """The key that `text` is; raises `BadKeyError`. Parameters have a wider grammar than topics."""
+    """Parse a key; raises `BadKeyError`. Parameters have a wider grammar than topics."""
     if not text.startswith("/"):
         raise BadKeyError(f"names here are resolved and begin with a slash: /{text.lstrip('~')}")
     if "//" in text:
@@ -98,7 +98,7 @@ def parse_key(text: str, *, parameter: bool = False) -> Key:
     steps = tuple((part.removesuffix("*"), part.endswith("*")) for part in parts[: -1 if subtree else None])
     if any("*" in step for step, _ in steps):
         raise BadKeyError("a star may stand at the end of a level only, and ** alone as the last level")
-    # A level that is nothing but a star can be any name, x too.
+    # A level that is only a star matches any name, also x.
     name = "".join(f"/{step or 'x'}" for step, _ in steps) or "/x"
     if not (is_parameter_key(name) if parameter else is_global_name(name)):
         raise BadKeyError("is not a ROS name: letters, digits and _ between single slashes")
@@ -106,7 +106,7 @@ def parse_key(text: str, *, parameter: bool = False) -> Key:
 
 
 def command_key(name: str) -> Key:
-    """The key of a call in `[Commands]`."""
+    """Return the key of a call in `[Commands]`."""
     return Key(name, (), subtree=False)
 
 

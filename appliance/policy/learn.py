@@ -1,15 +1,14 @@
-"""A least-privilege policy out of what a robot was seen to do.
+"""Learn a least-privilege policy from the recorded decisions of a robot.
 
-Run the robot with `audit-only = all`, then learn from the decisions that were recorded: each right that was used is
-granted to the hosts that used it, and nothing else. Two things are made wider than they were seen, because the next
-run would not get by with less:
+Run the robot with `audit-only = all`, then learn from the recorded decisions: each right that was used is granted to
+the hosts that used it, and nothing else. Two things are made wider than observed, because the next run needs them:
 
 1. An anonymous node name (`/rostopic_4711_1700000000000`) becomes a pattern (`/rostopic_*`).
-2. A parameter's key stands for what is below it as well (`/arm` becomes `/arm/**`), because a call on a namespace needs
-   the right on everything in it. So a host that may touch a namespace may touch the narrower keys in it, too.
+2. A parameter's key includes what is below it (`/arm` becomes `/arm/**`), because a call on a namespace needs the right
+   on everything in it. So a host that may touch a namespace may also touch the narrower keys in it.
 
-The result is for an engineer to read: every line says which nodes used the right and how often, hosts that are named
-together on several lines are a group, and a parameter's key that says what the one above it says is left out.
+The result is for an engineer to read: every line names the nodes that used the right, and how often. Hosts that occur
+together on several lines become a group. A parameter's key with the hosts of the key above it is left out.
 """
 
 import re
@@ -25,14 +24,14 @@ from appliance.policy.rights import rights_of_call
 from appliance.policy.sections import DECIDERS, PARAMETERS
 from roswire.names import is_global_name
 
-# What rospy appends (process id and milliseconds) and what roscpp appends (nanoseconds).
+# The suffixes of rospy (process id and milliseconds) and of roscpp (nanoseconds).
 _ANONYMOUS = re.compile(r"_[0-9]+_[0-9]{10,}$|_[0-9]{15,}$")
 _SHOWN_NODES = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """A request that passed, as it is recorded: `call` is its name on the wire, `key` the parameter it was about."""
+    """A request that passed, as recorded: `call` is its name on the wire, `key` the parameter it was about."""
 
     request: Request
     call: str = ""
@@ -47,16 +46,16 @@ class _Right:
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
-    """The policy as text; how many requests it stands on, how many were left out because no rule can grant them."""
+class LearnedPolicy:
+    """The policy as text; the number of requests that it is based on, and of those that no rule can grant."""
 
     text: str
     requests: int
     left_out: int
 
 
-def learn(observations: Iterable[Observation], robot: Collection[Address | Network] = ()) -> Learned:
-    """The policy that grants what was observed; `robot` is what the group of that name means."""
+def learn(observations: Iterable[Observation], robot: Collection[Address | Network] = ()) -> LearnedPolicy:
+    """Return the policy that grants what was observed; `robot` has the addresses of the group of that name."""
     rights: dict[tuple[Category, str], _Right] = {}
     requests = left_out = 0
     for observation in observations:
@@ -73,11 +72,11 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
             if is_global_name(request.caller_id):
                 right.nodes.add(_without_numbers(request.caller_id))
     _hand_down(rights)
-    return Learned("".join(_text(_needful(rights), robot)), requests, left_out)
+    return LearnedPolicy("".join(_text(_needful(rights), robot)), requests, left_out)
 
 
 def _needed(observation: Observation) -> Iterator[Request]:
-    """Everything that must be granted for this request to pass. Raises `BadWordError` where no rule can."""
+    """Yield everything that must be granted for this request to pass. Raises `BadWordError` if no rule can grant it."""
     for right in rights_of_call(observation.request, observation.call, observation.key or None):
         check_resource(right.request.category, right.request.resource)
         yield right.request
@@ -96,7 +95,7 @@ def _without_numbers(name: str) -> str:
 
 
 def _hand_down(rights: dict[tuple[Category, str], _Right]) -> None:
-    """Give who may touch a namespace the narrower keys in it: the most specific key decides alone."""
+    """Give the hosts of a namespace the narrower keys in it, because the most specific key decides alone."""
     for (category, key), right in rights.items():
         if category in PARAMETERS:
             levels = key.removesuffix("/**").split("/")
@@ -107,7 +106,7 @@ def _hand_down(rights: dict[tuple[Category, str], _Right]) -> None:
 
 
 def _needful(rights: dict[tuple[Category, str], _Right]) -> dict[tuple[Category, str], _Right]:
-    """Without the keys of parameters that have the same hosts as the nearest key above them."""
+    """Return the rights without the keys of parameters that have the same hosts as the nearest key above them."""
     left = dict(rights)
     for (category, key), right in rights.items():
         levels = key.removesuffix("/**").split("/") if category in PARAMETERS else []
@@ -144,7 +143,7 @@ def _text(rights: dict[tuple[Category, str], _Right], robot: Collection[Address 
 
 
 def _hosts(hosts: set[Address], robot: Collection[Address | Network]) -> tuple[str, str]:
-    """The group of the robot, if it is among them, and the addresses of the others."""
+    """Return the group of the robot, if it is among them, and the addresses of the others."""
     known = {host for host in hosts if any(_within(host, network) for network in robot)}
     rest = sorted(hosts - known, key=lambda host: (host.version, int(host)))
     return "robot" if known else "", " ".join(map(str, rest))

@@ -1,7 +1,7 @@
-"""What hosts have because a call gave it to them, and what of it a policy would end.
+"""Things that a call gave a host, and those among them that a policy would end.
 
-A reload (`master/graph/revocation`) and a dry run ask the same question about the same things: may the host make the
-call that gave it, now and under this policy? What that needs, `policy/rights` knows.
+A reload (`master/graph/revocation`) and a dry run ask the same question: may the host make the call that gave it, now
+and under this policy? `policy/rights` has the rights that this needs.
 """
 
 import ipaddress
@@ -9,23 +9,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
+from appliance.policy.commands import policy_call
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
-from appliance.policy.rights import decide, request_of, rights_to_keep, touch_of
+from appliance.policy.rights import decide, request_of, rights_to_keep
 from roswire.parameter_tree import Tree, holds_others, standing_at
 
-# What each call gives, in the words of a dry run. A node that asks for a topic has subscribed to it.
-_GIVEN = {
-    "registerPublisher": "publication",
-    "registerSubscriber": "subscription",
-    "requestTopic": "subscription",
-    "registerService": "service",
-    "lookupService": "call",
-    "subscribeParam": "parameter",
-}
 
-
-class Live(NamedTuple):
+class LiveRight(NamedTuple):
     """Something that a host has: `call` gave it, about `resource`.
 
     `namespace`: it is a parameter that holds others now.
@@ -39,23 +30,23 @@ class Live(NamedTuple):
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Self:
-        """From `fields`."""
+        """Make the right from its `fields`."""
         return cls(**{**fields, "host": ipaddress.ip_address(fields["host"])})
 
     def fields(self) -> dict[str, Any]:
-        """For another process."""
+        """Return the fields, for another process."""
         return {**self._asdict(), "host": str(self.host)}
 
     def requests(self) -> list[Request]:
-        """What a person would ask about it: the deed, and the parameter that it is about."""
+        """Return the requests that a person would ask about: the parameter that it is about, if any, and the deed."""
         asked = [request_of(self.call, self.host, self.caller_id, self.resource)]
-        touch = touch_of(self.call)
+        touch = policy_call(self.call).touches
         return asked if touch is None else [Request(self.host, self.caller_id, touch, self.resource), *asked]
 
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """Something live that a policy would end: `what` of the caller, about `resource`."""
+    """Something live that a policy would end: `what` the caller has, about `resource`."""
 
     host: str
     caller_id: str
@@ -64,23 +55,23 @@ class Ending:
     reason: str
 
 
-def live_by(call: str, host: Address, caller_id: str, resource: str, tree: Tree) -> Live:
-    """What this call gave, while `tree` are the parameters."""
-    namespace = touch_of(call) is not None and holds_others(standing_at(tree, resource)[0])
-    return Live(host, caller_id, call, resource, namespace)
+def live_by(call: str, host: Address, caller_id: str, resource: str, tree: Tree) -> LiveRight:
+    """Return the right that this call gave; `tree` has the present parameters."""
+    namespace = policy_call(call).touches is not None and holds_others(standing_at(tree, resource)[0])
+    return LiveRight(host, caller_id, call, resource, namespace)
 
 
-def may_keep(policy: Policy, live: Live) -> Decision:
-    """Whether a policy leaves it to the host."""
+def may_keep(policy: Policy, live: LiveRight) -> Decision:
+    """Return the decision whether the host may keep it under a policy."""
     request = request_of(live.call, live.host, live.caller_id, live.resource)
     return decide(policy, rights_to_keep(request, live.call, live.resource, namespace=live.namespace))
 
 
-def endings(policy: Policy, things: Iterable[Live]) -> list[Ending]:
-    """What of it the policy would end, each thing once."""
+def endings(policy: Policy, things: Iterable[LiveRight]) -> list[Ending]:
+    """Return the things that the policy would end, each once."""
     decided = ((live, may_keep(policy, live)) for live in things)
     found = (
-        Ending(str(live.host), live.caller_id, _GIVEN[live.call], live.resource, decision.reason)
+        Ending(str(live.host), live.caller_id, policy_call(live.call).gives, live.resource, decision.reason)
         for live, decision in decided
         if not decision.allowed
     )

@@ -1,7 +1,7 @@
-"""The nouns of the access policy: what is asked, and what is answered.
+"""The nouns of the access policy: questions and answers.
 
-`Request` and `Decision` are the contract between the policy and everything that asks it: RVMaster, the
-`rosrv policy` verbs, REST and the console show the same text.
+`Request` and `Decision` are the contract between the policy and its users: RVMaster, the `rosrv policy` verbs, REST and
+the console show the same text.
 """
 
 import enum
@@ -14,7 +14,7 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class _IPv4(ipaddress.IPv4Address):
-    """With its hash and its text kept: the standard library makes both anew each time, out of other texts."""
+    """An address that keeps its hash and its text; the standard library computes both each time."""
 
     __slots__ = ("_hash", "_text")
 
@@ -30,7 +30,7 @@ class _IPv4(ipaddress.IPv4Address):
 
 
 class _IPv6(ipaddress.IPv6Address):
-    """As `_IPv4`."""
+    """Like `_IPv4`."""
 
     __slots__ = ("_hash", "_text")
 
@@ -47,15 +47,15 @@ class _IPv6(ipaddress.IPv6Address):
 
 @lru_cache(4096)
 def address_of(text: str) -> Address:
-    """The address of a host, whose every call looks up what it holds: the same object for the same text.
+    """Return the address of a host: the same object for the same text, because every call looks up the host's holdings.
 
-    It is equal to any other `ipaddress` makes of the text, with the same hash. Raises `ValueError` for no address.
+    It is equal to the address that `ipaddress` makes of the text, with the same hash. Raises `ValueError`.
     """
     return _IPv6(text) if ":" in text else _IPv4(text)
 
 
 class Category(enum.StrEnum):
-    """What kind of thing a request touches; one section of the policy each (parameters share one)."""
+    """The kind of thing that a request touches; one section of the policy each (parameters share one)."""
 
     NODE = "node"  # use a node name                [Nodes]
     PUBLISH = "publish"  # publish a topic          [Publishers]
@@ -81,7 +81,7 @@ class Request:
     resource: str
 
     def fields(self) -> dict[str, str]:
-        """As the audit log writes it."""
+        """Return the fields as the audit log writes them."""
         return {
             "host": str(self.host),
             "caller_id": self.caller_id,
@@ -92,7 +92,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Where in the policy a decision stands."""
+    """The place of a rule in the policy."""
 
     section: str  # as written in the documentation: "Publishers"
     key: str  # as written in the file: "/arm/**", "default", "read /ns/**"
@@ -108,11 +108,11 @@ class Rule:
 class Decision:
     """The answer to a `Request`.
 
-    `rule` is the rule that decided, or None when no rule speaks of the request. `reason` is a sentence for a
-    person, which is in the audit record, `rosrv policy explain` and the console. `told` is the same without other
-    hosts' names and addresses, for the answer to the caller; None where the reason has none (`told_of`).
-    `would_deny` is set when the section is in audit-only mode: `allowed` is then True although the rules say no.
-    `needs` is the right that was asked for besides the deed itself, where that decided (`write /arm/**`).
+    `rule` is the rule that decided, or None if no rule matches the request. `reason` is a sentence for a person, in the
+    audit record, `rosrv policy explain` and the console. `told` is the same without other hosts' names and addresses,
+    for the answer to the caller; None if the reason has none (`told_of`). `would_deny` is set in audit-only mode if the
+    rules deny the request: `allowed` is then True all the same. `needs` is the further right that decided, if it was
+    not the deed itself (`write /arm/**`).
     """
 
     allowed: bool
@@ -124,16 +124,16 @@ class Decision:
 
     @property
     def word(self) -> Literal["allow", "deny", "would deny"]:
-        """The answer in the audit log's words."""
+        """Return the answer in the audit log's words."""
         return "would deny" if self.would_deny else "allow" if self.allowed else "deny"
 
 
 TELLS = ("rule", "full", "id")
-"""What a denied caller may be told, by `[Options] tell`: the first is the default."""
+"""The values of `[Options] tell`, which limits the text for a denied caller; the first is the default."""
 
 
 def told_of(decision: Decision, tell: str) -> str:
-    """What a caller is told of a denial: all (`full`), without who else may (`rule`), or only that (`id`)."""
+    """Return the text for a denied caller: all (`full`), without allowed hosts (`rule`), or only the fact (`id`)."""
     if tell == "full":
         return decision.reason
-    return "refused" if tell == "id" else decision.told or decision.reason
+    return "denied" if tell == "id" else decision.told or decision.reason

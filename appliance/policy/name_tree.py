@@ -1,10 +1,10 @@
-"""Finds the most specific key of a name: exact names by hash, patterns in a tree of levels.
+"""Find the most specific key of a name: exact names by hash, patterns in a tree of levels.
 
-A look-up takes one step per level of the name, whatever the number of keys, as long as stars stand at the
-end of keys. Keys with a star further in make the search branch; the compiler bounds their number.
+If stars are only at the end of keys, a look-up takes one step per level of the name, whatever the number of keys. Keys
+with an earlier star make the search branch; the compiler bounds their number.
 
-Invariants: `find` is the value of the key with the greatest `specificity` among those whose `matches` holds
-(the tests compare the two); the caller has put no key in twice and none that ties with another.
+Invariants: `find` returns the value of the key with the greatest `specificity` among those that match (the tests
+compare the two); the caller adds no key twice, and none that ties with another.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ Value = TypeVar("Value")
 
 @dataclass(slots=True)
 class _Node(Generic[Value]):
-    """Where a beginning of keys leads; `value`: a key that ends here; `subtree`: one that ends with `/**`."""
+    """A node of the tree: `value` for a key that ends here; `subtree` for one that ends with `/**`."""
 
     names: dict[str, "_Node[Value]"] = field(default_factory=dict)
     # Beginnings of a level, longest first; one table per length.
@@ -27,7 +27,7 @@ class _Node(Generic[Value]):
     subtree: tuple[Key, Value] | None = None
 
     def starred(self, level: str) -> Iterator["_Node[Value]"]:
-        """Nodes behind the stars that match a level, longest beginning first."""
+        """Yield the nodes behind the stars that match a level, longest beginning first."""
         for length, table in self.stars:
             node = table.get(level[:length])
             if node is not None:
@@ -40,7 +40,7 @@ class _Node(Generic[Value]):
 
 
 class KeyTree(Generic[Value]):
-    """Finds the value of the most specific key that matches a name."""
+    """A tree that finds the value of the most specific key that matches a name."""
 
     __slots__ = ("_exact", "_root")
 
@@ -49,7 +49,7 @@ class KeyTree(Generic[Value]):
         self._root: _Node[Value] = _Node()
 
     def add(self, key: Key, value: Value) -> None:
-        """Put a key in."""
+        """Add a key."""
         if key.exact:
             self._exact[key.text] = value
         node = self._root
@@ -61,7 +61,7 @@ class KeyTree(Generic[Value]):
             node.value = (key, value)
 
     def find(self, name: str) -> Value | None:
-        """The value of the most specific key for a resolved name (`/` is matched by `/**` only)."""
+        """Return the value of the most specific key for a resolved name (`/` is matched by `/**` only)."""
         found = self._exact.get(name)
         if found is not None:
             return found
@@ -76,7 +76,7 @@ class KeyTree(Generic[Value]):
         return pattern[1] if pattern is not None else None
 
     def below(self, name: str) -> list[Value]:
-        """Values of the keys that speak of names below `name` in particular, and decide some of them."""
+        """Return the values of the specific keys that decide some names below `name`."""
         inherited, ends = self._walk(name)
         prefix = "/" if name == "/" else name + "/"
         found = [pair for end in ends for child in end.children() for pair in _everything(child)]
@@ -87,12 +87,12 @@ class KeyTree(Generic[Value]):
         return [value for _, value in found]
 
     def inherited(self, name: str) -> Value | None:
-        """The value for those names below `name` of which no key speaks in particular."""
+        """Return the value for the names below `name` that have no more specific key."""
         inherited, _ = self._walk(name)
         return inherited[1] if inherited is not None else None
 
     def _walk(self, name: str) -> tuple[tuple[Key, Value] | None, list[_Node[Value]]]:
-        """The most specific `/**` key that holds all of `/name/**`, and the nodes that `name` leads to."""
+        """Return the most specific `/**` key that includes all of `/name/**`, and the nodes that `name` leads to."""
         reached = [self._root]
         subtrees = [self._root.subtree]
         for level in levels(name):
@@ -131,7 +131,7 @@ def _everything(node: _Node[Value]) -> Iterator[tuple[Key, Value]]:
 
 
 def _find(path: list[_Node[Value]], parts: list[str]) -> tuple[Key, Value] | None:
-    """The best pattern for a name whose first levels lead through `path` without a star.
+    """Return the best pattern for a name whose first levels lead through `path` without a star.
 
     Literal beginnings grow along the path, so its end is tried first. In one node the stars come before
     `subtree`: a longer beginning of a level beats a shorter one, and of /x/* and /x/**, equally long, the
@@ -150,7 +150,7 @@ def _find(path: list[_Node[Value]], parts: list[str]) -> tuple[Key, Value] | Non
 
 
 def _find_behind_star(node: _Node[Value], parts: list[str], depth: int) -> tuple[Key, Value] | None:
-    """The best pattern behind a star: all have the same literal beginning, so at most one of a kind fits."""
+    """Return the best pattern behind a star: all have the same literal beginning, so at most one of a kind fits."""
     waiting = [(node, depth)]
     subtree: tuple[Key, Value] | None = None
     while waiting:

@@ -1,9 +1,9 @@
 """A compiled policy, and the one function that decides: `Policy.decide(request)`.
 
-Pure: the same request always gets the same answer, without I/O and without a clock.
+It is pure: the same request always gets the same answer, without I/O and without a clock.
 
 Invariants:
-1. What no rule grants is denied, except that a missing extension section leaves its category free.
+1. A request that no rule grants is denied, except that a missing extension section leaves its category free.
 2. Exactly one rule decides a request: the most specific key of its section, or `default`.
 3. `Decision.reason` is a sentence shorter than 300 characters.
 4. Memory does not grow with requests: answers are kept for at most `_KEPT_DECISIONS` short resource names.
@@ -13,18 +13,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from appliance.policy import commands
-from appliance.policy.host_sets import Atom, HostTable, Network, canonical_address
+from appliance.policy.host_sets import Atom, HostSets, Network, canonical_address
 from appliance.policy.keys import Key, is_parameter_key
 from appliance.policy.model import Address, Category, Decision, Request, Rule
 from appliance.policy.name_tree import KeyTree
-from appliance.policy.policy_findings import Finding, quoted
-from appliance.policy.rate_limits import NO_LIMIT, LimitRule, LimitTable, Part, Rate
+from appliance.policy.policy_findings import PolicyFinding, quoted
+from appliance.policy.rate_limits import NO_LIMIT, LimitRule, LimitScope, LimitTable, Rate
 from appliance.policy.sections import BY_CATEGORY, PARAMETERS
 from roswire.names import is_global_name
 
 DEFAULT_PORTS = range(19001, 26001)
 
-_LIMITED = {Category.PUBLISH: Part.PUBLISHER, Category.SUBSCRIBE: Part.SUBSCRIBER}
+_LIMITED = {Category.PUBLISH: LimitScope.PUBLISHER, Category.SUBSCRIBE: LimitScope.SUBSCRIBER}
 _KEPT_DECISIONS = 8192
 _KEPT_NAME = 256
 _LONGEST_REASON = 299
@@ -34,8 +34,8 @@ _LONGEST_REASON = 299
 class CompiledRule:
     """One line of a deciding section.
 
-    `key` is None for `default`; `atoms` and `words` are the value, the words as they were written; `shown`
-    says for a person whom it means, `place` where it stands; `column` is where the key begins.
+    `key` is None for `default`; `atoms` and `words` are the value, the words as written; `shown` lists its hosts for a
+    person, `place` is its place in the file; `column` is where the key begins.
     """
 
     rule: Rule
@@ -51,13 +51,13 @@ class CompiledRule:
         return not self.atoms.isdisjoint(atoms)
 
     def granted_through(self, atoms: frozenset[Atom]) -> tuple[str, ...]:
-        """The words of the value that mean a host with these atoms."""
+        """Return the words of the value that include a host with these atoms."""
         return tuple(word for word, atom in self.words if atom in atoms)
 
 
 @dataclass(slots=True)
 class RuleTable:
-    """The rules of one category; `audit_only` lets pass what they deny."""
+    """The rules of one category; `audit_only`: requests that they deny still pass."""
 
     tree: KeyTree[CompiledRule] = field(default_factory=KeyTree)
     default: CompiledRule | None = None
@@ -67,18 +67,18 @@ class RuleTable:
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Policy:
-    """A policy in force (or about to be); made by `compile_policy` only.
+    """A policy in force (or about to be); only `compile_policy` makes it.
 
-    `text` and `file` are what it was compiled from; `warnings` the lint; `named` all whom a rule names; `present` the
-    categories that have a section; `ports` the ports for node proxies and relay; `monitored_topics` and
-    `monitored_services` the names in `[Monitor]`; `takeover` is `same-host` or `granted`; `enrolled` and `robot` are
-    the addresses that were given for `host:NAME` and `robot`.
+    `text` and `file` are its source; `warnings` the lint; `named` all hosts that a rule names; `present` the categories
+    that have a section; `ports` the ports for proxy endpoints and relay; `monitored_topics` and `monitored_services`
+    the names in `[Monitor]`; `takeover` is `same-host` or `granted`; `enrolled` and `robot` are the given addresses of
+    `host:NAME` and `robot`.
     """
 
     text: str
     file: str
-    warnings: tuple[Finding, ...]
-    hosts: HostTable
+    warnings: tuple[PolicyFinding, ...]
+    hosts: HostSets
     named: frozenset[Atom]
     tables: Mapping[Category, RuleTable]
     present: frozenset[Category]
@@ -99,9 +99,9 @@ class Policy:
         self._any_audit_only = any(table.audit_only for table in self.tables.values())
 
     def decide(self, request: Request) -> Decision:
-        """Whether the rules of the request's own category let its host touch its resource.
+        """Return the decision of the request's own category: whether its rules let the host touch the resource.
 
-        What else a call needs, and the decision on all of it, is `policy/rights`.
+        `policy/rights` lists the further rights that a call needs, and decides on all of them.
         """
         host = request.host
         key = (host.version, int(host), request.category, request.resource)
@@ -115,10 +115,10 @@ class Policy:
         return decision
 
     def decide_parameter(self, request: Request, *, namespace: bool = False) -> Decision:
-        """Whether a parameter call may touch the key and what is below it: a rule there that denies the host denies it.
+        """Return the decision on a parameter and what is below it: a rule below that denies the host denies the call.
 
-        `namespace`: the key is known to hold other keys; then the rule for those of them that have no key of their own
-        must grant the host too (an exact key `/arm` says nothing of `/arm/speed`).
+        `namespace`: the parameter is known to hold others. Then the rule for those without their own key must also
+        grant the host (an exact key `/arm` does not match `/arm/speed`).
         """
         decision = self.decide(request)
         if not decision.allowed or decision.would_deny or request.category not in self.present:
@@ -135,7 +135,7 @@ class Policy:
         return kept
 
     def _decide_below(self, request: Request, namespace: bool) -> Decision | None:
-        """The denial of the call on `request.resource` because of a key below it, if there is one."""
+        """Return the denial of the call on `request.resource` because of a key below it, if there is one."""
         table = self.tables[request.category]
         atoms = self.hosts.atoms_of(request.host)
         deciding = table.tree.below(request.resource)
@@ -151,48 +151,43 @@ class Policy:
                 return _by_rule(what, rule, table.audit_only)
         return None
 
-    @property
-    def limits_anything(self) -> bool:
-        """Whether there is a limit on any topic."""
-        return bool(self.limits.rules)
-
     def limit_rule(self, topic: str) -> LimitRule | None:
-        """The line of `[Limits]` that speaks of a topic."""
+        """Return the line of `[Limits]` for a topic."""
         return self.limits.find(topic)
 
-    def limit(self, part: Part, topic: str, host: Address | None = None) -> Rate:
-        """How much may pass for a publisher or subscriber on `host`, or for all publishers of a topic together."""
+    def limit(self, part: LimitScope, topic: str, host: Address | None = None) -> Rate:
+        """Return the limit of a publisher or subscriber on `host`, or of all publishers of a topic together."""
         rule = self.limits.find(topic)
         if rule is None:
             return NO_LIMIT
         return rule.rate(part, self.hosts.atoms_of(host) if host is not None else frozenset())
 
     def limit_on(self, request: Request) -> Rate:
-        """How much of what a request asks for may pass."""
+        """Return the limit on a request."""
         part = _LIMITED.get(request.category)
         return NO_LIMIT if part is None else self.limit(part, request.resource, request.host)
 
     def knows(self, address: Address) -> bool:
-        """Whether any rule names this address: if not, its requests need not even be read.
+        """Whether any rule includes this address: if not, its requests need not even be read.
 
         With a section in audit-only mode every address is known, because its requests pass.
         """
         return self._any_audit_only or not self.named.isdisjoint(self.hosts.atoms_of(address))
 
     def named_as(self, address: Address) -> Network:
-        """By what the policy names an address: itself, or the smallest network whose every address it means as well."""
+        """Return the policy's name of an address: itself, or the smallest network that it names as a whole."""
         return self.hosts.narrowest(address)
 
     def alike(self, address: Address) -> str:
-        """The same as text, which is looked up with at every call."""
+        """Return `named_as` as text, which every call uses for look-ups."""
         return self.hosts.alike(address)
 
     def counted_as(self, address: Address) -> str:
-        """By what a host's part of something shared is counted: as `alike`; all unknown hosts are one, named ""."""
+        """Return the name under which a host is counted: `alike`, and "" for all unknown hosts together."""
         return self.alike(address) if self.knows(address) else ""
 
     def names(self, address: Address) -> bool:
-        """Whether a rule names this address or its network, and not only everybody (`*`)."""
+        """Whether a rule names this address or its network, and not only all hosts (`*`)."""
         return self.hosts.names(address)
 
     def has_section(self, category: Category) -> bool:
@@ -204,11 +199,11 @@ class Policy:
         return self.tables[category].audit_only
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
-        """The networks and groups of this policy that hold an address (for `explain`)."""
+        """Return the networks and groups of this policy that contain an address (for `explain`)."""
         return self.hosts.atoms_of(address)
 
     def rules(self, category: Category) -> tuple[CompiledRule, ...]:
-        """The rules of a category in the order of the file, `default` included."""
+        """Return the rules of a category in the order of the file, `default` included."""
         return tuple(self.tables[category].rules)
 
     def _decide(self, request: Request) -> Decision:
@@ -233,7 +228,7 @@ class Policy:
             reason = f"{_what(request, 'may not')}: only its own key in [Commands] grants it, never default"
             return Decision(False, None, reason)
         decision = self._apply(request, table, found)
-        # audit-only is for learning what a robot does; no robot needs these calls, so they never just pass.
+        # audit-only is for learning what a robot does. No robot needs these calls, so they stay denied.
         return replace(decision, allowed=False, would_deny=False) if decision.would_deny else decision
 
     def _apply(self, request: Request, table: RuleTable, found: CompiledRule | None) -> Decision:
@@ -274,7 +269,7 @@ def _what(request: Request, may: str) -> str:
 
 
 def _by_rule(what: str, rule: CompiledRule, audit_only: bool) -> Decision:
-    """A denial by a rule; who may instead is left out of the reason where it would make it too long."""
+    """Return a denial by a rule; the reason lists the allowed hosts unless that makes it too long."""
     told = f"{what}, by {rule.place}"
     reason = f"{what}: {rule.shown}, by {rule.place}"
     decision = _decided(False, rule.rule, reason if len(reason) <= _LONGEST_REASON else told, audit_only)
@@ -287,6 +282,6 @@ def _shortened(text: str, limit: int = 60) -> str:
 
 
 def place_of(rule: Rule) -> str:
-    """Where a rule stands, short enough for a sentence."""
+    """Return the place of a rule, short enough for a sentence."""
     file = rule.file.rpartition("/")[2]
     return f"[{rule.section}] {_shortened(rule.key, 50)} ({_shortened(file, 30)}:{rule.line})"

@@ -1,15 +1,15 @@
-"""Text in, `Policy` out: reads the file, checks every word, compiles the rules.
+"""Compile a policy: read the text, check every word, compile the rules.
 
-All errors are reported at once. A section or value that is wrong is left out and the rest is still checked,
-so that what follows is judged as it would be once the error is mended.
+All errors are reported at once. A wrong section or value is left out and the rest is still checked, as if the error
+were fixed.
 """
 
 from collections.abc import Collection, Mapping
 
 from appliance.base.validation_messages import meant, nearest
 from appliance.policy import sections
-from appliance.policy.groups import Groups
-from appliance.policy.host_sets import HostTable, Network
+from appliance.policy.groups import HostGroups
+from appliance.policy.host_sets import HostSets, Network
 from appliance.policy.ini_reader import SectionText, read
 from appliance.policy.model import Address, Category
 from appliance.policy.policy import Policy
@@ -27,16 +27,16 @@ def compile_policy(
     hosts: Mapping[str, Address] | None = None,
     robot: Collection[Address | Network] = (),
 ) -> Policy:
-    """The policy that `text` says, or `PolicyError` with every error in it.
+    """Return the policy of a text. Raises `PolicyError` with every error in it.
 
     `file` names the text in findings and rules. `hosts` maps the names of enrolled hosts to their addresses
-    (`host:NAME`); a name that is not there means no host, and is a warning. `robot` is what the predefined
-    group `robot` holds.
+    (`host:NAME`); a name without an address includes no host, and is a warning. `robot` has the addresses of the
+    predefined group `robot`.
     """
     findings = Findings(file)
     written = _by_name(read(text, findings), findings)
-    table = HostTable()
-    groups = Groups(table, findings, hosts or {}, robot)
+    table = HostSets()
+    groups = HostGroups(table, findings, hosts or {}, robot)
     groups.define(written.get(sections.GROUPS))
     options = read_options(written.get(sections.OPTIONS), findings)
     ports = read_ports(written.get(sections.PORTS), findings)
@@ -74,7 +74,7 @@ def compile_policy(
 
 
 def _by_name(found: list[SectionText], findings: Findings) -> dict[str, SectionText]:
-    """Sections by the name in the documentation; unknown and repeated ones are errors."""
+    """Return sections by their documented names; unknown and repeated ones are errors."""
     by_fold = {name.casefold(): name for name in sections.NAMES}
     there = {section.name.text.casefold() for section in found}
     by_name: dict[str, SectionText] = {}
@@ -87,7 +87,7 @@ def _by_name(found: list[SectionText], findings: Findings) -> dict[str, SectionT
             findings.error(place.line, place.column, f"unknown section {quoted(place.text)}{guess}{known}")
             name = nearest(place.text, sections.NAMES)
             if name is not None and name.casefold() not in there:
-                by_name.setdefault(name, section)  # read as what was meant, so that one slip is one error
+                by_name.setdefault(name, section)  # read as intended, so that one slip is one error
         elif name in by_name:
             first = by_name[name]
             text = f"the section [{name}] stands already at line {first.name.line}: put its lines there"

@@ -1,7 +1,6 @@
-"""What is wrong with a text an operator wrote, and where: `file:line:column: error: text`.
+"""Errors and warnings in an operator's text, with their place: `file:line:column: error: text`.
 
-Errors refuse the file, warnings (the lint) never do. All of them are found in one go, so that a file is
-mended in one go.
+Errors reject the file, warnings (the lint) never do. All are found in one go, so that a file can be fixed in one go.
 """
 
 import enum
@@ -10,21 +9,21 @@ from dataclasses import dataclass
 MAXIMUM_FINDINGS = 200
 
 
-class Severity(enum.StrEnum):
-    """Whether a finding refuses the file."""
+class FindingSeverity(enum.StrEnum):
+    """The severity of a finding: an error rejects the file."""
 
     ERROR = "error"
     WARNING = "warning"
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Finding:
-    """One thing wrong: `line` and `column` count from 1; `text` says what was meant or what to write."""
+class PolicyFinding:
+    """One mistake; `line` and `column` count from 1, and `text` says what was meant or what to write."""
 
     file: str
     line: int
     column: int
-    severity: Severity
+    severity: FindingSeverity
     text: str
 
     def __str__(self) -> str:
@@ -33,37 +32,37 @@ class Finding:
 
 
 class PolicyError(Exception):
-    """The text is refused whole; `findings` holds every error (and the warnings found on the way)."""
+    """The whole text is rejected; `findings` has every error (and the warnings found so far)."""
 
-    def __init__(self, findings: list[Finding]) -> None:
+    def __init__(self, findings: list[PolicyFinding]) -> None:
         self.findings = findings
         super().__init__("\n".join(str(finding) for finding in findings))
 
 
 class Findings:
-    """Collects findings of one file; beyond `MAXIMUM_FINDINGS` errors it only counts."""
+    """The findings of one file; beyond `MAXIMUM_FINDINGS` errors they are only counted."""
 
     def __init__(self, file: str) -> None:
         self.file = file
-        self.warnings: list[Finding] = []
-        self._errors: list[Finding] = []
+        self.warnings: list[PolicyFinding] = []
+        self._errors: list[PolicyFinding] = []
         self._uncounted = 0
 
     def error(self, line: int, column: int, text: str) -> None:
         """Note an error."""
         if len(self._errors) < MAXIMUM_FINDINGS:
-            self._errors.append(Finding(self.file, line, column, Severity.ERROR, text))
+            self._errors.append(PolicyFinding(self.file, line, column, FindingSeverity.ERROR, text))
         else:
             self._uncounted += 1
 
     def warn(self, line: int, column: int, text: str) -> None:
         """Note a warning."""
         if len(self.warnings) < MAXIMUM_FINDINGS:
-            self.warnings.append(Finding(self.file, line, column, Severity.WARNING, text))
+            self.warnings.append(PolicyFinding(self.file, line, column, FindingSeverity.WARNING, text))
 
     @property
     def full(self) -> bool:
-        """Whether so many errors are noted that another one is only counted."""
+        """Whether the list is full, so that another error is only counted."""
         return len(self._errors) >= MAXIMUM_FINDINGS
 
     def raise_errors(self) -> None:
@@ -74,12 +73,12 @@ class Findings:
         if self._uncounted:
             last = findings[-1]
             text = f"{self._uncounted} more errors are not shown"
-            findings.append(Finding(self.file, last.line, last.column, Severity.ERROR, text))
+            findings.append(PolicyFinding(self.file, last.line, last.column, FindingSeverity.ERROR, text))
         raise PolicyError(findings)
 
 
 def quoted(text: str, limit: int = 60) -> str:
-    """A stranger's text for a person: in quotes, shortened, control characters escaped."""
+    """Return untrusted text for a person: in quotes, shortened, control characters escaped."""
     shown = text if len(text) <= limit else text[: limit - 1] + "…"
     return '"' + "".join(c if c.isprintable() and c != '"' else _escaped(c) for c in shown) + '"'
 

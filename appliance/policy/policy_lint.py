@@ -1,13 +1,13 @@
-"""What is allowed in a policy and still most likely not meant: warnings, never silent, never refusing."""
+"""Warn about valid rules that a policy most likely does not mean. Warnings never reject a policy."""
 
 import bisect
 import ipaddress
 from collections.abc import Mapping
 
 from appliance.policy import sections
-from appliance.policy.commands import STARTING_COMMANDS
-from appliance.policy.groups import Groups
-from appliance.policy.host_sets import EVERYONE, Atom, HostTable, Network
+from appliance.policy.commands import CALLS
+from appliance.policy.groups import HostGroups
+from appliance.policy.host_sets import EVERYONE, Atom, HostSets, Network
 from appliance.policy.ini_reader import SectionText
 from appliance.policy.model import Category
 from appliance.policy.policy import CompiledRule, RuleTable
@@ -22,8 +22,8 @@ def lint(
     present: set[Category],
     written: Mapping[str, SectionText],
     *,
-    groups: Groups,
-    hosts: HostTable,
+    groups: HostGroups,
+    hosts: HostSets,
     findings: Findings,
 ) -> None:
     """Note every warning about a policy without errors."""
@@ -43,8 +43,8 @@ def _shadowed_defaults(tables: Tables, findings: Findings) -> None:
             findings.warn(table.default.rule.line, table.default.column, text)
 
 
-def _dead_rules(tables: Tables, table: HostTable, findings: Findings) -> None:
-    """Rules that let a host publish, subscribe or offer although it may not use any node name."""
+def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
+    """Warn of rules that let a host publish, subscribe or offer although it may not use any node name."""
     named = {atom for rule in tables[Category.NODE].rules for atom in rule.atoms}
     if EVERYONE in named:
         return
@@ -61,8 +61,8 @@ def _dead_rules(tables: Tables, table: HostTable, findings: Findings) -> None:
         findings.warn(rule.rule.line, rule.column, text)
 
 
-def _nameless(named: set[Atom], table: HostTable) -> dict[Atom, Network]:
-    """For each atom that holds a network without any overlap with `[Nodes]`: one such network."""
+def _nameless(named: set[Atom], table: HostSets) -> dict[Atom, Network]:
+    """Return, for each atom with a network that does not overlap `[Nodes]`, one such network."""
     networks = table.networks()
     nodes = [network for network, atom in networks.items() if not named.isdisjoint(table.above([atom]))]
     overlap = _Overlap(nodes)
@@ -79,7 +79,7 @@ def _nameless(named: set[Atom], table: HostTable) -> dict[Atom, Network]:
 
 
 class _Overlap:
-    """Answers whether a network shares an address with any of a set of networks."""
+    """A set of networks that answers whether a network overlaps any of them."""
 
     def __init__(self, networks: list[Network]) -> None:
         self._starts: dict[int, list[int]] = {}
@@ -101,27 +101,27 @@ class _Overlap:
 def _nodes_that_cannot_start(
     tables: Tables, present: set[Category], written: Mapping[str, SectionText], findings: Findings
 ) -> None:
-    """Commands that every node needs and nobody is granted."""
+    """Warn of commands that every node needs and no host is granted."""
     if Category.COMMAND not in present:
         return
     table = tables[Category.COMMAND]
     place = written["Commands"].name
-    for command in STARTING_COMMANDS:
+    for command, call in CALLS.items():
         rule = table.tree.find(command) or table.default
-        if rule is None or not rule.atoms:
+        if call.at_start and (rule is None or not rule.atoms):
             line, column = (rule.rule.line, rule.column) if rule else (place.line, place.column)
-            text = f"{command} is granted to nobody, and a node needs it: {STARTING_COMMANDS[command]}"
+            text = f"{command} is granted to nobody, and a node needs it: {call.at_start}"
             findings.warn(line, column, text)
 
 
-def _unused_groups(groups: Groups, findings: Findings) -> None:
+def _unused_groups(groups: HostGroups, findings: Findings) -> None:
     for name, group in groups.groups.items():
         if not group.used and group.word is not None:
             findings.warn(group.word.line, group.word.column, f"the group {quoted(name)} is used nowhere")
 
 
 def _missing_sections(present: set[Category], findings: Findings) -> None:
-    """Missing sections that make the whole policy grant nothing a node can use."""
+    """Warn of missing sections without which the policy grants nothing that a node can use."""
     for decider in sections.DECIDERS:
         if not decider.extension and decider.categories[0] not in present:
             findings.warn(1, 1, f"there is no [{decider.name}] section: what it would grant is denied to all")

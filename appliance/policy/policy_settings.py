@@ -14,14 +14,14 @@ from roswire.names import is_global_name
 
 TAKEOVERS = ("same-host", "granted")
 AT_ONCE = "[Options] takeover = granted"
-"""What lets another host have a name that is held: so does a denial say it that this would have prevented."""
+"""The option that lets another host take a name; a denial that it would have prevented names it."""
 _MASTER_PORT = 11311
 _RANGE = re.compile(r"([0-9]{1,5})-([0-9]{1,5})", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What `[Options]` says: when another host may take a node name over, sections in audit-only mode, what is told."""
+    """`[Options]`: takeover of node names, sections in audit-only mode, and the text for denied hosts."""
 
     takeover: str = TAKEOVERS[0]
     audit_only: frozenset[str] = frozenset()
@@ -29,15 +29,15 @@ class Options:
 
 
 @dataclass(frozen=True, slots=True)
-class Monitor:
-    """What `[Monitor]` says: topics and services that are relayed even without a spec."""
+class MonitorSection:
+    """`[Monitor]`: topics and services that are relayed even without a specification."""
 
     topics: frozenset[str] = frozenset()
     services: frozenset[str] = frozenset()
 
 
 def read_ports(section: SectionText | None, findings: Findings) -> range:
-    """The ports for node proxies and relay, first to last."""
+    """Return the ports for proxy endpoints and relay, first to last."""
     ports = DEFAULT_PORTS
     for entry in _entries(section, ("range",), findings):
         ports = _range(entry, findings) or DEFAULT_PORTS
@@ -62,8 +62,8 @@ def _range(entry: Entry, findings: Findings) -> range | None:
     return None
 
 
-def read_monitor(section: SectionText | None, findings: Findings) -> Monitor:
-    """The names to relay."""
+def read_monitor(section: SectionText | None, findings: Findings) -> MonitorSection:
+    """Return the names to relay."""
     names: dict[str, set[str]] = {"topic": set(), "service": set()}
     for entry in _entries(section, tuple(names), findings):
         for word in entry.values:
@@ -73,11 +73,11 @@ def read_monitor(section: SectionText | None, findings: Findings) -> Monitor:
             elif word.text in names[entry.key.text]:
                 findings.warn(word.line, word.column, f"{word.text} is said twice")
             names[entry.key.text].add(word.text)
-    return Monitor(frozenset(names["topic"]), frozenset(names["service"]))
+    return MonitorSection(frozenset(names["topic"]), frozenset(names["service"]))
 
 
 def read_options(section: SectionText | None, findings: Findings) -> Options:
-    """The options; what the file does not set keeps its default."""
+    """Return the options; what the file does not set keeps its default."""
     options = Options()
     for entry in _entries(section, ("takeover", "audit-only", "tell"), findings):
         match entry.key.text:
@@ -115,13 +115,13 @@ def _audit_only(entry: Entry, findings: Findings) -> frozenset[str]:
     if chosen:
         what = "nothing" if len(chosen) == len(by_fold) else f"nothing by [{'], ['.join(sorted(chosen))}]"
         findings.warn(
-            entry.key.line, entry.key.column, f"audit-only: this policy refuses {what}, it only records"
+            entry.key.line, entry.key.column, f"audit-only: this policy denies {what}, it only records"
         )
     return frozenset(chosen)
 
 
 def _entries(section: SectionText | None, keys: Collection[str], findings: Findings) -> Iterator[Entry]:
-    """The entries of a section whose keys are known and not repeated; the others are errors."""
+    """Yield the entries of a section whose keys are known and not repeated; the others are errors."""
     first_lines: dict[str, int] = {}
     for entry in section.entries if section else ():
         word = entry.key

@@ -4,10 +4,9 @@
     /scan      = publisher guests 20 Hz, topic 100 Hz 2 MB/s
 
 `publisher` limits the publishers of the topic on each host together, `subscriber` each subscriber, `topic` all
-publishers together, which share it fairly by host. Hosts may follow the first two words: then only nodes there are
-limited. As in every section the most specific key speaks
-alone; of its clauses that mean a host the strictest counts. A limit says how much of what is allowed may pass; it
-decides no request.
+publishers together, which share it fairly by host. Hosts may follow the first two words: then only nodes on them are
+limited. As in every section, only the most specific key counts; among its clauses for a host, the strictest does. A
+limit bounds how much of the allowed traffic may pass; it decides no request.
 """
 
 import re
@@ -16,7 +15,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from appliance.base.validation_messages import meant
-from appliance.policy.groups import Groups
+from appliance.policy.groups import HostGroups
 from appliance.policy.host_sets import Atom
 from appliance.policy.ini_reader import Entry, SectionText, Word
 from appliance.policy.keys import BadKeyError, Key, parse_key
@@ -26,8 +25,8 @@ from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import DEFAULT, LIMITS
 
 
-class Part(StrEnum):
-    """Whose messages a limit counts together."""
+class LimitScope(StrEnum):
+    """The messages that a limit counts together."""
 
     PUBLISHER = "publisher"
     SUBSCRIBER = "subscriber"
@@ -36,7 +35,7 @@ class Part(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """What may pass in a second; 0 is without a limit."""
+    """Messages and bytes in a second; 0 is unlimited."""
 
     messages: float = 0.0
     bytes: float = 0.0
@@ -53,12 +52,12 @@ class Rate:
         return ", ".join(parts) or "no limit"
 
     def strictest(self, other: "Rate") -> "Rate":
-        """The lower of each."""
+        """Return the lower limit of each unit."""
         return Rate(_lower(self.messages, other.messages), _lower(self.bytes, other.bytes))
 
 
 NO_LIMIT = Rate()
-_PARTS = frozenset(part.value for part in Part)
+_PARTS = frozenset(part.value for part in LimitScope)
 _BYTES = {"B/s": 1.0, "kB/s": 1e3, "MB/s": 1e6, "GB/s": 1e9}
 _UNITS = {"Hz": 1.0, **_BYTES}
 _FOLDED = {unit.casefold(): unit for unit in _UNITS}
@@ -71,7 +70,7 @@ _LINES = 1000
 class Clause:
     """One limit of a line: of the nodes on hosts with one of these atoms (None: on every host)."""
 
-    part: Part
+    part: LimitScope
     atoms: frozenset[Atom] | None
     rate: Rate
 
@@ -84,8 +83,8 @@ class LimitRule:
     key: Key | None
     clauses: tuple[Clause, ...]
 
-    def rate(self, part: Part, atoms: frozenset[Atom]) -> Rate:
-        """The strictest of the clauses that mean this part of a host with these atoms."""
+    def rate(self, part: LimitScope, atoms: frozenset[Atom]) -> Rate:
+        """Return the strictest limit among the clauses for this part of a host with these atoms."""
         rate = NO_LIMIT
         for clause in self.clauses:
             if clause.part is part and (clause.atoms is None or not clause.atoms.isdisjoint(atoms)):
@@ -102,7 +101,7 @@ class LimitTable:
         self._default: LimitRule | None = None
 
     def add(self, rule: LimitRule) -> None:
-        """Put a line in."""
+        """Add a line."""
         self.rules.append(rule)
         if rule.key is None:
             self._default = rule
@@ -110,12 +109,12 @@ class LimitTable:
             self._tree.add(rule.key, rule)
 
     def find(self, topic: str) -> LimitRule | None:
-        """The line that speaks of a topic."""
+        """Return the line for a topic, if there is one."""
         return (self._tree.find(topic) or self._default) if self.rules else None
 
 
-def read_limits(section: SectionText | None, file: str, groups: Groups, findings: Findings) -> LimitTable:
-    """The lines of the section; what is wrong with them is noted in `findings` and left out."""
+def read_limits(section: SectionText | None, file: str, groups: HostGroups, findings: Findings) -> LimitTable:
+    """Return the lines of the section; wrong parts are noted in `findings` and left out."""
     table = LimitTable()
     first_lines: dict[str, int] = {}
     patterns: list[tuple[Key, int]] = []
@@ -140,7 +139,7 @@ def read_limits(section: SectionText | None, file: str, groups: Groups, findings
 
 
 def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key | None:
-    """The parsed key; None for `default` and (with an error noted) for a bad one."""
+    """Return the parsed key; None for `default` and (with an error noted) for a bad one."""
     if word.text == DEFAULT:
         return None
     try:
@@ -158,8 +157,8 @@ def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key
     return key
 
 
-def _clauses(entry: Entry, groups: Groups, findings: Findings) -> Iterator[Clause]:
-    """The clauses of a line: each begins with the word for its part."""
+def _clauses(entry: Entry, groups: HostGroups, findings: Findings) -> Iterator[Clause]:
+    """Yield the clauses of a line; each begins with the word for its part."""
     parts: list[tuple[Word, list[Word]]] = []
     for word in entry.values:
         if word.text in _PARTS:
@@ -179,23 +178,23 @@ def _clauses(entry: Entry, groups: Groups, findings: Findings) -> Iterator[Claus
             yield clause
 
 
-def _clause(part: Word, words: list[Word], groups: Groups, findings: Findings) -> Clause | None:
+def _clause(part: Word, words: list[Word], groups: HostGroups, findings: Findings) -> Clause | None:
     hosts = []
     while words and not _NUMBER.fullmatch(words[0].text):
         hosts.append(words.pop(0))
     rate = _rate(part, words, findings)
     if rate is None:
         return None
-    if hosts and part.text == Part.TOPIC:
+    if hosts and part.text == LimitScope.TOPIC:
         text = "topic limits all publishers together: name no hosts, or limit each publisher there"
         findings.error(hosts[0].line, hosts[0].column, text)
         return None
     atoms = frozenset(atom for _, atom in groups.read(hosts)) if hosts else None
-    return Clause(Part(part.text), atoms, rate)
+    return Clause(LimitScope(part.text), atoms, rate)
 
 
 def _rate(part: Word, words: list[Word], findings: Findings) -> Rate | None:
-    """Numbers with their units, in one word or in two; None with an error noted."""
+    """Parse numbers with their units, in one word or two; return None with an error noted."""
     found: dict[str, float] = {}
     words = list(words)
     while words:

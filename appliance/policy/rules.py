@@ -1,8 +1,8 @@
-"""Compiles the lines of the deciding sections into rule tables, and notes what is wrong with them."""
+"""Compile the lines of the deciding sections into rule tables, and note their mistakes."""
 
 from appliance.base.validation_messages import meant
 from appliance.policy import commands
-from appliance.policy.groups import Groups
+from appliance.policy.groups import HostGroups
 from appliance.policy.ini_reader import Entry, SectionText, Word
 from appliance.policy.keys import BadKeyError, Key, command_key, parse_key
 from appliance.policy.model import Category, Rule
@@ -11,13 +11,13 @@ from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import DEFAULT, PARAMETERS, Decider
 
 MAXIMUM_INNER_STARS = 1000
-"""Keys with a star before the end, in all sections: they make looking up a name branch."""
+"""Most keys with a star before the end, in all sections: they make the look-up of a name branch."""
 
 
 class RuleCompiler:
-    """Fills one `RuleTable` per category."""
+    """The compiler that fills one `RuleTable` per category."""
 
-    def __init__(self, file: str, groups: Groups, findings: Findings) -> None:
+    def __init__(self, file: str, groups: HostGroups, findings: Findings) -> None:
         self.tables = {category: RuleTable() for category in Category}
         self._file = file
         self._groups = groups
@@ -56,7 +56,7 @@ class RuleCompiler:
             )
 
     def _fits(self, category: Category, key: Key, name: Word) -> bool:
-        """Whether a pattern ties with none before it, and is not one too many."""
+        """Whether a pattern ties with none before it, within the number of patterns."""
         self._inner_stars += key.inner_star
         if self._inner_stars > MAXIMUM_INNER_STARS:
             text = f"more than {MAXIMUM_INNER_STARS} keys have a star before the end, as /*/state: use fewer"
@@ -81,7 +81,7 @@ class RuleCompiler:
             table.tree.add(rule.key, rule)
 
     def _category_and_name(self, decider: Decider, entry: Entry) -> tuple[Category, Word] | None:
-        """Which category a line speaks of; the lines of `[Parameters]` begin with it."""
+        """Return the category and name of a line; the lines of `[Parameters]` begin with the category."""
         if len(decider.categories) == 1:
             return decider.categories[0], entry.key
         verb, _, name = entry.key.text.partition(" ")
@@ -93,7 +93,7 @@ class RuleCompiler:
         return category, Word(name, entry.key.line, entry.key.column + len(verb) + 1)
 
     def _key(self, category: Category, name: Word) -> Key | None:
-        """The parsed key; None for `default` and (with an error noted) for a bad one."""
+        """Return the parsed key; None for `default` and (with an error noted) for a bad one."""
         if name.text == DEFAULT:
             return None
         if category is Category.COMMAND:

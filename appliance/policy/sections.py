@@ -8,10 +8,10 @@ from appliance.policy.model import Category
 
 @dataclass(frozen=True, slots=True)
 class Decider:
-    """A section that decides requests of the categories in `phrases`: what each does, before the name of the resource.
+    """A section that decides requests. `phrases` has its categories, with the words before the name of the resource.
 
-    `extension` sections grant everything to everybody when they are missing (the thesis knows nothing of
-    them); all others then grant nothing.
+    A missing `extension` section grants everything to all hosts (the thesis does not have these sections); any other
+    missing section grants nothing.
     """
 
     name: str
@@ -20,7 +20,7 @@ class Decider:
 
     @property
     def categories(self) -> tuple[Category, ...]:
-        """What it decides."""
+        """Return the categories that it decides."""
         return tuple(self.phrases)
 
 
@@ -44,7 +44,7 @@ PARAMETERS = frozenset({Category.READ, Category.WRITE})
 """The categories whose resources are keys of parameters."""
 
 DEFAULT = "default"
-"""The key for what no other key of a section matches."""
+"""The key for names that no other key of a section matches."""
 
 GROUPS, PORTS, MONITOR, LIMITS, OPTIONS = "Groups", "Ports", "Monitor", "Limits", "Options"
 
