@@ -1,1 +1,1 @@
-"""Sends the audit log on to a syslog receiver, from a process of its own that can only read it."""
+"""Forward the audit log to a syslog receiver, from a process that can only read it."""

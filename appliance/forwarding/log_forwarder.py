@@ -1,12 +1,12 @@
-"""Reads what the log has committed and sends it on: at least once, in order, from where it was.
+"""Forward the committed records of the log: in order, at least once, from the stored position.
 
 Invariants:
 
-1. It reads the database as any reviewer does: the log never waits for it, and loses nothing by it.
-2. Memory is bounded: `_BATCH` records and checkpoints at a time.
-3. The position moves only when the receiver has the batch; a failure is tried again, at growing distances, for ever.
-4. What was removed by retention before it could be sent is counted (`missed`) and told, not passed over.
-5. Of a log that was put back from a copy, what is recorded in the place of what had been sent is sent as well.
+1. The database is only read, so forwarding never delays the log or loses its records.
+2. Memory is bounded: at most `_BATCH` records and `_BATCH` checkpoints at a time.
+3. The position advances only when the receiver has the batch; failures are retried forever, with growing pauses.
+4. Records that retention removed before they were sent are counted and reported (`missed`).
+5. If the log was restored from a copy, records that reuse the sequence of a sent record are sent as well.
 """
 
 import time
@@ -21,11 +21,11 @@ import structlog
 from appliance.audit.copies import signed_checkpoints
 from appliance.audit.log_database import LogUnreadableError, reading
 from appliance.audit.query import Filter
-from appliance.audit.record import Record, Severity
-from appliance.audit.record_format import Entry
+from appliance.audit.record import AuditRecord, Severity
+from appliance.audit.record_format import LogEntry
 from appliance.audit.search import search
+from appliance.base.atomic_files import write_whole
 from appliance.channel.messages import ForwardingReported
-from appliance.forwarding.position import Position, load_position, save_position
 from appliance.forwarding.receiver import Receiver
 from appliance.forwarding.syslog import Formatter
 
@@ -37,9 +37,37 @@ _SAVE_SECONDS = 1.0
 _log = structlog.get_logger()
 
 
+class ForwardingPosition(msgspec.Struct, frozen=True):
+    """The last record (its sequence) and the last checkpoint (its number) of log `log` that the receiver has.
+
+    It is stored after the receiver has them, so after a crash some are sent again. `record` is the id of that record;
+    if the log was restored from a copy, another record may have its sequence.
+    """
+
+    log: str
+    sequence: int = 0
+    checkpoint: int = 0
+    record: str = ""
+
+
+def load_position(path: Path) -> ForwardingPosition | None:
+    """Return the stored position, or None. Raises `ValueError` and `OSError` if the file cannot be read."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=ForwardingPosition)
+    except FileNotFoundError:
+        return None
+    except msgspec.DecodeError as error:
+        raise ValueError(f"{path}: {error}; remove it to have the whole log forwarded again") from error
+
+
+def save_position(path: Path, position: ForwardingPosition) -> None:
+    """Write the position to the disk. Raises `OSError`."""
+    write_whole(path, msgspec.json.encode(position), 0o600)
+
+
 @dataclass(slots=True)
-class Forwarder:
-    """Forwards the log at `log` to `receiver`; the position is kept in the file `kept`. Used by one thread."""
+class LogForwarder:
+    """A forwarder of the database `log` to `receiver`, with its position in the file `kept`. For one thread."""
 
     log: Path
     kept: Path
@@ -48,13 +76,13 @@ class Forwarder:
     chosen: Chosen
     clock: Callable[[], int] = time.time_ns
     progress: ForwardingReported = field(default_factory=ForwardingReported)
-    _position: Position | None = None
-    _saved: Position | None = None
+    _position: ForwardingPosition | None = None
+    _saved: ForwardingPosition | None = None
     _saved_at: float = 0.0
     _failures: int = 0
 
     def step(self) -> float:
-        """Send the next batch; in how many seconds to come again."""
+        """Send the next batch; return the seconds to wait before the next call."""
         try:
             position = self._position or self._begin()
             more = self._forward(position)
@@ -67,24 +95,24 @@ class Forwarder:
         return 0.0 if more else _IDLE_SECONDS
 
     def close(self) -> None:
-        """Keep the position and let go of the receiver."""
+        """Store the position and close the connection."""
         self.receiver.close()
         try:
             self._save(0.0)
         except OSError as error:
             _log.error("the position is not kept: some records will be forwarded again", error=str(error))
 
-    def _begin(self) -> Position:
+    def _begin(self) -> ForwardingPosition:
         first, _last, log_id = _extent(self.log)
         position = load_position(self.kept)
         if position is not None and position.log != log_id:
             _log.warning("another audit log is forwarded from its beginning", log=log_id, before=position.log)
             position = None
-        self._position = _in_log(self.log, position) if position else Position(log_id, first - 1)
+        self._position = _in_log(self.log, position) if position else ForwardingPosition(log_id, first - 1)
         return self._position
 
-    def _forward(self, position: Position) -> bool:
-        """Whether there is more."""
+    def _forward(self, position: ForwardingPosition) -> bool:
+        """Forward a batch; return whether there is more."""
         _first, head, log_id = _extent(self.log)
         if log_id != position.log or head < position.sequence:
             self._position = None
@@ -102,7 +130,7 @@ class Forwarder:
         if messages:
             self.receiver.send(messages)
         last = ready[-1].number if ready else position.checkpoint
-        self._position = Position(
+        self._position = ForwardingPosition(
             position.log, through, last, entries[-1].record.id if entries else position.record
         )
         self.progress = ForwardingReported(
@@ -115,19 +143,19 @@ class Forwarder:
         )
         return head > through or len(ready) == _BATCH
 
-    def _wanted(self, record: Record) -> bool:
+    def _wanted(self, record: AuditRecord) -> bool:
         return (
             self.chosen == "all"
             or record.decision in ("deny", "would deny")
             or record.severity in (Severity.WARNING, Severity.ALARM)
         )
 
-    def _look(self, behind: int, entries: list[Entry]) -> None:
-        """What waits, while it is being sent."""
+    def _look(self, behind: int, entries: list[LogEntry]) -> None:
+        """Report the number and age of waiting records while they are being sent."""
         seconds = self._waited(entries)
         self.progress = msgspec.structs.replace(self.progress, behind=behind, seconds=seconds)
 
-    def _waited(self, entries: list[Entry]) -> float:
+    def _waited(self, entries: list[LogEntry]) -> float:
         return max(0.0, (self.clock() - entries[0].record.time) / 1e9) if entries else 0.0
 
     def _failed(self, reason: str) -> float:
@@ -148,7 +176,7 @@ class Forwarder:
 
 
 def _extent(path: Path) -> tuple[int, int, str]:
-    """First and last sequence, and the log's id. Raises `LogUnreadableError`."""
+    """Return first and last sequence, and the log's id. Raises `LogUnreadableError`."""
     with reading(path, advice="") as connection:
         query = "SELECT coalesce(min(sequence), 1), coalesce(max(sequence), 0) FROM record"
         first, last = connection.execute(query).fetchone()
@@ -156,11 +184,11 @@ def _extent(path: Path) -> tuple[int, int, str]:
     return int(first), int(last), str(log_id)
 
 
-def _in_log(path: Path, position: Position) -> Position:
-    """The position as far as the log has what it says. Raises `LogUnreadableError`.
+def _in_log(path: Path, position: ForwardingPosition) -> ForwardingPosition:
+    """Return the position, moved back if the log was restored from a copy. Raises `LogUnreadableError`.
 
-    A log that was put back from a copy went on from there: its ids are in order of time, so what is later than the
-    last record that was sent is new, whatever its sequence.
+    A restored log continues with sequences that were already used. Ids are in order of time, so every record with a
+    later id than the last sent record is new, whatever its sequence.
     """
     with reading(path, advice="") as connection:
 
@@ -178,4 +206,4 @@ def _in_log(path: Path, position: Position) -> Position:
         sequence = min(position.sequence, head) if before is None else int(before)
         number = ask("SELECT coalesce(max(number), 0) FROM checkpoint WHERE sequence <= ?", sequence)
     _log.warning("the audit log was put back from a copy: it is forwarded from there", sequence=sequence)
-    return Position(position.log, sequence, min(position.checkpoint, int(number)))
+    return ForwardingPosition(position.log, sequence, min(position.checkpoint, int(number)))

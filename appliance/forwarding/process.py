@@ -1,7 +1,7 @@
-"""The forwarder as a process of the appliance: lifeline, link to control, and a thread that forwards.
+"""Run the forwarder as a process of the appliance: lifeline, link to control, and a thread that forwards.
 
-It runs as a user of its own in the group that may read the audit log, and can write nothing but its position. The
-firewall lets this user reach the receiver and nobody else. It outlives control: what control has committed is there.
+Its user may read the audit log and write only the position. The firewall lets it reach only the receiver. It outlives
+control and sends the records that control has committed.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.configuration.settings import Settings, Syslog, load_resolved
-from appliance.forwarding.log_forwarder import Forwarder
+from appliance.forwarding.log_forwarder import LogForwarder
 from appliance.forwarding.receiver import DatagramReceiver, Receiver, StreamReceiver, tls_context
 from appliance.forwarding.syslog import LONGEST_DATAGRAM, LONGEST_IN_STREAM, Formatter
 
@@ -25,12 +25,12 @@ _LAST_SECONDS = 1.0
 
 
 def main(lifeline_fd: int, config: Path) -> None:
-    """Forward the log until the supervisor ends it."""
+    """Forward the log until the supervisor ends the process."""
     asyncio.run(_Process(load_resolved(config), lifeline_fd).run())
 
 
 class _Process:
-    """The parts of the process and the wires between them."""
+    """The parts of the process and their connections."""
 
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
         lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
@@ -40,14 +40,14 @@ class _Process:
             said=lambda _message: None,
             linked=lambda: self._reports.anew(self._forwarder.progress),
         )
-        self._reports = Reports(self._child.tell)
+        self._reports = ProgressReports(self._child.tell)
         self._ending = threading.Event()
         self._forwarder = make_forwarder(settings, Path.cwd() / "position.json")
 
     async def run(self) -> None:
-        """Forward from start to end."""
-        # A daemon: when a receiver hangs, the end does not wait for it; its batch is sent again at the next start.
-        said_with_logs = contextvars.copy_context()  # which process this is
+        """Forward until the supervisor stops the process."""
+        # A daemon thread: shutdown does not wait for a hanging receiver; its batch is sent again at the next start.
+        said_with_logs = contextvars.copy_context()  # the name of this process
         thread = threading.Thread(
             target=said_with_logs.run, args=(self._forward,), name="forward", daemon=True
         )
@@ -59,7 +59,7 @@ class _Process:
                 await asyncio.wait_for(self._child.ended.wait(), _REPORT_SECONDS)
             except TimeoutError:
                 if not thread.is_alive():
-                    break  # a defect, which it has said: the supervisor starts a fresh life
+                    break  # a defect, which is logged: the supervisor restarts the process
         self._ending.set()
         await asyncio.to_thread(thread.join, _LAST_SECONDS)
 
@@ -69,11 +69,11 @@ class _Process:
         self._forwarder.close()
 
 
-class Reports:
-    """Tells control how it stands. `send` says whether there was a control to tell.
+class ProgressReports:
+    """The reporter of progress to control; `send` returns whether control was connected.
 
-    Every control is told first what was told last: what was missed since then, or while there was none, it can tell
-    from what another control has recorded.
+    A new control process first gets the last report again. It compares the report with the records of its predecessor,
+    and so detects missed changes.
     """
 
     def __init__(self, send: Callable[[messages.ForwardingReported], bool]) -> None:
@@ -81,21 +81,21 @@ class Reports:
         self._told = messages.ForwardingReported()
 
     def tell(self, progress: messages.ForwardingReported) -> None:
-        """If something is new, tell it."""
+        """Report new progress."""
         if progress != self._told and self._send(progress):
             self._told = progress
 
     def anew(self, progress: messages.ForwardingReported) -> None:
-        """There is another control."""
+        """Repeat the last report to a new control process, then report the current progress."""
         if self._send(self._told):
             self.tell(progress)
 
 
-def make_forwarder(settings: Settings, kept: Path) -> Forwarder:
-    """What forwards as `settings` say; they must have a receiver."""
+def make_forwarder(settings: Settings, kept: Path) -> LogForwarder:
+    """Return the forwarder for these settings, in which a receiver must be configured."""
     wanted = settings.audit.syslog
     longest = LONGEST_DATAGRAM if wanted.destination[0] == "udp" else LONGEST_IN_STREAM
-    return Forwarder(
+    return LogForwarder(
         settings.state / "control" / "audit.db",
         kept,
         receiver_of(wanted),
@@ -109,13 +109,13 @@ def make_forwarder(settings: Settings, kept: Path) -> Forwarder:
 
 
 def receiver_of(wanted: Syslog) -> Receiver:
-    """The receiver that the configuration names."""
+    """Return the receiver that the configuration names."""
     protocol, host, port = wanted.destination
     if protocol == "udp":
         return DatagramReceiver(host, port)
     context: Callable[[], Any] | None = None
     if protocol == "tls":
-        # Made anew for each connection: files that were replaced count from the next one on.
+        # Made for each connection, so that replaced certificate files apply to the next connection.
         def context() -> Any:
             return tls_context(wanted.ca, wanted.certificate, wanted.key)
 

@@ -1,14 +1,14 @@
-"""The way to the receiver: UDP (RFC 5426), TCP with octet counting (RFC 6587), TLS (RFC 5425).
+"""Connections to the receiver: UDP (RFC 5426), TCP with octet counting (RFC 6587), TLS (RFC 5425).
 
 Invariants:
 
-1. `send` returns when the receiver's kernel has acknowledged every byte (TCP, TLS), or the datagrams have left (UDP);
-   else it raises `OSError`. No call takes longer than its limits.
-2. Nothing the receiver says is interpreted; that it closes the connection is noticed before more is sent.
-3. TLS means a certificate that the configured authority signed, for the configured name or address.
+1. `send` returns when the receiver's kernel has acknowledged every byte (TCP, TLS), or the datagrams have left (UDP).
+   Otherwise it raises `OSError`. All waits have a limit.
+2. Data from the receiver is discarded; a closed connection is detected before more is sent.
+3. TLS requires that the configured authority certifies the receiver's configured name or address.
 
-Syslog has no acknowledgement of its own: what a receiver had accepted and not yet worked off when it died is lost, and
-what a network drops of UDP too. Who cannot have that keeps the log itself; the checkpoints show a gap.
+Syslog has no acknowledgements. Messages that a receiver accepted but had not processed when it died are lost, and so
+are UDP packets that the network drops. The log itself has everything, and checkpoints reveal a gap.
 """
 
 import fcntl
@@ -26,28 +26,28 @@ from typing import Protocol
 _CONNECT_SECONDS = 5.0
 _SEND_SECONDS = 10.0
 _OBJECTION_SECONDS = 1.0
-_LOOK_SECONDS = (0.001, 0.02)  # between two looks at what is not acknowledged yet: at first, at most
+_LOOK_SECONDS = (0.001, 0.02)  # between two checks for acknowledgement: first, longest
 
 
 class Receiver(Protocol):
-    """Takes messages."""
+    """A receiver of messages."""
 
     def send(self, messages: Sequence[bytes]) -> None:
         """Send all of them, in order; see the invariants above. Raises `OSError`."""
 
     def close(self) -> None:
-        """Let go of the connection, if there is one."""
+        """Close the connection, if there is one."""
 
 
 class DatagramReceiver:
-    """One datagram for each message. That nobody listens is told by the other side only now and then."""
+    """A UDP receiver: one datagram per message. The other side does not always report that nothing listens."""
 
     def __init__(self, host: str, port: int) -> None:
         self._place = (host, port)
         self._socket: socket.socket | None = None
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Send each as a datagram."""
+        """Send each message as a datagram."""
         if self._socket is None:
             family = socket.AF_INET6 if ":" in self._place[0] else socket.AF_INET
             self._socket = socket.socket(family, socket.SOCK_DGRAM)
@@ -57,14 +57,14 @@ class DatagramReceiver:
             self._socket.send(message)
 
     def close(self) -> None:
-        """Close the socket."""
+        """Close the connection, if there is one."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
 
 class StreamReceiver:
-    """A connection that stays open. `context` gives what TLS needs anew at each connection; None: clear text."""
+    """A TCP receiver with a lasting connection; `context` returns the TLS context of each (None: clear text)."""
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class StreamReceiver:
         self._socket: socket.socket | None = None
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Send each with its length before it, and wait until all of it is acknowledged."""
+        """Send each message after its length, and wait until all bytes are acknowledged."""
         connection = self._socket
         if connection is None:
             connection = self._socket = self._connect()
@@ -101,7 +101,7 @@ class StreamReceiver:
         return connection
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection, if there is one."""
         if self._socket is not None:
             with suppress(OSError):
                 self._socket.close()
@@ -109,9 +109,9 @@ class StreamReceiver:
 
 
 def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> ssl.SSLContext:
-    """The receiver's certificate must be signed by `ca` (None: one the system trusts); ours, if it asks for one.
+    """Return a context that verifies the receiver by `ca` (None: the system's) and presents our certificate.
 
-    Raises `OSError` with the file that cannot be read.
+    Raises `OSError`, which names the unreadable file.
     """
     try:
         context = ssl.create_default_context(cafile=ca)
@@ -129,13 +129,13 @@ def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> 
 
 
 def _await_objection(connection: socket.socket) -> None:
-    """With TLS 1.3 a server says only after our side of the handshake that it does not want our certificate."""
+    """Raise `OSError` if the server rejects our certificate: with TLS 1.3 that happens after our handshake."""
     select.select([connection], [], [], _OBJECTION_SECONDS)
     _require_open(connection)
 
 
 def _require_open(connection: socket.socket) -> None:
-    """Raise `ConnectionResetError` when the receiver has closed; what it says is thrown away."""
+    """Discard the receiver's data. Raise `ConnectionResetError` if it has closed the connection."""
     connection.settimeout(0)
     try:
         while True:
@@ -158,6 +158,6 @@ def _await_acknowledgement(connection: socket.socket) -> None:
 
 
 def _unacknowledged(connection: socket.socket) -> int:
-    """How many bytes the receiver's kernel has not acknowledged (`SIOCOUTQ`, tcp(7))."""
+    """Return the number of bytes that the receiver's kernel has not acknowledged (`SIOCOUTQ`, tcp(7))."""
     answer = fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, b"\0\0\0\0")
     return int(struct.unpack("i", answer)[0])

@@ -1,12 +1,12 @@
-"""A record as a message of RFC 5424. No I/O.
+r"""Format records as messages of RFC 5424. No I/O.
 
 Invariants:
 
-1. A message is printable ASCII: whatever a stranger named himself, no receiver, terminal or line-based file acts on it,
-   and no value can end its parameter, its element or the message (RFC 5424, 6.3.3: `"`, `\\` and `]` are escaped).
-2. A message is at most `longest` bytes: first its details go, then the end of its text; both are said. What identifies
-   the record (sequence, id) is always there.
-3. The same record gives the same message: a receiver that gets it twice sees by `sequence` that it did.
+1. A message is printable ASCII, and `"`, `\` and `]` are escaped (RFC 5424, 6.3.3). A name chosen by a host can neither
+   control a receiver or a terminal, nor end its parameter, element or message.
+2. A message has at most `longest` bytes: first its details are left out, then its text is cut, both with a mark. The
+   sequence and id of the record are always included.
+3. The same record gives the same message; a receiver detects duplicates by `sequence`.
 """
 
 import json
@@ -17,9 +17,9 @@ import msgspec
 
 from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
 from appliance.audit.record import Severity
-from appliance.audit.record_format import Entry, fields_of, printable
+from appliance.audit.record_format import LogEntry, fields_of, printable
 
-ELEMENT = "rosrv@32473"  # 32473 is kept for examples (RFC 5612): the project has no number of its own
+ELEMENT = "rosrv@32473"  # 32473 is reserved for examples (RFC 5612); the project has no number
 LONGEST_DATAGRAM, LONGEST_IN_STREAM = 2048, 8192  # RFC 5426, 3.2; RFC 5425, 4.3.1
 _SEVERITIES = {
     Severity.DEBUG: 7,
@@ -31,12 +31,12 @@ _SEVERITIES = {
 _LONGEST_MESSAGE_ID = 32
 _LONGEST_HOST_NAME = 255
 _LONGEST_VALUE = 512
-_FIXED, _OPEN = 700, 5  # bytes of header and our own parameters at most; parameters that strangers make long
+_FIXED, _OPEN = 700, 5  # bytes of header and own parameters; number of parameters that callers choose
 _CUT = "..."
 
 
 class Formatter:
-    """Makes messages from `host_name`, of a facility (0 to 23), at most `longest` bytes each."""
+    """A formatter of messages from `host_name` with a facility (0 to 23), each at most `longest` bytes."""
 
     def __init__(self, *, facility: int, longest: int, host_name: str | None = None) -> None:
         self._facility = facility
@@ -44,8 +44,8 @@ class Formatter:
         self._room = min(_LONGEST_VALUE, (longest - _FIXED) // _OPEN)
         self._host = _name(host_name or socket.gethostname(), _LONGEST_HOST_NAME)
 
-    def record(self, entry: Entry) -> bytes:
-        """A record of the log."""
+    def record(self, entry: LogEntry) -> bytes:
+        """Format a record of the log."""
         record = entry.record
         head = self._head(record.severity, record.time, record.event)
         named = {name: _value(value, self._room) for name, value in fields_of(entry).items() if value}
@@ -61,7 +61,7 @@ class Formatter:
         return _message(head, ELEMENT, named, _shortened(text, room))
 
     def checkpoint(self, signed: SignedCheckpoint) -> bytes:
-        """A signed checkpoint: what `rosrv audit verify --checkpoints` finds again in the receiver's file."""
+        """Format a signed checkpoint so that `rosrv audit verify --checkpoints` finds it in the receiver's file."""
         head = self._head(Severity.NOTICE, signed.time, "checkpoint signed")
         fields = {
             name: str(value) for name, value in msgspec.structs.asdict(signed).items() if value is not None
@@ -81,7 +81,7 @@ def _message(head: str, element: str, fields: dict[str, str], text: str) -> byte
 
 
 def _value(value: str, room: int) -> str:
-    """A parameter's value, escaped, in at most `room` bytes."""
+    """Return a parameter's value, escaped, in at most `room` bytes."""
     pieces = [f"\\{character}" if character in '\\"]' else character for character in _ascii(value)]
     if sum(map(len, pieces)) <= room:
         return "".join(pieces)
@@ -105,12 +105,12 @@ def _shortened(text: str, room: int) -> str:
 
 
 def _name(text: str, longest: int) -> str:
-    """A field of the header: printable ASCII without space, or `-` where nothing is left (RFC 5424, 6)."""
+    """Return a field of the header: printable ASCII without space, or `-` if nothing is left (RFC 5424, 6)."""
     return "".join(character for character in text if "!" <= character <= "~")[:longest] or "-"
 
 
 def _time(time: int) -> str:
-    """RFC 3339 with microseconds, which is what RFC 5424 allows; `-` for a time that no calendar has."""
+    """Return the time in RFC 3339 with microseconds, as RFC 5424 allows; `-` if it is out of range."""
     seconds, fraction = divmod(time, 1_000_000_000)
     try:
         moment = datetime.fromtimestamp(seconds, UTC)

@@ -1,6 +1,6 @@
-"""RVMaster: stands where nodes expect the ROS Master, decides every request and forwards what is granted.
+"""RVMaster: listens where nodes expect the ROS master, decides every request and forwards granted ones.
 
-The way of a request: `http` (socket, limits) → `pipeline` (parse, canonicalise, decide, record, perform, answer)
-by the rows of `calls`; `gate` is the one decision point; `registry` knows who is who; `faces` stand between
-nodes; `reconcile` mends the difference between what is wanted and what is seen.
+The path of a request: `http` (socket, limits) → `pipeline` (parse, canonicalise, decide, record, perform, answer), by
+the rows of the call table. `gate` makes all decisions, `registry` has nodes and registrations, `endpoints` has the
+proxies between nodes, and `reconcile` makes the ROS master match the registry.
 """

@@ -1,4 +1,4 @@
-"""Who calls RVMaster or a node's outer face, the URI that a node gives for itself, and what is answered."""
+"""Define the caller of RVMaster or of a proxy endpoint, the URI that a node gives for itself, and the answer."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -10,22 +10,22 @@ from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
 
 Answer = list[Value]
-"""What a call returns: `[code, message, value]`; code 1 done, 0 failed or denied, -1 the caller's error."""
+"""The result of a call: `[code, message, value]`; code 1 done, 0 failed or denied, -1 the caller's error."""
 
 
 @dataclass(frozen=True, slots=True)
 class ApiUri:
-    """A node's or service's URI as it was given and as it was parsed."""
+    """The URI of a node or service, as given and as parsed."""
 
     text: str
     uri: NodeUri
 
 
 class Caller(NamedTuple):
-    """Who makes a call: the peer, and the `caller_id` he claims.
+    """The caller: the peer, and the `caller_id` that it claims.
 
-    `own` marks the appliance's own nodes, which reach RVMaster on a listener of their own. `target` is set on an
-    outer face: the incarnation that the call is for.
+    `own` marks the appliance's own nodes, which call RVMaster on a separate listener. `target` is the incarnation that
+    a call to a proxy endpoint is for.
     """
 
     peer: Peer
@@ -35,12 +35,12 @@ class Caller(NamedTuple):
     target: Incarnation | None = None
 
     def as_named(self, caller_id: str) -> "Caller":
-        """The same, by the name that it claims in this call."""
+        """Return the same caller with the name that it claims in this call."""
         return Caller(self.peer, caller_id, self.arrived, self.own, self.target)
 
     @property
     def asker(self) -> Asker:
-        """The caller as the audit log has him."""
+        """Return the caller in the form that the audit log records."""
         return Asker(
             self.peer.text, self.caller_id, self.arrived, None if self.target is None else self.target.name
         )

@@ -1,14 +1,13 @@
-"""Which host each parameter is charged to: whoever set it, with the namespaces that came to be for it.
+"""Charge each parameter, with the namespaces that were made for it, to the host that set it.
 
-A *place* is a key from which on another host owns the parameters than above it; so there are few places, however many
-parameters there are. What nobody set is the appliance's (loopback): its own parameters, and a tree of an earlier
-version.
+A *place* is a key from which on parameters have another owner than above it, so there are few places for any number of
+parameters. Parameters that no host set are the appliance's (loopback): its own, and the tree of an earlier version.
 
 Invariants:
 
 1. The weights of all places together are the weight of the tree.
-2. No place has the owner of the nearest place above it.
-3. Every place but the root is in the tree, is kept by the journal, and is gone with its key.
+2. A place and the nearest place above it have different owners.
+3. Every place except the root is a key of the tree, is stored by the journal, and is removed with its key.
 """
 
 from collections import Counter
@@ -25,35 +24,35 @@ from roswire.xmlrpc import Value
 
 APPLIANCE: Address = address_of("127.0.0.1")
 NAME_WEIGHT = 40
-"""About what is written around a member of a namespace, without its name and its value."""
-_VALUE, _TEXT, _ARRAY, _STRUCT = 45, 35, 50, 40  # about what is written around others
+"""The approximate bytes that a member of a namespace takes besides its name and its value."""
+_VALUE, _TEXT, _ARRAY, _STRUCT = 45, 35, 50, 40  # the same for other values
 _NUMBERS = frozenset({bool, int, float})
 
 
 class LimitReachedError(Exception):
-    """A call would take more than there is for all hosts; the text says what of."""
+    """A call would exceed a limit; the message has the limit."""
 
 
 class OwnersJournal(Protocol):
-    """Where owners are written that must survive a crash of control."""
+    """A store of owners, which survives a crash of control."""
 
     def parameter_owned(self, key: str, host: str) -> None:
-        """From this key on the parameters are this host's."""
+        """Store this host as the owner of the parameters at this key and below."""
 
     def parameters_disowned(self, key: str) -> None:
-        """This key and those below it are no places any more."""
+        """Remove the places at this key and below."""
 
 
 @dataclass(slots=True)
 class _Place:
-    """A key on the way to places below it; with an owner, it is one itself."""
+    """A place if it has an owner, otherwise a key on the path to places below it."""
 
     owner: Address | None = None
-    weight: int = 0  # of what is its own, without the places below it
+    weight: int = 0  # without the places below it
     below: "dict[str, _Place]" = field(default_factory=dict)
 
     def owned(self) -> "Iterator[_Place]":
-        """The places at this key and below."""
+        """Yield the places at this key and below."""
         if self.owner is not None:
             yield self
         for place in self.below.values():
@@ -61,7 +60,7 @@ class _Place:
 
 
 class ParameterCharges:
-    """Charges parameters to a pool of bytes. `owners` are keys and hosts, as the journal kept them."""
+    """The charges for parameters to a pool of bytes. `owners` are keys and hosts from the journal."""
 
     def __init__(
         self, pool: Pool[Address], journal: OwnersJournal, owners: Iterable[tuple[str, str]] = ()
@@ -76,7 +75,7 @@ class ParameterCharges:
             place.owner = address_of(host)
 
     def held(self, parts: Sequence[str], weight: int) -> Mapping[Address, int]:
-        """Who is charged for what is at this key and below, which weighs so much in all."""
+        """Return the weight of each owner at this key and below; `weight` is their sum."""
         path = self._path(parts)
         owner = _owner(_region(path, parts))
         if len(path) <= len(parts):
@@ -88,13 +87,13 @@ class ParameterCharges:
         return held
 
     def replaced(self, parts: Sequence[str], before: int, after: int, owner: Address) -> None:
-        """What is at this key weighed `before` in all, and now `after` (0: it is gone), which is this owner's."""
+        """Change the weight at this key from `before` to `after` (0: deleted), and charge this owner."""
         path = self._path(parts)
         region = _region(path, parts)
-        begun = len(path) > len(parts)  # whether it is a place, or on the way to one
+        begun = len(path) > len(parts)  # whether it is a place, or on the path to one
         place = path[-1] if begun else region
         if parts and place.owner == owner and not (begun and (place.below or not after)):
-            place.weight += after - before  # as nearly always: no place begins or ends
+            place.weight += after - before  # the usual case: no place begins or ends
             self.pool.charge(owner, after - before)
             return
         self._release(parts, before)
@@ -113,7 +112,7 @@ class ParameterCharges:
         self.pool.charge(owner, after)
 
     def recount(self, tree: Tree, *, final: bool) -> None:
-        """The tree is another one: each place has what is there now. `final`: places that are not there are gone."""
+        """Weigh the places of a replaced tree again. `final`: remove places that the tree lacks."""
         self._recount(self._root, tree, measure(tree)[0], (), final=final)
 
     def _release(self, parts: Sequence[str], weight: int) -> None:
@@ -136,7 +135,7 @@ class ParameterCharges:
     def _recount(
         self, place: _Place, value: Value, weight: int, parts: tuple[str, ...], *, final: bool
     ) -> int:
-        """What the places at this key and below have, of what weighs so much in all."""
+        """Weigh the places at this key and below again; return their sum. `weight` is the weight of the key."""
         owned = 0
         for name, below in list(place.below.items()):
             there = isinstance(value, dict) and name in value
@@ -157,7 +156,7 @@ class ParameterCharges:
         return weight
 
     def _path(self, parts: Sequence[str]) -> list[_Place]:
-        """The root, and what is known of the keys from there to this one."""
+        """Return the known places on the path from the root to this key."""
         path = [self._root]
         for part in parts:
             below = path[-1].below.get(part)
@@ -168,7 +167,7 @@ class ParameterCharges:
 
 
 def _region(path: list[_Place], parts: Sequence[str]) -> _Place:
-    """The nearest place above a key; the root is in its own."""
+    """Return the nearest place above a key; for the root, the root."""
     for place in reversed(path[: len(parts)]):
         if place.owner is not None:
             return place
@@ -186,9 +185,10 @@ def _key(parts: Sequence[str]) -> str:
 
 
 def measure(value: Value) -> tuple[int, int]:
-    """About how many bytes a value takes on the wire, and how deep it is (0: no array or struct).
+    """Return the approximate bytes that a value takes on the wire, and its depth (0: no array or struct).
 
-    Level by level, because values may be large: those of a level that are numbers or texts cost next to nothing.
+    Works level by level, because values may be large, and a level of numbers or texts is fast.
+
     Raises `ProtocolError` for `<nil/>`.
     """
     if type(value) in _NUMBERS:
@@ -210,7 +210,7 @@ def measure(value: Value) -> tuple[int, int]:
 
 
 def _own_weight(value: Value, below: list[Value]) -> int:
-    """What a value takes without what is in it, which is added to those `below`."""
+    """Return the weight of a value without its members, which are appended to `below`."""
     if isinstance(value, str):
         return _TEXT + text_weight(value)
     if isinstance(value, bytes):
@@ -222,10 +222,10 @@ def _own_weight(value: Value, below: list[Value]) -> int:
         below += value.values()
         return _STRUCT + NAME_WEIGHT * len(value) + text_weight("".join(value))
     if value is None:
-        raise ProtocolError("a value has <nil/> in it, which neither ROSMaster nor roscpp can send")
+        raise ProtocolError("a value has <nil/> in it, which neither the ROS master nor roscpp can send")
     return _VALUE
 
 
 def member_weight(name: str, value: Value) -> int:
-    """About how many bytes a member of a namespace takes, with its name."""
+    """Return the approximate bytes that a member of a namespace takes, with its name."""
     return NAME_WEIGHT + text_weight(name) + measure(value)[0]

@@ -1,6 +1,6 @@
-"""The mirror of ROSMaster's parameter tree, which survives its death, and room for what is about to be set.
+"""Mirror the ROS master's parameter tree, so that it survives the ROS master's death, and reserve room for writes.
 
-The mirror changes exactly as ROSMaster's tree does, and only after ROSMaster took the change.
+The mirror changes exactly like the ROS master's tree, and only after the ROS master accepted the change.
 """
 
 import contextlib
@@ -25,12 +25,13 @@ from roswire.xmlrpc import Value
 
 
 class ParameterMirror:
-    """A copy of ROSMaster's parameter tree, and who is charged for it; `changed()` hears of every change.
+    """A copy of the ROS master's parameter tree, and the hosts that are charged for it; `changed()` is called at each
+    change.
 
-    `weight` is about the bytes of the whole tree in an answer to `getParam("/")`. It and the depth are bounded: a
-    tree that ROSMaster could not tell any more would break it for everybody, and could not be read after a restart.
-    `note(key, value)` hears of each change of one parameter (None: it is gone); `since` are those after `tree`. What it
-    hears inside `together()` is kept at the end of that.
+    `weight` is the approximate size of the whole tree in an answer to `getParam("/")`. Size and depth are limited: a
+    tree that the ROS master could no longer send would break it for all nodes, and could not be read after a restart.
+    `note(key, value)` is called for each change of one parameter (None: deleted); `since` are the changes after `tree`.
+    Changes inside `together()` are saved at its end.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class ParameterMirror:
 
     @property
     def bytes_limit(self) -> int:
-        """What all parameters together may weigh."""
+        """Return the limit in bytes for all parameters together."""
         return self.charges.pool.bounds.whole
 
     def check(self, key: str, depth: int) -> None:
@@ -68,12 +69,12 @@ class ParameterMirror:
         if len(parts_of(key)) + depth > self._depth_limit:
             raise ProtocolError(f"parameter {key[:80]} would nest deeper than {self._depth_limit} levels")
 
-    def reserve(self, key: str, weight: int, host: Address) -> "Reserved":
-        """Keep room for a value that a host is about to set. Raises `LimitReachedError` when there is none for it.
+    def reserve(self, key: str, weight: int, host: Address) -> "Reservation":
+        """Reserve room for a value that a host is about to set. Raises `LimitReachedError` if there is none.
 
-        What takes no more than one host had there takes the place of that: it is charged to this host if it has room,
-        and stays the other's if not. So whoever may write can always correct a parameter, and two hosts together get
-        no more than their shares.
+        A value that is not larger than the present one always has room: it is charged to this host within its quota,
+        else still to the previous owner. So a host can always correct a parameter, and two hosts together cannot exceed
+        their quotas.
         """
         pool = self.charges.pool
         parts, before = self._place_of(key)
@@ -82,20 +83,20 @@ class ParameterMirror:
         growth = max(0, after - held.get(host, 0))
         refusal = pool.take(host, growth) if growth else ""
         if not refusal:
-            return Reserved(pool, host, growth, weight)
+            return Reservation(pool, host, growth, weight)
         former, most = max(held.items(), key=lambda item: item[1])
         if after > most:
             raise LimitReachedError(f"parameter {key[:80]} is not set: {refusal}")
-        return Reserved(pool, former, 0, weight)
+        return Reservation(pool, former, 0, weight)
 
     def replace(self, tree: Tree) -> None:
-        """Take the tree that ROSMaster has."""
+        """Replace the mirror by the ROS master's tree."""
         self.tree = tree
         self._recount(final=True)
         self._changed()
 
-    def set(self, key: str, value: Value, reserved: "Reserved") -> None:
-        """`key` (canonical) has this value, which is the mirror's from now on; a dictionary replaces the namespace."""
+    def set(self, key: str, value: Value, reserved: "Reservation") -> None:
+        """Set `key` (canonical) to this value, which the mirror keeps; a dictionary replaces the namespace."""
         reserved.release()
         parts, before = self._place_of(key)
         self._put_in(key, value)
@@ -107,7 +108,7 @@ class ParameterMirror:
         self._changed()
 
     def delete(self, key: str) -> None:
-        """`key` (canonical) is gone."""
+        """Delete `key` (canonical), if it exists."""
         parts = parts_of(key)
         there, in_the_way = standing_at(self.tree, key)
         if not parts or there is None or in_the_way is not None:
@@ -124,11 +125,11 @@ class ParameterMirror:
         self.charges.recount(self.tree, final=final)
 
     def _place_of(self, key: str) -> tuple[tuple[str, ...], int]:
-        """The topmost key that is new, or another, when `key` is set; and what is there now, in bytes."""
+        """Return the topmost key that setting `key` would create or replace, and its present weight."""
         parts = parts_of(key)
         node: Value = self.tree
         for depth, part in enumerate(parts, 1):
-            assert isinstance(node, dict)  # noqa: S101 - the root is one, and no other goes on; narrows for mypy
+            assert isinstance(node, dict)  # noqa: S101 - true for the root and checked below; narrows for mypy
             if part not in node:
                 return parts[:depth], 0
             if depth == len(parts) or not isinstance(node[part], dict):
@@ -156,8 +157,8 @@ class ParameterMirror:
             node.pop(name, None)
 
 
-class Reserved:
-    """Room for a value of this weight until ROSMaster has it or refuses it; `owner` is charged for it."""
+class Reservation:
+    """Room for a value of this weight until the ROS master accepts or rejects it; `owner` is charged for it."""
 
     __slots__ = ("_amount", "_pool", "owner", "weight")
 
@@ -168,14 +169,14 @@ class Reserved:
         self.weight = weight
 
     def release(self) -> None:
-        """It is set, and charged as what it is; or it could not be."""
+        """Release the room, because the value is set and charged, or was rejected."""
         if self._amount:
             self._pool.give_back(self.owner, self._amount)
             self._amount = 0
 
 
 def _with_namespaces(key: str, first: int, weight: int) -> int:
-    """What a value of this weight takes with its name and those of its key from the `first` on, which are new."""
+    """Return the weight of a value with its name and the new namespaces of its key, from part `first` on."""
     if not first:
         return weight
     *namespaces, name = parts_of(key)[first - 1 :]

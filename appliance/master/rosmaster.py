@@ -1,16 +1,15 @@
-"""The hidden ROSMaster as control calls it: kept-alive connections, and a door that is shut while it is rebuilt.
+"""Call the hidden ROS master over kept-alive connections, behind a door that is shut while it is rebuilt.
 
-While ROSMaster is down, or up but not yet told everything again, calls of nodes wait at the door (bounded): a node
-that registers in that moment notices nothing but a delay. The reconcile loop shuts the door, passes it with
-`call_now`, and opens it.
+While the ROS master is down or not yet restored, calls of nodes wait at the door, for a limited time: a registering
+node notices only a delay. The reconcile loop shuts and opens the door, and passes it with `call_now`.
 
-Calls whose parameters and answers are a few names (`small` in the table of calls) go one after the other: what comes
-while one is under way waits for its answer, and then travels with all others that wait, as one `system.multicall`, in
-their order. ROSMaster is one Python process, which does one thing at a time anyway; under load this saves most of what
-two processes cost each other, and a call that finds nothing under way goes at once. The answers are taken apart again,
-so that nobody notices: a fault of one part is that part's fault. What may be large, slow or impossible to write (a
-parameter's value) travels alone: it could fail, and would take the calls of others with it. One caller's own run of
-calls, whose order counts, travels together by `in_order`.
+Calls whose parameters and answers are a few names (`small` in the table of calls) go one after the other. Calls that
+arrive while one is under way wait for its answer, and then travel together as one `system.multicall`, in their order.
+The ROS master is one Python process, which does one thing at a time anyway; under load this saves most of the cost of
+two processes. A call goes at once if no other is under way. The answers are separated again, so that callers see no
+difference: a fault of one part only affects that part. A call that may be large, slow or impossible to write (a
+parameter's value) travels alone: if it failed, the calls of others would fail with it. A caller's own sequence of
+calls, whose order matters, travels together by `in_order`.
 """
 
 import asyncio
@@ -30,15 +29,15 @@ from appliance.rpc.xmlrpc_client import BrokenOffError, CallFailedError, Refused
 from roswire.errors import EncodingError
 from roswire.parameter_tree import Tree
 from roswire.uris import NodeUri
-from roswire.xmlrpc import Limits, Value
+from roswire.xmlrpc import Value, XmlRpcLimits
 
-_LARGEST = 64  # parts of one multicall: what one slow part can hold up
+_LARGEST = 64  # the most parts of a multicall, which one slow part delays
 Wanted = tuple[str, tuple[Value, ...]]
 _Waiting = tuple[str, tuple[Value, ...], "asyncio.Future[Value]"]
 
 
 class BatchingClient:
-    """Makes calls that are `small` over `client`, one after the other: those that wait together go together."""
+    """A client that makes `small` calls over `client` one after the other, and sends waiting calls together."""
 
     def __init__(self, client: XmlRpcClient, small: Collection[str]) -> None:
         self._client = client
@@ -48,7 +47,7 @@ class BatchingClient:
         self._sending: asyncio.Task[None] | None = None
 
     async def call(self, method: str, *params: Value) -> Value:
-        """Call `method` and return its value. Raises `CallFailedError`, `EncodingError`."""
+        """Call `method` and return its value. Raises `CallFailedError` and `EncodingError`."""
         if method not in self._small:
             return await self._client.call(method, *params)
         if self._busy:
@@ -62,18 +61,18 @@ class BatchingClient:
             self._send_waiting()
 
     async def in_order(self, calls: Sequence[Wanted]) -> "list[Value | CallFailedError]":
-        """Make these calls as one, one after the other; the outcome of each.
+        """Make these calls in order, as one multicall; return the outcome of each.
 
-        Raises `CallFailedError` when there is no usable answer for any, `EncodingError` when nothing was sent.
+        Raises `CallFailedError` if the multicall has no usable answer, `EncodingError` if nothing was sent.
         """
         parts: list[Value] = [{"methodName": method, "params": list(params)} for method, params in calls]
         values = await self._client.call("system.multicall", parts)
         if not isinstance(values, list) or len(values) != len(calls):
-            raise CallFailedError("the ROS Master answered a multicall with another number of answers")
+            raise CallFailedError("the ROS master answered a multicall with another number of answers")
         return [_outcome(method, value) for (method, _params), value in zip(calls, values, strict=True)]
 
     def _send_waiting(self) -> None:
-        waiting = [entry for entry in self._waiting if not entry[2].done()]  # the others have been given up
+        waiting = [entry for entry in self._waiting if not entry[2].done()]  # the others were cancelled
         part, self._waiting = waiting[:_LARGEST], waiting[_LARGEST:]
         self._busy = bool(part)
         if part:
@@ -100,16 +99,16 @@ def _outcome(method: str, value: Value) -> "Value | CallFailedError":
         case [one]:
             return one
         case {"faultString": str(text)}:
-            return CallFailedError(f"the ROS Master answered {method} with a fault: {text}")
+            return CallFailedError(f"the ROS master answered {method} with a fault: {text}")
         case _:
-            return CallFailedError(f"the ROS Master answered {method} with nonsense")
+            return CallFailedError(f"the ROS master answered {method} with nonsense")
 
 
 def _settle(answer: "asyncio.Future[Value]", outcome: "Value | CallFailedError | EncodingError") -> None:
     if answer.done():
         return
     if isinstance(outcome, CallFailedError | EncodingError):
-        # Each caller raises an exception of its own: one object raised in many tasks would mix their tracebacks.
+        # Each caller gets its own exception: one object raised in many tasks would mix their tracebacks.
         answer.set_exception(type(outcome)(*outcome.args))
     else:
         answer.set_result(outcome)
@@ -118,8 +117,8 @@ def _settle(answer: "asyncio.Future[Value]", outcome: "Value | CallFailedError |
 _T = TypeVar("_T")
 
 
-def limits_of_answers(limits: Limits, parameters: int) -> Limits:
-    """What ROSMaster may answer: the whole parameter tree of `parameters` bytes, which `limits` let in by parts."""
+def limits_of_answers(limits: XmlRpcLimits, parameters: int) -> XmlRpcLimits:
+    """Return the limits of an answer: a parameter tree of `parameters` bytes, set by parts that `limits` allow."""
     return replace(
         limits,
         body=4 * parameters + limits.body,
@@ -130,16 +129,16 @@ def limits_of_answers(limits: Limits, parameters: int) -> Limits:
 
 
 class RosMaster:
-    """ROSMaster at `127.0.0.1:port`; `doubtful` is set when it seems to be gone. Times are seconds.
+    """The ROS master at `127.0.0.1:port`; `doubtful` is set when it seems to be gone. Times are in seconds.
 
-    Calls that are `small` travel together.
+    Concurrent `small` calls are sent together.
     """
 
     def __init__(
         self,
         port: int,
         *,
-        limits: Limits,
+        limits: XmlRpcLimits,
         small: Collection[str] = (),
         timeout: float = 10.0,
         hold: float = 15.0,
@@ -164,20 +163,20 @@ class RosMaster:
 
     @property
     def reachable(self) -> bool:
-        """Whether calls pass (ROSMaster is there and whole)."""
+        """Whether the door is open: the ROS master is there and complete, and no reconcile round runs."""
         return self._open.is_set()
 
     @property
     def whole(self) -> bool:
-        """Whether ROSMaster is there and knows everything, also while a look at it has calls wait for a moment."""
+        """Whether the ROS master is there and complete, even while a reconcile round has shut the door."""
         return not self._away
 
     async def call(self, method: str, *params: Value) -> Answer:
-        """Call for a node; waits while the door is shut. Raises `CallFailedError` when it stays shut."""
+        """Call for a node; wait while the door is shut. Raises `CallFailedError` if it stays shut."""
         return await self._call(lambda: self.call_now(method, *params))
 
     async def call_in_order(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
-        """The same for several calls, carried out one after the other: the outcome of each, for itself."""
+        """Make several calls in order, like `call`; return the outcome of each."""
         return await self._call(lambda: self._in_order(calls))
 
     async def _in_order(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
@@ -199,10 +198,10 @@ class RosMaster:
                     with contextlib.suppress(RefusedError, BrokenOffError):
                         return await self._pass(make)
         except TimeoutError:
-            raise CallFailedError(f"the ROS Master did not come back within {self._hold:g} s") from None
+            raise CallFailedError(f"the ROS master did not come back within {self._hold:g} s") from None
 
     async def _pass(self, make: Callable[[], Awaitable[_T]]) -> _T:
-        """Call through the open door; shuts it when nobody is behind it."""
+        """Call through the open door; shut it if the ROS master refuses or breaks the connection."""
         self._enter()
         try:
             return await make()
@@ -213,7 +212,7 @@ class RosMaster:
             self._leave()
 
     async def call_now(self, method: str, *params: Value) -> Answer:
-        """Call whether or not the door is open: for the reconcile loop."""
+        """Call even while the door is shut, for the reconcile loop. Raises `CallFailedError`."""
         answer = _answer_to(method, await self.calls.call(method, *params))
         if isinstance(answer, CallFailedError):
             raise answer
@@ -224,13 +223,13 @@ class RosMaster:
         self.doubtful.set()
 
     def shut(self) -> None:
-        """Let calls wait from now on: ROSMaster is away, or knows nothing yet."""
+        """Let calls wait from now on, because the ROS master is away or not yet restored."""
         self._open.clear()
         self._away = True
 
     @contextlib.asynccontextmanager
     async def alone(self) -> AsyncIterator[None]:
-        """Shut the door and wait until those inside have left; it opens again unless the work inside fails."""
+        """Shut the door, and wait until calls under way have ended; open it again unless the `with` block fails."""
         async with self._alone:
             self._open.clear()
             await self._empty.wait()
@@ -253,10 +252,10 @@ class RosMaster:
 
 
 async def together(calls: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
-    """Make these calls in their order, none waiting for the one before; what they return.
+    """Start these calls in order, without waiting for each other; return their results.
 
-    For who shuts the door: everybody waits for the last of what may be thousands. Raises `CallFailedError`; the others
-    are given up then.
+    Used while the door is shut and all other calls wait, because there may be thousands. Raises `CallFailedError` after
+    cancelling the others.
     """
     try:
         async with asyncio.TaskGroup() as group:
@@ -270,7 +269,7 @@ def _answer_to(method: str, value: Value) -> Answer | CallFailedError:
     if isinstance(value, list) and len(value) == 3 and isinstance(value[0], int):
         return value
     return CallFailedError(
-        f"the ROS Master answered {method} with something that is not [code, message, value]"
+        f"the ROS master answered {method} with something that is not [code, message, value]"
     )
 
 
@@ -280,7 +279,7 @@ _log = structlog.get_logger()
 
 
 def own_parameters() -> Tree:
-    """What `roscore` sets on a new ROSMaster; a fresh `/run_id` at each call."""
+    """Return the parameters that `roscore` sets on a new ROS master, with a new `/run_id`."""
     tree: Tree = {"run_id": str(uuid.uuid1()), "rosdistro": os.environ.get("ROS_DISTRO", "Debian") + "\n"}
     try:
         text = _PACKAGE.read_text(encoding="utf-8")

@@ -1,8 +1,8 @@
-"""What monitors say, on `/rosout`: lines of output, verdicts and faults as `rosgraph_msgs/Log`, if it is configured.
+"""Publish reports of monitors on `/rosout`, if configured: output, verdicts and faults as `rosgraph_msgs/Log`.
 
-Robot people look there (`rostopic echo /rosout_agg`, rqt_console). The audit log has everything; here come the first of
-each kind and second with its text, as the relay tells them, and no more than `_A_SECOND` in a second: how many more
-there were is said. As with a node's own logger, DEBUG is left out.
+ROS users look there (`rostopic echo /rosout_agg`, rqt_console). The audit log has everything. On `/rosout`, only the
+first report of each kind and second has its text, as the relay sends it, and at most `_A_SECOND` reports per second are
+published, with the number of further ones. As with a node's own logger, DEBUG is omitted.
 """
 
 import time
@@ -14,6 +14,8 @@ from roswire.definitions import Definitions
 from roswire.log_message import DEBUG, ERROR, FATAL, INFO, TYPE, WARN, log_message
 
 TOPIC = "/rosout"
+PUBLICATIONS = {TOPIC: TYPE}
+"""The published topic, and its type."""
 _A_SECOND = 50
 _LEVELS = {"DEBUG": DEBUG, "INFO": INFO, "WARN": WARN, "ERROR": ERROR, "FATAL": FATAL}
 _ALARMING = frozenset({"violation", "fail", "timeout"})  # categories of verdicts
@@ -21,9 +23,9 @@ _ALARMING = frozenset({"violation", "fail", "timeout"})  # categories of verdict
 
 @dataclass(slots=True)
 class Rosout:
-    """Puts reports of monitors on `/rosout` in the name of `node`; `publish(message)` sends one.
+    """The publisher of reports of monitors on `/rosout` in the name of `node`; `publish(message)` sends one.
 
-    `file_of(monitor)` is the file of its specification.
+    `file_of(monitor)` returns the file of its specification.
     """
 
     node: str
@@ -36,7 +38,7 @@ class Rosout:
     _left_out: int = 0
 
     def reported(self, event: MonitorEvent) -> None:
-        """A monitor did something; what is not output, a verdict or a fault is left to the audit log."""
+        """Publish output, a verdict or a fault of a monitor; other events are only in the audit log."""
         level, text = _words(event)
         if level < INFO:
             return
@@ -60,14 +62,14 @@ class Rosout:
 
 
 def header(definitions: Definitions) -> OwnHeaderStated:
-    """What the relay needs to know to serve the topic."""
+    """Return the header with which the relay serves the topic."""
     return OwnHeaderStated(TOPIC, TYPE, definitions.md5sum(TYPE), definitions.full_text(TYPE))
 
 
 def _words(event: MonitorEvent) -> tuple[int, str]:
-    """The level of a report and its text; level 0 of one that is not for `/rosout`.
+    """Return the level and the text of a report; level 0 if it is not for `/rosout`.
 
-    Of those that are told as a count, level or category stand in the text.
+    Reports with only a count have the level or category in their text.
     """
     text, level, category = event.text, event.detail.get("level"), event.detail.get("category")
     if event.count and event.kind == "log":

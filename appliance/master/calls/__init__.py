@@ -1,1 +1,1 @@
-"""The Master API: the way of a request, the table of calls, and what each call does."""
+"""The Master API: the path of a request, the table of calls, and the effect of each call."""

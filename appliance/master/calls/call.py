@@ -1,10 +1,10 @@
-"""The nouns of RVMaster: a row of a table of calls, and one attempt to make such a call.
+"""Define a row of a table of calls, and an attempt to make such a call.
 
-`table.py` has the Master API's rows, `node_calls.py` those of the outer face. A row names a method of the part that
-carries the call out; mypy holds the method's parameters against the row's.
+`call_table.py` has the Master API's rows, `node_calls.py` those of the proxy endpoint. A row names the method that
+carries the call out; mypy compares the method's parameters with the row's.
 
-Each parameter is turned into its one canonical value before a decision: a name becomes what ROSMaster would resolve it
-to; a URI is parsed; anything else is a `PeerError` that names the parameter, as ROSMaster's own validators would.
+Before a decision, each parameter is converted to its canonical value: a name is resolved like in the ROS master, a URI
+is parsed. An invalid value is a `PeerError` with the name of the parameter, like in the ROS master's own validators.
 """
 
 import enum
@@ -14,8 +14,9 @@ from typing import Any, Generic, NamedTuple, TypeVar, cast, overload
 
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.graph.registry import Kind
+from appliance.policy.commands import ALIASES, policy_call
 from appliance.policy.model import Category, Decision, Request, told_of
-from appliance.policy.rights import category_of, request_of, touch_of
+from appliance.policy.rights import request_of
 from roswire import names
 from roswire.errors import InvalidNameError, PeerError, ProtocolError
 from roswire.names import check_caller_id, check_tool_id
@@ -26,11 +27,11 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter(Generic[T]):
-    """One parameter of a call: its name in the ROS documentation, and how its value is made a canonical one.
+class CallParameter(Generic[T]):
+    """A parameter of a call: its name in the ROS documentation, and the conversion to its canonical value.
 
-    `recorded`: it is a resolved name, short, and what a reviewer asks for: the record of a command has it, and a call
-    with a kind is about the first of them.
+    `recorded`: the record of a command has this parameter, a resolved name. The first such parameter of a call with a
+    kind is its resource.
     """
 
     name: str
@@ -90,7 +91,7 @@ def _parameter_value(value: Value, _caller_id: str) -> Value:
 
 
 def _check_members(value: Value, place: str) -> None:
-    """A namespace's members are below it: ROSMaster would read a name like `/a` as the key of another parameter."""
+    """Raise for a member name such as `/a`, which the ROS master would read as the key of another parameter."""
     if not isinstance(value, dict):
         return
     for name, member in value.items():
@@ -117,27 +118,27 @@ def _protocols(value: Value, _caller_id: str) -> list[list[Value]]:
     return protocols
 
 
-TOPIC = Parameter("topic", _name, recorded=True)
-TOPIC_TYPE = Parameter("topic_type", _type)
-SERVICE = Parameter("service", _name, recorded=True)
-NODE = Parameter("node", _name, recorded=True)
-CALLER_API = Parameter("caller_api", _node_api)
-SERVICE_API = Parameter("service_api", _service_api)
-SUBGRAPH = Parameter("subgraph", _subgraph, recorded=True)
-KEY = Parameter("key", _key, recorded=True)
-SEARCH_KEY = Parameter("key", _search_key, recorded=True)
-VALUE = Parameter("value", _parameter_value)
-MESSAGE = Parameter("msg", _text)
-STATE = Parameter("state", _text)
-MONITORS = Parameter("monitors", _names)
-PROTOCOLS = Parameter("protocols", _protocols)
-METHOD = Parameter("method_name", _text)
+TOPIC = CallParameter("topic", _name, recorded=True)
+TOPIC_TYPE = CallParameter("topic_type", _type)
+SERVICE = CallParameter("service", _name, recorded=True)
+NODE = CallParameter("node", _name, recorded=True)
+CALLER_API = CallParameter("caller_api", _node_api)
+SERVICE_API = CallParameter("service_api", _service_api)
+SUBGRAPH = CallParameter("subgraph", _subgraph, recorded=True)
+KEY = CallParameter("key", _key, recorded=True)
+SEARCH_KEY = CallParameter("key", _search_key, recorded=True)
+VALUE = CallParameter("value", _parameter_value)
+MESSAGE = CallParameter("msg", _text)
+STATE = CallParameter("state", _text)
+MONITORS = CallParameter("monitors", _names)
+PROTOCOLS = CallParameter("protocols", _protocols)
+METHOD = CallParameter("method_name", _text)
 
 
 def canonicalise(
-    parameters: Sequence[Parameter[Any]], caller_id: str, values: Sequence[Value]
+    parameters: Sequence[CallParameter[Any]], caller_id: str, values: Sequence[Value]
 ) -> tuple[object, ...]:
-    """The canonical values of a call's parameters. Raises `PeerError` with the parameter's name."""
+    """Return the canonical values of a call's parameters. Raises `PeerError` with the parameter's name."""
     check_arity(parameters, values)
     canonical = []
     for parameter, value in zip(parameters, values, strict=True):
@@ -148,8 +149,8 @@ def canonicalise(
     return tuple(canonical)
 
 
-def check_arity(parameters: Sequence[Parameter[Any]], values: Sequence[Value]) -> None:
-    """Raise `ProtocolError`, with ROSMaster's words, unless there are as many values as the call takes."""
+def check_arity(parameters: Sequence[CallParameter[Any]], values: Sequence[Value]) -> None:
+    """Raise `ProtocolError`, with the ROS master's text, if the number of values is wrong."""
     if len(values) != len(parameters):
         raise ProtocolError("Error: bad call arity")
 
@@ -164,7 +165,7 @@ def _type_name(value: Value) -> str:
     return "nothing" if value is None else type(value).__name__
 
 
-_CLAIM_SHOWN = 1024  # characters of a caller_id that is no name
+_CLAIM_SHOWN = 1024  # characters of a caller_id that is not a name
 
 S = TypeVar("S")
 A = TypeVar("A")
@@ -173,99 +174,104 @@ C = TypeVar("C")
 
 
 class Identity(enum.Enum):
-    """What a call claims by its `caller_id`, and so what is checked of it."""
+    """The claim that a call makes with its `caller_id`, and the check of it."""
 
-    NODE = "node"  # makes the node part of the graph: [Nodes] must grant the name, nobody else may hold it
-    FREE = "free"  # nobody else may hold the name; it need not be a node's
+    NODE = "node"  # makes the node part of the graph: [Nodes] must grant the name, no other host may hold it
+    FREE = "free"  # no other host may hold the name, which need not be a node's
     NOBODY = "nobody"  # the call has no caller_id
 
 
-class Verb(enum.StrEnum):
-    """What a call does with what it is about."""
+class CallVerb(enum.StrEnum):
+    """The effect of a call on its resource."""
 
-    REGISTER = "register"  # a node has it from then on
-    UNREGISTER = "unregister"  # a node gives it up
-    CONNECT = "connect"  # the caller learns where to connect, and may from then on
-    READ = "read"  # nothing changes: an empty caller_id will do, and repetitions are counted in the audit log
-    WRITE = "write"  # a ROS parameter, which has the value that the call brings, or is gone if it brings none
+    REGISTER = "register"  # the node has the resource from then on
+    UNREGISTER = "unregister"  # the node gives the resource up
+    CONNECT = "connect"  # the caller gets an address, and may connect from then on
+    READ = "read"  # nothing changes: an empty caller_id is valid, and the audit log counts repetitions
+    WRITE = "write"  # a ROS parameter gets the value in the call, or is deleted if there is none
     DO = "do"  # anything else
 
 
 @dataclass(frozen=True, slots=True)
 class Method(Generic[S]):
-    """A method of `S` that carries a call out, and the parameters of the call that follow the caller_id."""
+    """A method of `S` that carries out a call, and the parameters of the call after the caller_id."""
 
     perform: Callable[..., Awaitable[Value]]
-    parameters: tuple[Parameter[Any], ...]
+    parameters: tuple[CallParameter[Any], ...]
 
 
 @overload
 def method(perform: Callable[[S, Caller], Awaitable[Value]], /) -> Method[S]: ...
 @overload
-def method(perform: Callable[[S, Caller, A], Awaitable[Value]], a: Parameter[A], /) -> Method[S]: ...
+def method(perform: Callable[[S, Caller, A], Awaitable[Value]], a: CallParameter[A], /) -> Method[S]: ...
 @overload
 def method(
-    perform: Callable[[S, Caller, A, B], Awaitable[Value]], a: Parameter[A], b: Parameter[B], /
+    perform: Callable[[S, Caller, A, B], Awaitable[Value]], a: CallParameter[A], b: CallParameter[B], /
 ) -> Method[S]: ...
 @overload
 def method(
     perform: Callable[[S, Caller, A, B, C], Awaitable[Value]],
-    a: Parameter[A],
-    b: Parameter[B],
-    c: Parameter[C],
+    a: CallParameter[A],
+    b: CallParameter[B],
+    c: CallParameter[C],
     /,
 ) -> Method[S]: ...
-def method(perform: Callable[..., Awaitable[Value]], /, *parameters: Parameter[Any]) -> Method[Any]:
-    """The method, and which parameter of the call each of its own is."""
+def method(perform: Callable[..., Awaitable[Value]], /, *parameters: CallParameter[Any]) -> Method[Any]:
+    """Return a method with the call's parameter for each of its own parameters."""
     return Method(perform, parameters)
 
 
 @dataclass(frozen=True, slots=True)
-class Call(Generic[S]):
-    """One row of a table of calls.
+class RosCall(Generic[S]):
+    """One row of a table of calls. The fields below `in_run` follow from the others and from the policy's row.
 
-    method      what carries it out, and its parameters; the first line of its docstring is `system.methodHelp`
-    verb        what it does, with a thing of this
-    kind        (None: it is decided by its name alone, whatever its parameters name)
-    denial      the value of a denied answer: of the type the call returns, so that no client library stumbles over it
-    identity    what is checked of the caller_id
-    command     the name that the policy knows it by, where that is another (`policy/rights` says what it needs)
+    method      the method that carries it out, and its parameters; `system.methodHelp` returns its docstring
+    verb        its effect on a resource
+    kind        the kind of the resource (None: it is decided by its name alone, whatever its parameters are)
+    denial      the value in a denial: of the type that the call returns, because client libraries check that
+    command     its name in the policy, if `policy/commands` does not derive it
     tells       the answer is the value of the ROS parameter, which may be a large tree
-    small       parameters and answer are a few names: calls of the same moment travel to ROSMaster as one
-    in_run      in a multicall it is decided, recorded and carried out together with its neighbours that are, too
+    small       parameters and answer are a few names: concurrent calls are sent to the ROS master as one
+    in_run      adjacent calls of this sort in a multicall are decided, recorded and carried out together
     """
 
     name: str
     method: Method[S]
-    verb: Verb
+    verb: CallVerb
     kind: Kind | None = None
     denial: Value = 0
-    identity: Identity = Identity.FREE
     command: str | None = None
     tells: bool = False
     small: bool = False
     in_run: bool = False
-    resource: int | None = field(init=False)  # which parameter names what it is about
-    api: int | None = field(init=False)  # which is the caller's own URI
-    policy_name: str = field(init=False)  # the name that the policy knows it by
-    category: Category = field(init=False)  # what kind of thing it is decided and recorded as
+    identity: Identity = field(init=False)  # the check of the caller_id
+    resource: int | None = field(init=False)  # the index of the parameter that is its resource
+    api: int | None = field(init=False)  # the index of the caller's own URI
+    policy_name: str = field(init=False)
+    category: Category = field(init=False)  # for decision and record
+    touches: Category | None = field(
+        init=False
+    )  # whether it reads or writes the ROS parameter that it is about
 
     def __post_init__(self) -> None:
         parameters = self.method.parameters
-        places = [place for place, parameter in enumerate(parameters) if parameter.recorded]
-        own = [place for place, parameter in enumerate(parameters) if parameter.name == "caller_api"]
-        object.__setattr__(self, "resource", None if self.kind is None else places[0])
-        object.__setattr__(self, "api", own[0] if own else None)
-        object.__setattr__(self, "policy_name", self.command or self.name)
-        object.__setattr__(self, "category", category_of(self.policy_name))
-
-    @property
-    def touches(self) -> Category | None:
-        """Whether it reads or writes the ROS parameter that it is about."""
-        return touch_of(self.policy_name)
+        name = self.command or ALIASES.get(self.name, self.name)
+        row = policy_call(name)
+        derived = {
+            "identity": Identity.NOBODY if row.wire else Identity.NODE if row.node else Identity.FREE,
+            "resource": None
+            if self.kind is None
+            else next(place for place, parameter in enumerate(parameters) if parameter.recorded),
+            "api": parameters.index(CALLER_API) if CALLER_API in parameters else None,
+            "policy_name": name,
+            "category": row.category,
+            "touches": row.touches,
+        }
+        for field_name, value in derived.items():
+            object.__setattr__(self, field_name, value)
 
     def attempt(self, caller: Caller, params: Sequence[Value]) -> "Attempt":
-        """The call with canonical arguments, and the caller with the name that it claims. Raises `PeerError`."""
+        """Return the call with canonical arguments and the claimed name of its caller. Raises `PeerError`."""
         if self.identity is Identity.NOBODY:
             return Attempt(caller, self, canonicalise(self.method.parameters, "", params))
         if not params:
@@ -277,7 +283,7 @@ class Call(Generic[S]):
             raise ProtocolError("caller_id must be a string")
         if self.identity is Identity.NODE:
             check_caller_id(caller_id)
-        elif caller_id or self.verb not in {Verb.READ, Verb.CONNECT}:
+        elif caller_id or self.verb not in {CallVerb.READ, CallVerb.CONNECT}:
             check_tool_id(caller_id)
         arguments = canonicalise(self.method.parameters, caller_id, given)
         return Attempt(caller.as_named(caller_id), self, arguments)
@@ -285,14 +291,12 @@ class Call(Generic[S]):
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """A call that was understood: who makes it, its row, and its arguments, canonical and as the row has them.
-
-    `resource` is the topic, service or ROS parameter that it is about, empty when it is about none; `request` what it
-    is decided and recorded as.
+    """A valid call: its caller, its row, and its canonical arguments in the row's order. `resource` is its topic,
+    service or ROS parameter, or empty; `request` is its form for the decision and the record.
     """
 
     caller: Caller
-    call: Call[Any]
+    call: RosCall[Any]
     arguments: tuple[object, ...]
     resource: str = field(init=False)
     request: Request = field(init=False)
@@ -306,18 +310,18 @@ class Attempt:
 
     @property
     def api(self) -> ApiUri | None:
-        """The URI that the caller gives for itself."""
+        """Return the URI that the caller gives for itself."""
         return None if self.call.api is None else cast(ApiUri, self.arguments[self.call.api])
 
     @property
     def value(self) -> Value:
-        """The value that a call which writes a ROS parameter brings; None for one that takes it away."""
-        brings = self.call.verb is Verb.WRITE and len(self.arguments) > 1
+        """Return the value for a ROS parameter that the call sets; None if it deletes the parameter."""
+        brings = self.call.verb is CallVerb.WRITE and len(self.arguments) > 1
         return cast(Value, self.arguments[1]) if brings else None
 
     @property
     def about(self) -> dict[str, str]:
-        """What a command is about (a parameter's key, a node's name), for the record: its resource is the command."""
+        """Return the recorded parameters of a command (a key, a node's name), whose resource is only its name."""
         if self.call.category is not Category.COMMAND:
             return {}
         return {
@@ -327,32 +331,32 @@ class Attempt:
         }
 
 
-class Served(NamedTuple):
-    """A row that is served, and the part whose method carries it out."""
+class ServedCall(NamedTuple):
+    """A served row, and the object whose method carries it out."""
 
-    call: Call[Any]
+    call: RosCall[Any]
     part: Any
 
 
-Table = Mapping[str, Served]
-"""What a listener serves, by the call's name."""
+Table = Mapping[str, ServedCall]
+"""The calls that a listener serves, by name."""
 
 
-def served(calls: Iterable[Call[S]], part: S) -> dict[str, Served]:
-    """These calls, carried out by this part."""
-    return {call.name: Served(call, part) for call in calls}
+def served(calls: Iterable[RosCall[S]], part: S) -> dict[str, ServedCall]:
+    """Return these calls by name, carried out by `part`."""
+    return {call.name: ServedCall(call, part) for call in calls}
 
 
 def denial_text(decision: Decision, record: str, tell: str) -> str:
-    """What a denied caller is told: as much of the reason as the policy lets be told, and the record's id."""
+    """Return the text for a denied caller: as much of the reason as the policy allows, and the record's id."""
     return with_record(told_of(decision, tell), record)
 
 
 def with_record(text: str, record: str) -> str:
-    """What is told of a refusal that has this record; it has none when it is one of many that are counted."""
+    """Add the id of the record to the text of a denial, unless it is empty."""
     return f"{text} [{record}]" if record else text
 
 
 def claimed_name(params: Sequence[Value]) -> str:
-    """Whom a call that is not understood says it is from, for the record."""
+    """Return the `caller_id` that a rejected call claims, for the record."""
     return params[0][:_CLAIM_SHOWN] if params and isinstance(params[0], str) else ""

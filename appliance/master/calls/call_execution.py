@@ -1,14 +1,14 @@
-"""One call, from its parameters to its answer: canonicalise → decide → record → perform.
+"""Carry out a call, from its parameters to its answer: canonicalise → decide → record → perform.
 
-1. A call is decided when it is its turn, by the policy and the registry of that moment. Calls that register wait for
-   those that register under the same name, writes of parameters for those that touch them; nothing else waits.
-2. Who is denied as things are is denied at once: it waits for nobody, and nobody waits for it. Who had to wait is
-   decided again when it is its turn; who had not, is not: nothing else ran in between.
-3. Whether the node that holds a name is still there only the network can say: it is asked before the turn.
-4. A policy that comes into force while a call is carried out decides again what that left: when the policy took back
-   what it denies, the registry and the relay did not have it yet.
+1. A call is decided in its turn, by the policy and the registry of that time. A registering call waits for earlier ones
+   of the same name, a write of a parameter for earlier ones that overlap with it. Other calls do not wait.
+2. A call that is denied at its arrival is denied at once, and other calls do not wait for it. A call that had to wait
+   is decided again in its turn. For any other call nothing ran in between, so its decision is still valid.
+3. Whether the node that holds a name is still there is probed over the network, before the turn.
+4. If a new policy comes into force while a call is carried out, the caller's rights are decided again afterwards,
+   because the policy's own revocation could not see the result of the call yet.
 
-What goes wrong on the way is an answer of the right shape for the caller, and a record; never an exception.
+An error becomes a record and a well-formed answer, never an exception.
 """
 
 import contextlib
@@ -20,12 +20,20 @@ import structlog
 
 from appliance.audit.record import Severity
 from appliance.master.caller import Answer, Caller
-from appliance.master.calls.call import Attempt, Call, Table, Verb, claimed_name, denial_text, with_record
-from appliance.master.calls.call_order import Claims, WriteTurns
-from appliance.master.calls.gate import Contest, Gate, contested
-from appliance.master.calls.parameter_calls import ParameterCalls, Write
+from appliance.master.calls.call import (
+    Attempt,
+    CallVerb,
+    RosCall,
+    Table,
+    claimed_name,
+    denial_text,
+    with_record,
+)
+from appliance.master.calls.call_order import KeyTurns
+from appliance.master.calls.gate import CallGate, NameConflict, contested
+from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
 from appliance.master.calls.registration import given_up
-from appliance.master.endpoints.endpoint_addresses import NoPortError
+from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.parameter_charges import LimitReachedError
 from appliance.master.reconcile.enactor import Enactor
@@ -39,12 +47,12 @@ from roswire.errors import EncodingError, PeerError, ProtocolError
 from roswire.xmlrpc import Value
 
 _log = structlog.get_logger()
-_REGISTERS = (Verb.REGISTER, Verb.UNREGISTER)
+_REGISTERS = (CallVerb.REGISTER, CallVerb.UNREGISTER)
 _FAILURES = (NoPortError, LimitReachedError, PeerError, EncodingError, CallFailedError)
 
 
-class Visit(NamedTuple):
-    """One request: the table that is served to it, who makes it, and its bulk."""
+class ServedRequest(NamedTuple):
+    """A request: the table that is served to it, its caller, and its bulk."""
 
     table: Table
     caller: Caller
@@ -53,12 +61,12 @@ class Visit(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Execution:
-    """Carries calls out. What brings a value of `large` bytes or more to ROSMaster waits for others that do.
+    """The execution of calls. A write of at least `large` bytes waits for other such writes.
 
-    `redecide_for(host, caller_id)` takes back what the policy in force does not allow one caller.
+    `redecide_for(host, caller_id)` revokes what the policy in force does not allow this caller.
     """
 
-    gate: Gate
+    gate: CallGate
     policy: Callable[[], Policy]
     trail: AuditTrail
     registry: Registry
@@ -68,11 +76,13 @@ class Execution:
     redecide_for: Callable[[Address, str], None]
     large: int
     large_writes: LargeWrites
-    _claims: Claims = field(default_factory=Claims, init=False)
-    _writes: WriteTurns = field(default_factory=WriteTurns, init=False)
+    _names: KeyTurns = field(default_factory=KeyTurns, init=False)
+    _writes: KeyTurns = field(default_factory=KeyTurns, init=False)
 
-    async def understand(self, visit: Visit, method: str, params: Sequence[Value]) -> Attempt | Answer:
-        """The call with its canonical arguments, nothing decided yet; the answer when there is none."""
+    async def understand(
+        self, visit: ServedRequest, method: str, params: Sequence[Value]
+    ) -> Attempt | Answer:
+        """Return the call with its canonical arguments, still undecided; if it is invalid, return its answer."""
         if method not in visit.table:
             return self._unknown(visit.caller, method, params)
         call = visit.table[method].call
@@ -83,37 +93,37 @@ class Execution:
         except PeerError as error:
             return self._malformed(call, visit.caller, claimed_name(params), error)
 
-    async def answer(self, visit: Visit, attempt: Attempt) -> Value:
+    async def answer(self, visit: ServedRequest, attempt: Attempt) -> Value:
         """Decide one call and carry it out."""
         if self.parameters.weight_of_answer(attempt) >= self.large:
             await visit.bulk.take()
         call, probe = attempt.call, None
-        registers, writes = call.verb in _REGISTERS, call.verb is Verb.WRITE
+        registers, writes = call.verb in _REGISTERS, call.verb is CallVerb.WRITE
         outcome = self._decide(attempt)
-        if isinstance(outcome, Contest):  # of two that register
+        if isinstance(outcome, NameConflict):  # only for registering calls
             probe = await self.liveness.probe(outcome.holder)
         elif not outcome.allowed or not (registers or writes):
             return await self._carry_out(visit, attempt, outcome)
         elif writes:
             return await self._in_turn(visit, attempt, outcome)
-        async with self._claims.alone(attempt.caller.caller_id) as later:
-            if later or isinstance(outcome, Contest):
+        async with self._names.of_name(attempt.caller.caller_id) as later:
+            if later or isinstance(outcome, NameConflict):
                 outcome = self._settled(attempt, probe)
             if call.kind is Kind.PARAMETER:
                 return await self._in_turn(visit, attempt, outcome)
             return await self._carry_out(visit, attempt, outcome)
 
-    async def _in_turn(self, visit: Visit, attempt: Attempt, outcome: Decision) -> Value:
-        """Carry out what writes a parameter, or hears of its writes, when nothing else writes it."""
+    async def _in_turn(self, visit: ServedRequest, attempt: Attempt, outcome: Decision) -> Value:
+        """Carry out a write of, or a subscription to, a parameter while no other call writes the parameter."""
         async with self._turn([attempt]) as later:
             if later:
                 outcome = self._settled(attempt)
             return await self._carry_out(visit, attempt, outcome)
 
-    async def answer_run(self, visit: Visit, run: Sequence[Attempt]) -> list[Value]:
-        """Decide calls that read and write parameters one by one, and carry them out in their order.
+    async def answer_run(self, visit: ServedRequest, run: Sequence[Attempt]) -> list[Value]:
+        """Decide reads and writes of parameters one by one, and carry them out as if in their order.
 
-        No call of the run reads what one before it writes, so reads are carried out first.
+        No call of the run reads a parameter that an earlier one writes, so all reads are carried out first.
         """
         if sum(map(self.parameters.weight_of_answer, run)) >= self.large:
             await visit.bulk.take()
@@ -121,7 +131,7 @@ class Execution:
         writing = [
             attempt
             for attempt, look in zip(run, looks, strict=True)
-            if look.allowed and attempt.call.verb is Verb.WRITE
+            if look.allowed and attempt.call.verb is CallVerb.WRITE
         ]
         if not writing:
             return await self._carry_out_run(visit, run, looks)
@@ -135,19 +145,19 @@ class Execution:
 
     @contextlib.asynccontextmanager
     async def _turn(self, attempts: Sequence[Attempt]) -> AsyncIterator[bool]:
-        """Wait until nothing else writes the parameters that these calls are about; whether there was anything.
+        """Wait until no other call writes the parameters of these calls; yield whether there was one.
 
-        Who subscribes to a parameter hears of every write after the value that answers, so that has a turn, too.
+        A subscription also has a turn, so that its node is notified of every write after the value in the answer.
         """
         keys = [attempt.resource for attempt in attempts if attempt.call.kind is Kind.PARAMETER]
         host, values = attempts[0].caller.peer.host, [attempt.value for attempt in attempts]
         async with self._writes.alone(keys) as later, self.large_writes.turn(host, values) as large:
             yield later or large
 
-    async def _carry_out(self, visit: Visit, attempt: Attempt, decision: Decision) -> Value:
+    async def _carry_out(self, visit: ServedRequest, attempt: Attempt, decision: Decision) -> Value:
         policy, verb = self.policy(), attempt.call.verb
         denied = self._recorded(attempt, decision)
-        if denied is not None and verb is Verb.UNREGISTER:
+        if denied is not None and verb is CallVerb.UNREGISTER:
             self.enactor.carry_out(given_up(self.registry, attempt))
         obstacle = await self._obstacle() if self.trail.strict else None
         if obstacle is not None:
@@ -155,12 +165,12 @@ class Execution:
         if denied is not None:
             return denied
         answer = await self._perform(visit, attempt)
-        if verb in {Verb.REGISTER, Verb.CONNECT} and self.policy() is not policy:
+        if verb in {CallVerb.REGISTER, CallVerb.CONNECT} and self.policy() is not policy:
             self.redecide_for(attempt.caller.peer.host, attempt.caller.caller_id)
         return answer
 
     async def _carry_out_run(
-        self, visit: Visit, run: Sequence[Attempt], decisions: Sequence[Decision]
+        self, visit: ServedRequest, run: Sequence[Attempt], decisions: Sequence[Decision]
     ) -> list[Value]:
         policy, version = self.policy(), self.registry.version
         answers: list[Value] = [
@@ -173,7 +183,7 @@ class Execution:
                 continue
             if obstacle is not None:
                 answers[place] = [0, obstacle, attempt.call.denial]
-            elif attempt.call.verb is Verb.WRITE:
+            elif attempt.call.verb is CallVerb.WRITE:
                 writes.append(place)
             else:
                 answers[place] = await self._perform(visit, attempt)
@@ -184,9 +194,9 @@ class Execution:
             stands = all(self._settled(one).allowed for one in wanted)
         if not wanted or stands:
             outcomes = await self.parameters.write(
-                [Write(one.caller, one.resource, one.value) for one in wanted]
+                [ParameterWrite(one.caller, one.resource, one.value) for one in wanted]
             )
-        else:  # it changed while a read waited for ROSMaster, or records for the disk
+        else:  # the policy or registry changed while a read waited for the ROS master, or records for the disk
             looks = [self._settled(one) for one in wanted]
             outcomes = await self._carry_out_run(visit, wanted, looks)
         for place, outcome in zip(writes, outcomes, strict=True):
@@ -195,7 +205,7 @@ class Execution:
 
     # --- decide and record ---
 
-    def _decide(self, attempt: Attempt) -> Decision | Contest:
+    def _decide(self, attempt: Attempt) -> Decision | NameConflict:
         caller = attempt.caller
         obstacle = self.trail.obstacle or ("" if caller.own else self.trail.shut_out(caller.peer.text))
         if obstacle:
@@ -203,12 +213,12 @@ class Execution:
         return self.gate.decide(attempt, self.parameters.mirror.tree)
 
     def _settled(self, attempt: Attempt, probe: Probe | None = None) -> Decision:
-        """The decision, with what is known of the node that holds the name."""
+        """Return the decision, in a name conflict by the probe of the node that holds the name."""
         outcome = self._decide(attempt)
-        return contested(outcome, probe) if isinstance(outcome, Contest) else outcome
+        return contested(outcome, probe) if isinstance(outcome, NameConflict) else outcome
 
     def _recorded(self, attempt: Attempt, decision: Decision) -> Answer | None:
-        """Record a decision; the answer of a denial, None for what is allowed."""
+        """Record a decision; return the answer of a denial, or None if the call is allowed."""
         request, call = attempt.request, attempt.call
         record = self.trail.decided(
             attempt.caller.asker,
@@ -216,13 +226,13 @@ class Execution:
             request.category.value,
             request.resource,
             decision,
-            reads=call.verb is Verb.READ and request.category is Category.COMMAND,
+            reads=call.verb is CallVerb.READ and request.category is Category.COMMAND,
             **attempt.about,
         )
         return None if decision.allowed else [0, self._told(decision, record), call.denial]
 
     async def _obstacle(self) -> str | None:
-        """What a caller is told when its record must be on disk before the answer, and cannot be."""
+        """Wait until the records are on disk; return the text of a denial if they cannot be, else None."""
         if await self.trail.durable() is None:
             return None
         return f"denied: {NOT_RECORDED}"
@@ -232,7 +242,7 @@ class Execution:
 
     # --- perform, and what can go wrong ---
 
-    async def _perform(self, visit: Visit, attempt: Attempt) -> Value:
+    async def _perform(self, visit: ServedRequest, attempt: Attempt) -> Value:
         call, part = visit.table[attempt.call.name]
         try:
             return await call.method.perform(part, attempt.caller, *attempt.arguments)
@@ -240,7 +250,7 @@ class Execution:
             return self._failed(attempt, error)
 
     def _failed(self, attempt: Attempt, error: Exception) -> Answer:
-        """The answer to a call that was allowed and could not be carried out."""
+        """Return the answer to an allowed call that could not be carried out."""
         caller, call = attempt.caller, attempt.call
         match error:
             case NoPortError() | LimitReachedError():
@@ -262,9 +272,9 @@ class Execution:
                 wrong = ProtocolError(f"cannot be passed on: {error}")
                 return self._malformed(call, caller, caller.caller_id, wrong)
             case CallFailedError():
-                # The text names the hidden ROSMaster's address: it is for our log, not for a node.
+                # The text contains the hidden ROS master's address, so it is only logged.
                 _log.error("call failed", call=call.name, caller_id=caller.caller_id, error=str(error))
-                return [0, "the ROS Master does not answer; the appliance is bringing it back", call.denial]
+                return [0, "the ROS master does not answer; the appliance is bringing it back", call.denial]
         raise error
 
     def _unknown(self, caller: Caller, method: str, params: Sequence[Value]) -> Answer:
@@ -273,7 +283,7 @@ class Execution:
         record = self.trail.decided(caller.asker, method, Category.COMMAND.value, method[:200], decision)
         return [0, self._told(decision, record), 0]
 
-    def _malformed(self, call: Call[object], caller: Caller, claimed: str, error: PeerError) -> Answer:
+    def _malformed(self, call: RosCall[object], caller: Caller, claimed: str, error: PeerError) -> Answer:
         self.trail.happened(
             "malformed",
             str(error),

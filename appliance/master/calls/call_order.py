@@ -1,49 +1,50 @@
-"""Calls that touch each other are carried out one after the other: registrations by name, writes of parameters by key.
+"""Serialise overlapping calls: registrations with the same name, writes of overlapping parameter keys.
 
-Between the decision on a registration and ROSMaster's answer the registry does not know of it yet. Two hosts that
-register a free name at the same moment would both be told that it is free, and the later one would take it from the
-other. So the calls that make a node part of the graph wait for each other, name by name; a decision is made when it
-is the caller's turn. Who finds nobody before him enters without letting anything else run in between: what was decided
-just before stands.
+The registry gets a registration only after the ROS master's answer. Two hosts that register a free name at the same
+time would both be allowed, and the later one would take the name from the other. So registering calls of a name wait
+for each other, and are decided in their turn. A call that need not wait enters without a switch of tasks, so its
+decision is still valid.
 
-A write is decided by what is there: a value that stands where it needs a namespace is written, too. Between the
-decision and ROSMaster's answer another write could put such a value there, which nobody would have asked about. And
-two writes of one key that travel on two connections could reach ROSMaster in another order than the mirror. So
-whoever writes a key waits for those who came before and write it, something above it or something below it; a
-decision is made when it is the writer's turn.
+The decision on a write depends on the present tree: a plain value in place of a namespace that the key needs is
+overwritten too. Until the ROS master's answer, another write could set such a value, which the decision did not cover.
+Two writes of one key could also reach the ROS master and the mirror in different orders. So a write waits for earlier
+writes of its key or of keys above or below it, and is decided in its turn.
 """
 
 import asyncio
-from collections import deque
 from collections.abc import Collection
 
 
-class WriteTurns:
-    """The writes that are under way or wait, in the order they came."""
+class KeyTurns:
+    """The turns of running and waiting calls, in order of arrival."""
 
     def __init__(self) -> None:
-        self._turns: dict[WriteTurn, None] = {}
+        self._turns: dict[KeyTurn, None] = {}
 
     def __len__(self) -> int:
         return len(self._turns)
 
-    def alone(self, keys: Collection[str]) -> "WriteTurn":
-        """To be the only one who writes these keys (canonical), what is above and what is below them: `async with`."""
-        return WriteTurn(self._turns, _ended(keys))
+    def alone(self, keys: Collection[str]) -> "KeyTurn":
+        """Return an `async with` that waits for earlier calls with these canonical keys, or with overlapping ones."""
+        return KeyTurn(self._turns, _ended(keys))
+
+    def of_name(self, name: str) -> "KeyTurn":
+        """Return an `async with` that waits for earlier calls with exactly this name."""
+        return self.alone([name.replace("/", ".")])
 
 
-class WriteTurn:
-    """One write: entered when those before it that touch it are done."""
+class KeyTurn:
+    """The turn of a call: entered when earlier overlapping calls are done."""
 
     __slots__ = ("_done", "_keys", "_turns")
 
-    def __init__(self, turns: "dict[WriteTurn, None]", keys: tuple[str, ...]) -> None:
+    def __init__(self, turns: "dict[KeyTurn, None]", keys: tuple[str, ...]) -> None:
         self._turns = turns
         self._keys = keys
-        self._done: asyncio.Event | None = None  # made for who waits for this one
+        self._done: asyncio.Event | None = None  # made for calls that wait for this one
 
     async def __aenter__(self) -> bool:
-        """Whether it had to wait."""
+        """Wait for the turn; return whether there was a call to wait for."""
         before = [turn for turn in self._turns if self._touches(turn)]
         self._turns[self] = None
         try:
@@ -58,7 +59,7 @@ class WriteTurn:
         self._end()
 
     def done(self) -> asyncio.Event:
-        """Set when this one has ended."""
+        """Return an event that is set when this call has ended."""
         if self._done is None:
             self._done = asyncio.Event()
             if self not in self._turns:
@@ -70,74 +71,19 @@ class WriteTurn:
         if self._done is not None:
             self._done.set()
 
-    def _touches(self, other: "WriteTurn") -> bool:
+    def _touches(self, other: "KeyTurn") -> bool:
         return _meet(self._keys, other._keys)
 
 
 def touch(keys: Collection[str], others: Collection[str]) -> bool:
-    """Whether a key of one side is, or is above, one of the other side."""
+    """Whether a key of one side equals, or is above, a key of the other side."""
     return _meet(_ended(keys), _ended(others))
 
 
 def _ended(keys: Collection[str]) -> tuple[str, ...]:
-    """The keys with a slash at their end: one is above another if it is how the other begins."""
+    """Return the keys with a slash at the end, so that a key above another is a prefix of it."""
     return tuple({key if key == "/" else f"{key}/" for key in keys})
 
 
 def _meet(mine: tuple[str, ...], others: tuple[str, ...]) -> bool:
     return any(key.startswith(others) for key in mine) or any(other.startswith(mine) for other in others)
-
-
-class Claims:
-    """The names that are in use at the moment, each with those who wait for it; nothing is kept of other names."""
-
-    def __init__(self) -> None:
-        self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
-
-    def __len__(self) -> int:
-        return len(self._waiting)
-
-    def alone(self, name: str) -> "Claim":
-        """To be the only one who registers under this name, first come, first served: `async with`."""
-        return Claim(self._waiting, name)
-
-
-class Claim:
-    """One registering call: entered when those before it under its name have ended."""
-
-    __slots__ = ("_name", "_waiting")
-
-    def __init__(self, waiting: dict[str, deque[asyncio.Future[None]]], name: str) -> None:
-        self._waiting = waiting
-        self._name = name
-
-    async def __aenter__(self) -> bool:
-        """Whether it had to wait."""
-        before = self._waiting.get(self._name)
-        if before is None:
-            self._waiting[self._name] = deque()
-            return False
-        turn = asyncio.get_running_loop().create_future()
-        before.append(turn)
-        try:
-            await turn
-        except asyncio.CancelledError:
-            if turn.cancelled():
-                before.remove(turn)
-            else:  # it was its turn already
-                self._end()
-            raise
-        return True
-
-    async def __aexit__(self, *_error: object) -> None:
-        self._end()
-
-    def _end(self) -> None:
-        """The next one is let in; one that was cancelled and has not run since is no more there."""
-        waiting = self._waiting[self._name]
-        turn = next((future for future in waiting if not future.done()), None)
-        if turn is None:
-            del self._waiting[self._name]
-        else:
-            waiting.remove(turn)
-            turn.set_result(None)

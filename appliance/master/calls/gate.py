@@ -1,8 +1,8 @@
-"""The one decision point: the policy first, then the binding of claims to hosts, then the limits per host.
+"""Decide calls: by the policy first, then by the limits per host and the binding of names to hosts.
 
-`Gate.decide` is a function of the running policy, the registry and the parameters; it forwards nothing and records
-nothing. A question that only the network can answer (is the node that holds this name still there?) is returned as
-`Contest`, and asked again with the answer.
+`CallGate.decide` is a function of the running policy, the registry and the parameters, without side effects. If the
+decision depends on whether the node that holds a name is still there, it returns a `NameConflict`; `contested` then
+decides by the probe of that node.
 """
 
 import ipaddress
@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.master.caller import ApiUri, Caller
-from appliance.master.calls.call import Attempt, Identity, Verb
-from appliance.master.graph.own_node import OWN, ROSOUT
+from appliance.master.calls.call import Attempt, CallVerb, Identity
+from appliance.master.graph.own_node import OWN, PARAMETERS, ROSOUT, rosout_may_have
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.reconcile.liveness import Presence, Probe
 from appliance.policy.model import Address, Category, Decision
@@ -26,8 +26,8 @@ _TIMES_THE_REST = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Contest:
-    """Another host holds the name; the call is granted only if its node is gone. `decision` is then the answer."""
+class NameConflict:
+    """Another host holds the name; the call gets `decision` only if the node `holder` is gone."""
 
     holder: Incarnation
     decision: Decision
@@ -35,23 +35,23 @@ class Contest:
 
 @dataclass(frozen=True, slots=True)
 class HostLimits:
-    """How much of the registry one host may take."""
+    """The limits of a host in the registry, and of all hosts together."""
 
     nodes: int = 500
     registrations: int = NAMES.bounds.host
     registrations_in_all: int = NAMES.bounds.whole
 
 
-class Gate:
-    """Decides calls by the policy that `policy()` returns at that moment."""
+class CallGate:
+    """The decision point for calls, by the policy that `policy()` returns at the time of a call."""
 
     def __init__(self, policy: Callable[[], Policy], registry: Registry, limits: HostLimits) -> None:
         self._policy = policy
         self._registry = registry
         self._limits = limits
 
-    def decide(self, attempt: Attempt, tree: Tree) -> Decision | Contest:
-        """Whether the caller may make this call, while `tree` are the parameters."""
+    def decide(self, attempt: Attempt, tree: Tree) -> Decision | NameConflict:
+        """Return the decision on a call, given the parameters `tree`."""
         caller, call = attempt.caller, attempt.call
         if caller.own:
             return _of_own_node(attempt)
@@ -67,7 +67,7 @@ class Gate:
         denial = None
         if attempt.api is not None:
             denial = self._late(caller, attempt.api)
-            if denial is None and call.verb is not Verb.UNREGISTER:
+            if denial is None and call.verb is not CallVerb.UNREGISTER:
                 denial = (
                     self._taken(attempt)
                     or _unreachable(caller, attempt.api)
@@ -85,7 +85,7 @@ class Gate:
             )
         return None
 
-    def _bound(self, attempt: Attempt, decision: Decision) -> Decision | Contest:
+    def _bound(self, attempt: Attempt, decision: Decision) -> Decision | NameConflict:
         caller, call = attempt.caller, attempt.call
         holder = self._registry.holder(caller.caller_id)
         if holder is None:
@@ -94,15 +94,15 @@ class Gate:
             return _no(f"the name {holder.name} belongs to the appliance")
         if holder.host == caller.peer.host:
             return decision
-        if call.verb is Verb.REGISTER and call.kind is not Kind.PARAMETER:
+        if call.verb is CallVerb.REGISTER and call.kind is not Kind.PARAMETER:
             if self._policy().takeover == "granted":
                 return decision
-            return Contest(holder, decision)
+            return NameConflict(holder, decision)
         held, other = f"{caller.caller_id} is held by", f"{caller.peer.host} cannot speak for it"
         return _no(f"{held} {holder.host}; {other}", told=f"{held} a node of another host; {other}")
 
     def _taken(self, attempt: Attempt) -> Decision | None:
-        """A service has one provider, the last who registers it; what the appliance offers nobody takes from it."""
+        """Deny registering a service of the appliance, because a service goes to the last provider."""
         if attempt.call.kind is Kind.SERVICE:
             for provider in self._registry.registered(Kind.SERVICE, attempt.resource):
                 if provider.of_monitors:
@@ -110,9 +110,9 @@ class Gate:
         return None
 
     def is_own_subscriber(self, caller: Caller, topic: str) -> bool:
-        """Whether a node of the appliance calls another node, at its outer face, for a topic that it subscribed to.
+        """Whether one of the appliance's own nodes calls a proxy endpoint for a topic to which it is subscribed.
 
-        RVMaster has a listener for the appliance's own nodes, the faces have not.
+        Unlike RVMaster, proxy endpoints have no separate listener for the appliance's own nodes.
         """
         holder = self._registry.holder(caller.caller_id) if caller.peer.here else None
         return holder is not None and holder.own and (Kind.SUBSCRIPTION, topic) in holder.registrations
@@ -131,10 +131,10 @@ class Gate:
         return None
 
     def _too_many_names(self, host: Address) -> Decision | None:
-        """Hosts that the policy names as one network count as one: nobody gains by many addresses."""
+        """Deny a registration of a host with too many names; hosts of one network in the policy count as one host."""
         left = max(0, self._limits.registrations_in_all - self._registry.registrations)
         if self._registry.registrations < _TIMES_THE_REST * left:
-            return None  # nobody has so many
+            return None  # no host has that many
         policy = self._policy()
         named = policy.named_as(host)
         mine = sum(
@@ -151,7 +151,7 @@ class Gate:
         )
 
     def to_make_room(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        """The node of the caller's host that is gone and goes for good, so that a new one has room."""
+        """Return an unused or lost node of the caller's host to evict, if a new node would exceed the limit."""
         return self._registry.spare_of(caller.peer.host) if self._is_one_too_many(caller, api) else None
 
     def _is_one_too_many(self, caller: Caller, api: ApiUri) -> bool:
@@ -163,24 +163,24 @@ class Gate:
 
 
 def _of_own_node(attempt: Attempt) -> Decision:
-    """The appliance's own node has the rights that are written at it, whatever the policy says."""
+    """Decide calls of the appliance's own nodes: only rosout's defined rights are granted, whatever the policy says."""
     caller_id, call = attempt.caller.caller_id, attempt.call
     known = False
-    if caller_id != ROSOUT.name:
+    if caller_id != ROSOUT:
         what = f"speak as {caller_id[:80] or 'nobody'}"
-    elif call.verb in {Verb.REGISTER, Verb.UNREGISTER} and call.kind is not None:
-        known = ROSOUT.may_have(call.kind, attempt.resource)
+    elif call.verb in {CallVerb.REGISTER, CallVerb.UNREGISTER} and call.kind is not None:
+        known = rosout_may_have(call.kind, attempt.resource)
         what = f"have the {call.kind} {attempt.resource}"
-    elif call.verb is Verb.READ and attempt.resource:
-        known = attempt.resource in ROSOUT.parameters
+    elif call.verb is CallVerb.READ and attempt.resource:
+        known = attempt.resource in PARAMETERS
         what = f"read the parameter {attempt.resource}"
     else:
         what = f"call {call.name}"
-    return Decision(known, None, OWN if known else f"{ROSOUT.name} is {OWN} and may not {what}")
+    return Decision(known, None, OWN if known else f"{ROSOUT} is {OWN} and may not {what}")
 
 
 def _unreachable(caller: Caller, api: ApiUri) -> Decision | None:
-    """A node that listens on its own loopback cannot be called from another host, whatever the policy says."""
+    """Deny registrations with a loopback URI from another host: other hosts could not call that node."""
     if caller.peer.host.is_loopback or not _is_loopback(api.uri.host):
         return None
     return _no(
@@ -189,8 +189,8 @@ def _unreachable(caller: Caller, api: ApiUri) -> Decision | None:
     )
 
 
-def contested(contest: Contest, probe: Probe | None) -> Decision:
-    """The decision of a contest, once the holder's node was probed; not, when another has come to hold the name."""
+def contested(contest: NameConflict, probe: Probe | None) -> Decision:
+    """Return the decision on a name conflict by the probe of the holder; a missing or outdated probe denies."""
     holder = contest.holder
     if probe is not None and probe.holder is holder:
         if probe.presence is Presence.GONE:
@@ -227,5 +227,5 @@ def _is_loopback(host: str) -> bool:
 
 
 def _no(reason: str, told: str | None = None) -> Decision:
-    """A denial by no rule; `told` where the reason names another host."""
+    """Return a denial without a rule; `told` is the text for the caller if the reason names another host."""
     return Decision(False, None, reason, told=told)

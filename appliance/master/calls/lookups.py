@@ -1,13 +1,13 @@
-"""The calls that ask about the graph, and RVMaster's own."""
+"""Answer the calls about the graph and about RVMaster itself."""
 
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.master.caller import Answer, Caller
-from appliance.master.endpoints.endpoint_addresses import Addresses
+from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.graph.graph import Graph
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.reconcile.enactor import Enactor
@@ -17,19 +17,18 @@ from roswire.xmlrpc import Value
 
 @dataclass(frozen=True, slots=True)
 class LookupCalls:
-    """Answers from the registry, with what stands for nodes and services.
+    """The lookup calls, answered from the registry with the proxies of nodes and services.
 
-    That has what ROSMaster took and the policy leaves, and is there while ROSMaster is not.
-
-    `port` is RVMaster's, `stop(reason)` ends the appliance. `unseen` is a publisher that `getSystemState` leaves out.
+    The registry has all registrations that the ROS master accepted and the policy allows, also while the ROS master is
+    away. `port` is RVMaster's port, `stop(reason)` ends the appliance, `getSystemState` omits the publisher `unseen`.
     """
 
     registry: Registry
-    graph: Graph
+    graph: RosGraph
     enactor: Enactor
     relay: RelayControl
     mediation: Mediation
-    addresses: Addresses
+    addresses: AdvertisedAddresses
     port: int
     stop: Callable[[str], None]
     unseen: str | None = None

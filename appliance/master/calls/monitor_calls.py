@@ -1,4 +1,4 @@
-"""The calls of ROSRV's tools: which monitors there are, which are enabled, where their topics are carried."""
+"""Answer the calls of ROSRV's tools: list and switch monitors, and locate their topics."""
 
 from dataclasses import dataclass
 from typing import cast
@@ -8,7 +8,7 @@ from appliance.master.caller import Answer, Caller
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.registry import Kind, Registry
 from appliance.specifications.specification_files import SpecificationsRefusedError
-from appliance.specifications.specifications import Monitors, UnknownMonitorError
+from appliance.specifications.specification_manager import SpecificationManager, UnknownMonitorError
 from roswire.xmlrpc import Value
 
 _WORDS = {"enable": True, "disable": False}
@@ -17,9 +17,9 @@ _NOBODY = (0, 0)
 
 @dataclass(frozen=True, slots=True)
 class MonitorCalls:
-    """Asks and switches monitors. `real_port` is ROSMaster's, `port` RVMaster's."""
+    """The calls about monitors. `real_port` is the port of the ROS master, `port` that of RVMaster."""
 
-    monitors: Monitors
+    monitors: SpecificationManager
     registry: Registry
     relay: RelayControl
     real_port: int
@@ -51,12 +51,12 @@ class MonitorCalls:
     async def get_rv_state(self, _caller: Caller) -> Answer:
         """`getRVState(caller_id)` → `[real port, RVMaster's port, [[monitor, topic, XML-RPC port, TCP port], …]]`.
 
-        The ports are those that stand for each publisher of the topic; 0 for a topic that nobody publishes.
+        The ports are those of each publisher's proxy endpoint and relay; 0 for a topic without a publisher.
         """
         return [1, "RV State", cast(Value, self.rv_state())]
 
     def rv_state(self) -> list[object]:
-        """The value of `getRVState`."""
+        """Return the value of `getRVState`."""
         rows: list[list[object]] = []
         for monitor, topics in self.monitors.checked.topics.items():
             for topic in sorted(topics):

@@ -1,9 +1,9 @@
-"""`system.multicall`: the parts are answered in their order, and a part that fails holds up no other.
+"""Answer `system.multicall`: the parts are carried out in order, and a failed part does not affect the others.
 
-Roslaunch clears and sets parameters in one multicall, and the order is what counts. Calls that read and write
-parameters and follow each other are a *run*: each is decided and recorded by itself, they wait for the disk and for
-ROSMaster once. A read of what a run writes begins the next. Every run, and every other part, waits for the one before
-it; after each, other hosts may have their turn.
+roslaunch clears and sets parameters in one multicall, and relies on the order. Adjacent reads and writes of parameters
+form a *run*: each is decided and recorded separately, but they wait for the disk and for the ROS master only once. A
+read of a parameter that the run writes begins the next run. Each run or other part waits for the previous one; after
+each of them, other hosts have their turn.
 """
 
 import asyncio
@@ -11,8 +11,8 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from appliance.master.calls.call import Attempt, Verb, with_record
-from appliance.master.calls.call_execution import Execution, Visit
+from appliance.master.calls.call import Attempt, CallVerb, with_record
+from appliance.master.calls.call_execution import Execution, ServedRequest
 from appliance.master.calls.call_order import touch
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.policy.model import Category
@@ -22,8 +22,8 @@ from roswire.xmlrpc import Value
 
 MULTICALL = "system.multicall"
 PARSE_FAULT, LIMIT_FAULT = -32700, -32600
-_LONGEST_RUN = 64  # parts that reach ROSMaster in one request
-_LONGEST_READING = 8  # parts of a run that reads: each is answered before others have their turn
+_LONGEST_RUN = 64  # the most parts that reach the ROS master in one request
+_LONGEST_READING = 8  # the most parts of a run with reads, all answered before others have their turn
 _FORM = "a part of a multicall has methodName and params, nothing else"
 
 _Parts = deque["Value | Attempt"]
@@ -31,15 +31,15 @@ _Parts = deque["Value | Attempt"]
 
 @dataclass(frozen=True, slots=True)
 class Multicall:
-    """Answers multicalls. The answers to one have as many bytes as one call can be answered."""
+    """The answers to multicalls. All answers to one multicall together have at most `mirror.bytes_limit` bytes."""
 
     execution: Execution
     parameters: ParameterCalls
     trail: AuditTrail
     offload: int
 
-    async def answer(self, visit: Visit, params: tuple[Value, ...]) -> Value:
-        """The answers to the parts of one multicall."""
+    async def answer(self, visit: ServedRequest, params: tuple[Value, ...]) -> Value:
+        """Return the answers to the parts of one multicall."""
         if len(params) != 1 or not isinstance(params[0], list):
             why = "system.multicall takes one list of calls"
             self._refused(visit, why)
@@ -61,20 +61,20 @@ class Multicall:
             return results + [self._fault(visit, LIMIT_FAULT, "limit exceeded", why)] * len(left)
         return results
 
-    async def _why_no_more(self, visit: Visit, room: int) -> str:
-        """Why no more parts are carried out; empty when they are."""
+    async def _why_no_more(self, visit: ServedRequest, room: int) -> str:
+        """Return why no more parts are carried out, or an empty string."""
         if room <= 0:
             return f"the answers to a multicall have more than {self.parameters.mirror.bytes_limit} bytes"
         return await self.trail.still_owing(visit.caller.peer.text)
 
-    async def _run(self, visit: Visit, left: "_Parts", room: int) -> "_Run":
-        """The next parts, which are taken from those that are left, as they were understood."""
+    async def _run(self, visit: ServedRequest, left: "_Parts", room: int) -> "_Run":
+        """Parse the next parts of a run, and remove them from `left`."""
         run = _Run()
         weight, most = 0, min(room, self.offload)
         while left and len(run.answers) < run.longest and weight < most and _in_run(visit, left[0]):
             attempt = await self._understand(visit, left[0])
             if isinstance(attempt, Attempt):
-                if attempt.call.verb is Verb.WRITE:
+                if attempt.call.verb is CallVerb.WRITE:
                     run.written.append(attempt.resource)
                 elif touch([attempt.resource], run.written):
                     left[0] = attempt
@@ -87,12 +87,12 @@ class Multicall:
             run.answers.append(None if isinstance(attempt, Attempt) else attempt)
         return run
 
-    async def _one(self, visit: Visit, part: "Value | Attempt") -> Value:
+    async def _one(self, visit: ServedRequest, part: "Value | Attempt") -> Value:
         attempt = await self._understand(visit, part)
         return [await self.execution.answer(visit, attempt)] if isinstance(attempt, Attempt) else attempt
 
-    async def _understand(self, visit: Visit, part: "Value | Attempt") -> "Value | Attempt":
-        """A part as it was understood; else what stands for it in the answer."""
+    async def _understand(self, visit: ServedRequest, part: "Value | Attempt") -> "Value | Attempt":
+        """Return a part as an attempt; if it is invalid, return its entry in the answer."""
         match part:
             case Attempt():
                 return part
@@ -103,19 +103,19 @@ class Multicall:
                 return attempt if isinstance(attempt, Attempt) else [attempt]
         return self._refused(visit, _FORM)
 
-    async def _weigh(self, visit: Visit, answers: list[Value]) -> int:
-        """About how many bytes answers have, which are kept until the other parts have theirs."""
+    async def _weigh(self, visit: ServedRequest, answers: list[Value]) -> int:
+        """Return the approximate size of answers, which stay in memory until all parts are answered."""
         weight = weigh(answers, self.offload)
         if weight < self.offload:
             return weight
         await visit.bulk.take()
         return await visit.bulk.in_thread(weigh, answers, self.parameters.mirror.bytes_limit)
 
-    def _refused(self, visit: Visit, why: str) -> Value:
+    def _refused(self, visit: ServedRequest, why: str) -> Value:
         return self._fault(visit, PARSE_FAULT, "malformed", why)
 
-    def _fault(self, visit: Visit, code: int, event: str, why: str) -> Value:
-        """A fault in the place of a part's answer, recorded as this event."""
+    def _fault(self, visit: ServedRequest, code: int, event: str, why: str) -> Value:
+        """Record an event, and return a fault in place of a part's answer."""
         record = self.trail.happened(
             event,
             why,
@@ -129,7 +129,7 @@ class Multicall:
 
 @dataclass(slots=True)
 class _Run:
-    """Parts that are carried out together, and their answers (None: that of an attempt)."""
+    """The parts that are carried out together, and their answers (None: the attempt is not carried out yet)."""
 
     answers: list[Value] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
@@ -138,16 +138,16 @@ class _Run:
 
     @property
     def longest(self) -> int:
-        """The number of parts that it may have."""
+        """Return the largest number of parts."""
         return _LONGEST_READING if self.reads else _LONGEST_RUN
 
     def answered(self, attempts: Iterable[Value]) -> list[Value]:
-        """All answers, with those of the attempts."""
+        """Return the answers to all parts, given those to the attempts."""
         given = iter(attempts)
         return [[next(given)] if answer is None else answer for answer in self.answers]
 
 
-def _in_run(visit: Visit, part: "Value | Attempt") -> bool:
+def _in_run(visit: ServedRequest, part: "Value | Attempt") -> bool:
     if isinstance(part, Attempt):
         return part.call.in_run
     name = part.get("methodName") if isinstance(part, dict) else None

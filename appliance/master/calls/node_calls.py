@@ -1,10 +1,10 @@
-"""The outer face: the node API that other nodes and tools call, answered as if the appliance were not there.
+"""Answer the node API on a proxy endpoint, which other nodes and tools call as if it were the node itself.
 
-`caller.target` is the incarnation the call is for. Only `getPid` and `shutdown` are carried to the node; the rest is
-answered from the registry and the relay. A `getPid` that the node does not answer breaks off as the node's own
-connection would: `rosnode` takes that for a node it cannot reach and goes on, and ends at an answer that is an error.
-The node that publishes for monitors is control itself: its process is control's. `publisherUpdate` and `paramUpdate`
-are not in the table: only a master sends those, so from anybody else they are denied like any unknown call.
+The call is for the incarnation `caller.target`. Only `getPid`, `shutdown` and `requestTopic` for unrelayed topics are
+forwarded to the node; the registry and the relay answer the rest. If the node does not answer `getPid`, the connection
+breaks off: `rosnode` then skips the node, but would stop at an error. The publisher for monitors is control itself, so
+its process id is control's. `publisherUpdate` and `paramUpdate` are not in the table: only a master sends them, so they
+are denied like unknown calls.
 """
 
 import os
@@ -12,13 +12,13 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 from appliance.master.caller import Answer, Caller
-from appliance.master.calls.call import MESSAGE, PROTOCOLS, TOPIC, Call, Identity, Verb, method
-from appliance.master.calls.gate import Gate
-from appliance.master.endpoints.endpoint_addresses import Addresses
-from appliance.master.endpoints.node_api import NodeApi
+from appliance.master.calls.call import MESSAGE, PROTOCOLS, TOPIC, CallVerb, RosCall, method
+from appliance.master.calls.gate import CallGate
+from appliance.master.endpoints.node_api import NodeApiClient
+from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.master.endpoints.relay_control import RelayControl, tcpros_port
 from appliance.master.endpoints.traffic import Traffic
-from appliance.master.graph.graph import Graph
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile.enactor import Enactor
@@ -34,17 +34,17 @@ _NOTHING = Traffic()
 
 @dataclass(frozen=True, slots=True)
 class NodeCalls:
-    """Answers for the node that `caller.target` is. `port` is RVMaster's."""
+    """The node API of `caller.target`. `port` is RVMaster's port."""
 
     registry: Registry
-    graph: Graph
+    graph: RosGraph
     enactor: Enactor
     relay: RelayControl
     mediation: Mediation
-    addresses: Addresses
-    nodes: NodeApi
+    addresses: AdvertisedAddresses
+    nodes: NodeApiClient
     liveness: Liveness
-    gate: Gate
+    gate: CallGate
     port: int
 
     async def request_topic(self, caller: Caller, topic: str, protocols: list[list[Value]]) -> Answer:
@@ -56,7 +56,7 @@ class NodeCalls:
         if "TCPROS" not in names:
             offered = ", ".join(str(name)[:40] for name in names) or "nothing"
             return [0, f"only TCPROS is carried through the appliance; the subscriber offers {offered}", []]
-        own = target.own or self.gate.is_own_subscriber(caller, topic)  # who has no way but the relay
+        own = target.own or self.gate.is_own_subscriber(caller, topic)  # reached through the relay only
         if not own and not self.mediation.carries_topic(topic):
             return await self._negotiated_directly(target, topic, caller)
         granted = self.graph.topic_granted(target, topic, caller.peer.host, caller.caller_id)
@@ -66,7 +66,7 @@ class NodeCalls:
         return [1, f"ready on {address}:{port}", ["TCPROS", address, port]]
 
     async def _negotiated_directly(self, target: Incarnation, topic: str, caller: Caller) -> Answer:
-        """The node's own TCPROS port at its peer address; the host in its answer is never followed."""
+        """Return the node's own TCPROS port at its peer address; the host in its answer is ignored."""
         try:
             answer = await self.nodes.call(target, "requestTopic", caller.caller_id, topic, [["TCPROS"]])
             port = tcpros_port(answer)
@@ -183,25 +183,24 @@ def _typed(target: Incarnation, kind: Kind) -> list[Value]:
     ]
 
 
-NODE_CALLS: dict[str, Call[NodeCalls]] = {
+NODE_CALLS: dict[str, RosCall[NodeCalls]] = {
     call.name: call
     for call in (
-        Call(
+        RosCall(
             "requestTopic",
             method(NodeCalls.request_topic, TOPIC, PROTOCOLS),
-            Verb.CONNECT,
+            CallVerb.CONNECT,
             Kind.PUBLICATION,
-            denial=[],
-            identity=Identity.NODE,
+            [],
         ),
-        Call("getPid", method(NodeCalls.get_pid), Verb.READ, denial=-1),
-        Call("shutdown", method(NodeCalls.shutdown, MESSAGE), Verb.DO),
-        Call("getName", method(NodeCalls.get_name), Verb.READ, denial=""),
-        Call("getUri", method(NodeCalls.get_uri), Verb.READ, denial=""),
-        Call("getMasterUri", method(NodeCalls.get_master_uri), Verb.READ, denial=""),
-        Call("getSubscriptions", method(NodeCalls.get_subscriptions), Verb.READ, denial=[]),
-        Call("getPublications", method(NodeCalls.get_publications), Verb.READ, denial=[]),
-        Call("getBusInfo", method(NodeCalls.get_bus_info), Verb.READ, denial=[]),
-        Call("getBusStats", method(NodeCalls.get_bus_stats), Verb.READ, denial=[[], [], []]),
+        RosCall("getPid", method(NodeCalls.get_pid), CallVerb.READ, denial=-1),
+        RosCall("shutdown", method(NodeCalls.shutdown, MESSAGE), CallVerb.DO),
+        RosCall("getName", method(NodeCalls.get_name), CallVerb.READ, denial=""),
+        RosCall("getUri", method(NodeCalls.get_uri), CallVerb.READ, denial=""),
+        RosCall("getMasterUri", method(NodeCalls.get_master_uri), CallVerb.READ, denial=""),
+        RosCall("getSubscriptions", method(NodeCalls.get_subscriptions), CallVerb.READ, denial=[]),
+        RosCall("getPublications", method(NodeCalls.get_publications), CallVerb.READ, denial=[]),
+        RosCall("getBusInfo", method(NodeCalls.get_bus_info), CallVerb.READ, denial=[]),
+        RosCall("getBusStats", method(NodeCalls.get_bus_stats), CallVerb.READ, denial=[[], [], []]),
     )
 }

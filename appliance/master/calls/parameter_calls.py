@@ -1,12 +1,12 @@
-"""The parameter calls. What asks for no large tree is answered by the mirror: a node that starts asks for hundreds.
+"""Carry out the parameter calls. The mirror answers most reads, because a starting node makes hundreds.
 
-While ROSMaster is away or not whole, such a question waits as all calls do. Writes go to ROSMaster one after the other,
-in few requests.
+Reads of a large tree and `searchParam` go to the ROS master. While it is away or incomplete, all calls wait. Writes go
+to it in order, in few requests.
 
-`searchParam` finds a parameter for whoever may read it. ROSMaster looks for a relative key in the caller's namespace
-and then upwards. The `caller_id` is a claim, so anybody can look anywhere: whether a parameter is there that the host
-may not read must make no difference to the answer. So a global key is decided before it is looked for, and of a search
-upwards only those places count that may be read. What is told when nothing is found depends on the policy alone.
+`searchParam` finds parameters that the caller may read. The ROS master searches a relative key in the caller's
+namespace and then upwards. The `caller_id` is a claim, so any host can search anywhere. The answer must not reveal
+whether a parameter exists that the host may not read. So a global key is decided before the search, and a search
+upwards skips keys that the host may not read. The answer without a result depends on the policy alone.
 """
 
 import asyncio
@@ -17,10 +17,10 @@ from typing import NamedTuple
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import Attempt
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.graph.graph import Graph
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.parameter_updates import settled
 from appliance.master.parameter_charges import APPLIANCE, NAME_WEIGHT, LimitReachedError, measure
-from appliance.master.parameter_mirror import ParameterMirror, Reserved
+from appliance.master.parameter_mirror import ParameterMirror, Reservation
 from appliance.master.reconcile.enactor import Enactor
 from appliance.master.rosmaster import RosMaster, Wanted
 from appliance.policy.model import Address, Decision
@@ -31,12 +31,13 @@ from roswire.names import resolve_parameter
 from roswire.parameter_tree import names_in, standing_at
 from roswire.xmlrpc import Value
 
+_SEARCH = "searchParam"
 _NAMES_AT_ONCE = 500  # some milliseconds
-_TOGETHER_BYTES = 256 << 10  # of values that go to ROSMaster in one request
+_TOGETHER_BYTES = 256 << 10  # of the values in one request to the ROS master
 
 
-class Write(NamedTuple):
-    """A parameter is set, or deleted (`value` is None), for a caller."""
+class ParameterWrite(NamedTuple):
+    """A write of a parameter for a caller; `value` None deletes it."""
 
     caller: Caller
     key: str
@@ -45,11 +46,11 @@ class Write(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ParameterCalls:
-    """Reads and writes parameters; a tree of `large` bytes or more is asked of ROSMaster."""
+    """The parameter calls; the ROS master answers reads of at least `large` bytes."""
 
     rosmaster: RosMaster
     mirror: ParameterMirror
-    graph: Graph
+    graph: RosGraph
     enactor: Enactor
     rights: ParameterRights
     large: int
@@ -76,11 +77,11 @@ class ParameterCalls:
 
     async def set_param(self, caller: Caller, key: str, value: Value) -> Answer:
         """`setParam(caller_id, key, value)`."""
-        return await self._write_one(Write(caller, key, value))
+        return await self._write_one(ParameterWrite(caller, key, value))
 
     async def delete_param(self, caller: Caller, key: str) -> Answer:
         """`deleteParam(caller_id, key)`."""
-        return await self._write_one(Write(caller, key, None))
+        return await self._write_one(ParameterWrite(caller, key, None))
 
     async def get_param_names(self, caller: Caller) -> Answer:
         """`getParamNames(caller_id)`: those that the host may read."""
@@ -92,30 +93,61 @@ class ParameterCalls:
             names, answer[2] = answer[2], (found := [])
             for begin in range(0, len(names), _NAMES_AT_ONCE):
                 if begin:
-                    await asyncio.sleep(0)  # each is decided: others have their turn meanwhile
+                    await asyncio.sleep(0)  # each name is decided: others have their turn in between
                 some = names[begin : begin + _NAMES_AT_ONCE]
                 found += [name for name in some if self.rights.to_find(caller, str(name)).allowed]
         return answer
 
+    async def search_param(self, caller: Caller, key: str) -> Answer:
+        """`searchParam(caller_id, key)`: the name that is found is one the host may read."""
+        if caller.own or not caller.caller_id:
+            return await self.rosmaster.call(_SEARCH, caller.caller_id, key)
+        places = {name: self.rights.to_find(caller, name) for name in _places(key, caller.caller_id)}
+        hidden = [name for name, decision in places.items() if not decision.allowed]
+        if key.startswith("/") and hidden:
+            return [0, self.rights.recorded(caller, _SEARCH, hidden[0], places[hidden[0]]), ""]
+        answer = await self.rosmaster.call(_SEARCH, caller.caller_id, key)
+        found = _found(answer)
+        if found in hidden:
+            found = self._next_readable(key, places, found)
+            answer = [1, f"Found [{found}]", found] if found is not None else [-1, "", ""]
+        if found is not None and places[found].would_deny:
+            self.rights.recorded(caller, _SEARCH, found, places[found])
+        if answer[0] != 1 and hidden:
+            why = self.rights.recorded(caller, _SEARCH, hidden[0], places[hidden[0]])
+            return [-1, f"Cannot find parameter [{key}] in an upwards search of what may be read: {why}", ""]
+        return answer
+
+    def _next_readable(self, key: str, places: dict[str, Decision], hidden: str) -> str | None:
+        """Return the name that would have been found without the parameters that may not be read."""
+        levels = len([part for part in key.split("/") if part])
+        names = list(places)
+        for name in names[names.index(hidden) + 1 :]:
+            # As in the ROS master, only the key's first part must exist.
+            first = "/".join(name.split("/")[: -levels + 1 or None])
+            if places[name].allowed and standing_at(self.mirror.tree, first)[0] is not None:
+                return name
+        return None
+
     def weight_of_answer(self, attempt: Attempt) -> int:
-        """About how many bytes the answer has that tells a parameter's value; counting ends when that is `large`."""
+        """Return the approximate size of an answer with a parameter's value in bytes, counted up to `large`."""
         if not attempt.call.tells:
             return 0
         return weigh(standing_at(self.mirror.tree, attempt.resource)[0], self.large)
 
-    async def _write_one(self, write: Write) -> Answer:
+    async def _write_one(self, write: ParameterWrite) -> Answer:
         [outcome] = await self.write([write])
         if isinstance(outcome, Exception):
             raise outcome
         return outcome
 
-    async def write(self, writes: Sequence[Write]) -> list[Answer | Exception]:
-        """Carry out several writes one after the other, in few requests: the outcome of each.
+    async def write(self, writes: Sequence[ParameterWrite]) -> list[Answer | Exception]:
+        """Carry out several writes in order, in few requests; return the outcome of each.
 
-        A value is checked as if it came alone after those before it; one that fails holds up no other.
+        A value is checked as if it were sent after the earlier ones; a failed write does not affect the others.
         """
         outcomes: list[Answer | Exception] = []
-        waiting: list[tuple[Write, Reserved | None]] = []
+        waiting: list[tuple[ParameterWrite, Reservation | None]] = []
         weight = 0
         for write in writes:
             try:
@@ -126,7 +158,7 @@ class ParameterCalls:
                     waiting, weight = [], 0
                 try:
                     reserved = self._reserved(write, measured)
-                except LimitReachedError:  # those before it may make room
+                except LimitReachedError:  # earlier writes may make room
                     outcomes += await self._send(waiting)
                     waiting, weight = [], 0
                     reserved = self._reserved(write, measured)
@@ -138,14 +170,16 @@ class ParameterCalls:
             weight += NAME_WEIGHT + len(write.key) + measured
         return outcomes + await self._send(waiting)
 
-    def _reserved(self, write: Write, weight: int) -> Reserved | None:
+    def _reserved(self, write: ParameterWrite, weight: int) -> Reservation | None:
         if write.value is None:
             return None
         host: Address = APPLIANCE if write.caller.own else write.caller.peer.host
         return self.mirror.reserve(write.key, weight, host)
 
-    async def _send(self, waiting: list[tuple[Write, Reserved | None]]) -> list[Answer | Exception]:
-        """Make the calls; mirror, charges and subscribers follow what ROSMaster took."""
+    async def _send(
+        self, waiting: list[tuple[ParameterWrite, Reservation | None]]
+    ) -> list[Answer | Exception]:
+        """Make the calls, and update mirror, charges and subscribers by the writes that the ROS master accepted."""
         try:
             outcomes = await self._make([_wanted(write) for write, _reserved in waiting])
         finally:
@@ -158,8 +192,8 @@ class ParameterCalls:
                     self._written(write, reserved, outcome)
         return outcomes
 
-    def _written(self, write: Write, reserved: Reserved | None, outcome: Answer) -> None:
-        """ROSMaster answered so."""
+    def _written(self, write: ParameterWrite, reserved: Reservation | None, outcome: Answer) -> None:
+        """Update mirror and subscribers by the ROS master's answer to a write."""
         if reserved is not None and _is_set(outcome, write):
             self.mirror.set(write.key, write.value, reserved)
             self.enactor.carry_out(self.graph.parameter_set(write.key, write.value, write.caller.caller_id))
@@ -168,7 +202,7 @@ class ParameterCalls:
             self.enactor.carry_out(self.graph.parameter_deleted(write.key))
 
     async def _make(self, calls: list[Wanted]) -> list[Answer | Exception]:
-        """The outcomes of the calls, made as one if they are several."""
+        """Return the outcomes of the calls; several calls are sent as one multicall."""
         if not calls:
             return []
         try:
@@ -184,66 +218,24 @@ class ParameterCalls:
             return [error] * len(calls)
 
 
-def _wanted(write: Write) -> Wanted:
+def _wanted(write: ParameterWrite) -> Wanted:
     if write.value is None:
         return "deleteParam", (write.caller.caller_id, write.key)
     return "setParam", (write.caller.caller_id, write.key, write.value)
 
 
-def _is_set(answer: Answer, write: Write) -> bool:
-    """Whether ROSMaster has a value now, by its answer to `setParam`.
+def _is_set(answer: Answer, write: ParameterWrite) -> bool:
+    """Whether the ROS master has the value, given its answer to `setParam`.
 
-    It has it before it looks whom to tell, and answers with an error when that fails (a name like `a/b` in a
-    dictionary, and somebody who subscribed to what it looks like). What it does not take is a root that is none.
+    The ROS master stores the value before it computes the updates for subscribers. If the latter fails, it answers with
+    an error although the value is set (for example a name such as `a/b` in a dictionary, and a subscriber to that key).
+    It only rejects a root that is not a namespace.
     """
     return answer[0] == 1 or write.key != "/" or isinstance(write.value, dict)
 
 
-_CALL = "searchParam"
-
-
-@dataclass(frozen=True, slots=True)
-class ParameterSearch:
-    """Finds parameters."""
-
-    rosmaster: RosMaster
-    mirror: ParameterMirror
-    rights: ParameterRights
-
-    async def search_param(self, caller: Caller, key: str) -> Answer:
-        """`searchParam(caller_id, key)`: the name that is found is one the host may read."""
-        if caller.own or not caller.caller_id:
-            return await self.rosmaster.call(_CALL, caller.caller_id, key)
-        places = {name: self.rights.to_find(caller, name) for name in _places(key, caller.caller_id)}
-        hidden = [name for name, decision in places.items() if not decision.allowed]
-        if key.startswith("/") and hidden:
-            return [0, self.rights.recorded(caller, _CALL, hidden[0], places[hidden[0]]), ""]
-        answer = await self.rosmaster.call(_CALL, caller.caller_id, key)
-        found = _found(answer)
-        if found in hidden:
-            found = self._next_readable(key, places, found)
-            answer = [1, f"Found [{found}]", found] if found is not None else [-1, "", ""]
-        if found is not None and places[found].would_deny:
-            self.rights.recorded(caller, _CALL, found, places[found])
-        if answer[0] != 1 and hidden:
-            why = self.rights.recorded(caller, _CALL, hidden[0], places[hidden[0]])
-            return [-1, f"Cannot find parameter [{key}] in an upwards search of what may be read: {why}", ""]
-        return answer
-
-    def _next_readable(self, key: str, places: dict[str, Decision], hidden: str) -> str | None:
-        """The name that would have been found if nothing were at those that may not be read."""
-        levels = len([part for part in key.split("/") if part])
-        names = list(places)
-        for name in names[names.index(hidden) + 1 :]:
-            # It is enough that the key's first part is there.
-            first = "/".join(name.split("/")[: -levels + 1 or None])
-            if places[name].allowed and standing_at(self.mirror.tree, first)[0] is not None:
-                return name
-        return None
-
-
 def _places(key: str, caller_id: str) -> list[str]:
-    """The names that ROSMaster may answer with, in its order."""
+    """Return the names that the ROS master may find, in the order of its search."""
     if key.startswith("/"):
         return [resolve_parameter(key, caller_id)]
     namespace = [part for part in caller_id.split("/") if part]

@@ -1,4 +1,4 @@
-"""Who may be told which parameters, asked again where an answer or an update brings more than a decision looked at."""
+"""Check parameters in answers and updates, which may contain more than the decision on the call covered."""
 
 import time
 from collections.abc import Callable
@@ -17,15 +17,15 @@ from roswire.xmlrpc import Value
 
 @dataclass(frozen=True, slots=True)
 class ParameterRights:
-    """Asks the policy that `policy()` returns at that moment, and records what it denies."""
+    """The checks of parameters by the policy in force (`policy()`); denials are recorded."""
 
     policy: Callable[[], Policy]
     trail: AuditTrail
 
     def hidden(self, caller: Caller, call: str, key: str, answer: Answer) -> str | None:
-        """What a caller is told in the place of a namespace that he may not read; None when there is nothing to hide.
+        """Return the text that replaces a namespace which the caller may not read, or None if it may.
 
-        It was decided before, by what was there then; the answer has what is there now.
+        The call was decided by the parameters at that time; the answer has the present ones.
         """
         if answer[0] != 1 or not isinstance(answer[2], dict) or caller.own:
             return None
@@ -33,9 +33,9 @@ class ParameterRights:
         return None if decision.allowed else self.recorded(caller, call, key, decision)
 
     def may_be_told(self, incarnation: Incarnation, key: str, value: Value) -> bool:
-        """Whether a node that subscribed to `key`, or to something above it, may read its new value.
+        """Whether a node that subscribed to `key`, or to a key above it, may read the new value; denials are recorded.
 
-        The value of a parameter that was deleted is an empty namespace.
+        The value of a deleted parameter is an empty namespace.
         """
         if incarnation.own:
             return True
@@ -46,12 +46,12 @@ class ParameterRights:
         return decision.allowed
 
     def to_find(self, caller: Caller, key: str) -> Decision:
-        """Whether a caller may learn that there is a parameter of this name."""
+        """Return the decision whether a caller may learn that a parameter exists."""
         request = Request(caller.peer.host, caller.caller_id, Category.READ, key)
         return decide_right(self.policy(), right_to_find(request))
 
     def recorded(self, caller: Caller, call: str, key: str, decision: Decision) -> str:
-        """Record a decision on a parameter; what is told of it."""
+        """Record a decision on a parameter; return the text for the caller."""
         record = self.trail.decided(caller.asker, call, Category.READ.value, key, decision)
         return denial_text(decision, record, self.policy().tell)
 

@@ -1,6 +1,6 @@
-"""The way of a request: parse → answer the call, or the parts of a multicall → write the answer.
+"""Serve requests: parse → answer the call, or the parts of a multicall → write the answer.
 
-The same way serves the Master API and the outer faces, with another table of calls.
+The Master API and the proxy endpoints are served in the same way, with different tables of calls.
 """
 
 import time
@@ -10,9 +10,9 @@ import structlog
 
 from appliance.master.caller import Caller
 from appliance.master.calls.call import Attempt, Table
-from appliance.master.calls.call_execution import Execution, Visit
+from appliance.master.calls.call_execution import Execution, ServedRequest
 from appliance.master.calls.multicall import LIMIT_FAULT, MULTICALL, PARSE_FAULT, Multicall
-from appliance.master.endpoints.endpoint_addresses import Addresses
+from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Category
 from appliance.rpc.bulk import Bulk, weigh
@@ -22,7 +22,7 @@ from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.errors import EncodingError, LimitExceededError, PeerError
-from roswire.xmlrpc import Limits, MethodCall, Value, build_fault, build_response, parse_call
+from roswire.xmlrpc import MethodCall, Value, XmlRpcLimits, build_fault, build_response, parse_call
 
 _log = structlog.get_logger()
 _INTERNAL_FAULT = -32603
@@ -30,32 +30,32 @@ _INTERNAL_FAULT = -32603
 
 @dataclass(frozen=True, slots=True)
 class Pipeline:
-    """Serves requests by a table of calls. Bodies and answers over `offload` bytes are read and written in a thread.
+    """The path of requests by a table of calls.
 
-    Those of different hosts take the turns of `bulk` for that.
+    Bodies and answers over `offload` bytes are read and written in threads, for which hosts take turns in `bulk`.
     """
 
     execution: Execution
     multicall: Multicall
-    addresses: Addresses
+    addresses: AdvertisedAddresses
     trail: AuditTrail
-    limits: Limits
+    limits: XmlRpcLimits
     offload: int
     bulk: Turns
     processor: ProcessorTime
 
     def handler(self, table: Table, *, own: bool = False, target: Incarnation | None = None) -> Handler:
-        """The handler of one listener: its table, whether it is for the appliance's own nodes, and its target."""
+        """Return the handler of a listener with this table; `own`: it is for the appliance's own nodes."""
 
         async def handle(request: HttpRequest) -> bytes:
             await self.addresses.learn(request.peer)
             caller = Caller(request.peer, "", request.arrived, own=own, target=target)
             with Bulk(self.bulk, caller.peer.host, self.processor) as bulk:
-                return await self._serve(Visit(table, caller, bulk), request.body)
+                return await self._serve(ServedRequest(table, caller, bulk), request.body)
 
         return handle
 
-    async def _serve(self, visit: Visit, body: bytes) -> bytes:
+    async def _serve(self, visit: ServedRequest, body: bytes) -> bytes:
         try:
             if len(body) <= self.offload:
                 call = parse_call(body, self.limits)
@@ -76,7 +76,7 @@ class Pipeline:
             _log.error("answer cannot be written", call=call.method, error=str(error))
             return build_fault(_INTERNAL_FAULT, f"the answer to {call.method} cannot be written: {error}")
 
-    async def _answer(self, visit: Visit, call: MethodCall) -> Value:
+    async def _answer(self, visit: ServedRequest, call: MethodCall) -> Value:
         if call.method == MULTICALL and visit.caller.target is None:
             return await self.multicall.answer(visit, call.params)
         attempt = await self.execution.understand(visit, call.method, call.params)
@@ -88,7 +88,7 @@ class Pipeline:
         try:
             return await bulk.in_thread(parse_call, body, self.limits)
         finally:
-            bulk.give_back()  # to carry it out may take long
+            bulk.give_back()  # carrying the call out may take long
 
     def _not_understood(self, caller: Caller, body: bytes, error: PeerError) -> bytes:
         limit = isinstance(error, LimitExceededError)

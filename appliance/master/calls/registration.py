@@ -1,21 +1,22 @@
-"""The calls that make a node part of the graph, or take it out: topics, services, and parameters it is told of.
+"""Carry out the calls that register and unregister topics, services, and subscriptions to parameters.
 
-A registration outlasts control before its node is told of it (the store writes ahead): a ROS 1 node never registers
-twice, and ROSMaster, which knows the rest, can die in the same moment as control.
+A registration is durable before its node gets the answer (the store writes ahead), because a ROS 1 node never registers
+twice, and control and the ROS master may die at the same time.
 """
 
 from dataclasses import dataclass
 
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.call import Attempt
-from appliance.master.calls.gate import Gate
+from appliance.master.calls.gate import CallGate
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.endpoints.proxy_endpoints import Faces
+from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.graph.graph import Graph
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
-from appliance.master.reconcile.arrivals import Arrivals, MakingRoomForNobody
+from appliance.master.graph.revocation import CALLS
+from appliance.master.reconcile.arrivals import Arrivals, EvictionGuard
 from appliance.master.reconcile.enactor import Enactor
 from appliance.master.reconcile.entries import NO_SERVICE, stand_in
 from appliance.master.rosmaster import RosMaster
@@ -23,17 +24,17 @@ from appliance.master.rosmaster import RosMaster
 
 @dataclass(frozen=True, slots=True)
 class RegistrationCalls:
-    """Registers at ROSMaster under the node's inner URI; registry, relay and other nodes follow what it took."""
+    """The registering calls, made at the ROS master with the node's inner URI; accepted ones change the graph."""
 
     rosmaster: RosMaster
     registry: Registry
-    graph: Graph
+    graph: RosGraph
     enactor: Enactor
-    faces: Faces
+    faces: ProxyEndpoints
     arrivals: Arrivals
     relay: RelayControl
     mediation: Mediation
-    gate: Gate
+    gate: CallGate
     rights: ParameterRights
 
     async def register_publisher(
@@ -109,7 +110,7 @@ class RegistrationCalls:
                 holder
                 for holder in self.registry.registered(Kind.SERVICE, service)
                 if holder.name == caller.caller_id
-                # By its own port, or as `rosnode cleanup` does, by the one that lookupService told.
+                # By its own port, or, like `rosnode cleanup`, by the port that lookupService returned.
                 and (
                     holder.registrations[Kind.SERVICE, service].detail == str(port)
                     or self.relay.port(holder, Kind.SERVICE, service) == port
@@ -136,32 +137,31 @@ class RegistrationCalls:
     async def _unregister(self, caller: Caller, kind: Kind, topic: str, caller_api: ApiUri) -> Answer:
         node = self.arrivals.known(caller, caller_api) or self._told_as(caller, caller_api)
         inner = self.faces.inner_uri(node) if node is not None else self.faces.nobody()
-        method = "unregisterPublisher" if kind is Kind.PUBLICATION else "unregisterSubscriber"
-        answer = await self.rosmaster.call(method, caller.caller_id, topic, inner)
+        answer = await self.rosmaster.call(CALLS[kind][1], caller.caller_id, topic, inner)
         _speak_as_asked(answer, inner, caller_api)
         if answer[0] == 1 and node is not None:
             self.enactor.carry_out(self.graph.unregistered(node, kind, topic))
         return answer
 
     def _told_as(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        """The node that the caller speaks for by the URI that lookupNode told, as `rosnode cleanup` on its host."""
+        """Return the node whose URI from lookupNode the caller gives, like `rosnode cleanup` on the node's host."""
         holder = self.registry.holder(caller.caller_id)
         meant = holder is not None and (holder.host, holder.outer_port) == (caller.peer.host, api.uri.port)
         return holder if meant else None
 
-    async def _registering(self, caller: Caller, api: ApiUri) -> MakingRoomForNobody:
-        """The incarnation that registers, which makes room for nobody meanwhile.
+    async def _registering(self, caller: Caller, api: ApiUri) -> EvictionGuard:
+        """Return a guard of the incarnation that registers, which prevents its eviction.
 
-        A new one takes the room of one of its host's that has nothing or is gone.
+        If the host is at its limit, a new incarnation replaces one of the host that is unused or gone.
         """
         spare = self.gate.to_make_room(caller, api)
         if spare is not None:
             self.enactor.carry_out(self.graph.forgotten(spare))
-        return MakingRoomForNobody(await self.arrivals.incarnation_for(caller, api))
+        return EvictionGuard(await self.arrivals.incarnation_for(caller, api))
 
 
 def given_up(registry: Registry, denied: Attempt) -> list[Durable]:
-    """A node gives up what the policy has taken from it (it is denied that): it is not to be put back one day."""
+    """Forget a withdrawn registration that its node unregisters, although the call is denied; it will not come back."""
     kind, caller = denied.call.kind, denied.caller
     asked = next(argument for argument in denied.arguments if isinstance(argument, ApiUri))
     kept: list[Durable] = []
@@ -176,5 +176,5 @@ def given_up(registry: Registry, denied: Attempt) -> list[Durable]:
 
 
 def _speak_as_asked(answer: Answer, told: str, asked: ApiUri) -> None:
-    """ROSMaster's words may repeat the URI it was told, which is nobody's business: the caller reads his own."""
+    """Replace the inner URI in the ROS master's text by the caller's own."""
     answer[1] = str(answer[1]).replace(told, asked.text)

@@ -1,15 +1,15 @@
-"""What a request asks for, by the beginning of its body: for the record of a refusal that reads no further. No I/O.
+"""Parse the beginning of a request's body, for the record of a denial that reads no further. No I/O.
 
-The beginning is a stranger's, and a few KiB. Where it is a whole call of a known table, the record has what a decision
-of that call has: category and resource, the claimed name, the key or node. Else it has the method's name, if one is
-there.
+The beginning is untrusted, a few KiB. If it is a complete call of a known table, the record has the same fields as a
+decision on that call: category and resource, the claimed name, the key or node. Otherwise it has the method's name, if
+any.
 """
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from appliance.master.caller import Caller
-from appliance.master.calls.call import Call, claimed_name
+from appliance.master.calls.call import RosCall, claimed_name
 from appliance.master.calls.call_table import MASTER_CALLS
 from appliance.master.calls.multicall import MULTICALL
 from appliance.master.calls.node_calls import NODE_CALLS
@@ -17,17 +17,17 @@ from appliance.policy.model import Category
 from appliance.rpc.method_name import method_named
 from appliance.rpc.server import Peer
 from roswire.errors import PeerError
-from roswire.xmlrpc import Limits, Value, parse_call
+from roswire.xmlrpc import Value, XmlRpcLimits, parse_call
 
-_CALLS: Mapping[str, Call[Any]] = {**NODE_CALLS, **MASTER_CALLS}
-_LIMITS = Limits(body=8192, elements=256, depth=16, string=4096, parts=64)
+_CALLS: Mapping[str, RosCall[Any]] = {**NODE_CALLS, **MASTER_CALLS}
+_LIMITS = XmlRpcLimits(body=8192, elements=256, depth=16, string=4096, parts=64)
 _UNKNOWN = "unknown"
 _LONGEST = 200
 _MOST_PARTS = 8
 
 
-class Asked(NamedTuple):
-    """What was asked for; `about` is detail as a decision's record has it."""
+class PeekedRequest(NamedTuple):
+    """The request as far as it was read; `about` has details like those of a decision's record."""
 
     category: Category
     resource: str
@@ -35,8 +35,8 @@ class Asked(NamedTuple):
     about: dict[str, str]
 
 
-def asked_for(peer: Peer, beginning: bytes) -> Asked:
-    """What a peer's request with this beginning of a body asks for; an empty resource where nothing can be told."""
+def asked_for(peer: Peer, beginning: bytes) -> PeekedRequest:
+    """Read the beginning of a peer's request; the resource is empty if it cannot be read."""
     try:
         call = parse_call(beginning, _LIMITS)
     except PeerError:
@@ -51,16 +51,16 @@ def asked_for(peer: Peer, beginning: bytes) -> Asked:
         return _only_named(call.method, claimed_name(call.params))
     request = attempt.request
     about = {"call": row.name, **attempt.about}
-    return Asked(request.category, request.resource[:_LONGEST], request.caller_id, about)
+    return PeekedRequest(request.category, request.resource[:_LONGEST], request.caller_id, about)
 
 
-def _only_named(method: str, caller_id: str | None, about: dict[str, str] | None = None) -> Asked:
+def _only_named(method: str, caller_id: str | None, about: dict[str, str] | None = None) -> PeekedRequest:
     known = method if method in _CALLS or method == MULTICALL else _UNKNOWN
-    return Asked(Category.COMMAND, method[:_LONGEST], caller_id, {"call": known, **(about or {})})
+    return PeekedRequest(Category.COMMAND, method[:_LONGEST], caller_id, {"call": known, **(about or {})})
 
 
 def _parts(params: tuple[Value, ...]) -> str:
-    """The methods that a multicall asks for: the first of them."""
+    """Return the names of the first methods in a multicall, and the number of further ones."""
     parts = params[0] if params and isinstance(params[0], list) else []
     names = [str(part.get("methodName"))[:_LONGEST] for part in parts if isinstance(part, dict)]
     more = f" and {len(names) - _MOST_PARTS} more" if len(names) > _MOST_PARTS else ""

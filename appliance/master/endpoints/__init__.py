@@ -1,1 +1,1 @@
-"""How nodes are reached: faces, ports, addresses, and the relays that carry their topics."""
+"""The endpoints of nodes: proxies, ports, addresses, and the relays that carry their topics."""

@@ -1,9 +1,8 @@
-"""Calls from the appliance to nodes that come from a master: each node has a queue of its own, in order.
+"""Deliver the calls that nodes expect from a master: each node has its own queue, in order.
 
-A node that is slow or gone delays nobody else; ROSMaster's threads are answered before a node is called. Several
-lists of publishers for one topic are all delivered, because roscpp must see a removal before the addition that
-follows it. A call that fails is tried again a few times; then it is dropped, and `troubled` hears of it: the node is
-looked at, and told what it has missed when it answers (`Liveness.missed`).
+A slow or dead node does not delay others. All lists of publishers for a topic are delivered, because roscpp must see a
+removal before the addition that follows it. A failed call is repeated a few times, then dropped and reported to
+`troubled`: the node is checked, and gets the missed updates when it answers (`Watchlist.could_not_tell`).
 """
 
 import asyncio
@@ -13,11 +12,11 @@ from dataclasses import dataclass, field
 
 import structlog
 
-from appliance.master.endpoints.node_api import NodeApi
+from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address
-from appliance.quotas.pool import Bounds, Pool, Standing
+from appliance.quotas.pool import Bounds, Pool, QuotaClass
 from appliance.quotas.table import NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.xmlrpc_client import CallFailedError
@@ -29,7 +28,7 @@ MASTER_NAME = "/master"
 
 @dataclass(slots=True)
 class _Queue:
-    """What waits for one node, each call with its weight, and their sum."""
+    """The waiting calls for a node, each with its weight, and the sum of the weights."""
 
     incarnation: Incarnation
     calls: deque[tuple[NodeCall, int]] = field(default_factory=deque)
@@ -46,19 +45,20 @@ class _Queue:
 
 
 class Delivery:
-    """The queues. `troubled(incarnation, call, why)` hears of a call that is lost.
+    """The queues of calls. `troubled(incarnation, call, why)` is called for each lost call.
 
-    A queue holds at most `bound` calls, those of a host and all together what `queued` says in bytes: beyond, the
-    oldest go, of the queue that has most: of the host's own, or of the host that has most where all are too much.
-    Hosts take turns at `at_once` calls: nodes of one that answer nothing delay no call to another's.
+    A queue holds at most `bound` calls; `queued` limits the bytes of a host and of all hosts. Above a limit the oldest
+    call of the largest queue is dropped: in the host's own queues, or in those of the host with most bytes.
+
+    Hosts take turns at `at_once` calls, so that hanging nodes of one host do not delay calls to other hosts.
     """
 
     def __init__(
         self,
-        nodes: NodeApi,
+        nodes: NodeApiClient,
         *,
         troubled: Callable[[Incarnation, NodeCall, str], None],
-        standing: Callable[[Address], Standing],
+        quota_class: Callable[[Address], QuotaClass],
         bound: int = 10_000,
         queued: Bounds = QUEUED_NODE_CALLS.bounds,
         at_once: Bounds = NODE_CALLS_UNDER_WAY.bounds,
@@ -70,21 +70,21 @@ class Delivery:
         self._held: Pool[Address] = Pool(
             "bytes of calls that wait for nodes",
             queued,
-            lambda _host: Standing.REGISTERED,  # nobody else is told anything
+            lambda _host: QuotaClass.REGISTERED,  # only nodes with registrations get calls
         )
-        self._turns = Turns(at_once, standing)
+        self._turns = Turns(at_once, quota_class)
         self._tries = tries
         self._queues: dict[str, _Queue] = {}
         self._workers: dict[str, asyncio.Task[None]] = {}
 
     @property
     def waiting(self) -> int:
-        """How many calls wait, for all nodes together."""
+        """Return the number of waiting calls of all nodes."""
         return sum(len(queue.calls) for queue in self._queues.values())
 
     @property
     def weight(self) -> int:
-        """About how many bytes they take."""
+        """Return the approximate size of all waiting calls in bytes."""
         return self._held.total
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
@@ -102,13 +102,13 @@ class Delivery:
             self._workers[incarnation.key] = worker
 
     def drop(self, incarnation: Incarnation) -> None:
-        """Forget what waits for a node."""
+        """Drop the waiting calls of a node."""
         queue = self._queues.pop(incarnation.key, None)
         if queue is not None:
             self._held.give_back(incarnation.host, queue.weight)
 
     def _heaviest(self, host: Address) -> _Queue:
-        """The queue that makes room: of this host when it is beyond its own share, else of the host that has most."""
+        """Return the largest queue of this host if it exceeds its quota, else of the host with the most bytes."""
         if self._held.held(host) <= self._held.bounds.host:
             host, _ = max(self._held.holders(), key=lambda holder: holder[1])
         queues = (queue for queue in self._queues.values() if queue.incarnation.host == host)
@@ -144,7 +144,7 @@ class Delivery:
             except CallFailedError as error:
                 failure, heard = str(error), isinstance(error.__cause__, FaultReceived)
                 if call.method == "shutdown":
-                    return  # a node told to shut down often dies before it answers, or was dead: that is success
+                    return  # success: a node often dies before it answers, or was already dead
             else:
                 return
             finally:

@@ -1,8 +1,7 @@
-"""Control's side of the relays: states what is wanted, answers where publishers are.
-
-What is wanted is derived from the registry (nodes, publications, services) and the grants. Each topic and service is
-stated to the relay that carries it (`allocation`), a node to every relay that carries something of it. When a relay
-(re)appears everything of its is stated afresh between `StateBegan` and `StateEnded`; what is not said again is gone.
+"""Send the relays their wanted state and the addresses of publishers, and handle their reports. The wanted state is
+derived from the registry (nodes, publications, services) and the grants. Each topic and service is sent to the relay
+that carries it (`allocation`), a node to all relays that carry its topics or services. When a relay (re)appears, its
+whole state is sent between `StateBegan` and `StateEnded`, and the relay removes everything else.
 """
 
 import asyncio
@@ -16,59 +15,59 @@ from typing import Any
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
-from appliance.master.endpoints.endpoint_addresses import Places
-from appliance.master.endpoints.node_api import NodeApi
-from appliance.master.endpoints.topic_taps_control import TopicLooks
-from appliance.master.endpoints.traffic import Carried
+from appliance.master.endpoints.node_api import NodeApiClient
+from appliance.master.endpoints.node_ports import NodePorts
+from appliance.master.endpoints.topic_taps_control import TapRequests
+from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
-from appliance.policy.rate_limits import Part, Rate
+from appliance.policy.rate_limits import LimitScope, Rate
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Resource
-from appliance.specifications.specifications import Monitors
+from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.state_file import PermissionRow
 from roswire.xmlrpc import Value
 
 
-class RelayPost(Link):
-    """The link to relay `index`. What is sent while nobody is there is stated afresh when somebody is.
+class RelayOutbox(Link):
+    """The link to relay `index`. A new relay gets the whole state, with all changes from the time without a relay.
 
-    What it is sent `soon` goes some milliseconds later with all that comes until then (a node that starts registers
-    ten topics in that time), or before the next thing that is not: nobody connects to what a relay carries without a
-    grant, which is told at once, as are revoked grants, and `orders` are asked after all of it.
+    Messages with `soon` are batched for some milliseconds (a starting node registers ten topics in that time), or until
+    the next message without `soon`. This is safe because peers connect only with a grant, and grants and their
+    revocations are sent at once. `orders` sends its question after all earlier messages.
     """
 
     def __init__(self, index: int, heard: Callable[[Any], None], lost: Callable[[str], None]) -> None:
         super().__init__(heard, lost)
         self.index = index
-        self.placed: set[str] = set()  # incarnations whose port this relay has
+        self.placed: set[str] = set()  # keys of the incarnations whose port this relay has
         self._epoch = 0
         self._orders: deque[asyncio.Future[None]] = deque()
 
     def close(self) -> None:
-        """As `Link`; nobody waits for its orders any more."""
+        """Close the link, and end the wait for its orders."""
         super().close()
         self.placed.clear()
         while self._orders:
             self.carried_out()
 
     def orders(self) -> list[asyncio.Future[None]]:
-        """What is done when the relay has carried out all that it was told, or ends; nothing when nobody is there."""
+        """Return a future that is done when the relay has carried out its orders, or ends; [] without a relay."""
         if not self.send(messages.OrdersAsked()):
             return []
         self._orders.append(asyncio.get_running_loop().create_future())
         return [self._orders[-1]]
 
     def carried_out(self) -> None:
-        """The relay has carried out what it was told before it was asked first."""
+        """Handle the relay's answer to the oldest question: its orders are carried out."""
         if not (done := self._orders.popleft()).done():
             done.set_result(None)
 
     @contextmanager
     def restating(self) -> Iterator[None]:
-        """What is sent inside is all that the relay is to have."""
+        """Mark the messages sent inside this block as the whole state of the relay."""
         self._epoch += 1
         self.send(messages.StateBegan(self._epoch))
         yield
@@ -82,54 +81,55 @@ _WORDS = {kind: word for word, kind in _KINDS.items()}
 
 @dataclass(slots=True)
 class RelayControl:
-    """What control knows and wants of the relays.
+    """Control's end of the links to the relays.
 
-    `broken(incarnation)` hears of lost upstreams, `own_header` is of what control publishes itself, `own_call`
-    answers calls of the service that the appliance itself offers; `monitors()` are what relays are told and tell of.
+    `broken(incarnation)` is called for lost upstreams. `own_header` is the header of control's own publications,
+    `own_call` answers calls of the appliance's own service. `monitors()` returns the monitors that relays get and
+    report on.
     """
 
     registry: Registry
     grants: Grants
-    places: Places
-    nodes: NodeApi
-    carried: Carried
+    places: NodePorts
+    nodes: NodeApiClient
+    carried: RelayTraffic
     allocation: Allocation
     policy: Callable[[], Policy]
-    monitors: Callable[[], Monitors]
+    monitors: Callable[[], SpecificationManager]
     broken: Callable[[Incarnation], None]
     own_header: messages.OwnHeaderStated | None
     own_call: Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]]
-    _posts: tuple[RelayPost, ...] = field(init=False)
+    _posts: tuple[RelayOutbox, ...] = field(init=False)
     _asking: set[asyncio.Task[None]] = field(default_factory=set)
-    _looks: TopicLooks = field(default_factory=TopicLooks)
+    _looks: TapRequests = field(default_factory=TapRequests)
 
     def __post_init__(self) -> None:
-        """A place for each relay."""
+        """Create an entry for each relay."""
         self._posts = tuple(
-            RelayPost(index, partial(self._received, index), partial(self._lost, index))
+            RelayOutbox(index, partial(self._received, index), partial(self._lost, index))
             for index in range(self.allocation.relays)
         )
 
     @property
     def presence(self) -> str:
-        """`connected` when every relay is there, `away` when none is, else how many are away."""
+        """Return `connected` if all relays are connected, `away` if none is, else the number of missing ones."""
         away = sum(post.channel is None for post in self._posts)
         if not away:
             return "connected"
         return "away" if away == len(self._posts) else f"{away} of {len(self._posts)} are away"
 
     def port(self, incarnation: Incarnation, kind: Kind, resource: str) -> int:
-        """The port that stands for a publication or a service of an incarnation."""
+        """Return the relay's port for a publication or a service of an incarnation."""
         return incarnation.relay_ports[self.allocation.of(_WORDS[kind], resource)]
 
     # --- the links ---
 
     def attach(self, index: int, channel: Channel) -> None:
-        """A relay is there: serve its link and state everything that it is to carry."""
+        """Serve the link of a new relay, and send it its whole state."""
         post = self._posts[index]
         self.carried.lost(index)
         post.attach(channel)
-        # Before anything is placed: nothing goes past the monitors
+        # Before the topics, so that no message bypasses the monitors.
         post.send(self.monitors().statement(index))
         if self.own_header is not None:
             post.send(self.own_header)
@@ -142,44 +142,44 @@ class RelayControl:
         self.monitors().relay_lost(index)
 
     def send(self, message: messages.Message, relay: int) -> bool:
-        """Tell a relay; False when it is not there."""
+        """Send a message to a relay; return False if it is not connected."""
         return self._posts[relay].send(message)
 
     def publish(self, message: messages.OwnPublished) -> None:
-        """Publish as the appliance's own publisher, to whoever subscribes now."""
+        """Publish a message of the appliance's own publisher to the present subscribers."""
         self._post(TOPIC, message.topic).send(message)
 
     async def carried_out(self) -> None:
-        """Wait until every relay has carried out what it was told; one that ends or comes meanwhile begins with it."""
+        """Wait until every relay has carried out its orders; a relay that starts meanwhile starts with them."""
         if waiting := [order for post in self._posts for order in post.orders()]:
             await asyncio.wait(waiting)
 
     async def look(
         self, topic: str, count: int, seconds: float, *, latched: bool
     ) -> list[messages.MessageSeen]:
-        """The next messages of a topic, as its subscribers get them. Raises `TooManyLooksError`."""
+        """Return the next messages of a topic, as its subscribers get them. Raises `TooManyTapsError`."""
         send = self._post(TOPIC, topic).send
         return await self._looks.look(topic, count, seconds, send, latched=latched)
 
     def carries(self, relay: int, kind: str, resource: str) -> bool:
-        """Whether a topic or service is carried by this relay."""
+        """Whether this relay carries a topic or service."""
         return self.allocation.of(kind, resource) == relay
 
     def carried_now(self) -> set[Resource]:
-        """Topics and services of nodes that live."""
+        """Return the topics and services of live nodes."""
         return {
             (_WORDS[registration.kind], registration.resource)
             for _incarnation, registration in self.registry.in_order()
             if registration.kind in _WORDS
         }
 
-    def _post(self, kind: str, resource: str) -> RelayPost:
+    def _post(self, kind: str, resource: str) -> RelayOutbox:
         return self._posts[self.allocation.of(kind, resource)]
 
     # --- what is wanted ---
 
-    def _place(self, post: RelayPost, incarnation: Incarnation) -> None:
-        """State what a relay is to carry of an incarnation."""
+    def _place(self, post: RelayOutbox, incarnation: Incarnation) -> None:
+        """Send a relay its publications, services and grants of an incarnation."""
         for registration in incarnation.registrations.values():
             word = _WORDS.get(registration.kind)
             if word is not None and self.carries(post.index, word, registration.resource):
@@ -191,7 +191,7 @@ class RelayControl:
                 self.place_grant(row)
 
     def _place_one(
-        self, post: RelayPost, incarnation: Incarnation, kind: Kind, resource: str, detail: str
+        self, post: RelayOutbox, incarnation: Incarnation, kind: Kind, resource: str, detail: str
     ) -> None:
         if incarnation.key not in post.placed:
             post.placed.add(incarnation.key)
@@ -210,7 +210,7 @@ class RelayControl:
             post.send(placed, soon=True)
 
     def place_grant(self, row: PermissionRow) -> None:
-        """A subscriber or client is let in."""
+        """Have the relay admit a subscriber or client."""
         post = self._post(row.kind, row.resource)
         if row.kind == TOPIC:
             post.send(_grant(self.policy(), row))
@@ -219,21 +219,21 @@ class RelayControl:
             post.send(messages.ClientGranted(row.key, row.resource, row.host, row.caller_id, named))
 
     def revoke_grant(self, row: PermissionRow) -> None:
-        """A subscriber or client is let in no more; its connection is cut."""
+        """Have the relay revoke a grant and cut its connection."""
         _revoke(self._post(row.kind, row.resource), row)
 
     def place(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
-        """Carry a publication or a service."""
+        """Have the relay carry a publication or a service."""
         self._place_one(self._post(_WORDS[kind], resource), incarnation, kind, resource, detail)
 
     def withdraw(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
-        """Carry a publication or a service no longer."""
+        """Have the relay stop carrying a publication or a service."""
         _withdraw(self._post(_WORDS[kind], resource), incarnation, kind, resource)
 
     def withdraw_moving(self, moves: Iterable[Move]) -> None:
-        """Stop carrying what is about to be carried by another relay; the allocation is still the old one.
+        """Withdraw moving topics and services from their old relays, before the new allocation.
 
-        Its grants go, too: one that is revoked later is revoked where it is carried then, and may come back.
+        Their grants are also withdrawn: a later revocation goes only to the new relay.
         """
         for move in moves:
             post = self._posts[move.source]
@@ -243,7 +243,7 @@ class RelayControl:
                     _revoke(post, row)
 
     def place_moved(self, moves: Iterable[Move]) -> None:
-        """Carry what has moved, with its grants; the allocation is the new one."""
+        """Send moved topics and services with their grants to their new relays, after the new allocation."""
         for move in moves:
             kind, post = _KINDS[move.kind], self._posts[move.target]
             for incarnation in self.registry.registered(kind, move.name):
@@ -257,25 +257,25 @@ class RelayControl:
         return [row for row in rows if (row.kind, row.resource) == (move.kind, move.name)]
 
     def withdraw_node(self, incarnation: Incarnation) -> None:
-        """Carry nothing of an incarnation."""
+        """Have all relays stop carrying an incarnation."""
         for post in self._posts:
             if incarnation.key in post.placed:
                 post.placed.discard(incarnation.key)
                 post.send(messages.NodeWithdrawn(incarnation.key))
 
     def place_node(self, incarnation: Incarnation) -> None:
-        """Carry all that an incarnation has."""
+        """Have the relays carry all topics and services of an incarnation, with their grants."""
         for post in self._posts:
             self._place(post, incarnation)
 
     def _publication(self, incarnation: Incarnation, topic: str, detail: str) -> messages.PublicationPlaced:
         policy = self.policy()
-        together = policy.limit(Part.TOPIC, topic)
+        together = policy.limit(LimitScope.TOPIC, topic)
         return messages.PublicationPlaced(
             incarnation.key,
             topic,
             detail,
-            _flow(policy.limit(Part.PUBLISHER, topic, incarnation.host)),
+            _flow(policy.limit(LimitScope.PUBLISHER, topic, incarnation.host)),
             _flow(together),
             policy.counted_as(incarnation.host) if together else "",
             _names(policy, incarnation.host),
@@ -317,7 +317,7 @@ class RelayControl:
                 self.monitors().received(message, post.index)
 
     async def _answer(
-        self, post: RelayPost, asked: messages.UpstreamWanted | messages.OwnServiceCalled
+        self, post: RelayOutbox, asked: messages.UpstreamWanted | messages.OwnServiceCalled
     ) -> None:
         if isinstance(asked, messages.OwnServiceCalled):
             post.send(await self.own_call(asked))
@@ -325,7 +325,7 @@ class RelayControl:
             await self._find_upstream(post, asked.key, asked.topic)
 
     def _held_back(self, message: messages.LatchRefused | messages.MessagesLimited) -> None:
-        """Messages were not kept or not passed on."""
+        """Record that a relay did not keep or pass on messages."""
         if isinstance(message, messages.MessagesLimited):
             for row in message.rows:
                 self.carried.limited(row, self.policy().limit_rule(row.topic) if row.topic else None)
@@ -334,7 +334,7 @@ class RelayControl:
             if incarnation is not None:
                 self.carried.latch_refused(message, str(incarnation.host))
 
-    async def _find_upstream(self, post: RelayPost, key: str, topic: str) -> None:
+    async def _find_upstream(self, post: RelayOutbox, key: str, topic: str) -> None:
         incarnation = self.registry.by_key(key)
         if incarnation is None or (Kind.PUBLICATION, topic) not in incarnation.registrations:
             post.send(messages.UpstreamRefused(key, topic, "the node does not publish this topic any more"))
@@ -351,14 +351,14 @@ class RelayControl:
 
 def _grant(policy: Policy, row: PermissionRow) -> messages.GrantInstalled:
     host = address_of(row.host)
-    limit = policy.limit(Part.SUBSCRIBER, row.resource, host)
+    limit = policy.limit(LimitScope.SUBSCRIBER, row.resource, host)
     return messages.GrantInstalled(
         row.key, row.resource, row.host, row.caller_id, _flow(limit), _names(policy, host)
     )
 
 
 def _names(policy: Policy, host: Address) -> bool:
-    """Whether the policy names a host; it need not name the appliance itself."""
+    """Whether the policy names a host; loopback (the appliance itself) counts as named."""
     return host.is_loopback or policy.names(host)
 
 
@@ -366,14 +366,14 @@ def _flow(rate: Rate) -> messages.FlowLimit:
     return messages.FlowLimit(rate.messages, rate.bytes)
 
 
-def _withdraw(post: RelayPost, incarnation: Incarnation, kind: Kind, resource: str) -> None:
+def _withdraw(post: RelayOutbox, incarnation: Incarnation, kind: Kind, resource: str) -> None:
     if kind is Kind.PUBLICATION:
         post.send(messages.PublicationWithdrawn(incarnation.key, resource), soon=True)
     else:
         post.send(messages.ServiceWithdrawn(incarnation.key, resource), soon=True)
 
 
-def _revoke(post: RelayPost, row: PermissionRow) -> None:
+def _revoke(post: RelayOutbox, row: PermissionRow) -> None:
     if row.kind == TOPIC:
         post.send(messages.GrantRevoked(row.key, row.resource, row.host, row.caller_id))
     else:
@@ -381,7 +381,7 @@ def _revoke(post: RelayPost, row: PermissionRow) -> None:
 
 
 def tcpros_port(answer: Value) -> int:
-    """The port in a node's answer to `requestTopic`; the host in it is never followed."""
+    """Return the port in a node's answer to `requestTopic`, ignoring the host. Raises `CallFailedError`."""
     match answer:
         case [1, str(), ["TCPROS", str(), int(port)]] if 0 < port < 65536:
             return port

@@ -1,4 +1,4 @@
-"""Looks into topics: asked of the relay that carries one, and ended after a while. Few at a time."""
+"""Tap topics at the relays that carry them, for a limited time and only a few at once."""
 
 import asyncio
 from collections.abc import Callable
@@ -6,15 +6,15 @@ from collections.abc import Callable
 from appliance.channel import messages
 
 MOST = 8
-"""Looks at once; a relay refuses more."""
+"""The most taps at once; relays have the same limit."""
 
 
-class TooManyLooksError(Exception):
-    """Others look already."""
+class TooManyTapsError(Exception):
+    """The most taps are already open."""
 
 
-class TopicLooks:
-    """What is seen of topics, until it is enough."""
+class TapRequests:
+    """The open taps, which collect messages of topics."""
 
     def __init__(self) -> None:
         self._number = 0
@@ -29,9 +29,9 @@ class TopicLooks:
         *,
         latched: bool,
     ) -> list[messages.MessageSeen]:
-        """The next messages of a topic, fewer where no more came in time. Raises `TooManyLooksError`."""
+        """Return the next `count` messages of a topic, or those that came in time. Raises `TooManyTapsError`."""
         if len(self._open) >= MOST:
-            raise TooManyLooksError(f"{MOST} looks into topics are under way: try again")
+            raise TooManyTapsError(f"{MOST} looks into topics are under way: try again")
         self._number += 1
         number, seen, enough = self._number, list[messages.MessageSeen](), asyncio.Event()
         self._open[number] = count, seen, enough
@@ -47,7 +47,7 @@ class TopicLooks:
         return seen
 
     def seen(self, message: messages.MessageSeen) -> None:
-        """A relay has seen a message."""
+        """Add a message from a relay to its tap."""
         count, seen, enough = self._open.get(message.number, (0, [], None))
         if len(seen) < count:
             seen.append(message)

@@ -1,4 +1,4 @@
-"""What the relays carry, as they report it: connections, each with its records, and traffic."""
+"""Keep and record the connections and the traffic that the relays report."""
 
 import time
 from collections import Counter
@@ -17,9 +17,9 @@ from appliance.store.state_file import PermissionRow
 from appliance.telemetry.audit_trail import AuditTrail
 
 MOST_RESOURCES = 2000
-OTHERS = "(others)"  # no name of ROS has a bracket
+OTHERS = "(others)"  # ROS names cannot contain brackets
 
-_STILL_SECONDS = 3.0  # without a report: nothing flows
+_STILL_SECONDS = 3.0  # without a report, after which rates are 0
 
 
 @dataclass(slots=True)
@@ -32,15 +32,17 @@ class Traffic:
     seconds: float = 0.0  # monotonic, of the last report
     messages_per_second: float = 0.0  # between the last two reports
     bytes_per_second: float = 0.0
-    delays: list[int] = field(default_factory=list)  # as `TopicTraffic` has them
+    delays: list[int] = field(default_factory=list)  # as in `TopicTraffic`
     delay_seconds: float = 0.0
-    delay: float = 0.0  # of a message, on average, in the last report; seconds
+    delay: float = 0.0  # mean seconds per message in the last report
+    md5sum: str = ""  # of the publisher; empty until a relay has seen it
 
     def add(self, row: TopicTraffic, now: float, over: float) -> None:
-        """Count what the relay reported; it reports once a second, and only what changed, in `over` seconds."""
+        """Add a relay's report of `over` seconds; relays report once a second, and only changed rows."""
         self.messages += row.messages
         self.bytes += row.bytes
         self.dropped += row.dropped
+        self.md5sum = row.md5sum or self.md5sum
         passed = max(now - self.seconds, 1.0) if self.seconds else max(over, 1.0)
         self.messages_per_second = row.messages / passed
         self.bytes_per_second = row.bytes / passed
@@ -51,7 +53,7 @@ class Traffic:
         self.delay = row.delay_seconds / sum(row.delays) if row.delays else 0.0
 
     def include(self, other: "Traffic") -> None:
-        """Count what another has counted, too."""
+        """Add the counts of another object."""
         self.messages += other.messages
         self.bytes += other.bytes
         self.dropped += other.dropped
@@ -59,29 +61,29 @@ class Traffic:
         self.delay_seconds += other.delay_seconds
 
 
-class Carried:
-    """Connections and traffic of all relays, of which there are `relays`."""
+class RelayTraffic:
+    """The connections and traffic of all relays; `relays` is their number."""
 
     def __init__(self, trail: AuditTrail, registry: Registry, relays: int) -> None:
         self._trail = trail
         self._registry = registry
         self._relays = relays
         self.connections: dict[tuple[int, int], messages.ConnectionOpened] = {}
-        """By relay and its own number of them; the `number` in each is unique among all relays."""
+        """The connections, by relay and the relay's number of the connection; `number` is unique among all relays."""
         self.traffic: dict[tuple[str, str], Traffic] = {}
         self.limited_messages: Counter[tuple[str, str]] = Counter()
-        """How many messages limits dropped, by topic and whose limit it was; of at most `MOST_RESOURCES` topics."""
+        """The messages that limits dropped, by topic and limit; at most `MOST_RESOURCES` topics."""
         self._limited_topics: set[str] = set()
         self.memory: dict[int, dict[str, int]] = {}
-        """The bytes that each relay holds, by what they are."""
+        """The bytes that each relay holds, by kind."""
         self.past: dict[str, Traffic] = {}
-        """What went through topics and services of incarnations that are forgotten: counters never go back.
+        """The traffic of forgotten incarnations, by topic and service, so that counters never decrease.
 
-        Of at most `MOST_RESOURCES`; the rest is under `OTHERS`.
+        It has at most `MOST_RESOURCES` entries, and `OTHERS` for the rest.
         """
 
     def used(self) -> set[PermissionRow]:
-        """The grants that somebody is connected by."""
+        """Return the grants with a connection."""
         return {
             PermissionRow(
                 connection.key, connection.kind, connection.resource, connection.host, connection.caller_id
@@ -91,14 +93,14 @@ class Carried:
 
     @property
     def total(self) -> Traffic:
-        """What went through everything, forgotten incarnations included."""
+        """Return the total traffic, forgotten incarnations included."""
         total = Traffic()
         for traffic in (*self.past.values(), *self.traffic.values()):
             total.include(traffic)
         return total
 
     def flow(self, key: str, resource: str) -> Flow:
-        """What went and goes through a topic or service of an incarnation."""
+        """Return the traffic of a topic or service of an incarnation."""
         traffic = self.traffic.get((key, resource), Traffic())
         flows = time.monotonic() - traffic.seconds < _STILL_SECONDS
         return Flow(
@@ -111,26 +113,26 @@ class Carried:
         )
 
     def lost(self, relay: int) -> None:
-        """A relay is gone, and its connections and memory with it."""
+        """Forget the connections and memory of a relay that is gone."""
         self.memory.pop(relay, None)
         for number in [connection for connection in self.connections if connection[0] == relay]:
             del self.connections[number]
 
     def forgotten(self, key: str) -> None:
-        """An incarnation is gone for good."""
+        """Forget an incarnation, and add its traffic to `past`."""
         for carried in [carried for carried in self.traffic if carried[0] == key]:
             name = carried[1] if carried[1] in self.past or len(self.past) < MOST_RESOURCES else OTHERS
             self.past.setdefault(name, Traffic()).include(self.traffic.pop(carried))
 
     def reported(self, rows: list[TopicTraffic], over: float = 1.0) -> None:
-        """A relay's counters; the last words about a node that is forgotten count for nothing."""
+        """Add a relay's counters; those of a forgotten node are ignored."""
         now = time.monotonic()
         for row in rows:
             if self._registry.by_key(row.key) is not None:
                 self.traffic.setdefault((row.key, row.resource), Traffic()).add(row, now, over)
 
     def unrecorded(self, connections: int) -> None:
-        """So many connections came and went while a relay had no control."""
+        """Record the number of connections that began and ended while a relay had no control process."""
         if connections:
             self._trail.happened(
                 "records lost",
@@ -139,7 +141,7 @@ class Carried:
             )
 
     def opened(self, relay: int, message: messages.ConnectionOpened) -> None:
-        """Somebody is connected."""
+        """Record that a peer is connected."""
         number = message.number * self._relays + relay
         self.connections[relay, message.number] = msgspec.structs.replace(message, number=number)
         name = self._name(message.key)
@@ -154,7 +156,7 @@ class Carried:
         )
 
     def closed(self, relay: int, message: messages.ConnectionClosed) -> None:
-        """A connection has ended."""
+        """Record that a connection has ended."""
         connection = self.connections.pop((relay, message.number), None)
         if connection is None:
             return
@@ -169,7 +171,7 @@ class Carried:
         )
 
     def refused(self, message: messages.ConnectionRefused) -> None:
-        """Somebody was turned away; our own node that comes too late for what it may have attacks nobody."""
+        """Record a refused peer. The appliance's own node may connect too late, which is not an attack."""
         own = self._is_own(message.host, message.caller_id, message.resource)
         self._trail.happened(
             "connection refused",
@@ -185,7 +187,7 @@ class Carried:
         )
 
     def upstream_lost(self, message: messages.UpstreamLost, host: str) -> None:
-        """A publisher at this address is not read any more: recorded if it was cut for what it sent."""
+        """Record that a relay cut a publisher at this address because of its data."""
         if message.violation:
             self._trail.happened(
                 message.violation,
@@ -199,7 +201,7 @@ class Carried:
             )
 
     def latch_refused(self, message: messages.LatchRefused, host: str) -> None:
-        """A relay does not keep the latched message of a publisher at this address."""
+        """Record that a relay did not keep the latched message of a publisher at this address."""
         self._trail.happened(
             "limit exceeded",
             "its latched message is not kept for later subscribers: its host has no memory left for such in the relay",
@@ -213,7 +215,7 @@ class Carried:
         )
 
     def limited(self, row: messages.LimitedRow, rule: LimitRule | None) -> None:
-        """A relay dropped messages that were beyond a limit of the policy (`rule`, unless that has gone meanwhile)."""
+        """Record that a relay dropped messages beyond a limit of the policy (`rule`; None if it has changed since)."""
         topic = row.topic or OTHERS
         known = topic in self._limited_topics or len(self._limited_topics) < MOST_RESOURCES
         self._limited_topics.add(name := topic if known else OTHERS)
@@ -239,7 +241,7 @@ class Carried:
         )
 
     def publication_refused(self, message: messages.PublicationRefused) -> None:
-        """A publisher is not carried."""
+        """Record that a relay refuses to carry a publisher."""
         self._trail.happened(
             "publication refused",
             message.reason,
@@ -254,7 +256,7 @@ class Carried:
         return node.name if node is not None else ""
 
     def _is_own(self, host: str, caller_id: str, topic: str) -> bool:
-        """Whether this is the appliance's own node, which reaches the relay from where it is told to."""
+        """Whether this is one of the appliance's own nodes, at its address, with a topic that it subscribed to."""
         holder = self._registry.holder(caller_id)
         return (
             holder is not None

@@ -1,1 +1,1 @@
-"""The graph: who is who, who registered what, who is told, and what a change of the policy ends."""
+"""The graph: nodes, registrations, updates for subscribers, and the effects of a change of the policy."""

@@ -1,27 +1,27 @@
-"""What follows from a change of the graph, as data: `graph`, `registry`, `grants` and `revocation` return it.
+"""Define the effects of a change of the graph, as data: `graph`, `registry`, `grants` and `revocation` return them.
 
-They do nothing themselves; `enactor` carries effects out, in their order and in the same turn of the loop, so that
-nobody sees a change without what follows from it.
+`enactor` carries the effects out, in order and in the same turn of the event loop, so that no reader sees a change
+without its effects.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from appliance.audit.record import Severity
-from appliance.master.graph.registry import Durable, Incarnation, Kind, Registration
+from appliance.master.graph.registry import Durable, Incarnation, Kind, NodeRegistration
 from appliance.policy.model import Rule
 from appliance.store.state_file import PermissionRow
 from roswire.xmlrpc import Value
 
-_CALL_BYTES = 200  # a call with nothing in it, and a text with nothing in it, as Python keeps them
+_CALL_BYTES = 200  # an empty call, and an empty text, in Python's memory
 _TEXT_BYTES = 60
 
 
 @dataclass(frozen=True, slots=True)
 class NodeCall:
-    """One call to a node: method and parameters after the caller's name.
+    """A call to a node: method and parameters after the caller's name.
 
-    `size` is about how many bytes it takes, where that is known; a list of publishers is measured here.
+    `size` is its approximate size in bytes, if known; otherwise `weight` measures the call.
     """
 
     method: str
@@ -30,7 +30,7 @@ class NodeCall:
 
     @property
     def weight(self) -> int:
-        """About how many bytes it takes while it waits."""
+        """Return the approximate size of the waiting call in bytes."""
         if self.size:
             return self.size
         texts = [
@@ -41,7 +41,7 @@ class NodeCall:
 
 @dataclass(frozen=True, slots=True)
 class TellNode:
-    """Call a node, after what waits for it already."""
+    """A call to a node, after the calls that already wait for it."""
 
     node: Incarnation
     call: NodeCall
@@ -49,14 +49,14 @@ class TellNode:
 
 @dataclass(frozen=True, slots=True)
 class DropCalls:
-    """Nothing that waits for a node is told it any more."""
+    """The end of all waiting calls to a node."""
 
     node: Incarnation
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """The relay of a publication or service carries it."""
+class PlaceResource:
+    """A publication or service that its relay carries from now on."""
 
     node: Incarnation
     kind: Kind
@@ -65,8 +65,8 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Withdraw:
-    """The relay of a publication or service carries it no longer."""
+class WithdrawResource:
+    """A publication or service that its relay no longer carries."""
 
     node: Incarnation
     kind: Kind
@@ -75,79 +75,79 @@ class Withdraw:
 
 @dataclass(frozen=True, slots=True)
 class PlaceNode:
-    """The relays carry all that a node has, with its grants."""
+    """A node whose topics, services and grants the relays carry from now on."""
 
     node: Incarnation
 
 
 @dataclass(frozen=True, slots=True)
 class WithdrawNode:
-    """The relays carry nothing of a node."""
+    """A node that the relays no longer carry."""
 
     node: Incarnation
 
 
 @dataclass(frozen=True, slots=True)
 class CloseNode:
-    """Nothing stands for a node any more: its face and ports are closed, and its traffic is counted with the past."""
+    """A node whose endpoints are closed, and whose traffic is added to the past traffic."""
 
     node: Incarnation
 
 
 @dataclass(frozen=True, slots=True)
 class SaveGrant:
-    """Keep a grant: who has it never asks again."""
+    """A grant to store, because its node never asks again."""
 
     row: PermissionRow
 
 
 @dataclass(frozen=True, slots=True)
 class EraseGrant:
-    """A grant is kept no longer."""
+    """A grant to remove from the store."""
 
     row: PermissionRow
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceGrant:
-    """The relay lets a subscriber or client in."""
+    """A grant by which the relay admits a subscriber or client."""
 
     row: PermissionRow
 
 
 @dataclass(frozen=True, slots=True)
 class RevokeGrant:
-    """The relay lets a subscriber or client in no more, and cuts its connection."""
+    """A grant that the relay revokes, and whose connection it cuts."""
 
     row: PermissionRow
 
 
 @dataclass(frozen=True, slots=True)
 class PutBack:
-    """ROSMaster hears, in its turn, of registrations that a node has again."""
+    """Restored registrations of a node, to make at the ROS master in their turn."""
 
     node: Incarnation
-    registrations: tuple[Registration, ...]
+    registrations: tuple[NodeRegistration, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class TakeBack:
-    """ROSMaster hears, in its turn, of a registration that a node may not have any more."""
+    """A revoked registration of a node, to end at the ROS master in its turn."""
 
     node: Incarnation
-    registration: Registration
+    registration: NodeRegistration
 
 
 @dataclass(frozen=True, slots=True)
 class UsePorts:
-    """New nodes get ports of this range; hosts may be named otherwise, too."""
+    """The range of ports for new nodes under a new policy, which may name hosts differently."""
 
     ports: range
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
-    """The audit log hears of it; the fields are those of `AuditTrail.happened`."""
+class WriteRecord:
+    """A record for the audit log, with the fields of `AuditTrail.happened`."""
 
     event: str
     reason: str
@@ -165,8 +165,8 @@ Effect = (
     Durable
     | TellNode
     | DropCalls
-    | Place
-    | Withdraw
+    | PlaceResource
+    | WithdrawResource
     | PlaceNode
     | WithdrawNode
     | CloseNode
@@ -177,6 +177,6 @@ Effect = (
     | PutBack
     | TakeBack
     | UsePorts
-    | Record
+    | WriteRecord
 )
 Effects = list[Effect]

@@ -1,7 +1,7 @@
-"""Who may have which topic or service of which node through the relays: plain state, as the registry is.
+"""Keep the grants of the relays: clients, with the topics and services that they may use. Plain state, no I/O.
 
-Grants are kept, because a ROS node never asks twice. A host that has too many, or of all hosts that with most, loses
-its oldest ones that nobody is connected by.
+Grants are stored, because a ROS node never asks twice. Above the limit of a host, it loses its oldest grants without a
+connection; above the limit of all hosts, the host with most grants does.
 """
 
 from collections.abc import Callable, Collection, Iterable
@@ -15,17 +15,17 @@ _CLEARED_AT_ONCE = 1000
 
 
 class Grants:
-    """Every grant. `used()` are those that somebody is connected by now."""
+    """All grants. `used()` returns those with a connection now."""
 
     def __init__(self, used: Callable[[], Collection[PermissionRow]], bounds: Bounds = GRANTS.bounds) -> None:
         self.used = used
         self._bounds = bounds
-        self._of_node: dict[str, set[PermissionRow]] = {}  # by the key of who publishes or serves
-        self._of_host: dict[str, dict[PermissionRow, None]] = {}  # the same, in the order they were granted
+        self._of_node: dict[str, set[PermissionRow]] = {}  # by the key of the publisher or provider
+        self._of_host: dict[str, dict[PermissionRow, None]] = {}  # by client host, in order of granting
         self._count = 0
 
     def restore(self, rows: Iterable[PermissionRow]) -> Effects:
-        """Put back what was kept. Grants of an earlier version, for every name of a host, go: it looks up again."""
+        """Restore stored grants. Erase grants of an earlier version for all names of a host, which looks up again."""
         effects: Effects = []
         for row in rows:
             if row.caller_id:
@@ -35,15 +35,15 @@ class Grants:
         return effects
 
     def all(self) -> list[PermissionRow]:
-        """Every grant."""
+        """Return all grants."""
         return [row for rows in self._of_node.values() for row in rows]
 
     def of(self, key: str) -> Collection[PermissionRow]:
-        """The grants for what an incarnation publishes or serves."""
+        """Return the grants for the topics and services of an incarnation."""
         return self._of_node.get(key, ())
 
     def give(self, row: PermissionRow) -> Effects:
-        """This subscriber or client may have it; the grant is its host's newest, whenever it was granted first."""
+        """Give a grant, also if it exists; it becomes the newest grant of its host."""
         effects: Effects = []
         if row not in self._of_node.get(row.key, ()):
             effects.append(SaveGrant(row))
@@ -55,7 +55,7 @@ class Grants:
         return [*effects, PlaceGrant(row)]
 
     def take(self, row: PermissionRow) -> Effects:
-        """Take a grant back, if there is one; its connection is cut."""
+        """Revoke a grant, if it exists; its connection is cut."""
         rows = self._of_node.get(row.key, set())
         if row not in rows:
             return []
@@ -63,7 +63,7 @@ class Grants:
         return [*self._drop(row), RevokeGrant(row)]
 
     def forget(self, key: str) -> Effects:
-        """The incarnation is gone for good, and the grants for what it had with it."""
+        """Forget an incarnation that is gone for good, with the grants for its topics and services."""
         return [effect for row in self._of_node.pop(key, ()) for effect in self._drop(row)]
 
     def _add(self, row: PermissionRow) -> None:

@@ -1,10 +1,9 @@
-"""A change of the registry and what follows from it: who is told, what the relay carries, what is recorded.
+"""Change the registry, and return the effects: updates for nodes, relayed topics, records.
 
-Every way in which the graph changes is a verb here, so that no change can happen without its consequences: it changes
-the registry and the grants, and returns the effects, which whoever calls has `enactor` carry out. The
-lists of publishers that subscribers get are made from the registry at the moment of the change, values of parameters
-from the call that set them, never from what ROSMaster's notification threads say later: what is partial (while
-ROSMaster is rebuilt), out of date or misread by ROSMaster never reaches a node.
+Every change of the graph is a method here, so that no change lacks its effects. The method changes the registry and the
+grants, and returns the effects, which the caller passes to `enactor`. Lists of publishers come from the registry at the
+time of the change, and values of parameters from the call that set them. Later reports of the ROS master's notification
+threads are ignored, because they can be partial (while it is rebuilt), outdated or wrong.
 """
 
 import sys
@@ -18,21 +17,21 @@ from appliance.master.graph.effects import (
     DropCalls,
     Effects,
     NodeCall,
-    Place,
     PlaceGrant,
     PlaceNode,
-    Record,
+    PlaceResource,
     TellNode,
-    Withdraw,
     WithdrawNode,
+    WithdrawResource,
+    WriteRecord,
 )
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.parameter_updates import settled, updates_of
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
+from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration, Registry
 from appliance.policy.model import Address, Decision, address_of
 from appliance.policy.policy import Policy
-from appliance.policy.rate_limits import Part
+from appliance.policy.rate_limits import LimitScope
 from appliance.rpc.bulk import weigh
 from appliance.specifications.allocation import SERVICE, TOPIC
 from appliance.store.state_file import PermissionRow
@@ -42,8 +41,10 @@ _CARRIED = (Kind.PUBLICATION, Kind.SERVICE)
 
 
 @dataclass(frozen=True, slots=True)
-class Graph:
-    """The verbs. `may_be_told(node, key, value)` says whether the policy lets a node read a parameter's value."""
+class RosGraph:
+    """The changes of the graph. `may_be_told(node, key, value)`: whether the policy lets a node read a parameter's
+    value.
+    """
 
     registry: Registry
     grants: Grants
@@ -51,18 +52,18 @@ class Graph:
     may_be_told: Callable[[Incarnation, str, Value], bool]
 
     def registered(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> Effects:
-        """ROSMaster took a registration."""
+        """Record a registration that the ROS master accepted."""
         effects = self._take_name(incarnation)
         if incarnation.life is Life.SHADOW:  # it was lost while its call was under way
             effects += self.returned(incarnation)
         if kind is Kind.SERVICE:
             for provider in list(self.registry.registered(Kind.SERVICE, resource)):
-                if provider is not incarnation:  # ROSMaster keeps one provider of a service: the last
+                if provider is not incarnation:  # the ROS master keeps one provider of a service: the last
                     effects += self.unregistered(provider, Kind.SERVICE, resource)
         new = (kind, resource) not in incarnation.registrations
         effects += self.registry.register(incarnation, kind, resource, detail)
         if kind in _CARRIED:
-            effects.append(Place(incarnation, kind, resource, detail))
+            effects.append(PlaceResource(incarnation, kind, resource, detail))
         if kind is Kind.PUBLICATION:
             effects += self.tell(resource)
         if new:
@@ -71,12 +72,12 @@ class Graph:
         return effects
 
     def unregistered(self, incarnation: Incarnation, kind: Kind, resource: str) -> Effects:
-        """A registration is gone at ROSMaster."""
+        """Record that a registration is gone at the ROS master."""
         effects: Effects = [*self.registry.unregister(incarnation, kind, resource)]
         if not effects:
             return [*self.registry.unshelve(incarnation, kind, resource)]
         if kind in _CARRIED:
-            effects.append(Withdraw(incarnation, kind, resource))
+            effects.append(WithdrawResource(incarnation, kind, resource))
         if kind is Kind.PUBLICATION:
             effects += self.tell(resource)
         elif kind is Kind.SUBSCRIPTION:
@@ -86,9 +87,9 @@ class Graph:
         return [*effects, _record("unregistered", reason, incarnation, kind.value, resource)]
 
     def revoked(
-        self, incarnation: Incarnation, registration: Registration, decision: Decision, call: str
+        self, incarnation: Incarnation, registration: NodeRegistration, decision: Decision, call: str
     ) -> Effects:
-        """A registration is no longer allowed (`call`: see `revocation`); it is gone at ROSMaster."""
+        """Withdraw a registration that is no longer allowed (`call`: see `revocation`), also at the ROS master."""
         kind, resource = registration.kind, registration.resource
         effects: Effects = [
             revocation(decision, str(incarnation.host), incarnation.name, kind.value, resource, call=call),
@@ -99,8 +100,8 @@ class Graph:
             effects.append(_emptied(incarnation, resource))
         return effects
 
-    def granted_again(self, incarnation: Incarnation, registration: Registration) -> Effects:
-        """What the policy took back counts again, and ROSMaster is to hear of it; unless another has it now."""
+    def granted_again(self, incarnation: Incarnation, registration: NodeRegistration) -> Effects:
+        """Restore a registration that the policy took, also at the ROS master, unless another node has it now."""
         kind, resource = registration.kind, registration.resource
         if kind is Kind.SERVICE and self._others_offer(incarnation, resource):
             return [*self.registry.unshelve(incarnation, kind, resource)]
@@ -111,7 +112,7 @@ class Graph:
         return any(holder is not incarnation for holder in self.registry.registered(Kind.SERVICE, service))
 
     def _take_name(self, incarnation: Incarnation) -> Effects:
-        """From whoever has it: also from one that has nothing left, and is not to get anything back any more."""
+        """Take the name from its holder, and forget all that the holder could get back."""
         other = self.registry.occupant(incarnation.name)
         if other is None or other is incarnation:
             return []
@@ -121,7 +122,7 @@ class Graph:
         return effects
 
     def replaced(self, incarnation: Incarnation, by: Incarnation) -> Effects:
-        """Another incarnation took the name; the old one is told to shut down, with ROSMaster's words."""
+        """Replace an incarnation whose name another one took; shut it down with the ROS master's text."""
         lost = list(incarnation.registrations.values())
         reason = f"[{incarnation.name}] Reason: new node registered with same name"
         other = by.host != incarnation.host
@@ -139,7 +140,7 @@ class Graph:
         ]
 
     def lost(self, incarnation: Incarnation, why: str) -> Effects:
-        """The node does not answer any more: what it had counts for nobody until it returns."""
+        """Suspend the registrations of a node that does not answer any more, until it returns."""
         return [
             *self.registry.overshadow(incarnation, time.monotonic()),
             *self._tell_withdrawn(incarnation.registrations.values()),
@@ -149,9 +150,9 @@ class Graph:
         ]
 
     def returned(self, incarnation: Incarnation) -> Effects:
-        """A lost node answers again, and has what it had; ROSMaster is to be told.
+        """Restore the registrations of a lost node that answers again, also at the ROS master.
 
-        A service that another offers by now stays his: a service has one provider, the last.
+        A service that another node offers meanwhile stays with that node, the last provider.
         """
         effects = self._take_name(incarnation)
         for service in incarnation.resources(Kind.SERVICE):
@@ -165,13 +166,13 @@ class Graph:
             elif registration.kind is Kind.SUBSCRIPTION:
                 effects += self._tell_one(incarnation, registration.resource, always=True)
         for kind, topic in incarnation.shelf:
-            # Taken while it was away, or before and it may not have heard of it.
+            # Withdrawn while the node was away, or earlier without reaching it.
             if kind is Kind.SUBSCRIPTION:
                 effects.append(_emptied(incarnation, topic))
         return [*effects, _record("node returned", f"{incarnation.name} answers again", incarnation)]
 
     def forgotten(self, incarnation: Incarnation) -> Effects:
-        """An incarnation is dropped for good."""
+        """Forget an incarnation for good."""
         registrations = list(incarnation.registrations.values())
         effects: Effects = [*self.registry.forget(incarnation), *self._tell_withdrawn(registrations)]
         if self.registry.holder(incarnation.name) is None:
@@ -181,24 +182,24 @@ class Graph:
         return [*effects, *self._close(incarnation), DropCalls(incarnation)]
 
     def _close(self, incarnation: Incarnation) -> Effects:
-        """Nobody gets anything of it any more."""
+        """Close an incarnation to all other nodes."""
         return [WithdrawNode(incarnation), *self.grants.forget(incarnation.key), CloseNode(incarnation)]
 
     # --- grants ---
 
     def topic_granted(self, publisher: Incarnation, topic: str, host: Address, caller_id: str) -> Effects:
-        """This subscriber may have this topic of that publisher."""
+        """Grant a subscriber a topic of a publisher."""
         return self.grants.give(PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id))
 
     def service_granted(self, provider: Incarnation, service: str, host: Address, caller_id: str) -> Effects:
-        """This client may call this service of that provider. Nobody calls without a name."""
+        """Grant a client a service of a provider, unless the client has no name."""
         row = PermissionRow(provider.key, SERVICE, service, str(host), caller_id)
         return self.grants.give(row) if caller_id else []
 
     def _give_up(self, subscriber: Incarnation, topic: str) -> Effects:
-        """The subscriber gave the topic up: its grants for it, on every publisher, are gone.
+        """Remove the grants of a subscriber that gave the topic up, on every publisher.
 
-        Unless another of its name and host has the topic by now: grants are for these two, so they are its own.
+        A later subscriber with the same name and host keeps them, because grants are for name and host.
         """
         other = self.registry.holder(subscriber.name)
         if (
@@ -216,32 +217,34 @@ class Graph:
         ]
 
     def limits_changed(self, before: Policy, now: Policy) -> Effects:
-        """Return what states limits again that differ under another policy, and which hosts the policy names."""
+        """Return the effects that send the relays changed limits, and changes of the hosts that the policy names."""
         effects: Effects = []
         for node in self.registry.live():
             for registration in node.registrations.values():
-                parts = ((Part.PUBLISHER, node.host), (Part.TOPIC, None))
+                parts = ((LimitScope.PUBLISHER, node.host), (LimitScope.TOPIC, None))
                 if registration.kind is Kind.PUBLICATION and (
                     before.names(node.host) != now.names(node.host)
                     or _differ(before, now, registration.resource, parts)
                     or (
-                        now.limit(Part.TOPIC, registration.resource)
+                        now.limit(LimitScope.TOPIC, registration.resource)
                         and before.counted_as(node.host) != now.counted_as(node.host)
                     )
                 ):
-                    effects.append(Place(node, registration.kind, registration.resource, registration.detail))
+                    effects.append(
+                        PlaceResource(node, registration.kind, registration.resource, registration.detail)
+                    )
             for row in self.grants.of(node.key):
                 host = address_of(row.host)
                 if before.names(host) != now.names(host) or (
-                    row.kind == TOPIC and _differ(before, now, row.resource, ((Part.SUBSCRIBER, host),))
+                    row.kind == TOPIC and _differ(before, now, row.resource, ((LimitScope.SUBSCRIBER, host),))
                 ):
                     effects.append(PlaceGrant(row))
         return effects
 
-    # --- what subscribers are told ---
+    # --- updates for subscribers ---
 
     def tell(self, topic: str, *, always: bool = False) -> Effects:
-        """Give every subscriber of a topic its list, if it has another one (or `always`)."""
+        """Send every subscriber of a topic its list of publishers, if it has changed (or `always`)."""
         subscribers = self.registry.registered(Kind.SUBSCRIPTION, topic)
         return [
             effect
@@ -250,9 +253,9 @@ class Graph:
         ]
 
     def tell_everybody(self, concerned: Callable[[str], bool] = lambda _topic: True) -> Effects:
-        """Give every subscriber the lists of all (the concerned) topics: after a rebuild, a new relay or control.
+        """Send all subscribers the lists of all `concerned` topics: after a rebuild, for a new relay or control.
 
-        An empty one of a topic that the policy took: control may have died before the subscriber was told.
+        The list of a revoked topic is empty: control may have died before the subscriber received it.
         """
         topics = {
             registration.resource
@@ -269,23 +272,23 @@ class Graph:
         return effects
 
     def renew_all(self, topic: str) -> Effects:
-        """Have every subscriber of a topic drop its publishers and take them again: they are reached elsewhere."""
+        """Have every subscriber of a topic drop its publishers and connect again, at their new ports."""
         publishers = list(self.registry.registered(Kind.PUBLICATION, topic))
         subscribers = self.registry.registered(Kind.SUBSCRIPTION, topic)
         return [effect for subscriber in subscribers for effect in self.renew(subscriber, topic, publishers)]
 
     def remind(self, subscriber: Incarnation, topic: str) -> Effects:
-        """Give a subscriber its list of a topic once more; an empty one when the policy took the topic from it."""
+        """Send a subscriber its list of a topic again; an empty list if the policy withdrew the topic."""
         if (Kind.SUBSCRIPTION, topic) in subscriber.registrations:
             return self._tell_one(subscriber, topic, always=True)
         return [_emptied(subscriber, topic)] if (Kind.SUBSCRIPTION, topic) in subscriber.shelf else []
 
     def parameter_set(self, key: str, value: Value, caller_id: str) -> Effects:
-        """ROSMaster took this value; who set it is not told of it where others are who subscribed above."""
+        """Return the updates for a value that the ROS master accepted; the caller gets none for exactly this key."""
         return self._tell_parameters(key, value, caller_id)
 
     def parameter_deleted(self, key: str) -> Effects:
-        """The parameter is gone at ROSMaster."""
+        """Return the updates for a parameter that the ROS master deleted."""
         return self._tell_parameters(key, {}, None)
 
     def _tell_parameters(self, key: str, value: Value, caller_id: str | None) -> Effects:
@@ -304,16 +307,15 @@ class Graph:
         return effects
 
     def tell_parameter(self, subscriber: Incarnation, key: str, value: Value) -> Effects:
-        """Tell a node the value that a parameter has, which nobody changes any more.
+        """Send a node the present value of a parameter, if the node may read it.
 
-        It is told what it may read: all that comes to be below a key is told to those who subscribed to it, which was
-        decided by what was there then.
+        The subscription was decided by the keys that existed at that time, so the value is checked again.
         """
         told = self.may_be_told(subscriber, key, value)
         return [TellNode(subscriber, _param_update(key, value))] if told else []
 
     def renew(self, subscriber: Incarnation, topic: str, absent: Collection[Incarnation]) -> Effects:
-        """Have a subscriber drop these publishers and take them again: roscpp takes a list it knows for no news."""
+        """Have a subscriber drop these publishers and connect again, because roscpp ignores an unchanged list."""
         if not absent:
             return self.remind(subscriber, topic)
         gone = {publisher.outer_uri(subscriber.told) for publisher in absent}
@@ -323,10 +325,10 @@ class Graph:
     def absent(
         self, subscribers: Iterable[Incarnation]
     ) -> Iterator[tuple[Incarnation, str, list[Incarnation]]]:
-        """Which of their topics these have through the relay, and of which publishers they are not connected to.
+        """Yield these subscribers' relayed topics, with the publishers that they are not connected to.
 
-        Whether they have a grant does not count: one that was taken while the subscriber heard nothing is asked for
-        again only when it drops the publisher. So this follows from what is kept over a restart.
+        Grants are not considered: if one was withdrawn unnoticed, the subscriber asks again only after it drops the
+        publisher. So the result depends only on data that survive a restart.
         """
         used = self.grants.used()
         for subscriber in subscribers:
@@ -343,7 +345,7 @@ class Graph:
                     yield subscriber, topic, publishers
 
     def list_for(self, subscriber: Incarnation, topic: str) -> list[str]:
-        """The list that answers a registration: what the subscriber is told from here on is relative to it."""
+        """Return the list that answers a registration, and store it, so that only later changes are sent."""
         uris = self._publishers_for(subscriber, topic)
         subscriber.told_lists[topic] = uris
         return list(uris)
@@ -359,7 +361,7 @@ class Graph:
         hidden = self.mediation.hides_publishers(topic)
         return self.registry.uris_for(subscriber, Kind.PUBLICATION, topic, hidden=hidden)
 
-    def _tell_withdrawn(self, registrations: Iterable[Registration]) -> Effects:
+    def _tell_withdrawn(self, registrations: Iterable[NodeRegistration]) -> Effects:
         topics = [
             registration.resource for registration in registrations if registration.kind is Kind.PUBLICATION
         ]
@@ -368,13 +370,12 @@ class Graph:
 
 def revocation(
     decision: Decision, host: str, caller_id: str, category: str, resource: str, *, call: str
-) -> Record:
-    """The record of something that is taken back.
-
-    `call` gave it and is not allowed by the policy any more; empty where it was not the policy that decided.
+) -> WriteRecord:
+    """Return the record of a withdrawal. `call` is the call that the policy no longer allows; empty if the policy is
+    not the reason.
     """
     about = {"call": call, "needs": decision.needs}
-    return Record(
+    return WriteRecord(
         "revoked",
         decision.reason,
         host,
@@ -396,9 +397,9 @@ def _record(
     resource: str | None = None,
     *,
     severity: Severity = Severity.INFO,
-) -> Record:
+) -> WriteRecord:
     about = node.name if resource is None else resource
-    return Record(event, reason, str(node.host), node.name, category, about, severity)
+    return WriteRecord(event, reason, str(node.host), node.name, category, about, severity)
 
 
 def _list(subscriber: Incarnation, topic: str, uris: Iterable[str]) -> TellNode:
@@ -406,14 +407,16 @@ def _list(subscriber: Incarnation, topic: str, uris: Iterable[str]) -> TellNode:
 
 
 def _emptied(subscriber: Incarnation, topic: str) -> TellNode:
-    """Neither client library drops a publisher for anything but a list without it."""
+    """Return an empty list for a subscriber, because client libraries drop a publisher only if a list lacks it."""
     return _list(subscriber, topic, ())
 
 
-def _differ(before: Policy, now: Policy, topic: str, parts: Iterable[tuple[Part, Address | None]]) -> bool:
+def _differ(
+    before: Policy, now: Policy, topic: str, parts: Iterable[tuple[LimitScope, Address | None]]
+) -> bool:
     return any(before.limit(part, topic, host) != now.limit(part, topic, host) for part, host in parts)
 
 
 def _param_update(key: str, value: Value) -> NodeCall:
-    """The call as ROSMaster makes it: keys end with `/`, and an unset one has `{}`."""
+    """Return the call like the ROS master's: the key ends with `/`; the value of an unset key is `{}`."""
     return NodeCall("paramUpdate", (f"{key.rstrip('/')}/", value), weigh(value, sys.maxsize))

@@ -1,24 +1,24 @@
-"""What goes through the relay, and whose URIs nodes are told.
+"""Decide which topics and services are relayed, and which URIs nodes get.
 
-The default, all and full, is the boundary. `relaying: monitored` is the thesis's mode: only topics and services that
-the policy's `[Monitor]` names, or a specification has events on, are carried, the rest is negotiated between the
-nodes; `mediation: monitored` (only with it) also tells nodes each other's real URIs. Both are a choice for speed, not a
-boundary: a node that has been told a port can ask it for anything.
+The default, `all` and `full`, is a security boundary. With `relaying: monitored`, the thesis's mode, the relay carries
+only topics and services that the policy's `[Monitor]` names or that a specification has events on; nodes connect
+directly for the rest. With `mediation: monitored`, which requires it, nodes also get each other's real URIs. Both are
+faster, but not a boundary: a node that knows a port can send any request to it.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.policy.policy import Policy
-from appliance.specifications.specification_files import Checked
+from appliance.specifications.specification_files import CheckedSpecifications
 
 
 @dataclass(frozen=True, slots=True)
 class Mediation:
-    """The two modes, over the running policy."""
+    """The two modes, applied to the running policy."""
 
     policy: Callable[[], Policy]
-    specifications: Callable[[], Checked]
+    specifications: Callable[[], CheckedSpecifications]
     relay_all: bool = True
     stand_ins: bool = True
 
@@ -40,5 +40,5 @@ class Mediation:
         )
 
     def hides_publishers(self, topic: str) -> bool:
-        """Whether subscribers of a topic are told the publishers' outer URIs (else the real ones)."""
+        """Whether subscribers of a topic get the publishers' outer URIs instead of the real ones."""
         return self.stand_ins or self.carries_topic(topic)

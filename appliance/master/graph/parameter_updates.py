@@ -1,11 +1,11 @@
-"""Who is told what when a parameter is set or deleted: computed from the key and the value that were decided.
+"""Compute the updates for subscribers of a set or deleted parameter, from the decided key and value.
 
-As ROSMaster computes it (rosmaster's `compute_param_updates`), but from canonical keys alone, so that nobody is told of
-a key that is not the decided one or below it, whatever the names in a value look like:
+Like rosmaster's `compute_param_updates`, but from canonical keys alone, so that subscribers get only the decided key
+and keys below it, whatever the names in a value are:
 
-1. Who subscribed to the key, or to something above it, is told the key and its value.
-2. Who subscribed to something below it is told what that has in the new value, or `{}`: it is not set any more.
-   A value that is no namespace tells nothing of what was below it.
+1. Subscribers to the key, or to a key above it, get the key and its value.
+2. Subscribers to a key below it get their part of the new value, or `{}` if it is not set any more.
+   A value that is not a namespace causes no updates for keys below it.
 """
 
 from collections.abc import Iterable, Iterator
@@ -14,25 +14,27 @@ from typing import NamedTuple
 from roswire.xmlrpc import Value
 
 
-class Update(NamedTuple):
-    """Those who subscribed to `subscribed` are told that `key` has this value; all keys are canonical."""
+class ParameterUpdate(NamedTuple):
+    """An update: subscribers to `subscribed` get this value of `key`; both keys are canonical."""
 
     subscribed: str
     key: str
     value: Value
 
 
-def updates_of(key: str, value: Value, below: Iterable[str]) -> Iterator[Update]:
-    """What follows when `key` has this value now, or `{}`: it was deleted. `below` are subscribed keys below it."""
+def updates_of(key: str, value: Value, below: Iterable[str]) -> Iterator[ParameterUpdate]:
+    """Yield the updates for a new value of `key` (`{}` if deleted). `below` are the subscribed keys below it."""
     for above in _upwards(key):
-        yield Update(above, key, value)
+        yield ParameterUpdate(above, key, value)
     if isinstance(value, dict):
         for subscribed in below:
-            yield Update(subscribed, subscribed, _member(value, subscribed[len(key.rstrip("/")) + 1 :]))
+            yield ParameterUpdate(
+                subscribed, subscribed, _member(value, subscribed[len(key.rstrip("/")) + 1 :])
+            )
 
 
 def settled(value: Value) -> Value:
-    """The value as it is now: its namespaces are copied, which later calls change in their place."""
+    """Return a snapshot of a value: its namespaces are copied, because later calls change them in place."""
     return {name: settled(member) for name, member in value.items()} if isinstance(value, dict) else value
 
 
@@ -44,7 +46,7 @@ def _upwards(key: str) -> Iterator[str]:
 
 
 def _member(value: Value, path: str) -> Value:
-    """What is at the path in a namespace; `{}` for nothing."""
+    """Return the value at the path in a namespace, or `{}`."""
     for part in path.split("/"):
         if not isinstance(value, dict) or part not in value:
             return {}

@@ -1,17 +1,17 @@
-"""The registry: who is who, what each node registered, and who was told what.
+"""Keep the registry: nodes, their registrations, and the lists that subscribers have. No I/O, no clock.
 
-An *incarnation* is one life of a node: its name and the API URI it registered with, from one host. It holds the
-two faces and the relay port that stand for the node. The registry is plain state: it does no I/O and has no clock;
-every change returns what is to be kept of it (`Durable`), for `enactor` to carry out.
+An *incarnation* is one life of a node: its name and the API URI that it registered with, from one host. It has the two
+endpoints and the relay ports that represent the node. Every change returns the changes to save (`Durable`), which
+`enactor` carries out.
 
 Invariants:
 
 1. At most one incarnation of a name is *live*; it alone holds the name. An earlier one is *replaced* and never
    comes back.
-2. A live incarnation that does not answer any more becomes a *shadow*: its registrations are kept but count for
-   nobody until it returns or expires. A shadow does not hold its name.
-3. A registration has the order in which it was made; a rebuilt ROSMaster is given them in that order.
-4. Keys and ports are never given to another incarnation while this one is known.
+2. A live incarnation that no longer answers becomes a *shadow*: its registrations are kept but have no effect until it
+   returns or expires. A shadow does not hold its name.
+3. Registrations have a number, by which a rebuilt ROS master gets them in the order in which they were made.
+4. Other incarnations do not get the key or ports of an incarnation while it is known.
 """
 
 import enum
@@ -26,17 +26,17 @@ from appliance.policy.model import Address
 from roswire.uris import NodeUri, node_uri
 
 ANY_TYPE = "*"
-"""The type of a topic for who takes any."""
+"""The type of a topic for subscribers that accept any type."""
 
 _MOST_UNUSED_TYPES = 10_000
-"""Topics that nobody has whose types are known: names without end are no way to take memory."""
+"""The most topics without a node whose types are kept, to limit memory."""
 
 PUBLISHER_PATH = "/publisher/"
-"""The path of the API of the appliance's own publisher, on the listener of the inner faces."""
+"""The path of the API of the appliance's own publisher, on the listener of the master-side endpoints."""
 
 
 class Kind(enum.StrEnum):
-    """What can be registered."""
+    """The kind of a registration."""
 
     PUBLICATION = "publication"
     SUBSCRIPTION = "subscription"
@@ -48,7 +48,7 @@ _OF_TOPICS = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
 
 class Life(enum.StrEnum):
-    """Where an incarnation stands."""
+    """The state of an incarnation."""
 
     LIVE = "live"
     SHADOW = "shadow"
@@ -56,8 +56,8 @@ class Life(enum.StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Registration:
-    """One thing a node registered; `detail` is the topic's type, or the service's `rosrpc` port."""
+class NodeRegistration:
+    """A registration of a node; `detail` is the topic's type, or the service's `rosrpc` port."""
 
     kind: Kind
     resource: str
@@ -69,8 +69,8 @@ class Registration:
 class Incarnation:
     """One life of a node.
 
-    `api` is the URI it gave (its host is a claim and never followed); `told` is the appliance's address that this
-    node reaches us at, used in every URI we tell it. `own` marks the appliance's own nodes (the rosout aggregator).
+    `api` is the URI it gave, whose host is a claim and never used. `told` is the address at which this node reaches the
+    appliance, used in all URIs for it. `own` marks the appliance's own nodes (rosout, and the publisher for monitors).
     It has a port on every relay process: `relay_port` on the first, `more_relay_ports` on the others.
     """
 
@@ -84,59 +84,59 @@ class Incarnation:
     relay_port: int
     own: bool = False
     life: Life = Life.LIVE
-    changed: float = 0.0  # monotonic seconds when `life` changed, or of the start if that was before it
+    changed: float = 0.0  # monotonic seconds of the last change of `life`, or of control's start
     touched: float = 0.0  # monotonic seconds of its last registering call
-    registrations: dict[tuple[Kind, str], Registration] = field(default_factory=dict)
-    shelf: dict[tuple[Kind, str], Registration] = field(default_factory=dict)  # what the policy took back
+    registrations: dict[tuple[Kind, str], NodeRegistration] = field(default_factory=dict)
+    shelf: dict[tuple[Kind, str], NodeRegistration] = field(default_factory=dict)  # withdrawn by the policy
     told_lists: dict[str, tuple[str, ...]] = field(default_factory=dict)
     more_relay_ports: tuple[int, ...] = ()
-    calls: int = 0  # registering calls of it that are under way
+    calls: int = 0  # the number of its registering calls under way
 
     @property
     def spare(self) -> bool:
-        """Whether it has nothing, was taken nothing from, and asks for nothing now."""
+        """Whether it can be evicted: it is replaced, or has no registrations, withdrawn ones or calls under way."""
         return not (self.registrations or self.shelf or self.calls or self.own) or self.life is Life.REPLACED
 
     @property
     def of_monitors(self) -> bool:
-        """Whether this is the appliance's own publisher of what monitors publish."""
+        """Whether this is the appliance's own publisher of the monitors' messages."""
         return self.own and self.api.path == PUBLISHER_PATH
 
     @property
     def relay_ports(self) -> tuple[int, ...]:
-        """Its port on each relay process."""
+        """Return its port on each relay process."""
         return (self.relay_port, *self.more_relay_ports)
 
     @property
     def ports(self) -> tuple[int, ...]:
-        """Every port that stands for it."""
+        """Return every port that represents it."""
         return (self.outer_port, *self.relay_ports)
 
     @property
     def real_uri(self) -> str:
-        """The node's own API at its peer address (told only where nothing is mediated)."""
+        """Return the node's own API at its peer address (only for nodes without a proxy endpoint in between)."""
         return node_uri(str(self.host), self.api.port, self.api.path)
 
     @property
     def call_uri(self) -> NodeUri:
-        """Where the appliance calls the node: at its peer address, whatever host it claimed; our own at `own_node`."""
+        """Return the URI for calls to the node: at its peer address, whatever host it claimed; rosout has its own."""
         host = rosout_address.ADDRESS if self.own and not self.of_monitors else str(self.host)
         return NodeUri("http", host, self.api.port, self.api.path)
 
     def outer_uri(self, told: str) -> str:
-        """The URI other nodes know this one by, as seen by somebody who reaches the appliance at `told`."""
+        """Return the URI for other nodes that reach the appliance at `told`."""
         return node_uri(told, self.outer_port)
 
     def uri_for(self, told: str, *, hidden: bool) -> str:
-        """The outer URI when `hidden`, else the real one; the appliance's own nodes have no other for anybody."""
+        """Return the outer URI when `hidden`, else the real one; the appliance's own nodes have only the outer one."""
         return self.outer_uri(told) if hidden or self.own else self.real_uri
 
-    def in_order(self) -> list[Registration]:
-        """What it registered, in the order in which it did."""
+    def in_order(self) -> list[NodeRegistration]:
+        """Return its registrations, in their order."""
         return sorted(self.registrations.values(), key=lambda registration: registration.order)
 
     def resources(self, kind: Kind) -> list[str]:
-        """What it registered of that kind, in order."""
+        """Return its registrations of that kind, in their order."""
         return [
             registration.resource for registration in self.registrations.values() if registration.kind is kind
         ]
@@ -144,30 +144,30 @@ class Incarnation:
 
 @dataclass(frozen=True, slots=True)
 class SaveNode:
-    """Keep an incarnation: it is new, or its `life` or its ports have changed."""
+    """An incarnation to save: it is new, or its `life` or ports have changed."""
 
     node: Incarnation
 
 
 @dataclass(frozen=True, slots=True)
 class EraseNode:
-    """The incarnation and all its registrations are gone."""
+    """An incarnation to erase, with all its registrations."""
 
     key: str
 
 
 @dataclass(frozen=True, slots=True)
 class SaveRegistration:
-    """Keep a registration of the incarnation with this key; `shelved` is one that the policy took back."""
+    """A registration to save, of the incarnation with this key; `shelved`: the policy withdrew it."""
 
     key: str
-    registration: Registration
+    registration: NodeRegistration
     shelved: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class EraseRegistration:
-    """A registration is gone, or is not remembered on the shelf any more."""
+    """A registration to erase; `shelved`: one that the policy withdrew."""
 
     key: str
     kind: Kind
@@ -179,64 +179,64 @@ Durable = SaveNode | EraseNode | SaveRegistration | EraseRegistration
 
 
 class Registry:
-    """All incarnations that are known, by key, by name and by topic."""
+    """All known incarnations, by key, by name and by topic."""
 
     def __init__(self) -> None:
         self._by_key: dict[str, Incarnation] = {}
         self._known: dict[tuple[str, Address, str], Incarnation] = {}
         self._live: dict[str, Incarnation] = {}
         self._topics: dict[tuple[Kind, str], dict[str, Incarnation]] = {}
-        self._types: dict[str, str] = {}  # of topics, as ROSMaster has them
-        self._unused_types: dict[str, None] = {}  # of topics that nobody has any more, the oldest first
+        self._types: dict[str, str] = {}  # of topics, as in the ROS master
+        self._unused_types: dict[str, None] = {}  # of topics without a node, the oldest first
         self._subscribed_keys: list[str] = []  # the parameters of `_topics`, sorted
         self._nodes_of: Counter[Address] = Counter()
         self._registrations_of: Counter[Address] = Counter()
         self._order = 0
-        self.version = 0  # another after every change
+        self.version = 0  # increases with every change
 
     # --- looking ---
 
     def by_key(self, key: str) -> Incarnation | None:
-        """The incarnation with this key, whatever its life."""
+        """Return the incarnation with this key, whatever its life."""
         return self._by_key.get(key)
 
     def find(self, name: str, host: Address, api_text: str) -> Incarnation | None:
-        """The incarnation that registered as `name` from `host` with this API URI."""
+        """Return the incarnation that registered as `name` from `host` with this API URI."""
         return self._known.get((name, host, api_text))
 
     def holder(self, name: str) -> Incarnation | None:
-        """The live incarnation that holds a name: one with at least one registration."""
+        """Return the live incarnation that holds a name: one with at least one registration."""
         incarnation = self._live.get(name)
         return incarnation if incarnation is not None and incarnation.registrations else None
 
     def occupant(self, name: str) -> Incarnation | None:
-        """The live incarnation that holds a name, or would if it were given back what the policy took from it."""
+        """Return the live incarnation that holds a name, or would if the policy restored its registrations."""
         incarnation = self._live.get(name)
         there = incarnation is not None and (incarnation.registrations or incarnation.shelf)
         return incarnation if there else None
 
     def live(self) -> list[Incarnation]:
-        """All live incarnations."""
+        """Return all live incarnations."""
         return list(self._live.values())
 
     def all(self) -> list[Incarnation]:
-        """Every incarnation that is known."""
+        """Return all known incarnations."""
         return list(self._by_key.values())
 
     def registered(self, kind: Kind, resource: str) -> Iterable[Incarnation]:
-        """Live incarnations that registered this resource, in the order of registration."""
+        """Return the live incarnations that registered this resource, in the order of registration."""
         return self._topics.get((kind, resource), {}).values()
 
     def resources(self) -> Iterator[tuple[Kind, str, Iterable[Incarnation]]]:
-        """All that live incarnations registered, with who did."""
+        """Yield all resources that live incarnations registered, with these incarnations."""
         return ((kind, resource, holders.values()) for (kind, resource), holders in self._topics.items())
 
     def type_of(self, topic: str) -> str:
-        """The type of a topic: what the last publisher said, else the first subscriber that named one."""
+        """Return the type of a topic: from the last publisher, or else from the first subscriber that named one."""
         return self._types.get(topic, ANY_TYPE)
 
     def types(self) -> Iterable[tuple[str, str]]:
-        """Every topic and its type; also of topics that nobody has any more, as ROSMaster remembers them."""
+        """Return all topics with their types, including topics without a node, like the ROS master."""
         return self._types.items()
 
     @property
@@ -245,44 +245,50 @@ class Registry:
         return bool(self._subscribed_keys)
 
     def subscribed_below(self, key: str) -> list[str]:
-        """The keys of parameters below `key` that live incarnations subscribed to, sorted."""
+        """Return the keys of parameters below `key` that live incarnations subscribed to, sorted."""
         keys, above = self._subscribed_keys, key.rstrip("/")
-        # Those that begin with `above/` stand together, before `above0`: '0' follows '/'.
+        # Keys that begin with `above/` are adjacent, before `above0`: '0' follows '/'.
         below = keys[bisect_left(keys, f"{above}/") : bisect_left(keys, f"{above}0")]
         return [found for found in below if found != "/"]
 
     def nodes_of(self, host: Address) -> int:
-        """How many incarnations of a host are known (for the limit per host)."""
+        """Return the number of known incarnations of a host, for the limit per host."""
         return self._nodes_of.get(host, 0)
 
     def spare_of(self, host: Address) -> Incarnation | None:
-        """The incarnation of a host that makes room first: one that has nothing, else the one that was lost first."""
+        """Return the incarnation of a host to evict first: a spare one, or else the one that was lost first."""
         mine = [incarnation for incarnation in self._by_key.values() if incarnation.host == host]
         idle = next((incarnation for incarnation in mine if incarnation.spare), None)
         gone = (incarnation for incarnation in mine if incarnation.life is not Life.LIVE)
         return idle or min(gone, key=lambda incarnation: incarnation.changed, default=None)
 
     def spare(self, host: Address) -> Incarnation | None:
-        """The incarnation that makes room for one of this host: of it, or of another host one that has nothing."""
+        """Return the incarnation to evict for a new one of this host: its own, or a spare one of another host."""
         return self.spare_of(host) or next(
             (incarnation for incarnation in self._by_key.values() if incarnation.spare), None
         )
 
     @property
     def registrations(self) -> int:
-        """How many registrations all hosts have."""
+        """Return the number of registrations of all hosts."""
         return self._registrations_of.total()
 
     def registrations_by_host(self) -> Iterable[tuple[Address, int]]:
-        """How many registrations each host has."""
+        """Return the number of registrations by host."""
         return self._registrations_of.items()
 
     def registrations_of(self, host: Address) -> int:
-        """How many registrations a host has (for the limit per host)."""
+        """Return the number of registrations of a host, for the limit per host."""
         return self._registrations_of.get(host, 0)
 
-    def in_order(self) -> Iterator[tuple[Incarnation, Registration]]:
-        """Every registration of live incarnations, in the order they were made."""
+    def machines(self) -> dict[str, int]:
+        """Return the number of live nodes by address, without the appliance's own."""
+        return Counter(
+            str(one.host) for one in self._by_key.values() if one.life is Life.LIVE and not one.own
+        )
+
+    def in_order(self) -> Iterator[tuple[Incarnation, NodeRegistration]]:
+        """Yield every registration of live incarnations, in the order they were made."""
         pairs = [
             (incarnation, registration)
             for incarnation in self._live.values()
@@ -291,10 +297,10 @@ class Registry:
         return iter(sorted(pairs, key=lambda pair: pair[1].order))
 
     def uris_for(self, reader: Incarnation, kind: Kind, topic: str, *, hidden: bool) -> tuple[str, ...]:
-        """The URIs of a topic's publishers or subscribers as `reader` is told them.
+        """Return the URIs of a topic's publishers or subscribers for `reader`.
 
-        Its own entry is its own real URI, as it gave it; the others' are as `Incarnation.uri_for` has them. The
-        appliance's own nodes reach others through the appliance only.
+        Its own entry is the URI that it gave; the others come from `Incarnation.uri_for`. The appliance's own nodes
+        reach other nodes only through the appliance.
         """
         return tuple(
             incarnation.api_text
@@ -306,7 +312,7 @@ class Registry:
     # --- changing ---
 
     def add(self, incarnation: Incarnation) -> list[Durable]:
-        """Make a new incarnation known; it holds nothing yet."""
+        """Add a new incarnation, which has no registrations yet."""
         self.version += 1
         self._by_key[incarnation.key] = incarnation
         self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
@@ -314,7 +320,7 @@ class Registry:
         return [SaveNode(incarnation)]
 
     def restore(self, incarnation: Incarnation) -> None:
-        """Put back an incarnation that was read from the store, with its registrations."""
+        """Add an incarnation that was read from the store, with its registrations."""
         self.version += 1
         self._by_key[incarnation.key] = incarnation
         self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
@@ -329,7 +335,7 @@ class Registry:
                 self._index(incarnation, registration)
 
     def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> list[Durable]:
-        """Record that ROSMaster took this registration."""
+        """Record that the ROS master accepted a registration."""
         kept: list[Durable] = []
         self.version += 1
         if incarnation.life is Life.SHADOW:  # it was lost while its call was under way
@@ -340,25 +346,25 @@ class Registry:
             self._order += 1
             order = registration.order if registration is not None else self._order
             self._registrations_of[incarnation.host] += registration is None
-            registration = Registration(kind, resource, detail, order)
+            registration = NodeRegistration(kind, resource, detail, order)
             incarnation.registrations[kind, resource] = registration
             kept.append(SaveRegistration(incarnation.key, registration))
         self._index(incarnation, registration)
         return kept + self.unshelve(incarnation, kind, resource)
 
-    def shelve(self, incarnation: Incarnation, registration: Registration) -> list[Durable]:
-        """Remember what the policy took back: should it be granted again, the node would not ask for it."""
+    def shelve(self, incarnation: Incarnation, registration: NodeRegistration) -> list[Durable]:
+        """Store a registration that the policy withdrew, because its node would not repeat it when granted again."""
         incarnation.shelf[registration.kind, registration.resource] = registration
         return [SaveRegistration(incarnation.key, registration, shelved=True)]
 
     def unshelve(self, incarnation: Incarnation, kind: Kind, resource: str) -> list[Durable]:
-        """It is registered again, or the node gave it up; nothing to be kept if it was not on the shelf."""
+        """Forget a registration that the policy withdrew, if there is one."""
         if incarnation.shelf.pop((kind, resource), None) is None:
             return []
         return [EraseRegistration(incarnation.key, kind, resource, shelved=True)]
 
     def unregister(self, incarnation: Incarnation, kind: Kind, resource: str) -> list[Durable]:
-        """Record that a registration is gone; nothing to be kept if there was none."""
+        """Remove a registration, if it exists."""
         if incarnation.registrations.pop((kind, resource), None) is None:
             return []
         self.version += 1
@@ -367,7 +373,7 @@ class Registry:
         return [EraseRegistration(incarnation.key, kind, resource)]
 
     def replace(self, incarnation: Incarnation, when: float) -> list[Durable]:
-        """Another incarnation took the name: this one's registrations are gone."""
+        """Remove the registrations of an incarnation whose name another one took."""
         kept = [
             kept
             for kind, resource in list(incarnation.registrations)
@@ -376,13 +382,13 @@ class Registry:
         return kept + self._retire(incarnation, Life.REPLACED, when)
 
     def overshadow(self, incarnation: Incarnation, when: float) -> list[Durable]:
-        """The node does not answer: its registrations count for nobody until it returns."""
+        """Suspend the registrations of a node that does not answer, until it returns."""
         for kind, resource in incarnation.registrations:
             self._unindex(incarnation, kind, resource)
         return self._retire(incarnation, Life.SHADOW, when)
 
     def revive(self, incarnation: Incarnation, when: float) -> list[Durable]:
-        """A shadow answers again and its name is free: it is live as before."""
+        """Make a shadow live again: it answers, and its name is free."""
         self.version += 1
         incarnation.life, incarnation.changed = Life.LIVE, when
         self._live[incarnation.name] = incarnation
@@ -391,7 +397,7 @@ class Registry:
         return [SaveNode(incarnation)]
 
     def forget(self, incarnation: Incarnation) -> list[Durable]:
-        """Drop an incarnation for good; its ports may go to another."""
+        """Forget an incarnation for good; its ports may be reused."""
         self.version += 1
         for kind, resource in incarnation.registrations:
             self._unindex(incarnation, kind, resource)
@@ -413,15 +419,15 @@ class Registry:
             del self._live[incarnation.name]
         return [SaveNode(incarnation)]
 
-    def _index(self, incarnation: Incarnation, registration: Registration) -> None:
+    def _index(self, incarnation: Incarnation, registration: NodeRegistration) -> None:
         holders = self._topics.setdefault((registration.kind, registration.resource), {})
         if not holders and registration.kind is Kind.PARAMETER:
             insort(self._subscribed_keys, registration.resource)
         holders[incarnation.key] = incarnation
         self._note_type(registration)
 
-    def _note_type(self, registration: Registration) -> None:
-        """Take a topic's type as ROSMaster does: a publisher's, or a subscriber's and `*` where there is none yet."""
+    def _note_type(self, registration: NodeRegistration) -> None:
+        """Store a topic's type as the ROS master does: that of a publisher, or of a subscriber if no publisher gave one."""
         kind, topic, told = registration.kind, registration.resource, registration.detail
         if kind not in _OF_TOPICS:
             return
@@ -431,7 +437,7 @@ class Registry:
             self._types[topic] = told
 
     def adopt_types(self, types: Iterable[tuple[str, str]]) -> None:
-        """Take what ROSMaster remembers: of topics from before control began."""
+        """Adopt the ROS master's types of topics from before the start of control."""
         self.version += 1
         for topic, told in types:
             self._types[topic] = told
@@ -439,7 +445,7 @@ class Registry:
                 self._remember_unused(topic)
 
     def forget_types(self) -> None:
-        """A new ROSMaster knows nothing of topics that nobody has."""
+        """Forget topics without a node, which a new ROS master does not know."""
         self.version += 1
         for topic in self._unused_types:
             self._types.pop(topic, None)
@@ -468,5 +474,5 @@ class Registry:
 
 
 def new_key() -> str:
-    """A key for a new incarnation: 128 random bits, so that an inner URI cannot be guessed."""
+    """Return a key for a new incarnation: 128 random bits, so that a master-side URI cannot be guessed."""
     return secrets.token_hex(16)

@@ -1,18 +1,18 @@
-"""After a change of the policy, what nodes have is decided again: those that live, and those that are away for now.
+"""Decide all registrations and grants again after a change of the policy, for live nodes and for lost ones.
 
-What is no longer allowed is taken back, and remembered: what is allowed again (a rollback, a change that was not
-confirmed in time) is put back, because a ROS 1 node never registers twice.
+Registrations that are no longer allowed are withdrawn and stored. If they are allowed again (a rollback, a change that
+was not confirmed in time), they are registered again, because a ROS 1 node never registers twice.
 """
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from appliance.master.graph.effects import Effect, Effects, PutBack, Record, TakeBack, UsePorts
+from appliance.master.graph.effects import Effect, Effects, PutBack, TakeBack, UsePorts, WriteRecord
 from appliance.master.graph.grants import Grants
-from appliance.master.graph.graph import Graph, revocation
-from appliance.master.graph.own_node import OWN, ROSOUT
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
-from appliance.policy.live_rights import Live, live_by, may_keep
+from appliance.master.graph.graph import RosGraph, revocation
+from appliance.master.graph.own_node import OWN, rosout_may_have
+from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration, Registry
+from appliance.policy.live_rights import LiveRight, live_by, may_keep
 from appliance.policy.model import Address, Decision, address_of
 from appliance.policy.policy import Policy
 from appliance.specifications.allocation import TOPIC
@@ -25,21 +25,21 @@ CALLS = {
     Kind.SERVICE: ("registerService", "unregisterService"),
     Kind.PARAMETER: ("subscribeParam", "unsubscribeParam"),
 }
-"""The calls of the Master API by which a node has something of a kind, and gives it up."""
+"""The calls of the Master API that register and unregister each kind."""
 
 
 @dataclass(frozen=True, slots=True)
 class Revocation:
-    """Decides again what the registry and the grants hold, by the policy and the parameters (`tree`) at that moment."""
+    """The repeated decision on registrations and grants, by the present policy and the present parameters (`tree`)."""
 
     registry: Registry
     grants: Grants
-    graph: Graph
+    graph: RosGraph
     policy: Callable[[], Policy]
     tree: Callable[[], Tree]
 
-    def live(self) -> list[Live]:
-        """What `redecide` decides: all that nodes have by the policy."""
+    def live(self) -> list[LiveRight]:
+        """Return all registrations and grants of nodes, except the appliance's own, which `redecide` decides."""
         return [
             *(
                 self._registered(incarnation, registration.kind, registration.resource)
@@ -50,25 +50,25 @@ class Revocation:
         ]
 
     def policy_changed(self, before: Policy, now: Policy) -> Effects:
-        """All that follows from another policy, which is in force already."""
+        """Return all effects of a new policy, which is already in force."""
         return [UsePorts(now.ports), *self.redecide(), *self.graph.limits_changed(before, now)]
 
     def redecide(self) -> Effects:
-        """Take back what the running policy no longer allows, and put back what it grants again."""
+        """Revoke rights that the running policy no longer allows, and restore registrations that it grants again."""
         effects = self._redecide(self._registrations(), self.grants.all())
         for incarnation in self.registry.live():
             effects += self.returned(incarnation)
         return effects
 
     def redecide_for(self, host: Address, caller_id: str) -> Effects:
-        """Take back what one caller may not have: his call was decided before the policy changed, made after."""
+        """Revoke denied rights of a caller whose call was decided before a change of the policy and made after it."""
         return self._redecide(
             [pair for pair in self._registrations() if (pair[0].host, pair[0].name) == (host, caller_id)],
             [row for row in self.grants.all() if (row.host, row.caller_id) == (str(host), caller_id)],
         )
 
     def _redecide(
-        self, registrations: list[tuple[Incarnation, Registration]], grants: list[PermissionRow]
+        self, registrations: list[tuple[Incarnation, NodeRegistration]], grants: list[PermissionRow]
     ) -> Effects:
         effects: Effects = []
         for incarnation, registration in registrations:
@@ -83,7 +83,7 @@ class Revocation:
         return effects
 
     def expel(self, host: Address, reason: str) -> Effects:
-        """Take back all that a host has, whatever the policy says."""
+        """Revoke all registrations and grants of a host, whatever the policy says."""
         effects: Effects = []
         decision = Decision(False, None, reason)
         for incarnation, registration in self._registrations():
@@ -95,15 +95,15 @@ class Revocation:
         return effects
 
     def returned(self, incarnation: Incarnation) -> Effects:
-        """Give a running node what was taken from it and is granted now: it never registers twice.
+        """Restore withdrawn registrations that are granted now, because a node never registers twice.
 
-        The registry has it at once, so that the next change of the policy finds it; ROSMaster hears in its turn.
+        The registry has them at once, so that the next change of the policy finds them; the ROS master gets them later.
         """
         holder = self.registry.holder(incarnation.name)
         if holder is not None and holder is not incarnation:
             return []
         effects: Effects = []
-        back: list[Registration] = []
+        back: list[NodeRegistration] = []
         for registration in sorted(incarnation.shelf.values(), key=lambda registration: registration.order):
             if self.may_have(incarnation, registration.kind, registration.resource):
                 effects += self.graph.granted_again(incarnation, registration)
@@ -111,8 +111,8 @@ class Revocation:
                     back.append(registration)
         return [*effects, PutBack(incarnation, tuple(back))] if back else effects
 
-    def _registrations(self) -> list[tuple[Incarnation, Registration]]:
-        """Every registration that counts now or will when its node is back, in the order they were made."""
+    def _registrations(self) -> list[tuple[Incarnation, NodeRegistration]]:
+        """Return all registrations of live and lost nodes, in the order in which they were made."""
         pairs = [
             (incarnation, registration)
             for incarnation in self.registry.all()
@@ -122,10 +122,10 @@ class Revocation:
         return sorted(pairs, key=lambda pair: pair[1].order)
 
     def _take_back(
-        self, incarnation: Incarnation, registration: Registration, decision: Decision, call: str
+        self, incarnation: Incarnation, registration: NodeRegistration, decision: Decision, call: str
     ) -> Effects:
         effects = self.graph.revoked(incarnation, registration, decision, call)
-        if incarnation.life is Life.LIVE:  # else ROSMaster has been told
+        if incarnation.life is Life.LIVE:  # otherwise the ROS master does not have it
             effects.append(TakeBack(incarnation, registration))
         return effects
 
@@ -134,12 +134,12 @@ class Revocation:
         return [*self.grants.take(row), record]
 
     def may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
-        """Whether the policy in force grants a node what it has, had, or seems to have."""
+        """Whether the policy in force grants a node a registration."""
         return self._decide(incarnation, kind, resource).allowed
 
     def _decide(self, incarnation: Incarnation, kind: Kind, resource: str) -> Decision:
         if incarnation.own:
-            known = incarnation.of_monitors or ROSOUT.may_have(kind, resource)
+            known = incarnation.of_monitors or rosout_may_have(kind, resource)
             return Decision(known, None, OWN if known else f"{OWN} does not have this any more")
         return may_keep(self.policy(), self._registered(incarnation, kind, resource))
 
@@ -152,14 +152,14 @@ class Revocation:
         holder = self.registry.holder(row.caller_id)
         return row.kind == TOPIC and holder is not None and holder.own
 
-    def _registered(self, incarnation: Incarnation, kind: Kind, resource: str) -> Live:
+    def _registered(self, incarnation: Incarnation, kind: Kind, resource: str) -> LiveRight:
         return live_by(CALLS[kind][0], incarnation.host, incarnation.name, resource, self.tree())
 
-    def _granted(self, row: PermissionRow) -> Live:
+    def _granted(self, row: PermissionRow) -> LiveRight:
         call = "requestTopic" if row.kind == TOPIC else "lookupService"
-        return Live(address_of(row.host), row.caller_id, call, row.resource)
+        return LiveRight(address_of(row.host), row.caller_id, call, row.resource)
 
 
 def revoked(effects: Iterable[Effect]) -> int:
-    """How many registrations and grants these effects take back."""
-    return sum(isinstance(effect, Record) and effect.event == "revoked" for effect in effects)
+    """Return the number of registrations and grants that these effects revoke."""
+    return sum(isinstance(effect, WriteRecord) and effect.event == "revoked" for effect in effects)

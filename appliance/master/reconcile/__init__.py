@@ -1,1 +1,1 @@
-"""What keeps the graph and the world alike: effects carried out, and what is done without being asked."""
+"""Keep the graph, the ROS master and the robot's nodes consistent: carry out effects, check nodes, reconcile."""

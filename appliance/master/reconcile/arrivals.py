@@ -1,16 +1,16 @@
-"""How an incarnation comes to be: a call registers under a name, from a host, with an API URI.
+"""Make incarnations: each registering call has a name, a host and an API URI.
 
-Who is coming makes room for nobody: else two that come at once, where there is room for one, would take it from each
-other for ever.
+An incarnation with a registering call under way is not evicted. Otherwise two nodes that arrive at once, with room for
+one, would evict each other forever.
 """
 
 import time
 from dataclasses import dataclass
 
 from appliance.master.caller import ApiUri, Caller
-from appliance.master.endpoints.endpoint_addresses import Addresses, NoPortError, Places
-from appliance.master.endpoints.proxy_endpoints import Faces
-from appliance.master.graph.graph import Graph
+from appliance.master.endpoints.node_ports import AdvertisedAddresses, NodePorts, NoPortError
+from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Life, Registry, new_key
 from appliance.master.reconcile.enactor import Enactor
 from appliance.master.reconcile.liveness import Liveness
@@ -19,24 +19,24 @@ from appliance.policy.model import Address
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """Finds the incarnation that calls, or makes it."""
+    """The finder and maker of incarnations for callers."""
 
     registry: Registry
-    graph: Graph
+    graph: RosGraph
     enactor: Enactor
     liveness: Liveness
-    places: Places
-    faces: Faces
-    addresses: Addresses
+    places: NodePorts
+    faces: ProxyEndpoints
+    addresses: AdvertisedAddresses
 
     def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        """The incarnation that calls, if it is known."""
+        """Return the calling incarnation, if it is known."""
         return self.registry.find(caller.caller_id, caller.peer.host, api.text)
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
-        """The incarnation that calls; made, with its ports and durably, when it is new.
+        """Return the calling incarnation; make and save a new one with its ports if it is unknown.
 
-        Raises `NoPortError` when the range of ports is exhausted, or control has no descriptors; nothing stays then.
+        Raises `NoPortError` if the range of ports is exhausted, or control has no descriptors; nothing is changed then.
         """
         identity = (caller.caller_id, caller.peer.host, api.text)
         incarnation = self.registry.find(*identity)
@@ -46,15 +46,15 @@ class Arrivals:
             return incarnation
         if incarnation is not None and incarnation.life is Life.SHADOW:
             if self.registry.holder(incarnation.name) is None:
-                # It was away and adds to what it had, before anybody saw that it is back.
-                with MakingRoomForNobody(incarnation):
+                # It registers again before a check has found that it is back.
+                with EvictionGuard(incarnation):
                     await self.liveness.revive(incarnation)
                 return incarnation
-            # Another took its name meanwhile: it begins anew.
+            # Another incarnation took its name meanwhile, so it begins again.
             self.enactor.carry_out(self.graph.forgotten(incarnation))
         incarnation = self._make(caller, api)
         try:
-            with MakingRoomForNobody(incarnation):
+            with EvictionGuard(incarnation):
                 await self.faces.open(incarnation)
         except NoPortError:
             self.enactor.carry_out(self.graph.forgotten(incarnation))
@@ -81,7 +81,7 @@ class Arrivals:
         return incarnation
 
     def _open_ports(self, host: Address) -> tuple[int, ...]:
-        """Ports for a node of this host; who has no registration makes room at once. Raises `NoPortError`."""
+        """Return ports for a node of this host; evict spare incarnations if necessary. Raises `NoPortError`."""
         while True:
             try:
                 return self.places.open(host)
@@ -92,8 +92,8 @@ class Arrivals:
                 self.enactor.carry_out(self.graph.forgotten(spare))
 
 
-class MakingRoomForNobody:
-    """A registering call of an incarnation is under way."""
+class EvictionGuard:
+    """A guard for the time of a registering call, in which its incarnation is not evicted."""
 
     __slots__ = ("_incarnation",)
 

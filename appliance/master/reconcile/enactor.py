@@ -1,6 +1,6 @@
-"""Carries out what follows from changes of the graph (`effects`): the one place where they touch the world.
+"""Carry out the effects of changes of the graph (`effects.py`), which all other code only returns.
 
-What the store was told of the registry comes back after a restart (`restore`).
+After a restart, `restore` reads the registry from the store.
 """
 
 import asyncio
@@ -12,28 +12,29 @@ from typing import assert_never
 import structlog
 
 from appliance.master.endpoints.delivery import Delivery
-from appliance.master.endpoints.endpoint_addresses import Places
-from appliance.master.endpoints.proxy_endpoints import Faces
+from appliance.master.endpoints.node_ports import NodePorts
+from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.effects import (
     CloseNode,
     DropCalls,
     Effect,
+    Effects,
     EraseGrant,
-    Place,
     PlaceGrant,
     PlaceNode,
+    PlaceResource,
     PutBack,
-    Record,
     RevokeGrant,
     SaveGrant,
     TakeBack,
     TellNode,
     UsePorts,
-    Withdraw,
     WithdrawNode,
+    WithdrawResource,
+    WriteRecord,
 )
-from appliance.master.graph.graph import Graph
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import (
     Durable,
     EraseNode,
@@ -41,13 +42,15 @@ from appliance.master.graph.registry import (
     Incarnation,
     Kind,
     Life,
-    Registration,
+    NodeRegistration,
     Registry,
     SaveNode,
     SaveRegistration,
 )
-from appliance.master.reconcile.entries import Entries
-from appliance.policy.model import address_of
+from appliance.master.graph.revocation import Revocation, revoked
+from appliance.master.reconcile.entries import MasterRegistrations
+from appliance.policy.model import Address, address_of
+from appliance.policy.policy import Policy
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.store.state_file import IncarnationRow, RegistrationRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
@@ -58,20 +61,20 @@ _log = structlog.get_logger()
 
 @dataclass(slots=True)
 class Enactor:
-    """Tells nodes, relays, ROSMaster, the store and the audit log. ROSMaster hears of changes in their order."""
+    """The executor of effects on nodes, relays, the ROS master (in order), the store and the audit log."""
 
-    graph: Graph
-    entries: Entries
+    graph: RosGraph
+    entries: MasterRegistrations
     store: StateStore
     trail: AuditTrail
     delivery: Delivery
     relay: RelayControl
-    faces: Faces
-    places: Places
-    _last: asyncio.Task[None] | None = None  # of what ROSMaster is told
+    faces: ProxyEndpoints
+    places: NodePorts
+    _last: asyncio.Task[None] | None = None  # the last call to the ROS master
 
     def carry_out(self, effects: Iterable[Effect]) -> None:
-        """Do all of this, now and in this order; what ROSMaster is told is done in its turn."""
+        """Carry out effects now and in this order; calls to the ROS master are queued."""
         for effect in effects:
             match effect:
                 case TellNode(node, call):
@@ -91,7 +94,7 @@ class Enactor:
                     self.store.remove_permission(row)
                 case SaveNode() | EraseNode() | SaveRegistration() | EraseRegistration():
                     write(effect, self.store)
-                case Record():
+                case WriteRecord():
                     self.trail.happened(
                         effect.event,
                         effect.reason,
@@ -108,12 +111,12 @@ class Enactor:
                     self._tell_relays(effect)
 
     def _tell_relays(
-        self, effect: Place | Withdraw | PlaceNode | WithdrawNode | PlaceGrant | RevokeGrant
+        self, effect: PlaceResource | WithdrawResource | PlaceNode | WithdrawNode | PlaceGrant | RevokeGrant
     ) -> None:
         match effect:
-            case Place(node, kind, resource, detail):
+            case PlaceResource(node, kind, resource, detail):
                 self.relay.place(node, kind, resource, detail)
-            case Withdraw(node, kind, resource):
+            case WithdrawResource(node, kind, resource):
                 self.relay.withdraw(node, kind, resource)
             case PlaceNode(node):
                 self.relay.place_node(node)
@@ -126,10 +129,10 @@ class Enactor:
             case _:
                 assert_never(effect)
 
-    # --- ROSMaster ---
+    # --- the ROS master ---
 
-    async def put_back(self, node: Incarnation, registrations: Sequence[Registration]) -> None:
-        """Tell ROSMaster what a returned node has. A call that fails is made up for by the reconcile loop."""
+    async def put_back(self, node: Incarnation, registrations: Sequence[NodeRegistration]) -> None:
+        """Register a returned node's registrations at the ROS master; after a failure the reconcile loop does it."""
         try:
             values = await self.entries.put_back(node, registrations)
         except CallFailedError as error:
@@ -138,8 +141,8 @@ class Enactor:
         for key, value in values:
             self.carry_out(self.graph.tell_parameter(node, key, value))
 
-    async def take_out(self, node: Incarnation, registrations: Sequence[Registration]) -> None:
-        """Tell ROSMaster what a lost node has no more. A call that fails is made up for by the reconcile loop."""
+    async def take_out(self, node: Incarnation, registrations: Sequence[NodeRegistration]) -> None:
+        """Unregister a lost node's registrations at the ROS master; after a failure the reconcile loop does it."""
         try:
             await self.entries.end_lost(node, registrations)
         except CallFailedError as error:
@@ -161,14 +164,42 @@ class Enactor:
 
 
 def _not_told(node: Incarnation, error: CallFailedError) -> None:
-    _log.warning("ROSMaster was not told", node=node.name, error=str(error))
+    _log.warning("the ROS master was not told", node=node.name, error=str(error))
 
 
-_SHELVED = "revoked "  # before the kind of a registration that the policy took back
+@dataclass(frozen=True, slots=True)
+class Enforcement:
+    """The revocation of rights that are no longer allowed."""
+
+    revocation: Revocation
+    enactor: Enactor
+
+    def policy_changed(self, before: Policy, policy: Policy) -> int:
+        """Revoke rights that a new policy does not allow; return their number."""
+        return self._take_back(self.revocation.policy_changed(before, policy))
+
+    def expel(self, host: Address, reason: str) -> int:
+        """Revoke all rights of a host; return their number."""
+        return self._take_back(self.revocation.expel(host, reason))
+
+    def redecide_for(self, host: Address, caller_id: str) -> None:
+        """Revoke rights that the policy in force does not allow this caller."""
+        self.enactor.carry_out(self.revocation.redecide_for(host, caller_id))
+
+    async def carried_out(self) -> None:
+        """Wait until the relays have carried out all orders."""
+        await self.enactor.relay.carried_out()
+
+    def _take_back(self, effects: Effects) -> int:
+        self.enactor.carry_out(effects)
+        return revoked(effects)
+
+
+_SHELVED = "revoked "  # prefix of the stored kind of a withdrawn registration
 
 
 def write(effect: Durable, store: StateStore) -> None:
-    """Keep one change of the registry."""
+    """Store one change of the registry."""
     match effect:
         case SaveNode(node):
             store.save_incarnation(
@@ -192,7 +223,7 @@ def _kept_kind(kind: Kind, shelved: bool) -> str:
 
 
 def restore(registry: Registry, store: StateStore) -> int:
-    """Fill `registry` with what the store kept; the number of incarnations."""
+    """Fill `registry` from the store; return the number of incarnations."""
     incarnations, registrations = store.load_registry()
     by_key = {
         row.key: Incarnation(
@@ -206,7 +237,7 @@ def restore(registry: Registry, store: StateStore) -> int:
             relay_port=row.relay_port,
             own=row.own,
             life=Life(row.life),
-            changed=time.monotonic(),  # the row's may be of another life of the machine: only its order counts
+            changed=time.monotonic(),  # the stored time may be from before a restart of the machine
             more_relay_ports=row.more_relay_ports,
         )
         for row in incarnations
@@ -216,7 +247,7 @@ def restore(registry: Registry, store: StateStore) -> int:
         if owner is not None:
             kind = Kind(row.kind.removeprefix(_SHELVED))
             place = owner.shelf if row.kind.startswith(_SHELVED) else owner.registrations
-            place[kind, row.resource] = Registration(kind, row.resource, row.detail, row.ordinal)
+            place[kind, row.resource] = NodeRegistration(kind, row.resource, row.detail, row.ordinal)
     for incarnation in by_key.values():
         registry.restore(incarnation)
     return len(by_key)

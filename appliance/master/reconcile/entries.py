@@ -1,12 +1,12 @@
-"""What the hidden ROSMaster has of each node: made, ended and put back under the node's inner URI.
+"""Make, end and restore registrations at the hidden ROS master, with the node's inner URI.
 
-Every service of an incarnation has a stand-in there that nobody is ever told.
+Services are registered with a stand-in URI, which clients never get.
 """
 
 from collections.abc import Callable, Iterable
 
 from appliance.master.caller import Answer
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registration
+from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration
 from appliance.master.graph.revocation import CALLS
 from appliance.master.rosmaster import RosMaster, together
 from appliance.rpc.xmlrpc_client import CallFailedError
@@ -15,13 +15,13 @@ from roswire.xmlrpc import Value
 
 NAME = "/master"
 NO_SERVICE = "rosrpc://nobody:1"
-"""A stand-in that is nobody's."""
+"""The stand-in URI if no node is known."""
 
 
-class Entries:
-    """Calls ROSMaster for nodes; `inner_uri(node)` is what ROSMaster knows a node by.
+class MasterRegistrations:
+    """The registrations at the ROS master; `inner_uri(node)` is the URI by which it knows a node.
 
-    `pid` is of the ROSMaster that was told everything; None until there was one.
+    `pid` is the process id of the ROS master that has all registrations; None before the first one.
     """
 
     def __init__(self, rosmaster: RosMaster, inner_uri: Callable[[Incarnation], str]) -> None:
@@ -29,8 +29,8 @@ class Entries:
         self._inner_uri = inner_uri
         self.pid: int | None = None
 
-    async def make(self, node: Incarnation, registration: Registration) -> Answer:
-        """Register something that a node has, whether or not the door is open."""
+    async def make(self, node: Incarnation, registration: NodeRegistration) -> Answer:
+        """Make a registration of a node, even while the door is shut."""
         name, inner, resource = node.name, self._inner_uri(node), registration.resource
         told = {
             Kind.PUBLICATION: (resource, registration.detail, inner),
@@ -41,30 +41,32 @@ class Entries:
         return await self._rosmaster.call_now(CALLS[registration.kind][0], name, *told)
 
     async def end(self, node: Incarnation, kind: Kind, resource: str) -> None:
-        """Unregister something for a node that is gone or may not have it any more."""
+        """End a registration of a node that is gone or may not have it any more."""
         told = [resource, stand_in(node) if kind is Kind.SERVICE else self._inner_uri(node)]
-        if kind is Kind.PARAMETER:  # the one call that has them the other way round
+        if kind is Kind.PARAMETER:  # only this call has the reverse order
             told.reverse()
         await self._rosmaster.call(CALLS[kind][1], node.name, *told)
 
-    async def end_lost(self, node: Incarnation, registrations: Iterable[Registration]) -> None:
-        """Unregister what a lost node had; what is left of it stays when it comes back meanwhile."""
+    async def end_lost(self, node: Incarnation, registrations: Iterable[NodeRegistration]) -> None:
+        """End the registrations of a lost node, until it comes back."""
         for registration in registrations:
             if node.life is Life.LIVE:
                 return
             await self.end(node, registration.kind, registration.resource)
 
     async def put_back(
-        self, node: Incarnation, registrations: Iterable[Registration]
+        self, node: Incarnation, registrations: Iterable[NodeRegistration]
     ) -> list[tuple[str, Value]]:
-        """Register what a returned node had, as far as it still has it when ROSMaster can be told.
+        """Register the former registrations of a returned node, as far as it still has them when the ROS master is
+        reachable.
 
-        What was taken from it meanwhile is left out; and an earlier life of a node would have ROSMaster end the later.
-        Returns the parameters it subscribed to with their values: it heard of no change in the meantime, and ROSMaster
-        tells each change once. Raises `CallFailedError`, and then a round of the reconcile loop is due.
+        Registrations that were withdrawn meanwhile are left out, as is an earlier life of a node, because the ROS
+        master would end the later one. Return the parameters that the node subscribed to with their values: it missed
+        their changes, and the ROS master reports each change once. Raises `CallFailedError`, and then a round of the
+        reconcile loop is due.
         """
 
-        async def put(registration: Registration) -> tuple[str, Value] | None:
+        async def put(registration: NodeRegistration) -> tuple[str, Value] | None:
             if (
                 node.life is not Life.LIVE
                 or (registration.kind, registration.resource) not in node.registrations
@@ -78,7 +80,7 @@ class Entries:
         try:
             async with self._rosmaster.alone():
                 if (await self._rosmaster.call_now("getPid", NAME))[2] != self.pid:
-                    raise CallFailedError("the ROS Master is new: the next round tells it everything")
+                    raise CallFailedError("the ROS master is new: the next round tells it everything")
                 values = await together(put(registration) for registration in registrations)
         except CallFailedError:
             self._rosmaster.doubtful.set()
@@ -87,5 +89,5 @@ class Entries:
 
 
 def stand_in(node: Incarnation) -> str:
-    """The service URI that ROSMaster has for every service of an incarnation; nobody is ever told it."""
+    """Return the service URI under which the ROS master knows an incarnation's services; clients never get it."""
     return service_uri(node.key, node.relay_port)

@@ -1,12 +1,12 @@
-"""The reconcile loop: *wanted* (the registry, the parameter mirror) against *seen* (ROSMaster), mended.
+"""Reconcile the *wanted* state (the registry, the parameter mirror) with the *seen* state of the ROS master.
 
-Whatever happened (ROSMaster died, control died, a call was cut in its middle) is the same to it:
+The same loop covers all failures: the ROS master died, control died, a call was interrupted.
 
-- a ROSMaster that is new is told everything again, in the original order, while calls wait at the door;
-- a registration that is wanted and not seen is made again; one that is seen and not wanted is adopted when it
-  carries the key of a known incarnation and the policy in force grants it (control died before it was written down),
-  and unregistered otherwise, as when the policy has taken it and ROSMaster is not told yet: that ROSMaster has it is
-  a claim, no right;
+- a new ROS master gets everything again, in the original order, while calls wait at the door;
+- a registration that is wanted and not seen is made again; one that is seen and not wanted is adopted when it carries
+  the key of a known incarnation and the policy in force grants it (control died before it was written down), and
+  unregistered otherwise, as when the policy has taken it and the ROS master is not told yet: that the ROS master has it
+  is a claim, no right;
 - after a rebuild, or when a relay is new, every subscriber gets each of its lists once; when control is new, the values
   of its parameters.
 """
@@ -18,14 +18,14 @@ from typing import cast
 
 import structlog
 
-from appliance.master.endpoints.proxy_endpoints import Faces
-from appliance.master.graph.graph import Graph
+from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.parameter_updates import settled
 from appliance.master.graph.registry import Kind, Life, Registry
-from appliance.master.graph.revocation import Revocation
+from appliance.master.graph.revocation import CALLS, Revocation
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.master.reconcile.enactor import Enactor
-from appliance.master.reconcile.entries import NAME, NO_SERVICE, Entries, stand_in
+from appliance.master.reconcile.entries import NAME, NO_SERVICE, MasterRegistrations, stand_in
 from appliance.master.rosmaster import RosMaster, together
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.telemetry.audit_trail import AuditTrail
@@ -39,13 +39,13 @@ Seen = set[tuple[Kind, str, str]]
 
 @dataclass(frozen=True, slots=True)
 class Reconciler:
-    """Runs rounds when ROSMaster is in doubt and every `_ROUND_SECONDS`. `ready` is set after the first whole one."""
+    """The loop: a round when the ROS master is in doubt, and every `_ROUND_SECONDS`. The first success sets `ready`."""
 
     rosmaster: RosMaster
-    entries: Entries
+    entries: MasterRegistrations
     registry: Registry
-    faces: Faces
-    graph: Graph
+    faces: ProxyEndpoints
+    graph: RosGraph
     revocation: Revocation
     enactor: Enactor
     parameters: ParameterMirror
@@ -54,18 +54,18 @@ class Reconciler:
     ready: asyncio.Event = field(default_factory=asyncio.Event, init=False)
 
     def wake(self) -> None:
-        """Something happened: run a round now."""
+        """Run a round now."""
         self.rosmaster.doubtful.set()
 
     async def run(self) -> None:
-        """Run until cancelled; a round that fails is tried again until it succeeds."""
+        """Run rounds until cancelled; repeat a failed round until it succeeds."""
         while True:
             self.rosmaster.doubtful.clear()
             try:
                 await self.round()
             except CallFailedError as error:
                 self.rosmaster.shut()
-                _log.warning("the ROS Master is away", error=str(error))
+                _log.warning("the ROS master is away", error=str(error))
                 await asyncio.sleep(_RETRY_SECONDS)
                 continue
             self.ready.set()
@@ -76,7 +76,7 @@ class Reconciler:
                 pass
 
     async def round(self) -> None:
-        """Compare what ROSMaster has with what the registry has, once, and settle every difference."""
+        """Compare the ROS master with the registry once, and settle all differences."""
         async with self.rosmaster.alone():
             pid = (await self.rosmaster.call_now("getPid", NAME))[2]
             if pid == self.entries.pid:
@@ -96,14 +96,14 @@ class Reconciler:
             self.entries.pid = cast(int, pid)
 
     def _tell_parameters(self) -> None:
-        """Control is new: what it had not told yet, or not even heard of as done, is told."""
+        """Send the values of parameters that an earlier control process may not have sent."""
         for node, registration in self.registry.in_order():
             if registration.kind is Kind.PARAMETER:
                 value, _ = standing_at(self.parameters.tree, registration.resource)
                 told = {} if value is None else settled(value)
                 self.enactor.carry_out(self.graph.tell_parameter(node, registration.resource, told))
 
-    # --- a new ROSMaster ---
+    # --- a new ROS master ---
 
     async def _rebuild(self) -> None:
         self.rosmaster.shut()
@@ -115,11 +115,11 @@ class Reconciler:
         self.enactor.carry_out(self.graph.tell_everybody())
         if made:
             text = (
-                f"a new ROS Master was told {made} registrations and {len(tree)} parameter namespaces again"
+                f"a new ROS master was told {made} registrations and {len(tree)} parameter namespaces again"
             )
             self.trail.happened("reconciled", text, registrations=made)
 
-    # --- the same ROSMaster ---
+    # --- the same ROS master ---
 
     async def _compare(self) -> None:
         seen = await self._seen()
@@ -127,7 +127,7 @@ class Reconciler:
             (registration.kind, registration.resource, incarnation.name): (incarnation, registration)
             for incarnation, registration in self.registry.in_order()
             if registration.kind
-            is not Kind.PARAMETER  # ROSMaster does not tell who subscribed to a parameter
+            is not Kind.PARAMETER  # the ROS master does not list subscribers to parameters
         }
         uris = await self._inner_uris({name for _kind, _resource, name in seen})
         missing = await together(
@@ -180,11 +180,10 @@ class Reconciler:
             adopted = self.graph.registered(incarnation, kind, resource, types.get(resource, "*"))
             self.enactor.carry_out(adopted)
             return
-        # A service's real port is not known to ROSMaster, so an offer that was not written down is withdrawn.
+        # The ROS master does not know a service's real port, so a service that was not stored is unregistered.
         call = self.rosmaster.call_now
         if kind is Kind.SERVICE:
             uri = stand_in(incarnation) if incarnation is not None else NO_SERVICE
             await call("unregisterService", name, resource, uri)
         elif inner is not None:
-            method = "unregisterPublisher" if kind is Kind.PUBLICATION else "unregisterSubscriber"
-            await call(method, name, resource, inner)
+            await call(CALLS[kind][1], name, resource, inner)

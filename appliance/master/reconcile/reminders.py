@@ -1,39 +1,42 @@
-"""After a relay is new: subscribers that do not come back are told their lists again, a few times.
+"""Send subscribers their lists of publishers again, after a relay is new or a topic moved to another relay.
 
-rospy forgets a connection that broke and opens another only for a list that arrives *after* it saw the break; a list
-that overtakes the break (the machine is busy, the relay hung before it died) changes nothing, and there would never
-be another. roscpp comes back by itself to a port that stayed open; where it was shut for a while (the whole appliance
-was restarted) it gives up, and takes a list it knows for no news. So who is still away after the first reminders is
-told to drop the publisher and to take it again. So is who has no grant any more: the policy took it, and gave the topic
-back, while the subscriber or control did not hear of it.
+rospy reconnects only for a list that arrives *after* it noticed the broken connection; an earlier list has no effect
+(the machine is busy, the relay hung before it died). roscpp reconnects to a port that stayed open; if the port was
+closed for a while (the appliance was restarted) it gives up, and ignores an unchanged list. So a subscriber that is
+still absent after the first reminders gets a list without the publisher and then the publisher again. The same holds
+for a subscriber without a grant: the policy withdrew and restored the topic, and the subscriber or control missed it.
 """
 
 import asyncio
+from collections.abc import Sequence
 
-from appliance.master.graph.graph import Graph
+from appliance.channel.messages import Message
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.enactor import Enactor
+from appliance.specifications.allocation import TOPIC, Move, Resource
 
-_GENTLE = 2  # reminders before the publisher is to be dropped and taken again
-_PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds before each look
+_GENTLE = 2  # reminders before a subscriber must drop the publisher and connect again
+_PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds before each check
 
 
 class Reminders:
-    """Looks whether everybody is back whenever a relay was attached."""
+    """The checks, after a relay was attached, whether all subscribers are back."""
 
-    def __init__(self, registry: Registry, graph: Graph, enactor: Enactor) -> None:
+    def __init__(self, registry: Registry, graph: RosGraph, enactor: Enactor) -> None:
         self._registry = registry
         self._graph = graph
         self._enactor = enactor
         self.round: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
-        """A relay is new."""
+        """Start the checks from the beginning."""
         self.close()
         self.round = asyncio.get_running_loop().create_task(self._remind())
 
     def close(self) -> None:
-        """Stop looking."""
+        """Stop checking."""
         if self.round is not None:
             self.round.cancel()
 
@@ -47,3 +50,42 @@ class Reminders:
                 self._enactor.carry_out(
                     self._graph.renew(subscriber, topic, publishers if number >= _GENTLE else ())
                 )
+
+
+class RelayMoves:
+    """The interface to the relays for specifications (`specifications.relays`).
+
+    A topic moves when a specification connects it with a topic or service of another relay. It is not carried while its
+    connections are made again.
+    """
+
+    def __init__(self, relay: RelayControl, graph: RosGraph, enactor: Enactor, reminders: Reminders) -> None:
+        self._relay = relay
+        self._graph = graph
+        self._enactor = enactor
+        self._reminders = reminders
+
+    def send(self, message: Message, relay: int) -> bool:
+        """Send a message to a relay; return False if it is not connected."""
+        return self._relay.send(message, relay)
+
+    async def carried_out(self) -> None:
+        """Wait until every relay has carried out its orders."""
+        await self._relay.carried_out()
+
+    def carried_now(self) -> set[Resource]:
+        """Return the topics and services of live nodes."""
+        return self._relay.carried_now()
+
+    def withdraw(self, moves: Sequence[Move]) -> None:
+        """Withdraw moving topics and services from the relays, before the new allocation is adopted."""
+        self._relay.withdraw_moving(moves)
+
+    def place(self, moves: Sequence[Move]) -> None:
+        """Place moved topics and services, after the new allocation was adopted, and reconnect subscribers."""
+        self._relay.place_moved(moves)
+        for move in moves:
+            if move.kind == TOPIC:
+                self._enactor.carry_out(self._graph.renew_all(move.name))
+        if moves:
+            self._reminders.begin()

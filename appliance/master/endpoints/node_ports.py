@@ -1,13 +1,12 @@
-"""Where an incarnation is found: its outer face's port, its relay port, the sockets that listen there, and the address.
+"""Manage the ports and listening sockets of each incarnation (proxy endpoint, relays), and the advertised address.
 
-Control opens every listening socket and gives the supervisor a duplicate to keep, so that neither control's death
-nor the relay's closes a port; a restarted control gets them back by name.
+Control opens every listening socket and gives the supervisor a duplicate to keep, so that the death of control or of a
+relay does not close a port. A restarted control gets the sockets back by name.
 
-Ports come from the policy's `[Ports]` range, for each incarnation one and another for every relay process, the longest
-unused first: a subscriber that still knocks at a dead node's port finds nobody, not somebody else. A host gets no more
-once it has `_TIMES_THE_REST` times what is left for all others: one alone has three quarters of the range, and the next
-finds the same part of the rest. Hosts that the policy names as one network count as one, so that nobody gains by many
-addresses.
+Ports come from the policy's `[Ports]` range: per incarnation one, and one for each relay process. The longest unused
+port is taken first, so that a subscriber that still calls a dead node's port does not reach another node. A host may
+have `_TIMES_THE_REST` times as many ports as are left for others: the first host can get three quarters of the range,
+the next three quarters of the rest. Hosts that the policy names as one network count as one host.
 """
 
 import asyncio
@@ -21,7 +20,7 @@ import structlog
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.host_sets import Network
 from appliance.policy.model import Address
-from appliance.quotas.pool import Pool, Standing
+from appliance.quotas.pool import Pool, QuotaClass
 from appliance.quotas.table import NODE_PORTS
 from appliance.rpc.front import plain_address
 from appliance.rpc.server import Peer, listen
@@ -30,14 +29,14 @@ _TIMES_THE_REST = 3
 
 
 class NoPortError(Exception):
-    """Every port of the range is in use; the text says what to change."""
+    """No port is available; the message has the remedy."""
 
 
-class Places:
+class NodePorts:
     """The listening sockets of all incarnations.
 
-    `keep(name, socket)` and `drop(name)` tell the supervisor; `host` is the address RVMaster listens on;
-    `named_as(address)` is by what the policy in force names a host.
+    `keep(name, socket)` and `drop(name)` notify the supervisor; `host` is the address that RVMaster listens on;
+    `named_as(address)` returns the network by which the policy in force names a host.
     """
 
     def __init__(
@@ -58,11 +57,11 @@ class Places:
         self.unused = deque(ports)
         self._sockets: dict[str, sockets.socket] = {}
         self._named_as = named_as
-        self._owners: dict[int, tuple[Address, Network]] = {}  # of each port, and as whose it counts
+        self._owners: dict[int, tuple[Address, Network]] = {}  # by port: host, charged network
         self.taken = self._counted()
 
     def policy_changed(self, ports: range) -> None:
-        """Take new ports from this range from now on, those in use stay; hosts may be named otherwise, too."""
+        """Take new ports from this range, keep those in use, and charge them by the names in the new policy."""
         if ports != self._range:
             self._range = ports
             used = {socket.getsockname()[1] for socket in self._sockets.values()}
@@ -72,7 +71,7 @@ class Places:
     def _counted(self) -> Pool[Network]:
         whole = len(self._range)
         bounds = NODE_PORTS.bounds.sized(whole, whole * _TIMES_THE_REST // (_TIMES_THE_REST + 1))
-        pool: Pool[Network] = Pool("ports", bounds, lambda _named: Standing.REGISTERED)
+        pool: Pool[Network] = Pool("ports", bounds, lambda _named: QuotaClass.REGISTERED)
         self._owners = {port: (host, self._named_as(host)) for port, (host, _named) in self._owners.items()}
         for _host, named in self._owners.values():
             pool.charge(named)
@@ -85,7 +84,7 @@ class Places:
             self.taken.charge(named)
 
     def open(self, host: Address) -> tuple[int, ...]:
-        """Reserve ports with listening sockets for a node of this host: (outer, one for each relay).
+        """Open listening sockets for a node of this host; return the ports: the outer one, and one for each relay.
 
         Raises `NoPortError`.
         """
@@ -118,21 +117,20 @@ class Places:
         return tuple(sock.getsockname()[1] for sock in opened)
 
     def socket(self, port: int) -> sockets.socket:
-        """The listening socket of a port that was opened or adopted."""
+        """Return the listening socket of an opened or adopted port."""
         return self._sockets[f"port:{port}"]
 
     def adopt(self, name: str, sock: sockets.socket) -> None:
-        """Take a kept socket back after a restart of control."""
+        """Use a kept socket after a restart of control."""
         self._sockets[name] = sock
         port = sock.getsockname()[1]
         if port in self.unused:
             self.unused.remove(port)
 
     def reopen(self, incarnation: Incarnation) -> bool:
-        """Open the same ports again (after a restart of the appliance); False when another process has one.
+        """Open the same ports again (after a restart of the appliance); return False if another process has one.
 
-        If there are more or fewer relays than then, the incarnation has as many ports afterwards.
-        Raises `NoPortError`.
+        If the number of relays has changed, adapt the number of ports. Raises `NoPortError`.
         """
         opened: list[sockets.socket] = []
         for port in incarnation.ports[: self._each]:
@@ -154,7 +152,7 @@ class Places:
         return True
 
     def close(self, incarnation: Incarnation) -> None:
-        """Close its ports; they go to the end of the line."""
+        """Close the ports of an incarnation; they are reused last."""
         for port in incarnation.ports:
             owner = self._owners.pop(port, None)
             if owner is not None:
@@ -168,20 +166,20 @@ class Places:
                 self.unused.append(port)
 
     def close_unclaimed(self, claimed: set[int]) -> None:
-        """Close kept sockets that belong to no known incarnation; the next to be opened come after those claimed."""
+        """Close kept sockets without a known incarnation; the next ports to open are above the claimed ones."""
         for name, sock in list(self._sockets.items()):
             port = sock.getsockname()[1]
             if port not in claimed:
                 del self._sockets[name]
                 sock.close()
                 self._drop(name)
-                if port in self._range:  # it may be from before the range was another
+                if port in self._range:  # the range may have changed since
                     self.unused.append(port)
         last = max(claimed, default=0)
         self.unused = deque(sorted(self.unused, key=lambda port: (port <= last, port)))
 
     def listen(self) -> sockets.socket:
-        """A socket that listens at the next port that is free."""
+        """Return a socket that listens on the next free port. Raises `NoPortError`."""
         for _ in range(len(self.unused)):
             port = self.unused.popleft()
             try:
@@ -202,15 +200,14 @@ _log = structlog.get_logger()
 _ANSWER_SECONDS = 3.0
 
 
-class Addresses:
-    """Which of the appliance's addresses a host is told.
+class AdvertisedAddresses:
+    """The choice of the appliance's address for each host.
 
-    It is the one the host reached us at; unless `advertise:` names another for its network, or (in a namespace of its
-    own, behind address translation) the machine's address that the host really used.
+    It is the address at which the host reached the appliance. Exceptions are an address for its network in
+    `advertise:`, and, in a network namespace behind address translation, the machine's address that the host used.
 
-    `advertised` are (network, address) pairs; `route_to(host)` asks for a translated address, if that can be.
-
-    `listen` is the address that RVMaster, the faces and the relay listen on.
+    `advertised` are (network, address) pairs; `route_to(host)` finds the translated address (None: no translation).
+    `listen` is the address that RVMaster, the proxy endpoints and the relay listen on.
     """
 
     def __init__(
@@ -226,15 +223,15 @@ class Addresses:
         self._routes: dict[Address, str | None] = {}
 
     def told_to(self, peer: Peer) -> str:
-        """The address this peer is told."""
+        """Return the appliance's address for this peer."""
         for network, address in self._advertised:
             if peer.host in network:
                 return str(address)
-        # The appliance's own nodes come to a listener of their own, on loopback, where nothing else may be.
+        # The appliance's own nodes use a separate loopback listener, where other services may not listen.
         return self._routes.get(peer.host) or self.listen or peer.local
 
     async def learn(self, peer: Peer) -> None:
-        """Find out how this peer reaches us, once; to be awaited before `told_to`."""
+        """Find out once at which address this peer reaches the appliance; call this before `told_to`."""
         if self._route_to is None or peer.host in self._routes:
             return
         if len(self._routes) > 10_000:
