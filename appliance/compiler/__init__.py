@@ -1,1 +1,1 @@
-"""The compiler: reads specifications for control, in a process that has nothing else."""
+"""The compiler: parses specifications for control in a process without any other access."""

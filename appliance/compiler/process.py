@@ -2,12 +2,11 @@
 
 Invariants:
 
-1. It has no network and no file: what it reads are the messages of its lifeline and its link to control.
-2. Texts that take more memory or processor time than there is for them end it, and nothing else.
-3. It is there while it is needed: when nobody has asked for `_IDLE_SECONDS` it ends, with exit status 0.
-4. A question ends when its budget of processor time is used up, with an answer that says so, and when control closes
-   the link: work that no process waits for any more takes no processor. A thread cannot be stopped, so the process ends
-   with it (status 0), and the supervisor starts the next one when control asks.
+1. It has no network and no files, only its lifeline and its link to control.
+2. Texts that exceed its memory or processor time end only this process.
+3. It ends with exit status 0 after `_IDLE_SECONDS` without work.
+4. Work ends with an answer when its budget of processor time is used up, or without one when control closes the link. A
+   thread cannot be stopped, so the process ends too (status 0), and the supervisor starts the next one on demand.
 """
 
 import asyncio
@@ -22,10 +21,10 @@ from appliance.channel.child_process import Child
 from appliance.quotas.table import DRY_RUNS
 from appliance.specifications.specification_files import SpecificationsRefusedError
 
-_MEMORY = 1 << 30  # bytes of addresses: its own libraries are 50 MiB of that
+_MEMORY = 1 << 30  # bytes of address space; its own libraries take 50 MiB
 _WORK_SECONDS = 60  # of processor time, for one question of an order
 _DRY_RUN_SECONDS = DRY_RUNS.bounds.host  # the same, for a dry run
-_SPARE_SECONDS = 5  # after which the kernel ends a process that does not even answer
+_SPARE_SECONDS = 5  # after which the kernel kills a process that has not answered
 _IDLE_SECONDS = 60.0
 
 
@@ -33,13 +32,13 @@ _Question = messages.ContentsWanted | messages.PartsWanted
 
 
 def main(lifeline_fd: int) -> None:
-    """Read specifications until nobody asks, or the supervisor ends it."""
+    """Compile specifications until control is done, or the supervisor ends the process."""
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
-    asyncio.run(Process(Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)).run())
+    asyncio.run(CompilerProcess(Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)).run())
 
 
-class Process:
-    """Answers one question after the other."""
+class CompilerProcess:
+    """The compiler's loop, which answers one question after the other."""
 
     def __init__(self, lifeline: Channel) -> None:
         self._child = Child(lifeline, messages.CompilerLink, said=self._said, lost=self._lost)
@@ -47,7 +46,7 @@ class Process:
         self._working = False
 
     async def run(self) -> None:
-        """Work from start to end."""
+        """Answer questions until none comes for `_IDLE_SECONDS`, or the supervisor stops the process."""
         self._child.attach(messages.Ready())
         ended = asyncio.ensure_future(self._child.ended.wait())
         while not ended.done():
@@ -61,7 +60,7 @@ class Process:
         self._child.close()
 
     async def _work(self, wanted: _Question) -> None:
-        """Answer a question, within its budget of processor time."""
+        """Answer a question within its budget of processor time."""
         budget = _budget(wanted)
         ends = _used() + budget
         self._working = True
@@ -77,7 +76,7 @@ class Process:
         os._exit(0)
 
     def _lost(self, _reason: str) -> None:
-        """Control closed the link: it does not wait for what is being compiled."""
+        """End the process, because control no longer waits for its work."""
         if self._working:
             os._exit(0)
 
@@ -87,7 +86,7 @@ class Process:
 
 
 def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | messages.CompilationRefused:
-    """What is in these texts, or all that is wrong with them; or what relays run of them."""
+    """Return the contents of these texts, all their errors, or the parts that relays run."""
     ends = int(_used()) + _budget(wanted) + _SPARE_SECONDS
     resource.setrlimit(resource.RLIMIT_CPU, (ends, resource.RLIM_INFINITY))
     try:
@@ -98,7 +97,7 @@ def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | m
         return messages.ContentsFound(wanted.number, checking.contents(wanted.files, wanted.definitions))
     except SpecificationsRefusedError as error:
         return messages.CompilationRefused(wanted.number, error.findings)
-    except (MemoryError, SystemError):  # what Python 3.11 makes of some errors of the first kind
+    except (MemoryError, SystemError):  # as which Python 3.11 reports some lack of memory
         text = f"they take more than the {_MEMORY >> 20} MiB of memory that there are to compile them"
     except Exception as error:  # noqa: BLE001  a defect of the compiler is a reason to refuse, no more
         text = f"a defect of rosrv, please report it: {type(error).__name__}: {error}"
@@ -106,7 +105,7 @@ def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | m
 
 
 def _used() -> float:
-    """Seconds of processor time that this process has used."""
+    """Return the seconds of processor time that this process has used."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 

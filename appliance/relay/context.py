@@ -1,25 +1,39 @@
-"""What every part of one relay shares."""
+"""The objects that all parts of one relay share."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.relay.bounds import Limits
-from appliance.relay.connections.frames import Scratch
-from appliance.relay.connections.memory import Memory
-from appliance.relay.loop import Loop
-from appliance.relay.monitors.interceptor import Middle
+from appliance.relay.grant_table import GrantTable
+from appliance.relay.loop import EventLoop
+from appliance.relay.monitors.interceptor import Interceptor
+from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
+from appliance.relay.transport.frames import Scratch
+from appliance.relay.transport.memory import RelayMemory
 
 
 @dataclass(frozen=True, slots=True)
 class RelayContext:
-    """Loop, bounds, the voice to control, what hosts hold of the memory, where small frames come in, monitors."""
+    """The loop, limits, reports, memory of hosts, scratch area and monitors of one relay."""
 
-    loop: Loop
-    limits: Limits
+    loop: EventLoop
+    limits: RelayLimits
     reporter: Reporter
-    memory: Memory
+    memory: RelayMemory
     scratch: Scratch
-    middle: Middle
+    interceptor: Interceptor
     payer: Callable[[str], str]
-    """Who pays for the processor time of a host now."""
+    """Returns the payer for the processor time of a host."""
+
+    @classmethod
+    def of(
+        cls,
+        loop: EventLoop,
+        limits: RelayLimits,
+        reporter: Reporter,
+        interceptor: Interceptor,
+        table: GrantTable,
+    ) -> "RelayContext":
+        """Return the context of a new relay with this table."""
+        memory = RelayMemory.of(limits, table.quota_class)
+        return cls(loop, limits, reporter, memory, Scratch(), interceptor, table.payer)

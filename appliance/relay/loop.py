@@ -1,20 +1,20 @@
 """The relay's event loop: epoll and timers, single-threaded, nothing else.
 
-Why not asyncio: one frame per read costs a callback, a transport and a future's worth of Python; raw epoll
-with one bound method per descriptor halves the delay a relayed message sees.
+Not asyncio, which costs a callback, a transport and a future for each read: raw epoll with one bound method per
+descriptor halves the delay of a relayed message.
 
 Processor time is a quota. A descriptor is watched for a *payer*: a host that the policy names, all other hosts with a
 registration together, all hosts without one, or new connections. The relay's own descriptors (control, lifeline) have
-no payer. A payer with more than `_DIRECT` descriptors has an epoll of its own inside the loop's, so however many of
-them are ready, those of others are found in time. Payers are served by deficit round robin in its continuous form: the
-payer that has used the least processor time goes first, for at most `QUANTUM`; credit for idle time is one quantum, and
-a new payer begins behind others. A payer is *costly* when it used much more than a quantum the last time. All others
-that are ready come before the next costly one, for a quantum together, even where they have used more.
+no payer. A payer with more than `_DIRECT` descriptors has its own epoll inside the loop's. However many of them are
+ready, those of others are found in time. Payers are served by deficit round robin in its continuous form: the payer
+that has used the least processor time goes first, for at most `QUANTUM`; credit for idle time is one quantum, and a new
+payer begins behind others. A payer is *costly* when it used much more than a quantum the last time. All others that are
+ready come before the next costly one, for a quantum together, even if they have used more.
 
 Invariants:
-- A handler is never called for a descriptor that was unwatched earlier in the same turn, and a descriptor
-  closed through `discard` is closed only at the end of the turn, so its number cannot mean another socket
-  within it. An event that waits for the payer's next turn is forgotten when the descriptor is unwatched or changed.
+- A handler is never called for a descriptor that was unwatched earlier in the same turn, and a descriptor closed
+  through `discard` is closed only at the end of the turn, so its number cannot mean another socket in that turn. An
+  event that waits for the payer's next turn is forgotten when the descriptor is unwatched or changed.
 - A turn calls the relay's own handlers first. It begins no further handler or timer after `QUANTUM`, except for one
   costly payer, so it lasts that long and the time of two handlers, of which one is not costly. Handlers with much to do
   stop when the quantum is `over` and call `later`.
@@ -43,7 +43,7 @@ UNKNOWN = "unknown hosts"
 """The payer for all hosts without a registration."""
 
 ANYBODY = "hosts with a registration, by *"
-"""The payer for all hosts with a registration that no rule names but one for everybody."""
+"""The payer for all hosts with a registration that the policy only names by `*`."""
 
 ACCEPTING = "new connections"
 """The payer for listening sockets."""
@@ -51,12 +51,12 @@ ACCEPTING = "new connections"
 QUANTUM = RELAY_TURN.bounds.host * 1000
 """Nanoseconds of processor time that a payer gets in one go."""
 
-_DIRECT = 64  # descriptors of a payer in the loop's epoll: those in one of its own cost 0.7 µs more each time
-_PAYERS = 512  # payers beyond which those that have nothing are forgotten
-_COSTLY = 3 * QUANTUM  # payers whose handlers stop when the quantum is over use less in one go
+_DIRECT = 64  # descriptors of a payer in the loop's epoll; in its own epoll each event costs 0.7 µs more
+_PAYERS = 512  # number of payers beyond which idle ones are forgotten
+_COSTLY = 3 * QUANTUM  # more than a payer uses whose handlers stop when the quantum is over
 _LITTLE = 1e-4  # seconds that are not charged while no other payer is ready
 
-# Python takes memory for so many each time: for more of them not from where that is quick
+# Python allocates memory for this number each time; for more, it leaves its fast allocator
 _EVENTS_PER_TURN = 64
 _LONGEST_WAIT = 3600.0
 _UNKNOWN = -1
@@ -64,7 +64,7 @@ _UNKNOWN = -1
 Handler = Callable[[int], None]
 
 
-class Timer:
+class LoopTimer:
     """A callback that is due at a time of the loop's clock; `cancel` may be called at any time."""
 
     __slots__ = ("callback",)
@@ -73,12 +73,12 @@ class Timer:
         self.callback: Callable[[], None] | None = callback
 
     def cancel(self) -> None:
-        """The callback will not be called."""
+        """Do not call the callback."""
         self.callback = None
 
 
 class _Payer:
-    """One class of the quota: what is ready, what waits for its next turn, and the processor time that it has used."""
+    """A payer: its ready events, what waits for its next turn, and the processor time that it has used."""
 
     __slots__ = (
         "costly",
@@ -110,8 +110,8 @@ class _Watched(NamedTuple):
     epoll: select.epoll
 
 
-class Loop:
-    """Watches descriptors and timers until `stop`. `processor_time` returns nanoseconds."""
+class EventLoop:
+    """The loop, which watches descriptors and timers until `stop`. `processor_time` returns nanoseconds."""
 
     def __init__(self, processor_time: Callable[[], int] = time.thread_time_ns) -> None:
         self._epoll = select.epoll()
@@ -119,9 +119,9 @@ class Loop:
         self._payers: dict[str, _Payer] = {}
         self._crowds: dict[int, _Payer] = {}  # by the descriptors of their epolls
         self._waiting: dict[str, _Payer] = {}
-        self._floor = 0  # the least that a payer with something to do has used
+        self._floor = 0  # the least time used by a payer with something to do
         self._room = _EVENTS_PER_TURN
-        self._timers: list[tuple[float, int, Timer]] = []
+        self._timers: list[tuple[float, int, LoopTimer]] = []
         self._order = itertools.count()
         self._discarded: list[socket.socket] = []
         self._running = False
@@ -150,7 +150,7 @@ class Loop:
             watched.payer.events.pop(descriptor, None)
 
     def unwatch(self, descriptor: int) -> None:
-        """No handler is called for the descriptor any more; unknown descriptors are fine."""
+        """Call no handler for the descriptor any more; ignore an unknown descriptor."""
         watched = self._watched.pop(descriptor, None)
         if watched is None:
             return
@@ -167,9 +167,9 @@ class Loop:
             self.unwatch(sock.fileno())
             self._discarded.append(sock)
 
-    def after(self, seconds: float, callback: Callable[[], None]) -> Timer:
+    def after(self, seconds: float, callback: Callable[[], None]) -> LoopTimer:
         """Call `callback` once, `seconds` from now."""
-        timer = Timer(callback)
+        timer = LoopTimer(callback)
         heapq.heappush(self._timers, (self.clock() + seconds, next(self._order), timer))
         return timer
 
@@ -180,7 +180,7 @@ class Loop:
         self._waiting[payer] = found
 
     def used(self) -> int:
-        """Return the processor time that the running handler has used, in nanoseconds, or since it asked first."""
+        """Return the processor time (ns) of the running handler; if its start is unknown, since its first call."""
         now = self._processor_time()
         if self._since == _UNKNOWN:
             self._since = now
@@ -257,7 +257,7 @@ class Loop:
                     payer.crowd.close()
 
     def _serve_alone(self, number: int, events: int) -> None:
-        """Nobody else has anything to do: what takes little is not even charged."""
+        """Serve the only ready descriptor; a short handler is not even charged."""
         self._since, began = _UNKNOWN, self.clock()
         handler, payer, _ = self._watched[number]
         handler(events)
@@ -283,7 +283,7 @@ class Loop:
             elif watched is not None:
                 self._since = _UNKNOWN
                 watched.handler(events)
-        # Who is not among so many is among the next ones: the kernel reports them in turn.
+        # The kernel reports ready descriptors in turn: the next report has others.
         if len(found) == self._room:
             self._room *= 2
         elif len(found) < self._room // 4:
@@ -300,7 +300,7 @@ class Loop:
         costly = next((payer for payer in in_order if payer.costly), None)
         for payer in in_order:
             if self._since - began >= QUANTUM or (costly is None and payer.spent - least > QUANTUM):
-                break  # whoever has used more waits for those that may be ready again
+                break  # payers that have used more wait for those that may be ready again
             if not payer.costly:
                 self._serve(payer)
         if costly is not None and costly.spent - least <= QUANTUM:
@@ -308,7 +308,7 @@ class Loop:
         self._floor = max(self._floor, min(map(_spent, in_order)))
 
     def _serve(self, payer: _Payer) -> None:
-        """Serve one payer for a quantum; its events and what it left for later begin in turn."""
+        """Serve one payer for a quantum; its events and what it left for later take turns in beginning."""
         began = self._since
         if not payer.later:
             self._call_ready(payer, began)

@@ -1,14 +1,14 @@
-"""What the relay tells control: connections, refusals (folded), lost publishers, traffic.
+"""Reports to control: connections, refusals, lost publishers, traffic.
 
-Without a link the counters go on, and refusals are counted; a new control is told of both, of the connections that are
-open, and of those that have ended meanwhile.
+Without a link the counters continue, and refusals are counted. A new control gets both, and the connections that are
+open or have ended meanwhile.
 
 Invariants:
 - `TrafficReported` is sent at most once per `report_every`.
-- Equal refusals within that time are one message with a count, and there are at most `refusals` different
-  ones; what a flood of strangers sends cannot grow the relay or fill the link.
-- What limits dropped is counted for at most `_KEPT` parts; beyond, for all others together.
-- Of the connections that end without a link, `_KEPT` are kept to be told; the others are counted.
+- Equal refusals within that time are one message with a count, and there are at most `refusals` different ones, so
+  floods of unknown hosts cannot grow the relay or fill the link.
+- Messages that limits dropped are counted for at most `_KEPT` parts; the others are counted together.
+- Of the connections that end without a link, `_KEPT` are kept for the next control; the others are counted.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,44 +23,44 @@ from appliance.channel.messages import (
     TopicTraffic,
     TrafficReported,
 )
-from appliance.relay.bounds import Limits
-from appliance.relay.connections.loop_channel import Link
-from appliance.relay.connections.rate_limit import Part
+from appliance.relay.relay_limits import RelayLimits
+from appliance.relay.transport.loop_channel import LoopLink
+from appliance.relay.transport.rate_limit import Part
 
 _Refusal = tuple[str, str, str, str, str, str]
 _Limited = tuple[str, str, Part, str, str]
-"""Key of the incarnation, topic, whose limit, host and caller id of the publisher or subscriber."""
+"""Key of the incarnation, topic, scope of the limit, host and caller id of the publisher or subscriber."""
 
 _TEXT = 300
 _KEPT = 1000
 
 
 class Reporter:
-    """The relay's voice; without a control nobody hears it."""
+    """Reports to control, if there is one."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: RelayLimits) -> None:
         self._limits = limits
-        self._link: Link | None = None
+        self._link: LoopLink | None = None
         self._open: dict[int, ConnectionOpened] = {}
         self._number = 0
         self._refused: dict[_Refusal, int] = {}
         self._ended: list[tuple[ConnectionOpened, str]] = []  # without a link
         self._unrecorded = 0
         self._silent = 0  # ticks without a link
-        self._memory: dict[str, int] = {}  # as told last
+        self._memory: dict[str, int] = {}  # as last reported
         self._limited: dict[_Limited, list[int]] = {}
 
-    def attach(self, link: Link | None) -> None:
-        """Speak to this control from now on."""
+    def attach(self, link: LoopLink | None) -> None:
+        """Report to this control from now on."""
         self._link = link
 
     @property
     def attached(self) -> bool:
-        """Whether there is a control to hear."""
+        """Whether there is a control to report to."""
         return self._link is not None
 
     def repeat_connections(self) -> None:
-        """Tell a new control which connections have ended while there was none, and which are open."""
+        """Report to a new control the connections that have ended without one, and those that are open."""
         ended, self._ended = self._ended, []
         for opened, reason in ended:
             self.send(opened)
@@ -70,12 +70,12 @@ class Reporter:
         self._memory = {}
 
     def send(self, message: Message) -> None:
-        """Tell control, if there is one."""
+        """Send a message to control, if it is there."""
         if self._link is not None:
             self._link.send(message)
 
     def opened(self, key: str, resource: str, kind: str, host: str, caller_id: str) -> int:
-        """A connection is served; its number."""
+        """Report a new connection and return its number."""
         self._number += 1
         message = ConnectionOpened(self._number, key, resource, kind, host, caller_id[:_TEXT])
         self._open[self._number] = message
@@ -83,7 +83,7 @@ class Reporter:
         return self._number
 
     def closed(self, number: int, reason: str) -> None:
-        """A connection that was served has ended."""
+        """Report the end of a served connection."""
         opened = self._open.pop(number, None)
         if opened is None:
             return
@@ -95,9 +95,9 @@ class Reporter:
             self._unrecorded += 1
 
     def refused(self, key: str, asked: tuple[str, str], host: str, caller_id: str, reason: str) -> None:
-        """A connection is refused: told at once the first time, then counted until the next `tick`.
+        """Report a refused connection at once the first time, then counted at the next `tick`.
 
-        `asked` is the kind and the name of what its header asked for.
+        `asked` is the kind and the name of the topic or service in its header.
         """
         kind, resource = asked
         refusal = (key, kind, resource[:_TEXT], host, caller_id[:_TEXT], reason[:_TEXT])
@@ -107,11 +107,11 @@ class Reporter:
             self._refused[refusal] = int(self._link is None)
             self.send(ConnectionRefused(*refusal, 1))
         else:
-            folded = ("", "", "", "", "", "further refusals of other peers, not told one by one")
+            folded = ("", "", "", "", "", "further refusals of other peers, not reported one by one")
             self._refused[folded] = self._refused.get(folded, 0) + 1
 
     def limited(self, what: _Limited, messages: int, size: int) -> None:
-        """A limit dropped messages: told with the next tick, one row for each part that was limited."""
+        """Count messages that a limit dropped, for the next tick: one row for each limit."""
         if what not in self._limited and len(self._limited) >= _KEPT:
             what = ("", "", what[2], "", "")
         row = self._limited.setdefault(what, [0, 0])
@@ -119,7 +119,7 @@ class Reporter:
         row[1] += size
 
     def tick(self, traffic: Callable[[], list[TopicTraffic]], memory: Mapping[str, int]) -> None:
-        """Send the counts since the last tick; without a link they stay (`traffic` takes them) for the next.
+        """Send the counts since the last tick; without a link they wait for the next (`traffic` takes them).
 
         `memory` has the bytes that are held now.
         """

@@ -1,8 +1,7 @@
-"""Looks into topics: a few messages, read for a person as subscribers get them, and told to control.
+"""Topic taps: a few messages as subscribers get them, parsed and sent to control for an operator.
 
-A message is read here, where strangers' bytes are, by the definition in its publisher's header; what goes to control
-is bounded: `ros/message_view.py` cuts long values, and a look has at most `MOST_MESSAGES`. The definition is read once
-for a look and a publisher. A topic that nobody looks into costs nothing.
+A message is parsed in the relay, which handles untrusted bytes anyway, by the definition in its publisher's header.
+The data for control is bounded: `roswire/message_view.py` cuts long values, and a tap has at most `MOST_MESSAGES`.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ from functools import partial
 from typing import Any
 
 from appliance.channel.messages import LookWanted, Message, MessageSeen
-from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.relayed_topic import RelayedTopic
+from appliance.relay.transport.frames import Batch
 
 MOST_LOOKS = 8
 MOST_MESSAGES = 20
@@ -22,8 +21,8 @@ MOST_MESSAGES = 20
 Tap = Callable[[Batch], None]
 
 
-class Looks:
-    """Which topics operators look into. `tell(message)` reaches control."""
+class TopicTaps:
+    """The topics that operators tap; `tell(message)` reaches control."""
 
     def __init__(self, tell: Callable[[Message], None]) -> None:
         self._tell = tell
@@ -31,7 +30,7 @@ class Looks:
         self._left: dict[int, int] = {}
 
     def begin(self, wanted: LookWanted, topics: Iterable[RelayedTopic]) -> None:
-        """Look into a topic, of all its publishers; beyond `MOST_LOOKS` nothing is seen."""
+        """Tap a topic of all its publishers; do nothing if `MOST_LOOKS` taps are open."""
         if len(self._open) >= MOST_LOOKS:
             return
         taps = self._open[wanted.number] = []
@@ -39,16 +38,16 @@ class Looks:
         for topic in topics:
             tap = partial(self._see, wanted.number, topic, _Reader(topic))
             taps.append((topic, tap))
-            topic.look(tap, latched=wanted.latched)
+            topic.tap(tap, latched=wanted.latched)
 
     def end(self, number: int) -> None:
-        """Look away."""
+        """Remove a tap."""
         for topic, tap in self._open.pop(number, ()):
-            topic.look_away(tap)
+            topic.untap(tap)
         self._left.pop(number, None)
 
     def end_all(self) -> None:
-        """There is no control to tell."""
+        """Remove all taps, because there is no control."""
         for number in list(self._open):
             self.end(number)
 
@@ -64,7 +63,7 @@ class Looks:
 
 
 class _Reader:
-    """Reads the messages of one publisher by the definition in the header that it has at the time."""
+    """A reader of one publisher's messages, by the definition in its current header."""
 
     def __init__(self, topic: RelayedTopic) -> None:
         self._topic = topic
@@ -75,7 +74,7 @@ class _Reader:
         self._reader = PublisherReader({})
 
     def read(self, data: bytes) -> tuple[str, dict[str, Any], str]:
-        """The type, the fields, and why there are none but the first bytes."""
+        """Return the type, the fields, and why there are only the first bytes (else empty)."""
         header = self._topic.header or {}
         if header is not self._header:
             self._header, self._reader = header, self._made_for(header)

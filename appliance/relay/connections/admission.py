@@ -1,32 +1,31 @@
-"""Whether a peer's header may be served: what it lacks in itself, and what it lacks in the table.
+"""Check a peer's header: for flaws of its own, and against the grant table.
 
-The first is refused at once. The second may only be missing *yet*: a grant is on its way on the link while
-the peer is faster, or a new control (or this new relay) is being told everything and has not come to it.
-roscpp never tries again after an error header, so such a peer is kept waiting for a moment instead
-(`Limits.grant_seconds`, and for as long as a restatement goes on).
+A flawed header is refused at once. A missing grant may be on its way: on the link, or in the restatement of a new
+control. roscpp never tries again after an error header, so such a peer waits (`RelayLimits.grant_seconds`, and for as
+long as a restatement goes on).
 """
 
 from collections.abc import Mapping
 
 from appliance.channel.messages.relay_link import NO_GRANT
 from appliance.relay.connections.headers import switched_on, too_long
-from appliance.relay.granted import StatedTable
+from appliance.relay.grant_table import GrantTable
 from roswire.errors import InvalidNameError
 from roswire.names import check_tool_id
 
 _REQUIRED = {"topic": ("md5sum", "callerid"), "service": ("md5sum", "callerid")}
 
 NOTHING = ("", "")
-"""What a header asks for that names neither a topic nor a service, or is not there."""
+"""Stands for a header that names neither a topic nor a service, or is missing."""
 
 
 def asked_for(fields: Mapping[str, str]) -> tuple[str, str]:
-    """The kind and the name of the topic or service a header names; both empty when it names neither."""
+    """Return the kind and the name of the topic or service in a header; two empty strings if there is none."""
     return next(((kind, fields[kind]) for kind in _REQUIRED if fields.get(kind)), NOTHING)
 
 
 def flaw(fields: Mapping[str, str], rest: bytes) -> str:
-    """Why nobody may be served with such a header, in the words of rospy where it has some; empty when all is well."""
+    """Return why a header is rejected, in rospy's words where it has any; empty if the header is valid."""
     if "topic" in fields and "service" in fields:
         return "its header names a topic and a service; a connection is for one of them"
     for kind, required in _REQUIRED.items():
@@ -44,8 +43,8 @@ def flaw(fields: Mapping[str, str], rest: bytes) -> str:
     return "its header names neither a topic nor a service"
 
 
-def missing(table: StatedTable, key: str, host: str, fields: Mapping[str, str]) -> str:
-    """What the table lacks for this peer to be served at the port of incarnation `key`; empty when nothing."""
+def missing(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -> str:
+    """Return what the table lacks to serve this peer at the port of incarnation `key`; empty if nothing."""
     node = table.node(key)
     name = key if node is None else node.name
     caller_id = fields["callerid"]
@@ -53,7 +52,7 @@ def missing(table: StatedTable, key: str, host: str, fields: Mapping[str, str]) 
         topic = fields["topic"]
         if table.publication(key, topic) is None:
             return f"[{name}] is not a publisher of [{topic}]"
-        if not table.may_subscribe(key, topic, host, caller_id):
+        if table.grant(key, topic, host, caller_id) is None:
             return f"{NO_GRANT} [{caller_id}] at {host} to subscribe to [{topic}]; requestTopic comes first"
         return ""
     service = fields["service"]
@@ -64,11 +63,11 @@ def missing(table: StatedTable, key: str, host: str, fields: Mapping[str, str]) 
     return ""
 
 
-def bound_name(table: StatedTable, key: str, host: str, fields: Mapping[str, str]) -> str | None:
-    """The name under which a client may call a service: its own, which it has looked the service up by.
+def bound_name(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -> str | None:
+    """Return the name under which a client calls a service: its own, under which it has looked up the service.
 
-    A probe calls nothing. The tools that probe may have looked the service up by another name (roswtf probes as
-    `/rosservice`): the service sees that one.
+    A probe calls nothing. A tool may probe under another name than it looked up the service (roswtf probes as
+    `/rosservice`): then the service sees the name of the look-up.
     """
     caller_id, service = fields["callerid"], fields["service"]
     if table.may_call(key, service, host, caller_id):

@@ -1,10 +1,8 @@
-"""The conversation of one service connection after the headers, without sockets.
+"""The requests and replies of one service connection after the headers, without sockets.
 
-The client sends a request, the service a reply, in turns; on a persistent connection over and over. A request
-that comes before its turn waits, and the client is not read while one does (`may_read`).
-
-Both are taken apart and written afresh: what passes here are whole requests and replies, one at a time, which
-is where a monitor can stand (`_request`, `_reply`).
+The client sends a request, then the service a reply; on a persistent connection repeatedly. An early request waits, and
+the client is not read meanwhile (`may_read`). Requests and replies are parsed and encoded again, and each is judged by
+monitors (`_request`, `_reply`).
 
 Invariants:
 - There is at most one request at the service, and no reply without one.
@@ -14,7 +12,7 @@ Invariants:
 from collections import deque
 from collections.abc import Callable
 
-from appliance.relay.monitors.interceptor import Judged
+from appliance.relay.monitors.interceptor import ServiceVerdict
 from roswire.errors import ProtocolError
 from roswire.tcpros import (
     FrameParser,
@@ -29,11 +27,11 @@ _REPLY_HEAD = 5  # bytes before the body of a reply
 
 
 class ServiceExchange:
-    """Requests one way, replies the other: `to_service(data)` and `to_client(data)` write.
+    """The requests and replies of one connection; `to_service(data)` and `to_client(data)` write them.
 
     `count(size)` is called for each request and reply. `held` is the bytes of requests that are not whole or have to
-    wait, `held_replies` those of replies that are not whole. `judge(part, body)` is where monitors stand: it says what
-    becomes of a `request` or `response`.
+    wait, `held_replies` those of replies that are not whole. `judge(part, body)` returns the monitors' verdict on a
+    `request` or `response`.
     """
 
     def __init__(
@@ -44,7 +42,7 @@ class ServiceExchange:
         to_service: Callable[[bytes], None],
         to_client: Callable[[bytes], None],
         count: Callable[[int], None],
-        judge: Callable[[str, bytes], Judged] | None = None,
+        judge: Callable[[str, bytes], ServiceVerdict] | None = None,
     ) -> None:
         self._persistent = persistent
         self._to_service = to_service
@@ -66,21 +64,21 @@ class ServiceExchange:
 
     @property
     def ready(self) -> bool:
-        """Whether a request waits that may go to the service."""
+        """Whether a waiting request may go to the service."""
         return bool(self._waiting) and not self._busy and not self.done
 
     @property
     def unfinished(self) -> int:
-        """The bytes of a request or reply that is not whole; 0 while whole requests wait for their turn."""
+        """Return the bytes of an incomplete request or reply; 0 while complete requests wait for their turn."""
         return self.held_replies + (0 if self._waiting else self.held)
 
     def from_client(self, data: bytes) -> None:
-        """Bytes from the client. Raises `PeerError` when they are no request."""
+        """Take bytes from the client. Raises `PeerError` when they are not a request."""
         self.held += len(data)
         self._waiting.extend(self._requests.feed(data))
 
     def from_service(self, data: bytes) -> None:
-        """Bytes from the service. Raises `PeerError` when they are no reply, or one that nobody asked for."""
+        """Take bytes from the service. Raises `PeerError` when they are not a reply to a request."""
         self.held_replies += len(data)
         for reply in self._replies.feed(data):
             if not self._busy:
@@ -88,7 +86,7 @@ class ServiceExchange:
             self._reply(reply)
 
     def advance(self) -> None:
-        """The client has taken all that was written to it: its next request goes to the service."""
+        """Send the next request, now that the client has read all that was written to it."""
         if self.ready:
             self._request(self._waiting.popleft())
 
@@ -106,7 +104,7 @@ class ServiceExchange:
         self._to_service(data)
 
     def _refuse(self, reason: str) -> None:
-        """The client reads the reason where it expects a reply."""
+        """Send the client the reason in place of a reply."""
         self.done = not self._persistent
         data = encode_service_error(reason)
         self._count(len(data))

@@ -1,7 +1,7 @@
-"""The connection headers that the relay writes in the name of others: known fields only, under names that are bound.
+"""The connection headers that the relay writes for others: known fields only, with verified names.
 
-A header is a claim. What its sender says it is called is replaced by the name that control knows it by, and a field
-that ROS does not have stays with the relay, so that nobody reads in it what nobody decided.
+Headers are not trusted. The sender's name is replaced by the registered one. Fields that ROS does not define are
+dropped, because no rule decides on them.
 """
 
 from collections.abc import Mapping
@@ -15,16 +15,16 @@ _TRUE = frozenset({"1", "true"})
 
 _OF_PEER = ("callerid", "topic", "service", *_OF_CLIENT, *_SWITCHES)
 _LONGEST = 1024
-"""Characters of a field that is kept as long as its connection: names of ROS, types, sums."""
+"""Most characters of a field that is kept as long as its connection: names, types, md5sums."""
 
 
 def kept(fields: Mapping[str, str]) -> dict[str, str]:
-    """What is remembered of a peer's header while it is connected."""
+    """Return the fields of a peer's header that are kept while it is connected."""
     return _known(fields, _OF_PEER)
 
 
 def too_long(fields: Mapping[str, str]) -> str:
-    """Why a header is not remembered: a field of it is longer than any name of ROS; empty when none is."""
+    """Return why a header is too long to keep (a field is longer than any ROS name); empty if it is not."""
     for name in _OF_PEER:
         if len(fields.get(name, "")) > _LONGEST:
             return f"its header has a {name} of {len(fields[name])} characters"
@@ -32,7 +32,7 @@ def too_long(fields: Mapping[str, str]) -> str:
 
 
 def size_of(fields: Mapping[str, str]) -> int:
-    """About how many bytes a header takes."""
+    """Return approximately how many bytes a header takes."""
     return sum(len(name) + len(value) for name, value in fields.items())
 
 
@@ -42,18 +42,18 @@ def switched_on(fields: Mapping[str, str], name: str) -> bool:
 
 
 def to_service(fields: Mapping[str, str], caller_id: str) -> dict[str, str]:
-    """What the service is told of its client."""
+    """Return the header that a service gets from its client."""
     switches = {name: "1" for name in _SWITCHES if switched_on(fields, name)}
     return {"callerid": caller_id, "service": fields["service"], **_known(fields, _OF_CLIENT), **switches}
 
 
 def to_client(fields: Mapping[str, str], node: str) -> dict[str, str]:
-    """What the client is told of the service, which this node offers."""
+    """Return the header that a client gets from a service of this node."""
     return {"callerid": node, **_known(fields, _OF_SERVICE)}
 
 
 def to_subscriber(fields: Mapping[str, str], node: str, topic: str) -> dict[str, str]:
-    """What a subscriber is told of the publisher, which is this node."""
+    """Return the header that a subscriber gets from this node."""
     return {"callerid": node, "topic": topic, **_known(fields, _OF_PUBLISHER)}
 
 

@@ -1,40 +1,40 @@
-"""The relay's listening sockets, one per incarnation, and the bounds on who may come in.
+"""The relay's listening sockets, one for each incarnation, and the limits on connections.
 
 Invariants:
-- There are never more than `connections` peers, nor more than `connections_per_host` of one host, nor more of
-  strangers together than is theirs (`RELAY_CONNECTIONS` of the table of shares), in whatever stage. A peer within
-  its share that finds no room is let in if `make_room` finds another that has to go.
+- There are at most `connections` peers, `connections_per_host` of one host, and a quota for all unknown hosts together
+  (`RELAY_CONNECTIONS`), in any stage. A peer within its quota that finds no room is accepted if `make_room` ends
+  another connection.
 - Accepting is a payer of its own in the loop: a flood of connections is accepted a quantum at a time, and each
-  connection is charged to its host as well. When the process has no descriptor left, listening pauses instead of
-  spinning.
+  connection is also charged to its host. When the process has no descriptor left, listening pauses.
 """
 
 import errno
 import socket
 from collections.abc import Callable
 
-from appliance.quotas.pool import Pool, Standing
+from appliance.quotas.pool import Pool, QuotaClass
 from appliance.quotas.table import RELAY_CONNECTIONS
-from appliance.relay.bounds import Limits
-from appliance.relay.loop import ACCEPTING, QUANTUM, READ, Loop
+from appliance.relay.loop import ACCEPTING, QUANTUM, READ, EventLoop
+from appliance.relay.relay_limits import RelayLimits
+from appliance.relay.transport.sockets import tune
 
 _NO_DESCRIPTOR_PAUSE = 0.2
 _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
 
-class Ports:
-    """Accepts peers: `arrived(key, sock, host)`, or `turned_away(key, host, reason)` without room.
+class ListeningPorts:
+    """The acceptor of peers: calls `arrived(key, sock, host)`, or `turned_away(key, host, reason)` without room.
 
-    `standing(host)` is what the table knows of a host, `payer(host)` who pays for it. `make_room(host)` ends a
-    connection for one of this host and says whether there was one.
+    `quota_class(host)` returns a host's class in the table, `payer(host)` its payer in the loop. `make_room(host)` ends
+    a connection to make room for one of this host, and returns whether there was one.
     """
 
     def __init__(
         self,
-        loop: Loop,
-        limits: Limits,
+        loop: EventLoop,
+        limits: RelayLimits,
         *,
-        standing: Callable[[str], Standing],
+        quota_class: Callable[[str], QuotaClass],
         payer: Callable[[str], str],
         arrived: Callable[[str, socket.socket, str], None],
         turned_away: Callable[[str, str, str], None],
@@ -47,11 +47,10 @@ class Ports:
         self._listening: dict[str, socket.socket] = {}
         self._make_room = make_room
         bounds = RELAY_CONNECTIONS.bounds.sized(limits.connections, limits.connections_per_host)
-        self.connected: Pool[str] = Pool("connections to the relay", bounds, standing)
+        self.connected: Pool[str] = Pool("connections to the relay", bounds, quota_class)
 
     def open(self, key: str, descriptor: int) -> None:
-        """Listen on this socket for the incarnation; an earlier socket of it is closed after the new one
-        listens."""
+        """Listen on this socket for the incarnation, then close its earlier socket."""
         sock = socket.socket(fileno=descriptor)
         sock.setblocking(False)
         before = self._listening.get(key)
@@ -61,18 +60,18 @@ class Ports:
             self._loop.discard(before)
 
     def close(self, key: str) -> None:
-        """Listen for the incarnation no more."""
+        """Stop listening for the incarnation."""
         sock = self._listening.pop(key, None)
         if sock is not None:
             self._loop.discard(sock)
 
     def close_all(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         for key in list(self._listening):
             self.close(key)
 
     def left(self, host: str) -> None:
-        """A peer that arrived is gone."""
+        """Count one peer of this host less."""
         self.connected.give_back(host)
 
     def _watch(self, key: str, sock: socket.socket) -> None:
@@ -89,7 +88,12 @@ class Ports:
                 if error.errno in _EXHAUSTED:
                     self._pause(key, listening)
                     return
-                continue  # this peer is gone already; the next may be well
+                continue  # this peer has left already; the next may be connected
+            try:
+                tune(sock)
+            except OSError:
+                sock.close()
+                continue
             host = address[0].removeprefix("::ffff:")
             payer = self._payer(host)
             reason = self._take(host)
@@ -111,7 +115,7 @@ class Ports:
         self._loop.after(_NO_DESCRIPTOR_PAUSE, resume)
 
     def _take(self, host: str) -> str:
-        """Count one more of this host; why not, when there is no room and nobody makes it."""
+        """Count one more connection of this host; return the reason if there is no room and none can be made."""
         pool = self.connected
         reason = pool.take(host)
         while reason and pool.held(host) < pool.bounds.host and self._make_room(host):

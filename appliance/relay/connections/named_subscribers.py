@@ -1,18 +1,17 @@
-"""Subscribers that their publisher must see by name: the topics of actions.
+"""Extra connections for subscribers that their publisher must see by name: the topics of actions.
 
-A publisher sees one connection of the relay for any number of subscribers. An action client, though, waits until the
-topics it sends goals and cancellations on are connected to *its server*, which it knows by the `callerid` of the
-status messages (actionlib, `wait_for_server`). For these topics a subscriber that is served (of a host the first
-sixteen names) gets a presence: one more connection to the publisher, under the subscriber's own `callerid`, whose
-messages are thrown away. It is opened only after the subscriber is served, so that what the publisher then sends does
-reach it. These topics carry a message now and then, so that sending it once more costs nothing.
+A publisher sees one connection of the relay for all subscribers. But an action client waits until the topics of its
+goals and cancellations are connected to *its server*, which it knows by the `callerid` of the status messages
+(actionlib, `wait_for_server`). For these topics each served subscriber (the first sixteen names of a host) gets another
+connection to the publisher with the subscriber's `callerid`; its messages are discarded. It is opened after the
+subscriber is served, so that the subscriber gets everything that the publisher then sends.
 """
 
 from functools import partial
 
-from appliance.relay.connections.sockets import Stream, begin_connect
 from appliance.relay.context import RelayContext
-from appliance.relay.loop import Timer
+from appliance.relay.loop import LoopTimer
+from appliance.relay.transport.sockets import BufferedSocket, begin_connect
 from roswire.tcpros import encode_header
 
 _GOAL = "ActionGoal"
@@ -21,12 +20,12 @@ _RETRY_SECONDS = 1.0
 
 
 def looks_for_names(type_name: str) -> bool:
-    """Whether a publisher of this type waits for a subscriber of a certain name."""
+    """Whether a publisher of this type waits for a subscriber with a certain name."""
     return type_name.endswith(_GOAL) or type_name == _CANCEL
 
 
-class Presences:
-    """The presences at one publisher of one topic, at `host:port` while its main connection is open."""
+class NamedSubscribers:
+    """The extra connections to one publisher of one topic, while its main connection is open."""
 
     def __init__(self, context: RelayContext, topic: str, host: str) -> None:
         self._context = context
@@ -34,18 +33,18 @@ class Presences:
         self._host = host
         self._wanted: frozenset[str] = frozenset()
         self._address: tuple[str, int] | None = None
-        self._streams: dict[str, Stream] = {}
-        self._retry: Timer | None = None
+        self._streams: dict[str, BufferedSocket] = {}
+        self._retry: LoopTimer | None = None
 
-    def want(self, names: frozenset[str], address: tuple[str, int]) -> None:
-        """These subscribers are served now, of the publisher at this address."""
+    def update(self, names: frozenset[str], address: tuple[str, int]) -> None:
+        """Set the subscribers that are served now, and the address of the publisher."""
         self._wanted, self._address = names, address
         for name in [stream for stream in self._streams if stream not in names]:
             self._streams.pop(name).close()
         self._open_missing()
 
     def close(self) -> None:
-        """The main connection is gone, and they with it."""
+        """Close all connections with the main connection."""
         self._wanted, self._address = frozenset(), None
         for stream in self._streams.values():
             stream.close()
@@ -64,7 +63,7 @@ class Presences:
             except (OSError, OverflowError):
                 self._try_again()
                 return
-            self._streams[name] = Stream(
+            self._streams[name] = BufferedSocket(
                 self._context.loop,
                 sock,
                 partial(self._received, name),

@@ -1,12 +1,11 @@
-"""The service that the appliance itself offers (`std_srvs/Trigger`): control answers it, by way of the relay.
+"""The service that the appliance itself offers (`std_srvs/Trigger`); control answers it through the relay.
 
-To a client's connection it is a service like any other: it stands where the stream to a node would (`OwnServer`), so
-grants, headers, monitors and bounds are the same.
+`OwnServer` replaces the connection to a node, so grants, headers, monitors and limits are those of every service.
 
 Invariants:
-- Of one host one call is with control at a time, and a second lies between two. What it calls meanwhile is answered as
-  that one is, so that no host can occupy control with calls.
-- A call is answered: when control ends before it has, in words that say so.
+- Control gets at most one call of a host at a time, and one a second. Further calls get the same answer, so no host can
+  keep control busy.
+- Every call is answered; if control ends first, the answer says so.
 """
 
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from appliance.channel.messages import Message, OwnServiceAnswered, OwnServiceCalled
-from appliance.relay.loop import Loop
+from appliance.relay.loop import EventLoop
 from roswire.tcpros import HeaderParser, encode_header, encode_service_reply
 
 HEADER: Final = {
@@ -29,7 +28,7 @@ _SECOND = 1.0
 
 @dataclass(slots=True)
 class _Call:
-    """The last call of a host: the clients that wait for its answer, or the answer and until when it holds."""
+    """The last call of a host: the clients that wait for its answer, or the answer and until when it is valid."""
 
     number: int
     waiting: list["OwnServer"] = field(default_factory=list)
@@ -38,16 +37,16 @@ class _Call:
 
 
 class OwnService:
-    """Its clients, and what control answers. `send` tells control, if there is one."""
+    """The clients and calls of the service that the appliance offers; `send` sends to control, if it is there."""
 
-    def __init__(self, loop: Loop, send: Callable[[Message], None]) -> None:
+    def __init__(self, loop: EventLoop, send: Callable[[Message], None]) -> None:
         self._loop = loop
         self._send = send
         self._calls: dict[str, _Call] = {}
         self._number = 0
 
     def call(self, service: str, host: str, caller_id: str, server: "OwnServer") -> None:
-        """A request has come in."""
+        """Ask control, or give the answer to this host's last call if that was within a second."""
         last = self._calls.get(host)
         if last is not None and not last.until:
             last.waiting.append(server)
@@ -59,24 +58,24 @@ class OwnService:
             self._send(OwnServiceCalled(self._number, service, host, caller_id))
 
     def forget(self, host: str, server: "OwnServer") -> None:
-        """A client has gone."""
+        """Drop a client that has disconnected."""
         last = self._calls.get(host)
         if last is not None and server in last.waiting:
             last.waiting.remove(server)
 
     def answered(self, answer: OwnServiceAnswered) -> None:
-        """Control has answered."""
+        """Give control's answer to the clients that wait for it."""
         for call in [call for call in self._calls.values() if call.number == answer.number]:
             self._settle(call, answer.success, answer.text)
 
     def control_gone(self) -> None:
-        """There is no control that could answer what was asked."""
+        """Answer all open calls: control has gone."""
         for call in list(self._calls.values()):
             if not call.until:
                 self._settle(call, False, _AWAY)
 
     def tidy(self) -> None:
-        """A second is over."""
+        """Forget answers that are older than a second."""
         now = self._loop.clock()
         self._calls = {host: call for host, call in self._calls.items() if not call.until or now < call.until}
 
@@ -90,9 +89,9 @@ class OwnService:
 
 
 class OwnServer:
-    """One client's connection to it, in the place of a `Stream`: `received` gets what a service would send.
+    """One client's connection, in the place of a `BufferedSocket`: `received` gets what a service would send.
 
-    `opened()` is called at once when the loop turns; then the client's header is to be sent, and requests in turns.
+    `opened()` is called in the next turn of the loop; then the client's header must be sent, and its requests.
     """
 
     backlog = 0
@@ -100,13 +99,13 @@ class OwnServer:
     def __init__(
         self,
         own: OwnService,
-        loop: Loop,
+        loop: EventLoop,
         *,
         called: tuple[str, str, str],
         received: Callable[[bytes], None],
         opened: Callable[[], None],
     ) -> None:
-        """`called` are the service, the client's host and its name."""
+        """`called` is the service, the client's host and the client's name."""
         self._own = own
         self._loop = loop
         self._called = called
@@ -115,7 +114,7 @@ class OwnServer:
         self._timer = loop.after(0, opened)
 
     def send(self, data: bytes) -> None:
-        """The client's header, which the grant has vouched for; then requests, which have nothing in them."""
+        """Take the client's header, which its grant has verified, and then its empty requests."""
         if self._greeted:
             self._own.call(*self._called, self)
             return
@@ -129,10 +128,10 @@ class OwnServer:
             self.answered(encode_header({"error": reason}))
 
     def answered(self, reply: bytes) -> None:
-        """Give it to the client when the loop turns."""
+        """Give the reply to the client in the next turn of the loop."""
         self._timer = self._loop.after(0, lambda: self._received(reply))
 
     def close(self) -> None:
-        """The client has gone, or may not call any more."""
+        """Forget the client."""
         self._timer.cancel()
         self._own.forget(self._called[1], self)

@@ -1,63 +1,63 @@
-"""Peers that have come and are not served: what their headers hold, and which of them makes room.
+"""Connections that are not served yet: the memory of their headers, and which one makes room.
 
 Invariants:
-- The first `_FREE` bytes of a header are counted by nobody, so that no flood of long ones keeps out a header as ROS
-  nodes send it; what is beyond counts in the memory of its host.
-- The peer that waits longest goes first, and a host without a grant before one with a grant. Of hosts with a grant
-  only what has waited for `_PATIENCE` seconds goes for another of them.
+- The first `_FREE` bytes of a header are not counted, so a flood of long headers does not keep out normal ones. The
+  rest counts in the memory of its host.
+- The connection that has waited longest makes room first, and those of hosts without a grant before those of hosts with
+  one. The latter make room only after `_PATIENCE` seconds.
 """
 
 from collections.abc import Callable
 from typing import Protocol
 
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from appliance.quotas.queue import Queue
-from appliance.relay.connections.memory import HostShares
+from appliance.relay.transport.memory import MemoryPool
 
 _FREE = 4096
 _PATIENCE = 1.0
 
 
-class Guest(Protocol):
-    """A peer that waits."""
+class PendingConnection(Protocol):
+    """A connection that is not served yet, or a refused one."""
 
     def make_room(self) -> None:
         """End now, and `leave`."""
 
 
-class Anteroom:
-    """The peers that wait.
+class PendingConnections:
+    """The connections that are not served yet.
 
-    `standing(host)` says whether a host has a grant; `clock` is monotonic seconds; `headers` is what hosts hold of the
-    memory for headers.
+    `quota_class(host)` shows whether a host has a grant; `clock` is monotonic seconds; `headers` is the memory for
+    headers.
     """
 
     def __init__(
-        self, clock: Callable[[], float], standing: Callable[[str], Standing], headers: HostShares
+        self, clock: Callable[[], float], quota_class: Callable[[str], QuotaClass], headers: MemoryPool
     ) -> None:
         self._clock = clock
-        self._standing = standing
-        self._hosts: dict[Guest, str] = {}
-        self._long: dict[Guest, int] = {}
+        self._quota_class = quota_class
+        self._hosts: dict[PendingConnection, str] = {}
+        self._long: dict[PendingConnection, int] = {}
         self._headers = headers
-        self._waiting: Queue[str, Guest] = Queue(standing)
-        self._with_long_headers: Queue[str, Guest] = Queue(standing)
+        self._waiting: Queue[str, PendingConnection] = Queue(quota_class)
+        self._with_long_headers: Queue[str, PendingConnection] = Queue(quota_class)
 
-    def enter(self, guest: Guest, host: str) -> None:
-        """This peer waits from now on."""
+    def enter(self, guest: PendingConnection, host: str) -> None:
+        """Add a connection."""
         self._hosts[guest] = host
         self._waiting.put(guest, host, self._clock())
 
-    def leave(self, guest: Guest) -> None:
-        """End the peer's waiting, if it waits."""
+    def leave(self, guest: PendingConnection) -> None:
+        """Remove a connection; ignore an unknown one."""
         self._waiting.remove(guest)
         self._with_long_headers.remove(guest)
         host, held = self._hosts.pop(guest, None), self._long.pop(guest, 0)
         if host is not None and held:
             self._headers.of(host).add(-held)
 
-    def hold(self, guest: Guest, size: int) -> str:
-        """Count the bytes that its header has by now; the reason if that is too much."""
+    def hold(self, guest: PendingConnection, size: int) -> str:
+        """Count the bytes that its header has by now; return the reason if there are too many (else empty)."""
         host, before = self._hosts[guest], self._long.get(guest, 0)
         more = max(0, size - _FREE) - before
         if more <= 0:
@@ -78,17 +78,19 @@ class Anteroom:
         return why
 
     def make_room(self, host: str) -> bool:
-        """End the connection of a peer whose place this host may have; whether there was one."""
+        """End a connection that has a lesser claim than this host; return whether there was one."""
         return self._end_longest(self._waiting, host)
 
-    def _end_longest(self, queue: Queue[str, Guest], host: str, *, but: Guest | None = None) -> bool:
-        mine = self._standing(host)
-        for standing in Standing:
-            found = queue.longest(standing) if standing <= mine else None
+    def _end_longest(
+        self, queue: Queue[str, PendingConnection], host: str, *, but: PendingConnection | None = None
+    ) -> bool:
+        mine = self._quota_class(host)
+        for quota_class in QuotaClass:
+            found = queue.longest(quota_class) if quota_class <= mine else None
             if found is None or found[0] is but:
                 continue
             young = self._clock() - found[2] < _PATIENCE
-            if standing is Standing.REGISTERED and young:
+            if quota_class is QuotaClass.REGISTERED and young:
                 continue
             found[0].make_room()
             return True

@@ -1,123 +1,127 @@
-"""One relayed topic of one publisher: who gets its messages, without sockets.
+"""One relayed topic of one publisher: its subscribers and the messages that they get, without sockets.
 
-A topic has one upstream (the connection to the publisher), subscribers that wait for the publisher's header,
-and subscribers that are served. The upstream exists while there is a subscriber, and a short linger beyond.
+A topic has one upstream (the connection to the publisher), subscribers that wait for the publisher's header, and
+subscribers that are served. The upstream exists while there is a subscriber or a monitor, and lingers shortly.
 
-When the upstream is lost, the subscribers stay: the publication still stands, so its node lives or control
-will withdraw it, and then they are cut. Keeping them is what keeps traffic flowing: rospy never connects
-again to an address that closed on it (only a `publisherUpdate` makes it), roscpp waits up to 20 s between two
-tries; but when the publisher is reached again, messages go on at once for both. Frames are passed on whole
-(`frames`), so nobody has been left with a torn one. Only when the publisher comes back with another type or
-md5sum are they cut: they must read the new header. A publisher that is killed and restarted is another
-incarnation with another key and port; its subscribers are told by control, and the old connections end with
-the withdrawal.
+The subscribers stay when the upstream is lost: their publication is still placed, and control withdraws it if the node
+is gone. rospy never reconnects to an address that closed its connection, and roscpp waits up to 20 s; over the kept
+connections messages go on at once. Frames are passed on whole (`frames`), so no subscriber gets a torn one. Subscribers
+are cut only if the publisher returns with another type or md5sum, because they must read the new header.
 
-A topic that monitors want has its upstream without any subscriber, too. What they leave of a batch (`middle`) is
-what subscribers get and what is latched. What monitors publish comes from no upstream and goes past them
-(`published`). What a new publisher says first is kept for those that are on their way (`first_words`).
+Subscribers get, and the relay latches, only what monitors pass on. Messages that monitors publish have no upstream and
+bypass monitors (`published`). First messages are kept for subscribers on their way (`startup_replay`).
 
-A latched message that the publisher's host has no memory for is passed on and not kept (`latch`). A later
-subscriber gets it from the publisher, which the relay connects to anew when there is room again; the others get it
-once more.
+A latched message without memory for its publisher's host is passed on and not kept. A later subscriber gets it from
+the publisher, to which the relay reconnects when there is memory again; the other subscribers get it twice.
 
-When *all* subscribers are behind at the same moment, the publisher is not read until one has caught up, for at
-most `queue_grace`: a subscriber process that was descheduled for some milliseconds under a flood loses nothing,
-and large messages do not pile up. One that takes longer is slow: what is beyond its bounds is dropped until it
-has caught up completely, and it never delays the others, since one that keeps up is never behind.
+While *all* subscribers are behind, the publisher is not read until one has caught up, for at most `queue_grace`: a
+subscriber that the scheduler paused for some milliseconds loses nothing. Beyond its bounds, the oldest messages of a
+slower subscriber are dropped. It never delays the others, since one that keeps up is not behind.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from appliance.channel.messages import LatchRefused, TopicTraffic
-from appliance.recorder.ring import Stream
-from appliance.relay.connections.delays import Delays
-from appliance.relay.connections.frames import Batch
+from appliance.channel.messages import DELAY_BOUNDS, LatchRefused, TopicTraffic
+from appliance.recorder.ring import RingStream
 from appliance.relay.connections.headers import to_subscriber
-from appliance.relay.connections.memory import HostShare
-from appliance.relay.connections.rate_limit import Part, PublicationFlow
-from appliance.relay.connections.startup_replay import APPEARED, FirstWords
-from appliance.relay.recorder_ring import LeftOut
+from appliance.relay.connections.startup_replay import APPEARED, StartupReplay
+from appliance.relay.recorder_ring import ExcludedStream, RecorderRing
+from appliance.relay.transport.frames import Batch
+from appliance.relay.transport.memory import HostMemory
+from appliance.relay.transport.rate_limit import Part, PublicationRateLimit
 
 _ROW = 16  # subscribers between two readings of the processor time
-_SEEN_OF_A_HOST = 16  # subscribers that a publisher may see by name: each is a connection to it more
+_SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
 
 
-class Member(Protocol):
-    """A subscriber, as its topic sees it."""
+class TopicSubscriber(Protocol):
+    """A subscriber, as its topic uses it."""
 
     host: str
     """The address it comes from."""
 
     caller_id: str
-    """The caller id that it gives: a claim."""
+    """The caller id that it claims."""
 
     missed: bool
-    """Whether its limit kept the last message from it."""
+    """Whether its rate limit dropped the last message for it."""
 
     behind_since: float | None
-    """When so much waited for it first that it is behind; None once it has caught up completely."""
+    """When its queue first became so long that it is behind; None once it has caught up completely."""
 
     def greet(self, header: Mapping[str, str]) -> bool:
-        """Answer with the publisher's header, or refuse if the types differ; whether it is served now."""
+        """Answer with the publisher's header, or refuse if the types differ; return whether it is served now."""
 
     def deliver(self, batch: Batch) -> int:
-        """Send the batch or queue it; how many messages it does not get."""
+        """Send the batch or queue it; return how many messages it does not get."""
 
     @property
     def full(self) -> bool:
         """Whether its queue has reached its bounds."""
 
     def trim(self) -> int:
-        """Drop what is beyond the bounds, oldest first; how many messages."""
+        """Drop messages beyond the bounds, oldest first; return how many."""
 
-    def look(self) -> None:
-        """A second is over."""
+    def check_stall(self) -> None:
+        """Cut the connection if it makes no progress; called once a second."""
 
     def cut(self, reason: str) -> None:
         """Close its connection."""
 
 
-class Upstream(Protocol):
-    """The connection to the publisher, as its topic sees it."""
+class Upstream:
+    """The connection to the publisher. By default, its methods do nothing."""
 
-    def want(self) -> None:
-        """There is somebody to serve."""
+    def connect(self) -> None:
+        """Connect, because the topic is wanted."""
 
-    def spare(self) -> None:
-        """There is nobody to serve any more."""
+    def release(self) -> None:
+        """Close the connection soon, because the topic is no longer wanted."""
 
     def pause(self, seconds: float) -> None:
-        """Do not read until `resume`, or for so long."""
+        """Stop reading until `resume`, for at most these seconds."""
 
     def resume(self) -> None:
-        """Read on."""
+        """Go on reading."""
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
-        """Others are served now, of a topic of this type; `names` says who when the turn of the loop is over."""
+        """Report new subscribers of a topic of this type; `names` returns them when the turn of the loop is over."""
 
-    def give_again(self) -> None:
+    def request_latched(self) -> None:
         """Have a latching publisher give its message again."""
 
+    def ask_again(self) -> None:
+        """Repeat an open question to a new control."""
 
-class Recorder(Protocol):
-    """The flight recorder, as a topic sees it."""
+    def found(self, host: str, port: int) -> None:
+        """Connect to the address that control has found; ignore an answer that is no longer awaited."""
 
-    def open(self, topic: str, host: str, header: Mapping[str, str]) -> Stream | LeftOut | None:
-        """A publisher is connected; None: what it says is not recorded."""
+    def refused(self) -> None:
+        """Ask again later, because control has no address."""
+
+    def recheck(self) -> None:
+        """Apply the specifications that are in force now."""
+
+    def check_stall(self) -> None:
+        """Cut a publisher that holds memory for a message and sends nothing of it; called once a second."""
+
+    def close(self) -> None:
+        """Close everything, because the publication is withdrawn."""
 
 
 Through = Callable[[Batch], Batch | None]
-"""Monitors: the frames that go on, as they leave them; None when none does."""
+"""Passes frames through monitors; returns the frames that go on, None if none does."""
 
 
 class RelayedTopic:
     """A topic of an incarnation at `host`, with its subscribers; `share` counts what is kept of it.
 
-    `fresh`: the publisher has just appeared. `limited(part, messages, size)` hears what limits
-    dropped; `flow` is where they are set. `make_room(size)` tries to have others give up so much of
-    theirs, `refused(message)` is called when a latched message is not kept. `over()`: the publisher's quantum is
-    used up; subscribers that have not got a batch by then get it at its next turn, before anything else is read.
+    `fresh`: the publisher has just appeared. `limited(part, messages, size)` is called with what rate limits dropped;
+    `flow` sets them. `make_room(size)` tries to free that much memory of others, `refused(message)` is called if a
+    latched message is not kept. Once the publisher's quantum is used up (`over()`), the remaining subscribers get the
+    batch at its next turn, before anything else is read.
     """
 
     def __init__(
@@ -129,12 +133,12 @@ class RelayedTopic:
         *,
         grace: float,
         clock: Callable[[], float],
-        share: HostShare,
+        share: HostMemory,
         fresh: bool,
         limited: Callable[[Part, int, int], None],
         make_room: Callable[[int], None],
         refused: Callable[[LatchRefused], None],
-        recorded: Recorder | None,
+        recorded: RecorderRing | None,
         over: Callable[[], bool] = lambda: False,
     ) -> None:
         self.key = key
@@ -145,50 +149,54 @@ class RelayedTopic:
         self._grace = grace
         self._clock = clock
         self._share = share
-        self.flow = PublicationFlow(share, limited)
+        self.flow = PublicationRateLimit(share, limited)
         self._make_room = make_room
         self._refused = refused
         self._recorder = recorded
         self.over = over
-        self._waits: tuple[Batch, tuple[Member, ...]] | None = None  # a batch, and who has yet to get it
-        self._recording: Stream | LeftOut | None = None
+        self._waits: tuple[Batch, tuple[TopicSubscriber, ...]] | None = (
+            None  # a batch, and who has yet to get it
+        )
+        self._recording: RingStream | ExcludedStream | None = None
         self._unkept: LatchRefused | None = None
         self._fresh_until = clock() + (APPEARED if fresh else -1)
         self._header: dict[str, str] | None = None
-        # There may be thousands, which end in one turn of the loop: none is looked for.
-        self._waiting: dict[Member, None] = {}
-        self._served: dict[Member, None] = {}
-        self._row: tuple[Member, ...] | None = None  # those that are served, once they are gone through
+        # There may be thousands, and all may end in one turn of the loop: so none is searched for.
+        self._waiting: dict[TopicSubscriber, None] = {}
+        self._served: dict[TopicSubscriber, None] = {}
+        self._row: tuple[TopicSubscriber, ...] | None = (
+            None  # those that are served, once they are gone through
+        )
         self._latched: Batch | None = None
         self._latching = False
         self._withheld = False
-        self._first_words: FirstWords | None = None
+        self._startup_replay: StartupReplay | None = None
         self._paused = False
         self._connected = False
         self.through: Through | None = None
-        self._looks: tuple[Callable[[Batch], None], ...] = ()
+        self._taps: tuple[Callable[[Batch], None], ...] = ()
         self._wanted = False
         self._reported = True
         self._next = 1
         self._messages = self._bytes = self._dropped = 0
-        self._delays = Delays()
+        self._delays = DelayCounts()
 
     @property
-    def members(self) -> tuple[Member, ...]:
-        """All that are connected for this topic."""
+    def members(self) -> tuple[TopicSubscriber, ...]:
+        """Return all subscribers of this topic."""
         return (*self._waiting, *self._served)
 
-    def join(self, member: Member) -> None:
-        """A subscriber with a grant: served at once when the publisher's header is known, else when it is."""
+    def join(self, member: TopicSubscriber) -> None:
+        """Add a subscriber with a grant; it is served when the publisher's header is known."""
         if self._header is None:
             self._waiting[member] = None
         else:
             self._serve(member, self._header)
         if self.upstream is not None:
-            self.upstream.want()
+            self.upstream.connect()
 
-    def leave(self, member: Member) -> None:
-        """A subscriber's connection is closed."""
+    def leave(self, member: TopicSubscriber) -> None:
+        """Remove a subscriber whose connection is closed."""
         self._waiting.pop(member, None)
         self._served.pop(member, None)
         self._row = None
@@ -200,32 +208,32 @@ class RelayedTopic:
 
     @property
     def header(self) -> Mapping[str, str] | None:
-        """The publisher's header, as subscribers have it; None while it is not known."""
+        """Return the publisher's header, as subscribers get it; None while it is not known."""
         return self._header
 
-    def look(self, look: Callable[[Batch], None], *, latched: bool) -> None:
-        """Somebody looks at what subscribers get from now on, a `latched` message first; `look` keeps no batch."""
-        self._looks += (look,)
+    def tap(self, tap: Callable[[Batch], None], *, latched: bool) -> None:
+        """Call `tap` with everything that subscribers get, first with a `latched` message; it must not keep a batch."""
+        self._taps += (tap,)
         if latched and self._latched is not None:
-            look(self._latched)
+            tap(self._latched)
         if self.upstream is not None:
-            self.upstream.want()
+            self.upstream.connect()
 
-    def look_away(self, look: Callable[[Batch], None]) -> None:
-        """The look is over."""
-        self._looks = tuple(other for other in self._looks if other != look)
+    def untap(self, tap: Callable[[Batch], None]) -> None:
+        """Remove a tap."""
+        self._taps = tuple(other for other in self._taps if other != tap)
         self._spare_unwanted()
 
     @property
     def _is_wanted(self) -> bool:
-        return bool(self._waiting or self._served or self._wanted or self._looks)
+        return bool(self._waiting or self._served or self._wanted or self._taps)
 
     def _spare_unwanted(self) -> None:
         if not self._is_wanted and self.upstream is not None:
-            self.upstream.spare()
+            self.upstream.release()
 
     def monitor(self, through: Through | None, *, wanted: bool) -> None:
-        """From the next batch on messages go `through` monitors (None: past them), who want them or do not."""
+        """Pass messages `through` monitors from the next batch on (None: past them); `wanted`: they need messages."""
         self.through = through
         if wanted == self._wanted:
             return
@@ -233,11 +241,11 @@ class RelayedTopic:
         if self.upstream is None:
             return
         if wanted:
-            self.upstream.want()
+            self.upstream.connect()
         self._spare_unwanted()
 
     def upstream_opened(self, header: Mapping[str, str]) -> None:
-        """The publisher has answered with its header."""
+        """Begin to serve, because the publisher has answered with its header."""
         header = to_subscriber(header, self.name, self.topic)
         before, self._header = self._header, header
         self._latching = header.get("latching", "0") == "1"
@@ -254,15 +262,15 @@ class RelayedTopic:
             self._serve(member, header)
         self._announce()
         if self._is_wanted and self.upstream is not None:
-            self.upstream.want()
+            self.upstream.connect()
 
     @property
     def lacks_latched(self) -> bool:
-        """Whether monitors have kept back what a latching publisher gave, and nothing came through since."""
+        """Whether monitors have held back a latching publisher's message, and let nothing through since."""
         return self._latching and self._withheld and self._latched is None
 
     def upstream_closed(self) -> None:
-        """The connection to the publisher is gone; its subscribers stay (see above)."""
+        """Keep the subscribers while there is no connection to the publisher (see above)."""
         self._end_recording()
         self.hand_out(divided=False)
         self._latch(None)
@@ -270,7 +278,7 @@ class RelayedTopic:
         self._withheld = False
         self._paused = False
         self._connected = False
-        self._forget_first_words()
+        self._forget_startup_replay()
         self._forget_header()
 
     def _end_recording(self) -> None:
@@ -279,9 +287,9 @@ class RelayedTopic:
             self._recording = None
 
     def received(self, batch: Batch, since: float) -> Batch | None:
-        """Frames have come from the publisher (`since`: when, by the clock): through the middle, to the subscribers.
+        """Pass frames of the publisher, received at `since`, through monitors to the subscribers.
 
-        Returns those that monitors leave for the publisher's next turn (`go_on`).
+        Return those that monitors leave for the publisher's next turn (`go_on`).
         """
         self._messages += batch.messages
         self._bytes += len(batch.view)
@@ -294,15 +302,15 @@ class RelayedTopic:
         return self._take(batch, passing, since)
 
     def go_on(self, rest: Batch, since: float) -> Batch | None:
-        """Go on with frames that were left for later; as `received`."""
+        """Like `received`, for frames that were left for later."""
         return self._take(rest, rest, since)
 
     def _take(self, batch: Batch, passing: Batch | None, since: float) -> Batch | None:
-        """Record a batch, of which this passes."""
+        """Record a batch, of which `passing` goes on."""
         recording = self._recording
         if recording is None:
             return None if passing is None else self._admit(passing, since)
-        # Recorded when subscribers have it, so that nothing is later; monitors may change it in place meanwhile.
+        # Recorded after subscribers get it, to delay nothing; monitors may change it in place meanwhile.
         whole = batch
         if self.through is not None and recording.keeps:
             whole = Batch(memoryview(bytes(batch.view)), batch.messages, batch.last, stride=batch.stride)
@@ -322,7 +330,7 @@ class RelayedTopic:
         return rest
 
     def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:
-        """Give a batch to monitors and subscribers; returns what monitors had no time for."""
+        """Give a batch to monitors and subscribers; return the part that monitors had no time for."""
         left = batch if self.through is None else self.through(batch)
         rest = batch.tail(batch.left) if batch.left else None
         if left is None:
@@ -334,7 +342,7 @@ class RelayedTopic:
         return rest
 
     def published(self, batch: Batch) -> None:
-        """A monitor publishes: to the subscribers, and to no monitor."""
+        """Send a message of a monitor to the subscribers, past all monitors."""
         self._messages += batch.messages
         self._bytes += len(batch.view)
         self._reported = False
@@ -344,25 +352,25 @@ class RelayedTopic:
         self._pass_on(batch, divided=False)
 
     def _pass_on(self, batch: Batch, *, divided: bool) -> None:
-        for look in self._looks:
-            look(batch)
+        for tap in self._taps:
+            tap(batch)
         if self._latching:
             self._latch(batch)
-        if self._first_words is not None:
+        if self._startup_replay is not None:
             now = self._clock()
-            if self._first_words.over(now) or not self._first_words.add(batch, now):
-                self._forget_first_words()
+            if self._startup_replay.over(now) or not self._startup_replay.add(batch, now):
+                self._forget_startup_replay()
         self.hand_out(divided=False)  # the batch before
         self._waits = batch, self._each()
         self.hand_out(divided=divided)
 
     @property
     def undelivered(self) -> int:
-        """The bytes of a batch that some subscribers get at the publisher's next turn (`hand_out`)."""
+        """Return the bytes of a batch that some subscribers get at the publisher's next turn (`hand_out`)."""
         return 0 if self._waits is None else len(self._waits[0].view)
 
     def hand_out(self, *, divided: bool = True) -> None:
-        """Give subscribers the batch that waits for them, for a quantum if the work may be `divided`."""
+        """Give subscribers the batch that waits for them; if `divided`, only for one quantum."""
         if self._waits is None:
             return
         (batch, members), self._waits = self._waits, None
@@ -379,55 +387,55 @@ class RelayedTopic:
             self._pause_or_trim()
 
     def relieve(self) -> None:
-        """A subscriber has caught up, or is gone, or time is up: the publisher is read."""
+        """Read the publisher again."""
         if self._paused:
             self._paused = False
             if self.upstream is not None:
                 self.upstream.resume()
 
     def cut_all(self, reason: str) -> None:
-        """The topic is withdrawn: every subscriber's connection is closed."""
+        """Cut every subscriber, because the topic is withdrawn."""
         self._end_recording()
         for member in self.members:
             member.cut(reason)
 
     def tidy(self) -> None:
-        """A second is over: what was kept for a moment is given up, and what is beyond the share of a subscriber.
+        """Free temporary data, and trim queues beyond their bounds; called once a second.
 
-        What a limit kept back of a latching publisher goes on when it may.
+        A latched message that a limit delayed is passed on when the limit permits it.
         """
         now = self._clock()
         waiting = self.flow.later(now)
         if waiting is not None:
             self._admit(waiting, now, divided=False)
-        if self._first_words is not None and self._first_words.over(now):
-            self._forget_first_words()
+        if self._startup_replay is not None and self._startup_replay.over(now):
+            self._forget_startup_replay()
         for member in self._each():
             if self._latched is not None and member.missed:
                 self._dropped += member.deliver(self._latched)
             if member.full:
                 self._dropped += member.trim()
                 self._reported = False
-            member.look()
+            member.check_stall()
 
     @property
     def latched(self) -> int:
-        """The bytes of the latched message that is kept."""
+        """Return the bytes of the latched message."""
         return 0 if self._latched is None else len(self._latched.view)
 
     def give_up_latched(self) -> None:
-        """Make room for a host that has less."""
+        """Drop the latched message for a host that holds less."""
         size = self.latched
         self._latch(None)
         self._keep_not(size)
 
     def repeat(self) -> None:
-        """There is a new control: it is told what is not kept."""
+        """Tell a new control which latched message is not kept."""
         if self._unkept is not None:
             self._refused(self._unkept)
 
     def traffic(self) -> TopicTraffic | None:
-        """The counters since the last call; None when nothing has changed."""
+        """Return the counters since the last call; None if nothing has changed."""
         if self._reported:
             return None
         row = TopicTraffic(
@@ -438,12 +446,13 @@ class RelayedTopic:
             self._dropped,
             len(self._served),
             *self._delays.take(),
+            "" if self._header is None else self._header.get("md5sum", ""),
         )
         self._messages = self._bytes = self._dropped = 0
         self._reported = True
         return row
 
-    def _serve(self, member: Member, header: Mapping[str, str]) -> None:
+    def _serve(self, member: TopicSubscriber, header: Mapping[str, str]) -> None:
         if not member.greet(header):
             return
         self._served[member] = self._row = None
@@ -453,14 +462,14 @@ class RelayedTopic:
             self._dropped += member.deliver(self._latched)
         elif self._unkept is not None:
             if self.upstream is not None and not self._share.refusal(self._unkept.size):
-                self.upstream.give_again()
-        elif self._first_words is not None and not self._first_words.over(self._clock()):
-            for batch in self._first_words.give(member.caller_id):
+                self.upstream.request_latched()
+        elif self._startup_replay is not None and not self._startup_replay.over(self._clock()):
+            for batch in self._startup_replay.give(member.caller_id):
                 self._dropped += member.deliver(batch)
         self.relieve()
 
     def _listen(self) -> None:
-        """Begin to keep what a publisher says first that has just appeared and has nobody but a monitor."""
+        """Begin to keep the first messages of a new publisher whose only subscriber is a monitor."""
         now = self._clock()
         if (
             now <= self._fresh_until
@@ -468,16 +477,16 @@ class RelayedTopic:
             and not self._latching
             and not (self._waiting or self._served)
         ):
-            self._first_words = FirstWords(self._share, now)
+            self._startup_replay = StartupReplay(self._share, now)
         self._fresh_until = now - 1  # the next connection is not its first
 
-    def _forget_first_words(self) -> None:
-        if self._first_words is not None:
-            self._first_words.forget()
-            self._first_words = None
+    def _forget_startup_replay(self) -> None:
+        if self._startup_replay is not None:
+            self._startup_replay.forget()
+            self._startup_replay = None
 
     def _forget_header(self) -> None:
-        """Without a connection the header is only good for those who have been given it."""
+        """Drop the header if there is no connection and no subscriber that has read it."""
         if not self._connected and not self._served:
             self._header = None
 
@@ -494,14 +503,14 @@ class RelayedTopic:
                 names.add(member.caller_id)
         return frozenset().union(*of_host.values())
 
-    def _each(self) -> tuple[Member, ...]:
-        """Those that are served, however many of them end meanwhile."""
+    def _each(self) -> tuple[TopicSubscriber, ...]:
+        """Return the served subscribers; the tuple stays the same while some of them end."""
         if self._row is None:
             self._row = tuple(self._served)
         return self._row
 
     def _latch(self, batch: Batch | None) -> None:
-        """Remember the last message of a batch, if its host has the memory for it; None forgets."""
+        """Keep the last message of a batch, if its host has memory for it; with None, drop the kept one."""
         if self._latched is not None:
             self._share.add(-len(self._latched.view))
             self._latched = None
@@ -524,7 +533,7 @@ class RelayedTopic:
             self._refused(self._unkept)
 
     def _pause_or_trim(self) -> None:
-        """Let the subscribers catch up if all are behind and have not been for long; else drop for the full."""
+        """Pause the publisher if all subscribers have just fallen behind; else trim the full queues."""
         since = [member.behind_since for member in self._each() if member.behind_since is not None]
         if since and len(since) == len(self._served) and self.upstream is not None:
             left = max(since) + self._grace - self._clock()
@@ -539,3 +548,28 @@ class RelayedTopic:
 
 def _identity(header: Mapping[str, str]) -> tuple[str | None, ...]:
     return tuple(header.get(field) for field in ("type", "md5sum", "message_definition", "latching"))
+
+
+class DelayCounts:
+    """Counts of messages by their delay in the relay, since the last `take`.
+
+    The delay is from receiving a batch to handing it to the subscribers' sockets, and counts for each message of the
+    batch. The time in the queue of a slow subscriber does not count.
+    """
+
+    __slots__ = ("_counts", "_seconds")
+
+    def __init__(self) -> None:
+        self._counts = [0] * (len(DELAY_BOUNDS) + 1)
+        self._seconds = 0.0
+
+    def add(self, seconds: float, messages: int) -> None:
+        """Count messages with this delay."""
+        self._counts[bisect_left(DELAY_BOUNDS, seconds)] += messages
+        self._seconds += seconds * messages
+
+    def take(self) -> tuple[list[int], float]:
+        """Return the counts (none if nothing was counted) and the sum in seconds, and reset them."""
+        counts, seconds = self._counts, self._seconds
+        self._counts, self._seconds = [0] * len(counts), 0.0
+        return (counts if any(counts) else []), seconds

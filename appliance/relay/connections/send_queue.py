@@ -1,30 +1,29 @@
-"""What waits for one slow subscriber: bounded, oldest dropped first, never a torn frame.
+"""The messages that wait for one slow subscriber: bounded, the oldest dropped first, never a torn frame.
 
-The outbox exists only while the socket does not take everything; a subscriber that keeps up never fills it.
-It holds batches on frame boundaries, shared with the other subscribers' outboxes (one copy per batch, not per
-subscriber), and apart from them the rest of a frame whose first bytes have been sent.
+It is used only while the socket does not take everything. It holds batches, cut at frame boundaries and shared with
+other subscribers' queues, and the rest of a frame whose first bytes have been sent.
 
 Invariants:
 - Bytes leave in the order they came; a frame whose first byte was sent is sent whole.
-- What is left of that frame is counted, and the memory that is held for it is less than `LITTLE` times as much.
+- The rest of that frame is counted, and holds less than `LITTLE` times its size in memory.
 - After `trim`, at most `queue_messages` frames and `queue_bytes` wait besides the one being sent.
 """
 
 from collections import deque
 from math import ceil
 
-from appliance.relay.bounds import Limits
-from appliance.relay.connections.frames import LITTLE, boundary_at, equal_frames
-from appliance.relay.connections.memory import HostShare
+from appliance.relay.relay_limits import RelayLimits
+from appliance.relay.transport.frames import LITTLE, boundary_at, equal_frames
+from appliance.relay.transport.memory import HostMemory
 
 _VECTORS = 64
 _BEHIND = 1 << 20
 
 
-class Outbox:
-    """Frames on their way to one subscriber."""
+class SendQueue:
+    """The frames that wait for one subscriber."""
 
-    def __init__(self, limits: Limits, share: HostShare) -> None:
+    def __init__(self, limits: RelayLimits, share: HostMemory) -> None:
         self._limit_messages = limits.queue_messages
         self._limit_size = limits.queue_bytes
         self._share = share
@@ -38,32 +37,32 @@ class Outbox:
 
     @property
     def messages(self) -> int:
-        """Frames that wait and have not been started."""
+        """Return the number of frames that wait and are not started."""
         return self._messages
 
     @property
     def size(self) -> int:
-        """Their bytes."""
+        """Return the bytes of these frames."""
         return self._size
 
     @property
     def behind(self) -> bool:
-        """Whether so much waits that it is worth letting the subscriber catch up, if that holds up nobody."""
+        """Whether the queue is so long that the subscriber should catch up first, if that delays no other."""
         return self._size >= _BEHIND or self.full
 
     @property
     def begun(self) -> int:
-        """The bytes that are left of a message in the middle of being sent."""
+        """Return the unsent bytes of a frame that is sent in part."""
         return 0 if self._started is None else len(self._started)
 
     @property
     def short(self) -> bool:
-        """Whether it holds memory, and its host has no more of it."""
+        """Whether the queue holds memory, and its host may have no more."""
         return bool(self) and self._share.exhausted
 
     @property
     def full(self) -> bool:
-        """Whether another message would be one too many, for this queue or for the host."""
+        """Whether another message would exceed the bounds of this queue or the memory of the host."""
         return (
             self._messages >= self._limit_messages
             or self._size >= self._limit_size
@@ -71,7 +70,7 @@ class Outbox:
         )
 
     def append(self, view: memoryview, messages: int, sent: int = 0, rest: memoryview | None = None) -> None:
-        """Queue a batch of which the first `sent` bytes are sent already. It stays as it is, or its `rest` does."""
+        """Queue a batch; its first `sent` bytes are sent. The batch, or its `rest`, must not change."""
         if sent:
             rest = view[sent:] if rest is None else rest
             gone, end = boundary_at(view, sent)
@@ -84,13 +83,12 @@ class Outbox:
             self._count(messages, len(view))
 
     def begin(self, rest: memoryview) -> None:
-        """Something has been sent in part (a frame, or the connection header): `rest` goes before all
-        else."""
+        """Put the rest of a frame (or of the connection header) before everything else."""
         self._started = _apart(rest)
         self._share.add(len(rest))
 
     def vectors(self) -> list[memoryview]:
-        """What to send next, in order."""
+        """Return what to send next, in order."""
         views = [] if self._started is None else [self._started]
         for index, (view, _messages) in enumerate(self._waiting):
             if index == _VECTORS:
@@ -99,7 +97,7 @@ class Outbox:
         return views
 
     def advance(self, sent: int) -> None:
-        """The socket took the first `sent` bytes of `vectors()`."""
+        """Remove the first `sent` bytes of `vectors()`, which the socket has taken."""
         if self._started is not None:
             taken = min(sent, len(self._started))
             self._share.add(-taken)
@@ -122,7 +120,7 @@ class Outbox:
             sent = 0
 
     def trim(self) -> int:
-        """Drop the oldest frames beyond the bounds, or all when the host has no memory left; how many."""
+        """Drop the oldest frames beyond the bounds, or all if the host has no memory left; return how many."""
         before = self._messages
         limit_messages, limit_size = self._limit_messages, self._limit_size
         if self._share.exhausted:
@@ -161,5 +159,5 @@ class Outbox:
 
 
 def _apart(rest: memoryview) -> memoryview:
-    """The bytes; in memory of their own if they are little of what they stand in."""
+    """Return the bytes, copied if they are a small part of their buffer."""
     return memoryview(bytes(rest)) if LITTLE * len(rest) <= memoryview(rest.obj).nbytes else rest

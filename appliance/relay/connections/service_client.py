@@ -1,12 +1,10 @@
-"""A service client's connection and the one made for it to the service.
+"""A service client's connection and the one to the service.
 
-The client's header has been checked against the grants; the service is connected to, gets the client's header
-written afresh (`persistent`, `probe` and `md5sum=*` included, a session's own fields left out), and its answer goes
-back the same way (`headers`). Then requests and replies alternate (`exchange`).
+The client's header has been checked against the grants. The service gets it written again (`headers`), and its answer
+goes back in the same way. Then requests and replies alternate (`exchange`).
 
-A service that never answers holds this client and nobody else. One that cannot be reached, or dies before its
-header, is answered with an error header, as rospy and roscpp expect; one that dies later ends the client's
-connection, as it would without the appliance.
+A service that never answers holds up only this client. If it cannot be reached, or dies before its header, the client
+gets an error header, as rospy and roscpp expect. If it dies later, the client's connection ends, as in plain ROS.
 """
 
 import errno
@@ -15,24 +13,24 @@ from collections.abc import Callable, Mapping
 
 from appliance.channel.messages import PublicationRefused, TopicTraffic
 from appliance.relay.connections.exchange import ServiceExchange
-from appliance.relay.connections.frames import SMALL
 from appliance.relay.connections.headers import size_of, switched_on, to_client, to_service
-from appliance.relay.connections.memory import Stall, Weight
 from appliance.relay.connections.own_service import OwnServer, OwnService
-from appliance.relay.connections.sockets import Stream, begin_connect
 from appliance.relay.context import RelayContext
-from appliance.relay.granted import Service
-from appliance.relay.loop import Timer
-from appliance.relay.monitors.interceptor import Judged
-from appliance.relay.monitors.observation_points import Place
+from appliance.relay.grant_table import PeerGrant, ServiceEndpoint
+from appliance.relay.loop import LoopTimer
+from appliance.relay.monitors.interceptor import ServiceVerdict
+from appliance.relay.monitors.observation_points import ObservationPoint
+from appliance.relay.transport.frames import SMALL
+from appliance.relay.transport.memory import HeldBytes, StallDetector
+from appliance.relay.transport.sockets import BufferedSocket, begin_connect
 from roswire.errors import PeerError
 from roswire.tcpros import HeaderParser, encode_header
 
-_PATIENT = 1 << 20  # so much may wait for ever, as long as its host has memory
+_PATIENT = 1 << 20  # bytes that may wait for ever, while the host has memory
 
 
 class ServiceTraffic:
-    """What went through one service since the last report, and how many are connected."""
+    """The traffic of one service since the last report, and its clients."""
 
     def __init__(self) -> None:
         self.messages = 0
@@ -41,18 +39,18 @@ class ServiceTraffic:
         self.changed = False
 
     def count(self, size: int) -> None:
-        """A request or reply of so many bytes goes through."""
+        """Count a request or reply."""
         self.messages += 1
         self.bytes += size
         self.changed = True
 
     def connected(self, change: int) -> None:
-        """Count so many clients more."""
+        """Add `change` to the number of clients."""
         self.clients += change
         self.changed = True
 
     def row(self, key: str, service: str) -> TopicTraffic | None:
-        """The counters since the last call; None when nothing has changed."""
+        """Return the counters since the last call; None if nothing has changed."""
         if not self.changed:
             return None
         row = TopicTraffic(key, service, self.messages, self.bytes, 0, self.clients)
@@ -62,24 +60,24 @@ class ServiceTraffic:
 
 
 class ServiceClient:
-    """One client of one service; `caller_id` is the name it is bound to. `own`: the appliance itself offers it.
+    """One client of one service; `caller_id` is the name it is bound to. With `own`, the appliance offers it.
 
-    Either `ended()` is called once, when both connections are closed, or `refuse(sock, reason)`, which takes
-    the client's socket over.
+    Once, either `ended(self)` is called when both connections are closed, or `refuse(self, sock, reason)`, which takes
+    over the client's socket.
     """
 
     def __init__(
         self,
         context: RelayContext,
         sock: socket.socket,
-        service: Service,
+        service: ServiceEndpoint,
         host: str,
         fields: Mapping[str, str],
         *,
         caller_id: str,
         traffic: ServiceTraffic,
-        refuse: Callable[[socket.socket, str], None],
-        ended: Callable[[], None],
+        refuse: Callable[["ServiceClient", socket.socket, str], None],
+        ended: Callable[["ServiceClient"], None],
         own: OwnService | None = None,
     ) -> None:
         self.service = service
@@ -95,13 +93,13 @@ class ServiceClient:
         self._live = True
         memory = context.memory
         self._weights = (
-            Weight(memory.frames.of(host)),
-            Weight(memory.frames.of(service.host)),
-            Weight(memory.queues.of(host)),
+            HeldBytes(memory.frames.of(host)),
+            HeldBytes(memory.frames.of(service.host)),
+            HeldBytes(memory.queues.of(host)),
         )
-        self._stall = Stall(context.limits.stall_seconds)
-        self._server: Stream | OwnServer | None = None
-        self._timer: Timer | None = None
+        self._stall = StallDetector(context.limits.stall_seconds)
+        self._server: BufferedSocket | OwnServer | None = None
+        self._timer: LoopTimer | None = None
         self._parser = HeaderParser(context.limits.header_bytes)
         self._greeted = False
         self._header: dict[str, str] = {}
@@ -113,7 +111,7 @@ class ServiceClient:
             count=traffic.count,
             judge=self._judge,
         )
-        self._client = Stream(
+        self._client = BufferedSocket(
             context.loop,
             sock,
             self._client_received,
@@ -123,8 +121,13 @@ class ServiceClient:
         )
         self._client.read(False)
 
+    @property
+    def grant(self) -> PeerGrant:
+        """Return the grant that it uses."""
+        return "service", self.service.key, self.service.service, self.host, self.caller_id
+
     def start(self, rest: bytes) -> None:
-        """Connect to the service; `rest` is what the client has sent after its header."""
+        """Connect to the service; `rest` is the bytes that the client has sent after its header."""
         try:
             self._exchange.from_client(rest)
             self._server = self._reach()
@@ -137,8 +140,8 @@ class ServiceClient:
         self._patience(self._context.limits.connect_seconds)
         self._weigh()
 
-    def _reach(self) -> Stream | OwnServer:
-        """What leads to the service. Raises `OSError` and `OverflowError`."""
+    def _reach(self) -> BufferedSocket | OwnServer:
+        """Return the connection to the service. Raises `OSError` and `OverflowError`."""
         loop, service = self._context.loop, self.service
         if self._own is not None:
             called = service.service, self.host, self.caller_id
@@ -146,19 +149,19 @@ class ServiceClient:
             return OwnServer(self._own, loop, called=called, received=received, opened=opened)
         sock = begin_connect(service.host, service.port)
         received, broken = self._server_received, self._server_broken
-        return Stream(
+        return BufferedSocket(
             loop, sock, received, broken, payer=self._context.payer(self.host), opened=self._connected
         )
 
-    def judge_again(self) -> None:
-        """Other specifications are in force: a service that does not fit them is carried no longer."""
+    def recheck(self) -> None:
+        """Cut the client if the service does not fit the specifications in force."""
         if self._greeted:
-            objection = self._context.middle.service_objection(self.service.service, self._header)
+            objection = self._context.interceptor.service_objection(self.service.service, self._header)
             if objection:
                 self.cut(objection)
 
-    def look(self) -> None:
-        """A second is over: one that keeps memory for a message that nothing comes of, or is not taken, is cut."""
+    def check_stall(self) -> None:
+        """Cut a client whose message makes no progress and holds memory; called once a second."""
         held = (
             self._exchange.unfinished + self._client.backlog + (self._server.backlog if self._server else 0)
         )
@@ -168,15 +171,15 @@ class ServiceClient:
             self.cut(f"{held} bytes of a message wait, and nothing of it has come or gone for {seconds:g} s")
 
     def cut(self, reason: str) -> None:
-        """Close both connections; empty for the client's own end."""
+        """Close both connections; the reason is empty if the client ended."""
         if self._live:
             self._release()
             self._client.close()
             self._context.reporter.closed(self._number, reason)
-            self._ended()
+            self._ended(self)
 
     def _patience(self, seconds: float) -> None:
-        """From now on the service has so long."""
+        """Give the service this many seconds from now on."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self._context.loop.after(
@@ -206,7 +209,7 @@ class ServiceClient:
         if "error" in header:
             self._turn_away(header["error"])
             return
-        objection = self._context.middle.service_objection(self.service.service, header)
+        objection = self._context.interceptor.service_objection(self.service.service, header)
         if objection:
             self._context.reporter.send(PublicationRefused(self.service.key, self.service.service, objection))
             self._turn_away(objection)
@@ -222,12 +225,12 @@ class ServiceClient:
         self._to_client(encode_header(to_client(header, self.service.node)))
         self._guard(self._exchange.from_service, self._parser.rest)
 
-    def _judge(self, part: str, body: bytes) -> Judged:
-        """What the monitors make of a request or a reply. They may be others than when the client came."""
-        middle, service = self._context.middle, self.service
-        if part == "request":
-            return middle.request(Place(service.key, service.service, self.host, self.caller_id), body)
-        return middle.response(Place(service.key, service.service, service.host, service.node), body)
+    def _judge(self, part: str, body: bytes) -> ServiceVerdict:
+        """Return the monitors' verdict; the monitors may have changed since the client came."""
+        service = self.service
+        sender = (self.host, self.caller_id) if part == "request" else (service.host, service.node)
+        point = ObservationPoint(service.key, service.service, *sender)
+        return self._context.interceptor.judge(point, part, body)
 
     def _client_received(self, data: bytes) -> None:
         if not data:
@@ -236,7 +239,7 @@ class ServiceClient:
             self._guard(self._exchange.from_client, data)
 
     def _guard(self, feed: Callable[[bytes], None], data: bytes) -> None:
-        """Feed the exchange; a peer that breaks the protocol loses its connection."""
+        """Feed the exchange, and cut a peer that breaks the protocol."""
         try:
             feed(data)
         except PeerError as error:
@@ -245,7 +248,7 @@ class ServiceClient:
         self._advance()
 
     def _advance(self) -> None:
-        """Go on as far as the client has taken what was written to it."""
+        """Go on, if the client has taken everything that was written to it."""
         if not self._live or not self._greeted:
             return
         while self._live and not self._client.backlog:
@@ -260,7 +263,7 @@ class ServiceClient:
             self._weigh()
 
     def _weigh(self) -> None:
-        """Count what this connection holds in memory; too much for a host ends it."""
+        """Count the memory that this connection holds; end it if that is too much for a host."""
         waiting = self._client.backlog + (self._server.backlog if self._server else 0)
         of_service = self._exchange.held_replies + size_of(self._header)
         parts = (self._exchange.held, of_service, waiting)
@@ -296,10 +299,10 @@ class ServiceClient:
             self.cut("" if self._exchange.may_read or self._exchange.done else reason)
 
     def _turn_away(self, reason: str) -> None:
-        """The client gets the reason in a header of its own."""
+        """Send the client the reason in a header."""
         if self._live:
             self._release()
-            self._refuse(self._client.take(), reason)
+            self._refuse(self, self._client.take(), reason)
 
     def _release(self) -> None:
         self._live = False
@@ -314,5 +317,5 @@ class ServiceClient:
 
 
 def _why(error: Exception) -> str:
-    """The error without the address of the service's node, which is not the client's to know."""
+    """Return the error without the address of the service's node, which the client must not learn."""
     return errno.errorcode.get(getattr(error, "errno", None) or 0, "it has no address that can be called")

@@ -1,22 +1,21 @@
-"""What a publisher that has just appeared said first, for subscribers that are on their way.
+"""The first messages of a new publisher, for subscribers on their way.
 
-With a monitor on its topic a publisher has a connection, and counts one subscriber, before the real one is there. A
-publisher that waits for its subscriber and then says one thing would say it to the monitor alone. So what it says
-first is kept for `SECONDS` and given to every subscriber that comes in that time: in plain ROS it would have been
-connected when the publisher spoke.
+A monitor on its topic connects to a publisher, and counts as a subscriber, before the real subscriber. A publisher that
+waits for a subscriber and then sends one message would send it to the monitor alone. So its first messages are kept for
+`SECONDS` and sent to each subscriber that comes in that time; in plain ROS it would have been connected.
 
 Invariants:
-- Of a stream nothing is kept: a publisher that still speaks `SPEECH` seconds after its first message goes on speaking,
-  and a new subscriber gets what it says next, as in plain ROS. A command must not be carried out after it was meant.
-- What is kept is without a gap up to the latest message, so a subscriber that gets it misses nothing after it.
-- Nobody gets it twice: a subscriber that connects again under the same name in that time gets what comes then.
+- Streams are not kept: a publisher that still sends `SPEECH` seconds after its first message continues, and a new
+  subscriber gets the next messages, as in plain ROS. A command must not be executed late.
+- The kept messages have no gap up to the latest one.
+- A subscriber that reconnects under the same name in that time does not get them again.
 """
 
-from appliance.relay.connections.frames import Batch
-from appliance.relay.connections.memory import HostShare
+from appliance.relay.transport.frames import Batch
+from appliance.relay.transport.memory import HostMemory
 
 APPEARED = 5.0
-"""Seconds after which a publisher has not just appeared any more."""
+"""Seconds after which a publisher no longer counts as new."""
 
 SECONDS = 1.0
 SPEECH = 0.25
@@ -24,10 +23,10 @@ _MESSAGES = 200
 _BYTES = 1 << 20
 
 
-class FirstWords:
-    """The first messages of one topic; times are seconds of the relay's clock, `began` is when it is listened to."""
+class StartupReplay:
+    """The first messages of one topic; times are seconds of the relay's clock, from `began` on."""
 
-    def __init__(self, share: HostShare, began: float) -> None:
+    def __init__(self, share: HostMemory, began: float) -> None:
         self._share = share
         self._until = began + APPEARED
         self._first: float | None = None
@@ -37,11 +36,11 @@ class FirstWords:
         self._given: set[str] = set()
 
     def over(self, now: float) -> bool:
-        """Whether every subscriber that was on its way has had the time to come."""
+        """Whether every subscriber that was on its way has had time to connect."""
         return now > self._until
 
     def add(self, batch: Batch, now: float) -> bool:
-        """Messages have come; False when they are more than first words, and none is to be kept."""
+        """Keep messages; return False if there are too many: from then on none is kept."""
         if self._first is None:
             self._first, self._until = now, now + SECONDS
         self._messages += batch.messages
@@ -59,12 +58,12 @@ class FirstWords:
         return True
 
     def give(self, caller_id: str) -> list[Batch]:
-        """What a subscriber that is served now is given, the oldest first."""
+        """Return the messages for a new subscriber, the oldest first."""
         again = caller_id in self._given
         self._given.add(caller_id)
         return [] if again else self._batches
 
     def forget(self) -> None:
-        """Keep nothing."""
+        """Drop all messages."""
         self._share.add(-self._bytes)
         self._batches, self._bytes = [], 0

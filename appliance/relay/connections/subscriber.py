@@ -1,21 +1,21 @@
-"""A subscriber's connection: the publisher's header, then frames; nothing is expected from the subscriber.
+"""A subscriber's connection: the publisher's header, then frames.
 
 Invariants:
-- No send ever blocks. What the socket does not take waits in the subscriber's own `Outbox`.
-- A subscriber that sends anything after its header is cut: its connection is for the one topic it was
-  granted.
+- No send blocks. Bytes that the socket does not take wait in the subscriber's `SendQueue`.
+- A subscriber that sends anything after its header is cut: its connection is for the one topic of its grant.
 """
 
 import socket
 from collections.abc import Callable, Mapping
 
-from appliance.relay.connections.frames import LARGE, Batch
-from appliance.relay.connections.memory import Stall
-from appliance.relay.connections.rate_limit import FlowShare
 from appliance.relay.connections.relayed_topic import RelayedTopic
-from appliance.relay.connections.send_queue import Outbox
+from appliance.relay.connections.send_queue import SendQueue
 from appliance.relay.context import RelayContext
+from appliance.relay.grant_table import PeerGrant
 from appliance.relay.loop import READ, WRITE
+from appliance.relay.transport.frames import LARGE, Batch
+from appliance.relay.transport.memory import StallDetector
+from appliance.relay.transport.rate_limit import RateAllowance
 from roswire.tcpros import encode_header
 
 _ANY = "*"
@@ -24,8 +24,8 @@ _ANY = "*"
 class Subscriber:
     """One subscriber of one relayed topic.
 
-    Either `ended()` is called once, when its connection is closed, or `refuse(sock, reason)`, which takes the
-    socket over, when the types differ.
+    Once, either `ended(self)` is called when its connection is closed, or, if the types differ, `refuse(self, sock,
+    reason)`, which takes over the socket.
     """
 
     def __init__(
@@ -36,13 +36,13 @@ class Subscriber:
         host: str,
         fields: Mapping[str, str],
         *,
-        refuse: Callable[[socket.socket, str], None],
-        ended: Callable[[], None],
+        refuse: Callable[["Subscriber", socket.socket, str], None],
+        ended: Callable[["Subscriber"], None],
     ) -> None:
         self.topic = topic
         self.host = host
         self.caller_id = fields["callerid"]
-        self.flow: FlowShare | None = None
+        self.flow: RateAllowance | None = None
         self.missed = False
         self.behind_since: float | None = None
         self._loop = context.loop
@@ -53,21 +53,26 @@ class Subscriber:
         self._refuse = refuse
         self._ended = ended
         self._share = context.memory.queues.of(host)
-        self._outbox = Outbox(context.limits, self._share)
-        self._writing = False  # whether the loop says when the socket takes more
-        self._stall = Stall(context.limits.stall_seconds)
+        self._queue = SendQueue(context.limits, self._share)
+        self._writing = False  # whether the loop watches for room in the socket
+        self._stall = StallDetector(context.limits.stall_seconds)
         self._number = 0
         self._live = True
         self._loop.watch(sock.fileno(), READ, self._ready, context.payer(host))
 
+    @property
+    def grant(self) -> PeerGrant:
+        """Return the grant that it uses."""
+        return "topic", self.topic.key, self.topic.topic, self.host, self.caller_id
+
     def greet(self, header: Mapping[str, str]) -> bool:
-        """Answer with the publisher's header, or with an error header where type and md5sum do not fit."""
+        """Answer with the publisher's header, or with an error header if type or md5sum do not fit."""
         mismatch = describe_mismatch(self.fields, header)
         if mismatch:
             self._live = False
             self._loop.unwatch(self._socket.fileno())
             self.topic.leave(self)
-            self._refuse(self._socket, mismatch)
+            self._refuse(self, self._socket, mismatch)
             return False
         self._number = self._reporter.opened(
             self.topic.key, self.topic.topic, "topic", self.host, self.caller_id
@@ -81,23 +86,23 @@ class Subscriber:
             self._cut_by(error, "cannot be written to")
             return False
         if sent < len(data):
-            self._outbox.begin(memoryview(data)[sent:])
+            self._queue.begin(memoryview(data)[sent:])
             self._write(True)
         return True
 
     def deliver(self, batch: Batch) -> int:
-        """Send the frames, or queue what the socket does not take; how many it does not get.
+        """Send the frames, or queue what the socket does not take; return how many messages are dropped.
 
-        Large ones are not begun while its host has no memory for what the socket may leave.
+        Large frames are not begun while its host has no memory for the bytes that the socket may leave.
         """
         if self.flow is not None:
             passing = self._limited(self.flow, batch)
             if passing is None:
                 return 0
             batch = passing
-        outbox = self._outbox
+        queue = self._queue
         if self._writing:
-            outbox.append(batch.keep(), batch.messages)
+            queue.append(batch.keep(), batch.messages)
         else:
             view = batch.view
             if len(view) > LARGE and self._share.exhausted:
@@ -112,16 +117,16 @@ class Subscriber:
             if sent == len(view):
                 return 0
             if sent:
-                outbox.append(view, batch.messages, sent, batch.rest(sent))
+                queue.append(view, batch.messages, sent, batch.rest(sent))
             else:
-                outbox.append(batch.keep(), batch.messages)
+                queue.append(batch.keep(), batch.messages)
             self._write(True)
-        if self.behind_since is None and outbox.behind:
+        if self.behind_since is None and queue.behind:
             self.behind_since = self._loop.clock()
         return 0
 
-    def _limited(self, flow: FlowShare, batch: Batch) -> Batch | None:
-        """The first messages, as many as its limit lets pass; the others are told."""
+    def _limited(self, flow: RateAllowance, batch: Batch) -> Batch | None:
+        """Return the first messages, as many as the limit allows, and report the others."""
         count = flow.room(batch, batch.messages, self._loop.clock())
         self.missed = count < batch.messages
         if self.missed:
@@ -141,30 +146,30 @@ class Subscriber:
     @property
     def full(self) -> bool:
         """Whether the queue has reached its bounds."""
-        return self._outbox.full
+        return self._queue.full
 
     def trim(self) -> int:
-        """Drop the oldest messages beyond the bounds; how many."""
-        return self._outbox.trim()
+        """Drop the oldest messages beyond the bounds; return how many."""
+        return self._queue.trim()
 
-    def look(self) -> None:
-        """A second is over: beyond its host's share, one that takes nothing of a message that has begun is cut."""
-        begun = self._outbox.begun if self._outbox.short else 0
+    def check_stall(self) -> None:
+        """Cut a subscriber beyond its host's quota that takes nothing of a message; called once a second."""
+        begun = self._queue.begun if self._queue.short else 0
         if self._stall.seen(begun, self._loop.clock()):
             self.cut("its host has no memory left in the relay, and it does not take the rest of a message")
 
     def cut(self, reason: str) -> None:
-        """Close the connection; empty for the subscriber's own end."""
+        """Close the connection; the reason is empty if the subscriber ended."""
         if self._live:
             self._live = False
             self._loop.discard(self._socket)
-            self._outbox.clear()
+            self._queue.clear()
             self.topic.leave(self)
             self._reporter.closed(self._number, reason)
-            self._ended()
+            self._ended(self)
 
     def _cut_by(self, error: OSError, what: str) -> None:
-        """A node that ends with messages unread resets the connection; a write may notice its end before a read."""
+        """Cut the subscriber for an error; a reset counts as its normal end."""
         self.cut(
             "" if isinstance(error, BrokenPipeError | ConnectionResetError) else f"{what}: {error.strerror}"
         )
@@ -176,22 +181,22 @@ class Subscriber:
             self._listen()
 
     def _flush(self) -> None:
-        outbox = self._outbox
+        queue = self._queue
         try:
-            sent = self._socket.sendmsg(outbox.vectors())
+            sent = self._socket.sendmsg(queue.vectors())
         except BlockingIOError:
             return
         except OSError as error:
             self._cut_by(error, "cannot be written to")
             return
-        outbox.advance(sent)
-        if not outbox:
+        queue.advance(sent)
+        if not queue:
             self.behind_since = None
             self._write(False)
             self.topic.relieve()
 
     def _write(self, on: bool) -> None:
-        """Write what waits as soon as the socket takes it, or nothing waits."""
+        """Switch writing by the loop on or off."""
         self._writing = on
         self._loop.change(self._socket.fileno(), READ | WRITE if on else READ)
 
@@ -215,7 +220,7 @@ class Subscriber:
 
 
 def describe_mismatch(wanted: Mapping[str, str], offered: Mapping[str, str]) -> str:
-    """Why a subscriber's header does not fit a publisher's; empty when it does.
+    """Return why a subscriber's header does not fit a publisher's; empty if it fits.
 
     As in ROS, the md5sum decides.
     """

@@ -4,8 +4,8 @@
       ^               |                          |                        |                  |
       +---linger------+------ refused, failed, lost: wait (doubling), then ask again --------+
 
-A `Publisher` keeps at it while somebody wants the topic. A flow of more than `retry_longest` resets the wait: one that
-answers its header and then closes, or breaks the protocol, is waited for ever longer.
+A `PublisherConnection` tries again while the topic is wanted. A flow of more than `retry_longest` seconds resets the
+wait. The wait grows for a publisher that answers its header and then closes, or breaks the protocol.
 """
 
 import socket
@@ -13,23 +13,23 @@ from collections.abc import Callable
 
 from appliance.channel.messages import PublicationRefused, UpstreamLost, UpstreamWanted
 from appliance.channel.messages.relay_link import Violation
-from appliance.relay.connections.frames import SMALL, Batch, FrameReceiver
 from appliance.relay.connections.headers import size_of
-from appliance.relay.connections.memory import Stall, Weight
-from appliance.relay.connections.named_subscribers import Presences, looks_for_names
-from appliance.relay.connections.relayed_topic import RelayedTopic
-from appliance.relay.connections.sockets import Stream, begin_connect
+from appliance.relay.connections.named_subscribers import NamedSubscribers, looks_for_names
+from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
 from appliance.relay.context import RelayContext
-from appliance.relay.loop import READ, Timer
+from appliance.relay.loop import READ, LoopTimer
+from appliance.relay.transport.frames import SMALL, Batch, FrameReceiver
+from appliance.relay.transport.memory import HeldBytes, StallDetector
+from appliance.relay.transport.sockets import BufferedSocket, begin_connect
 from roswire.errors import LimitExceededError, PeerError
 from roswire.tcpros import HeaderParser, encode_header
 
 _CALLER_ID = "/rosrv"
-_REASON = 1000  # characters that are reported; an error in a header is as long as the publisher likes
+_REASON = 1000  # reported characters; a publisher chooses the length of the error in its header
 
 
-class Publisher:
-    """The upstream of one relayed topic. `objection(header)` says why a publisher is refused, if it is."""
+class PublisherConnection(Upstream):
+    """The upstream of one relayed topic; `objection(header)` returns why a publisher is refused (empty: it is not)."""
 
     def __init__(
         self,
@@ -44,40 +44,40 @@ class Publisher:
         self._payer = context.payer(topic.host)
         self._reporter = context.reporter
         self._limits = limits = context.limits
-        self._weight = Weight(context.memory.frames.of(topic.host))
+        self._weight = HeldBytes(context.memory.frames.of(topic.host))
         self._receiver = FrameReceiver(
             context.scratch, limits.message_bytes, context.memory.frames.of(topic.host)
         )
-        self._stall = Stall(limits.stall_seconds)
+        self._stall = StallDetector(limits.stall_seconds)
         self._buffer = self._receiver.buffer
         self._received = self._receiver.received
         self._wanted = False
         self._asked = False
         self.failures = 0
         self._flowing = 0.0  # since when
-        self._timer: Timer | None = None
-        self._linger: Timer | None = None
-        self._pause: Timer | None = None
-        self._announcing: Timer | None = None
+        self._timer: LoopTimer | None = None
+        self._linger: LoopTimer | None = None
+        self._pause: LoopTimer | None = None
+        self._announcing: LoopTimer | None = None
         self._rest: Batch | None = None
-        self._left = False  # whether something that has come is left for the next turn
+        self._left = False  # whether received data is left for the next turn
         self._scheduled = False
         self._since = 0.0
         self._early = b""
         self._scratch = context.scratch
-        self._rest_weight = Weight(context.memory.frames.of(topic.host))
-        self._stream: Stream | None = None
+        self._rest_weight = HeldBytes(context.memory.frames.of(topic.host))
+        self._stream: BufferedSocket | None = None
         self._socket: socket.socket | None = None
         self._recv_into: Callable[[memoryview], int]
         self._parser = HeaderParser(limits.header_bytes)
         self._address = ("", 0)
         self._header: dict[str, str] = {}
-        self._presences = Presences(context, topic.topic, topic.host)
+        self._named_subscribers = NamedSubscribers(context, topic.topic, topic.host)
         self._objection = objection
         self._objected = ""
 
-    def want(self) -> None:
-        """Somebody is to be served: connect unless that is done or under way."""
+    def connect(self) -> None:
+        """Connect, unless that is done or under way."""
         self._wanted = True
         if self._linger is not None:
             self._linger.cancel()
@@ -85,25 +85,25 @@ class Publisher:
         if self._socket is None and self._stream is None and self._timer is None:
             self.ask()
 
-    def spare(self) -> None:
-        """No subscriber is left; the connection is kept for a moment, for one that comes back at once."""
+    def release(self) -> None:
+        """Keep the connection for a short time, for a subscriber that returns at once."""
         self._wanted = False
         if self._linger is None:
             self._linger = self._loop.after(self._limits.linger, self._close_unwanted)
 
     def ask(self) -> None:
-        """Ask control where the publisher is, and again if no answer comes."""
+        """Ask control for the publisher's address, and again if no answer comes."""
         self._asked = True
         self._set_timer(self._limits.answer_seconds, self.ask)
         self._reporter.send(UpstreamWanted(self._topic.key, self._topic.topic))
 
     def ask_again(self) -> None:
-        """There is a new control: an open question is put to it."""
+        """Repeat an open question to a new control."""
         if self._asked:
             self.ask()
 
     def found(self, host: str, port: int) -> None:
-        """Control's answer; one that nobody waits for is ignored."""
+        """Connect to the address that control has found; ignore an answer that is no longer awaited."""
         if not self._asked:
             return
         self._asked = False
@@ -115,7 +115,7 @@ class Publisher:
             self._lose(f"cannot connect to {host}:{port}: {error}")
             return
         self._parser = HeaderParser(self._limits.header_bytes)
-        self._stream = Stream(
+        self._stream = BufferedSocket(
             self._loop,
             sock,
             self._header_received,
@@ -126,13 +126,13 @@ class Publisher:
         self._set_timer(self._limits.connect_seconds, self._late(f"no answer from {host}:{port}"))
 
     def refused(self) -> None:
-        """Control could not get the address; it is asked again later."""
+        """Ask again later, because control has no address."""
         if self._asked:
             self._asked = False
             self._retry()
 
     def close(self) -> None:
-        """The publication is withdrawn."""
+        """Close everything, because the publication is withdrawn."""
         self._wanted = False
         self._asked = False
         for timer in (self._timer, self._linger, self._pause):
@@ -142,13 +142,13 @@ class Publisher:
         self._drop_connection()
 
     def pause(self, seconds: float) -> None:
-        """Leave what comes in the kernel's buffer until `resume`, but no longer than `seconds`."""
+        """Leave data in the kernel's buffer until `resume`, for at most `seconds`."""
         if self._socket is not None and self._pause is None:
             self._loop.unwatch(self._socket.fileno())
             self._pause = self._loop.after(seconds, self._topic.relieve)
 
     def resume(self) -> None:
-        """Read on."""
+        """Go on reading."""
         if self._pause is not None:
             self._pause.cancel()
             self._pause = None
@@ -157,9 +157,9 @@ class Publisher:
             elif self._socket is not None:
                 self._loop.watch(self._socket.fileno(), READ, self._ready, self._payer)
 
-    def look(self) -> None:
-        """A second is over: a publisher that keeps memory for a message and sends nothing of it is cut."""
-        self._receiver.rest()
+    def check_stall(self) -> None:
+        """Cut a publisher that holds memory for a message and sends nothing of it; called once a second."""
+        self._receiver.trim_buffer()
         held = self._receiver.unfinished if self._pause is None and not self._left else 0
         if self._stall.seen(held, self._clock()):
             self._lose(
@@ -168,13 +168,13 @@ class Publisher:
             )
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
-        """Others are served now: the publishers of some types must see them by name."""
+        """Show new subscribers by name to the publishers of types that need it."""
         if self._socket is not None and looks_for_names(type_name) and self._announcing is None:
             self._announcing = self._loop.after(0, lambda: self._show(names()))
 
     def _show(self, names: frozenset[str]) -> None:
         self._announcing = None
-        self._presences.want(names, self._address)
+        self._named_subscribers.update(names, self._address)
 
     def _connected(self) -> None:
         fields = {
@@ -218,14 +218,14 @@ class Publisher:
             return "the relay has no memory left for headers of this host", "limit exceeded"
         return None
 
-    def give_again(self) -> None:
+    def request_latched(self) -> None:
         """Have a latching publisher give its message again, on a new connection."""
         if self._socket is not None and self._wanted:
             self._drop_connection()
             self.ask()
 
-    def judge_again(self) -> None:
-        """Other specifications are in force: a publisher that does not fit them is refused, or again carried."""
+    def recheck(self) -> None:
+        """Disconnect a publisher that the specifications now reject; retry one that they may accept now."""
         if self._socket is not None:
             reason = self._objection(self._header)
             if reason:
@@ -235,7 +235,7 @@ class Publisher:
             self.ask()
 
     def _object(self, reason: str) -> None:
-        """The publisher is not carried; it is tried again, for it may come back with another definition."""
+        """Disconnect, and try again: the publisher may return with another definition."""
         if reason != self._objected:
             self._objected = reason
             self._reporter.send(PublicationRefused(self._topic.key, self._topic.topic, reason))
@@ -281,7 +281,7 @@ class Publisher:
                 self._continue(rest)
 
     def _continue(self, rest: Batch | None) -> None:
-        """Go on with what has come, while there is time; nothing else is read before that is done."""
+        """Process received data while there is time; nothing else is read before."""
         sock = self._socket
         while sock is not None and self._socket is sock:
             receiver = self._receiver
@@ -300,7 +300,7 @@ class Publisher:
             rest = None if batch is None else self._topic.received(batch, self._since)
 
     def _leave(self, rest: Batch | None) -> None:
-        """Leave this, and what else has come, for the publisher's next turn."""
+        """Leave these frames, and other received data, for the publisher's next turn."""
         self._rest = rest
         self._rest_weight.set(self._topic.undelivered + (0 if rest is None else len(rest.view)))
         self._receiver.set_aside()
@@ -315,7 +315,7 @@ class Publisher:
             self._loop.later(self._go_on, self._payer)
 
     def _go_on(self) -> None:
-        """It is the publisher's turn again."""
+        """Continue in the publisher's next turn."""
         self._scheduled = False
         if not self._left or self._pause is not None:
             return
@@ -330,7 +330,7 @@ class Publisher:
         self._continue(rest)
 
     def _read_on(self) -> None:
-        """All that has come is done."""
+        """Read again, because all received data is processed."""
         if self._left and self._socket is not None:
             self._left = False
             if self._pause is None:
@@ -371,7 +371,7 @@ class Publisher:
         self._drop_connection()
 
     def _drop_connection(self) -> None:
-        self._presences.close()
+        self._named_subscribers.close()
         if self._announcing is not None:
             self._announcing.cancel()
             self._announcing = None
@@ -399,7 +399,7 @@ class Publisher:
 
 
 def _refusal(header: dict[str, str]) -> tuple[str, Violation] | None:
-    """Why a publisher's header begins no conversation, and what that is."""
+    """Return why a publisher's header is rejected, and the kind of violation."""
     if "error" in header:
         return f"the publisher says: {header['error']}", "connection refused"
     missing = [field for field in ("type", "md5sum") if field not in header]

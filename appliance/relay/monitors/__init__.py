@@ -1,1 +1,1 @@
-"""Specifications in the middle of topics and services."""
+"""Monitors between publishers and subscribers, and between clients and services."""

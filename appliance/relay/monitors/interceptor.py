@@ -1,17 +1,16 @@
-"""Monitors in the middle: the specifications in force, and what they do to messages, requests and replies.
+"""The monitors of one relay: the specifications in force, and their effects on messages, requests and replies.
 
-A topic without an enabled event never comes here (`stands` is asked when something changes, not per message). The
-messages of the others go through their lanes (`lane.py`).
+A topic without an enabled event bypasses monitors (`intercepts` is asked when something changes, not per message). The
+messages of other topics go through their pipelines (`topic_pipeline.py`).
 
 Invariants:
-- Whatever goes wrong with a monitor, a defect of this program included, ends the way of that message and of nothing
-  else: it is dropped and told.
-- Specifications that cannot be taken change nothing; a relay that has none yet blocks everything then.
-- One swap is between two messages. What monitors publish is not given to monitors.
-- The clock of monitors never goes back and makes no leap: it is the time of the day when the relay started, and
-  from there the monotonic clock. The messages of one batch have come at the same time.
-- A message may take its monitors `budget` seconds of processor time. One that takes longer is cut off: that is a fault.
-  Messages behind it wait for their publisher's next turn. Ticks that are late and take long are left out.
+- A fault of a monitor, or a defect of this program, drops and reports only that message.
+- Refused specifications change nothing; a relay without any specifications then blocks everything.
+- Specifications are replaced between two messages. Monitors do not get messages that monitors publish.
+- The clock of monitors never goes back or jumps: it is the time of day when the relay started, continued by the
+  monotonic clock. The messages of one batch have the same time.
+- A message may take `budget` seconds of processor time in its monitors; beyond, it is cut off, which is a fault.
+  Messages behind it wait for their publisher's next turn. Late ticks that take long are skipped.
 """
 
 from __future__ import annotations
@@ -27,25 +26,23 @@ from appliance.channel.messages import (
     SpecificationsStated,
     SpecificationsTaken,
 )
-from appliance.relay.loop import Loop, Timer
-from appliance.relay.monitors.keeper import Keeper
+from appliance.relay.loop import EventLoop, LoopTimer
 from appliance.relay.monitors.loader import Loader, Result
-from appliance.relay.monitors.margin_counts import Margins
-from appliance.relay.monitors.observation_points import NOWHERE, Place, Senders
+from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoint, Senders
 from appliance.relay.monitors.observations import SHOWN, Observations
-from appliance.relay.monitors.observer import Observer, refusal
-from appliance.relay.monitors.pace import Pace
-from appliance.relay.monitors.shadow import Trials
-from appliance.relay.monitors.topic_pipeline import Lane, dropped
+from appliance.relay.monitors.observer import Observer, dropped, refusal
+from appliance.relay.monitors.shadow import ShadowMonitors
+from appliance.relay.monitors.state_keeper import StateKeeper
+from appliance.relay.monitors.time_budget import TimeBudget
 from appliance.relay.report import Reporter
 from rosmop.form.connected_groups import way_of
-from rosmop.run.causes import Sender
+from rosmop.run.outcomes import MessageSender
 from rosmop.runtime.action_context import Published
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
-    from rosmop.run.fast_path import FastLane, Prepared
-    from rosmop.run.monitor import Monitor
+    from rosmop.run.fast_path import BatchOptions, FastLane
+    from rosmop.run.monitor import MonitorInstance
     from rosmop.run.outcomes import Outcome
 
 _AFTER_DEFECT = 1.0
@@ -53,25 +50,25 @@ _NO_MEMORY = "the relay process before this one ended, and nothing keeps the sta
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """What becomes of a request or a reply: the body to pass on, or the reason why it is refused."""
+class ServiceVerdict:
+    """The body of a request or reply to pass on, or the reason for refusing it."""
 
     body: bytes
     refused: str | None = None
 
 
-class Middle:
+class Interceptor:
     """The monitors of one relay.
 
-    `budget` is how many seconds of processor time a message may take. `publish(published)` sends what a monitor
-    publishes; `changed(topics)` is called when other topics may be wanted, with those whose messages may fare otherwise
-    now (None: all). `holder(host)` is charged for the slices that messages of this host make, `payer(host)` for their
-    processor time.
+    `budget` is the most seconds of processor time that a message may take. `publish(published)` sends what a monitor
+    publishes; `changed(topics)` is called when other topics may be wanted, with those whose messages may be judged
+    differently now (None: all). `holder(host)` is charged for the slices that messages of this host make, `payer(host)`
+    for their processor time.
     """
 
     def __init__(
         self,
-        loop: Loop,
+        loop: EventLoop,
         reporter: Reporter,
         *,
         budget: float,
@@ -90,38 +87,35 @@ class Middle:
         self._switches: dict[str, bool] = {}
         self.blocked = ""
         self._awaited: SpecificationsStated | None = None
-        self.sight = object()
-        self._paces: dict[Place, Pace] = {}
-        """Of places whose messages were cut off in the last two seconds, and others."""
-        self._prepared: dict[tuple[Place, str], Prepared] = {}
-        """For the walks of requests and replies until there is another `sight`: at most a second."""
-        self._timer: Timer | None = None
+        self.preparation = object()
+        self._time_budgets: dict[ObservationPoint, TimeBudget] = {}
+        """The time budgets of points whose messages were cut off lately, and others."""
+        self._prepared: dict[tuple[ObservationPoint, str], BatchOptions] = {}
+        """The options of walks of requests and replies, valid until the next `preparation`: at most a second."""
+        self._timer: LoopTimer | None = None
         self._due: int | None = None
         self._loader = Loader(loop, self.loaded, self.holder_of)
         self.observations = Observations(loop, reporter, self._rows)
         self._changed = changed
         self._holder = holder
         self._payer = payer
-        self._shared_pace = Pace()
+        self._shared_pace = TimeBudget()
         self.senders = Senders()
-        self._margins = Margins()
         self._publish = publish
-        self._keeper: Keeper | None = None
-        self.observer = Observer(self.observations, self._published, self._margins, self.senders)
-        self._on_trial = Observer(
-            self.observations, lambda _published: None, self._margins, self.senders, "trial "
-        )
-        self.trials = Trials(loop, self.now, self._on_trial)
+        self._keeper: StateKeeper | None = None
+        self.observer = Observer(self.observations, self._published, self.senders)
+        self._shadow_observer = Observer(self.observations, lambda _published: None, self.senders, "shadow ")
+        self.shadow = ShadowMonitors(loop, self.now, self._shadow_observer)
 
-    def remember(self, keeper: Keeper) -> None:
-        """Keep the state of the monitors there, and begin with what it has; before anything is stated."""
+    def remember(self, keeper: StateKeeper) -> None:
+        """Keep the monitors' state in `keeper`, and begin with its state; call this before anything is stated."""
         self._keeper = keeper
         self._offset = keeper.offset
 
     # --- what control states ---
 
     def state(self, message: SpecificationsStated) -> None:
-        """Take these specifications, at once or when they are loaded; the same as before keep their state."""
+        """Take these specifications, at once or when they are loaded; unchanged ones keep their state."""
         self._switches = dict(message.enabled)
         if not self._loader.busy:
             if self._stated is not None and not self.blocked and _same(message, self._stated):
@@ -138,42 +132,40 @@ class Middle:
         self._loader.later(message)
 
     def loaded(self, message: SpecificationsStated, result: Result) -> None:
-        """Put a set that was loaded into force, or refuse it, and tell control."""
+        """Put a loaded set into force, or refuse it, and tell control."""
         if message is self._awaited:
             self._awaited = None
-        self.look_again()
+        self.invalidate_prepared()
         if isinstance(result, list):
             self._refuse(message, result)
             return
         result.limit_time(time.thread_time, self.budget)
-        result.explain_when(self.observer.asks, self._on_trial.asks)
+        result.explain_when(self.observer.asks, self._shadow_observer.asks)
         before, now, first = self.monitors, self.now(), self._stated is None or bool(self.blocked)
         if before is None:
-            outcome = self._begun(result, now, restarted=first and message.restarted)
+            outcome = self._start_outcome(result, now, restarted=first and message.restarted)
         else:
-            incomplete = self.trials.settle()
-            self._margins.take(before, now)
+            incomplete = self.shadow.settle()
             outcome = result.succeed(before, now, incomplete)
         self.monitors, self._stated, self.blocked = result, message, ""
         began = list(result.began)
-        self._margins.keep([monitor.name for monitor in (*result.monitors, *result.tried)], began)
         for monitor in result.monitors:
             if monitor.name in message.moved and monitor.name in began and not monitor.held:
                 result.hold_lost(
                     monitor, "it is on another relay process now, and its state was on the one before"
                 )
             if monitor.why_held and monitor.name in began and not self._switches.get(monitor.name, True):
-                monitor.resume()  # it was disabled, and guarded nothing
+                monitor.resume()  # a disabled monitor guarded nothing
         if self._keeper is not None:
             self._keeper.take(result)
         self.observer.keep([monitor.name for monitor in result.monitors], began, now)
-        self.observer.told(outcome, NOWHERE)
-        self.trials.take(result, outcome)
+        self.observer.report(outcome, NOWHERE)
+        self.shadow.take(result, outcome)
         anew = None if first else _topics(_replaced(before, result))
         self._taken(message, began, anew)
 
-    def _begun(self, monitors: MonitorSet, now: int, *, restarted: bool) -> Outcome:
-        """The first monitors of this process begin, or go on where an earlier one ended."""
+    def _start_outcome(self, monitors: MonitorSet, now: int, *, restarted: bool) -> Outcome:
+        """Start the first monitors of this process, with the state of an earlier process if there is one."""
         left = self._keeper.recovered() if self._keeper is not None else None
         if left is not None:
             return monitors.recover(left.groups, left.lost, now, restarted=restarted)
@@ -182,16 +174,16 @@ class Middle:
         return monitors.start(now, restarted=restarted)
 
     def holder_of(self, source: int) -> str:
-        """Return who is charged for the slices that messages of this source make."""
-        place = self.senders.place(source)
-        return self._holder("" if place is None else place.host)
+        """Return the host that is charged for the slices that messages of this source make."""
+        point = self.senders.point(source)
+        return self._holder("" if point is None else point.host)
 
     def _taken(self, message: SpecificationsStated, began: list[str], anew: frozenset[str] | None) -> None:
-        self.look_again()
+        self.invalidate_prepared()
         held: list[str] = []
         because: dict[str, str] = {}
         if self.monitors is not None:
-            both = (*self.monitors.monitors, *self.monitors.tried)
+            both = (*self.monitors.monitors, *self.monitors.shadowed)
             switches = {monitor.name: self._switches.get(monitor.name, True) for monitor in both}
             switched = _topics(self.monitors.switch(switches, self.now()))
             anew = None if anew is None else anew | switched
@@ -199,12 +191,12 @@ class Middle:
             because = {one.name: one.why_held for one in self.monitors.monitors if one.why_held}
             self.keep_all()
         self.schedule()
-        self.trials.schedule()
+        self.shadow.schedule()
         self._changed(anew)
         self._reporter.send(SpecificationsTaken(message.revision, began, held, message.statement, because))
 
     def _refuse(self, message: SpecificationsStated, findings: list[str]) -> None:
-        self.look_again()
+        self.invalidate_prepared()
         if self._stated is None:
             reason = f"the specifications of revision {message.revision} could not be taken: {findings[0]}"
             self.blocked = reason
@@ -212,20 +204,20 @@ class Middle:
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
 
     def switch(self, name: str, enabled: bool) -> None:
-        """Let the events of a monitor happen, or not; an unknown name is fine (it is gone)."""
-        self.look_again()
+        """Enable or disable a monitor; an unknown name is ignored."""
+        self.invalidate_prepared()
         self._switches[name] = enabled
         if self.monitors is not None:
             switched = self.monitors.switch({name: enabled}, self.now())
             if switched:
                 self.keep_all()
                 self.schedule()
-                self.trials.schedule()
+                self.shadow.schedule()
                 self._changed(_topics(switched))
 
     def resume(self, name: str) -> frozenset[str]:
-        """Let the topics of a monitor that holds them go on; they."""
-        self.look_again()
+        """Have a monitor let its held topics go on; return the topics."""
+        self.invalidate_prepared()
         if self.monitors is None:
             return frozenset()
         held = [monitor for monitor in self.monitors.monitors if monitor.name == name and monitor.held]
@@ -238,42 +230,42 @@ class Middle:
 
     @property
     def preparing(self) -> bool:
-        """Whether specifications are loaded that must be in force before anything else is carried out."""
+        """Whether specifications are being loaded that must be in force before anything else is carried out."""
         return self._awaited is not None
 
-    def stands(self, topic: str) -> bool:
-        """Whether messages of a topic go through here."""
+    def intercepts(self, topic: str) -> bool:
+        """Whether messages of a topic go through monitors."""
         return bool(self.blocked) or (self.monitors is not None and self.monitors.wants(topic))
 
     def wants(self, topic: str) -> bool:
-        """Whether a monitor wants a topic's messages even if nobody else does."""
+        """Whether a monitor wants a topic's messages even without a subscriber."""
         return self.monitors is not None and self.monitors.wants(topic)
 
     def objection(self, topic: str, header: Mapping[str, str]) -> str:
-        """Why a publisher's messages cannot be understood by the monitors of its topic; empty when they can."""
+        """Return why the monitors of a topic cannot read a publisher's messages; empty if they can."""
         monitors = self.monitors
-        name = monitors.type_of(topic, tried=True) if monitors is not None else None
+        name = monitors.type_of(topic, shadowed=True) if monitors is not None else None
         if monitors is None or name is None:
             return ""
         objection = _other_definition(topic, name, monitors.md5sum(name), header)
         return self._objection(topic, objection, monitors.type_of(topic) is None)
 
     def service_objection(self, service: str, header: Mapping[str, str]) -> str:
-        """The same of a service, by the header it answers with."""
+        """Like `objection`, for a service, by the header that it answers with."""
         monitors = self.monitors
-        name = monitors.service_type_of(service, tried=True) if monitors is not None else None
+        name = monitors.service_type_of(service, shadowed=True) if monitors is not None else None
         if monitors is None or name is None:
             return ""
         objection = _other_definition(service, name, monitors.definitions.service_md5sum(name), header)
         return self._objection(service, objection, monitors.service_type_of(service) is None)
 
     def _objection(self, resource: str, objection: str, only_tried: bool) -> str:
-        """Those on trial object to nothing: they are not given what they do not understand."""
-        self.trials.understand(resource, objection)
+        """Return the objection, unless only monitors in shadow mode have it: they just do not get these messages."""
+        self.shadow.understand(resource, objection)
         return "" if only_tried else objection
 
     def header_of(self, topic: str) -> dict[str, str] | None:
-        """The connection header, without names, for what monitors publish on a topic; None if none does."""
+        """Return the connection header, without names, for a topic that monitors publish; None if none does."""
         if self.monitors is None or topic not in self.monitors.publications:
             return None
         name = self.monitors.publications[topic]
@@ -287,7 +279,7 @@ class Middle:
     # --- what is kept ---
 
     def keep(self, way: str) -> None:
-        """Keep the state of those that judge messages on a topic: before one of these is passed on."""
+        """Keep the state of the monitors that judge messages on a topic, before one of these is passed on."""
         if self._keeper is not None:
             self._keeper.keep(way)
 
@@ -302,46 +294,73 @@ class Middle:
 
     # --- messages ---
 
-    def lane(self, place: Place) -> Lane:
-        """Where the messages of this publication go through."""
-        return Lane(self, place)
-
-    def pace(self, place: Place) -> Pace:
-        """Return the pace of messages from a place; hosts that pay as one have one."""
-        if self._payer(place.host) != place.host:
+    def time_budget(self, point: ObservationPoint) -> TimeBudget:
+        """Return the time budget for messages of a point; hosts that pay as one share one."""
+        if self._payer(point.host) != point.host:
             return self._shared_pace
-        if place not in self._paces:
-            self._paces[place] = Pace()
-        return self._paces[place]
+        if point not in self._time_budgets:
+            self._time_budgets[point] = TimeBudget()
+        return self._time_budgets[point]
 
-    def look_again(self) -> None:
-        """Something has happened that may change what lanes have prepared, and what is prepared here."""
-        self.sight = object()
+    def invalidate_prepared(self) -> None:
+        """Invalidate what pipelines and services have prepared."""
+        self.preparation = object()
         self._prepared.clear()
 
-    def request(self, place: Place, body: bytes) -> Judged:
-        """What becomes of a client's request to a service."""
-        return self._service(place, "request", body)
-
-    def response(self, place: Place, body: bytes) -> Judged:
-        """What becomes of a service's reply to a request."""
-        return self._service(place, "response", body)
+    def judge(self, point: ObservationPoint, part: str, body: bytes) -> ServiceVerdict:
+        """Return the verdict on a client's `request` to a service, or on the service's `response` (the `part`)."""
+        service = point.resource
+        if self.blocked:
+            return ServiceVerdict(b"", self.blocked)
+        if self.monitors is None or self.monitors.service_type_of(service, shadowed=True) is None:
+            return ServiceVerdict(body)
+        now, due = self.now(), self.monitors.next_due
+        view = memoryview(body)
+        outcome = self._walked(self.monitors, point, way_of(service, part), body, now)
+        if outcome is None:
+            self.invalidate_prepared()
+            time_budget = self.time_budget(point)
+            self.monitors.hurry(time_budget.part(now))
+            try:
+                outcome = self.monitors.process_service(
+                    service, part, bytearray(body), now, MessageSender(self.senders.number(point))
+                )
+            except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
+                outcome = dropped(view, now, self.observer.defect(error, point, now))
+            if outcome.faults and self.monitors.late:
+                time_budget.cut(now)
+            if self.monitors.tapped:
+                self.shadow.wait(point, None)
+        elif self.monitors.next_due != due:
+            self.invalidate_prepared()
+        self.keep(way_of(service, part))
+        self.observer.report(outcome, point)
+        self.schedule()
+        if outcome.result == "dropped":
+            self.observer.dropped(outcome, point, view)
+            return ServiceVerdict(b"", refusal(outcome, part))
+        if outcome.result == "changed":
+            self.observer.changed(outcome, point, body[:SHOWN], len(body))
+            return ServiceVerdict(bytes(outcome.buffer))
+        return ServiceVerdict(body)
 
     def tick(self) -> None:
-        """A second is over."""
-        self.look_again()
+        """Send the counts of this second; called once a second."""
+        self.invalidate_prepared()
         self.observer.tick(self.now())
-        self.trials.tick()
-        if self.monitors is not None:
-            self._margins.take(self.monitors, self.now())
+        self.shadow.tick()
         self.observations.tick()
         now = self.now()
-        self._paces = {place: pace for place, pace in self._paces.items() if pace.part(now) < 1}
+        self._time_budgets = {
+            point: time_budget
+            for point, time_budget in self._time_budgets.items()
+            if not time_budget.recovered(now)
+        }
 
     def close(self) -> None:
-        """The relay ends."""
+        """Stop loading, and all timers."""
         self._loader.close()
-        self.trials.close()
+        self.shadow.close()
         if self._timer is not None:
             self._timer.cancel()
 
@@ -351,74 +370,40 @@ class Middle:
         if self.monitors is None:
             return []
         rows = self.observer.rows(self.monitors.monitors, self.now())
-        return rows + self._on_trial.rows(self.monitors.tried, self.now())
+        return rows + self._shadow_observer.rows(self.monitors.shadowed, self.now())
 
-    def _service(self, place: Place, part: str, body: bytes) -> Judged:
-        service = place.resource
-        if self.blocked:
-            return Judged(b"", self.blocked)
-        if self.monitors is None or self.monitors.service_type_of(service, tried=True) is None:
-            return Judged(body)
-        now, due = self.now(), self.monitors.next_due
-        view = memoryview(body)
-        outcome = self._walked(self.monitors, place, way_of(service, part), body, now)
-        if outcome is None:
-            self.look_again()
-            pace = self.pace(place)
-            self.monitors.hurry(pace.part(now))
-            try:
-                outcome = self.monitors.process_service(
-                    service, part, bytearray(body), now, Sender(self.senders.number(place))
-                )
-            except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-                outcome = dropped(view, now, self.observer.defect(error, place, now))
-            if outcome.faults and self.monitors.late:
-                pace.cut(now)
-            if self.monitors.tapped:
-                self.trials.wait(place, None)
-        elif self.monitors.next_due != due:
-            self.look_again()
-        self.keep(way_of(service, part))
-        self.observer.told(outcome, place)
-        self.schedule()
-        if outcome.result == "dropped":
-            self.observer.dropped(outcome, place, view)
-            return Judged(b"", refusal(outcome, part))
-        if outcome.result == "changed":
-            self.observer.changed(outcome, place, body[:SHOWN], len(body))
-            return Judged(bytes(outcome.buffer))
-        return Judged(body)
-
-    def _walked(self, monitors: MonitorSet, place: Place, way: str, body: bytes, now: int) -> Outcome | None:
-        """What the module says, if nothing is to be told of it but how much there was; a refusal is told its client."""
+    def _walked(
+        self, monitors: MonitorSet, point: ObservationPoint, way: str, body: bytes, now: int
+    ) -> Outcome | None:
+        """Return the fast path's outcome, if it needs no report besides counts; else None."""
         observer = self.observer
 
-        def prepare(walker: FastLane) -> Prepared:
-            prepared = self._prepared.get((place, way))
+        def prepare(lane: FastLane) -> BatchOptions:
+            prepared = self._prepared.get((point, way))
             if prepared is None:
-                prepared = self._prepared[place, way] = walker.prepare(
-                    loud=walker.changes and observer.shows(place),
-                    told=[True] * len(walker.events),
-                    counted=[observer.hides_verdict(verdict, place) for verdict in walker.verdicts],
-                    source=self.senders.number(place),
+                prepared = self._prepared[point, way] = lane.prepare(
+                    loud=lane.changes and observer.shows(point),
+                    told=[True] * len(lane.events),
+                    counted=[observer.hides_verdict(verdict, point) for verdict in lane.verdicts],
+                    source=self.senders.number(point),
                 )
             return prepared
 
         try:
-            fuel = self.pace(place).fuel(now, self.budget)
-            return monitors.taken(way, body, now, prepare, fuel)
+            fuel = self.time_budget(point).fuel(now, self.budget)
+            return monitors.process_fast(way, body, now, prepare, fuel)
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
-            observer.defect(error, place, now)
+            observer.defect(error, point, now)
             return None
 
     # --- time ---
 
     def now(self) -> int:
-        """The time of monitors, in nanoseconds."""
+        """Return the time of monitors, in nanoseconds."""
         return self._offset + time.monotonic_ns()
 
     def schedule(self) -> None:
-        """See that `_advance` is called when the next tick or deadline is due, or earlier."""
+        """Have `_advance` called when the next tick or deadline is due, or earlier."""
         due = self.monitors.next_due if self.monitors is not None else None
         if due is None or (self._due is not None and self._due <= due):
             return
@@ -428,14 +413,14 @@ class Middle:
         self._timer = self._loop.after(max(0, due - self.now()) / 1e9, self._advance)
 
     def _advance(self) -> None:
-        self.look_again()
+        self.invalidate_prepared()
         self._due = self._timer = None
         if self.monitors is None:
             return
         self.monitors.hurry(1.0)
         try:
             for outcome in self.monitors.advance(self.now()):
-                self.observer.told(outcome, NOWHERE)
+                self.observer.report(outcome, NOWHERE)
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
             now = self.now()
             self.observer.defect(error, NOWHERE, now)
@@ -446,12 +431,12 @@ class Middle:
         self.schedule()
 
 
-def _topics(monitors: Iterable[Monitor]) -> frozenset[str]:
+def _topics(monitors: Iterable[MonitorInstance]) -> frozenset[str]:
     return frozenset(step.event.topic for monitor in monitors for step in monitor.steps if step.event.topic)
 
 
-def _replaced(before: MonitorSet | None, after: MonitorSet) -> list[Monitor]:
-    """The monitors of both sets that do not go on as they were."""
+def _replaced(before: MonitorSet | None, after: MonitorSet) -> list[MonitorInstance]:
+    """Return the monitors of both sets that do not continue unchanged."""
     earlier = before.monitors if before is not None else ()
     kept = {monitor.name for monitor in after.monitors} & {monitor.name for monitor in earlier} - set(
         after.began
@@ -460,11 +445,11 @@ def _replaced(before: MonitorSet | None, after: MonitorSet) -> list[Monitor]:
 
 
 def _same(one: SpecificationsStated, other: SpecificationsStated) -> bool:
-    return (one.part, one.enabled.keys(), one.on_fault, one.trials, one.slices) == (
+    return (one.part, one.enabled.keys(), one.on_fault, one.shadows, one.slices) == (
         other.part,
         other.enabled.keys(),
         other.on_fault,
-        other.trials,
+        other.shadows,
         other.slices,
     )
 

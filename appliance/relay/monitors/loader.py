@@ -1,6 +1,6 @@
-"""What the compiler made becomes monitors beside the loop, so that messages go on while a large set is loaded.
+"""Load compiled specifications in a thread beside the loop, so that messages go on while a large set is loaded.
 
-One statement at a time, in the order they came; `done` is called by the loop.
+Statements are loaded one at a time, in the order they came; the loop calls `done`.
 """
 
 import os
@@ -11,26 +11,26 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Union
 
 from appliance.channel.messages import SpecificationsStated
-from appliance.relay.loop import READ, Loop
+from appliance.relay.loop import READ, EventLoop
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
     from rosmop.run.slice_quota import HolderOf
 
-_SWITCH_SECONDS = 0.0005  # the loop waits so long at most for the thread that loads
+_SWITCH_SECONDS = 0.0005  # the longest that the loop waits for the loading thread
 
 Result = Union["MonitorSet", list[str]]
-"""The monitors, or what is wrong with the specifications."""
+"""The monitors, or the errors of the specifications."""
 
 
 class Loader:
-    """Loads what is stated; `done(statement, result)` hears of each.
+    """The thread that loads specifications and calls `done(statement, result)` for each.
 
     `holder_of(source)` is charged for the slices that messages of a source make.
     """
 
     def __init__(
-        self, loop: Loop, done: Callable[[SpecificationsStated, Result], None], holder_of: "HolderOf"
+        self, loop: EventLoop, done: Callable[[SpecificationsStated, Result], None], holder_of: "HolderOf"
     ) -> None:
         self._loop = loop
         self._holder_of = holder_of
@@ -41,18 +41,18 @@ class Loader:
         self._wake = -1
 
     def later(self, message: SpecificationsStated) -> None:
-        """Load it while the loop goes on."""
+        """Load the specifications of a message while the loop goes on."""
         self._waiting.append(message)
         if self._thread is None:
             self._begin()
 
     @property
     def busy(self) -> bool:
-        """Whether something is being loaded, or waits for it."""
+        """Whether something is being loaded or waits to be."""
         return self._thread is not None or bool(self._waiting)
 
     def close(self) -> None:
-        """Wait for the one that is being loaded; its result is nobody's."""
+        """Wait for the thread, and discard its result."""
         self._waiting.clear()
         if self._thread is not None:
             self._thread.join()
@@ -81,12 +81,12 @@ class Loader:
         self._close_wake()
         self._thread = None
         self._done(self._waiting.popleft(), self._result)
-        if self._waiting and self._thread is None:  # `done` may have brought others, and begun
+        if self._waiting and self._thread is None:  # `done` may have added others and begun
             self._begin()
 
     @staticmethod
     def load(message: SpecificationsStated, holder_of: "HolderOf") -> Result:
-        """The set that these specifications make, or what is wrong with them."""
+        """Return the monitors of these specifications, or the errors."""
         try:
             from appliance.relay.monitors import monitor_sets  # noqa: PLC0415  half a second of a small machine
 

@@ -1,22 +1,22 @@
-"""Where monitors see something: which publication or service, whose message, and which of its messages."""
+"""The points at which monitors act: a publication or service, a sender, and one of the sender's messages."""
 
 import struct
 from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from appliance.relay.monitors.batch import Passage
-from rosmop.run.causes import SEQ, Sender
+from appliance.relay.monitors.batch_progress import BatchProgress
+from rosmop.run.outcomes import SEQ, MessageSender
 
 HEAD = 12
-"""Bytes of `std_msgs/Header` that are told: seq and stamp."""
+"""The reported bytes of `std_msgs/Header`: seq and stamp."""
 
 _HEADER = struct.Struct("<III")
 _SENDERS = 4096
 
 
-class Place(NamedTuple):
-    """A topic or service of an incarnation, and the sender of what is seen there: publisher, client or server."""
+class ObservationPoint(NamedTuple):
+    """A topic or service of an incarnation, and the sender of its messages: publisher, client or server."""
 
     key: str
     resource: str
@@ -24,62 +24,64 @@ class Place(NamedTuple):
     caller_id: str = ""
 
 
-NOWHERE = Place("", "")
-"""What happens by time is about no message."""
+NOWHERE = ObservationPoint("", "")
+"""The point of timed events, which concern no message."""
 
 
 class Senders:
-    """Numbers for places, by which monitors tell later what came from where; the latest `_SENDERS` are known."""
+    """Numbers for observation points, to name the senders of earlier messages; the latest `_SENDERS` are known."""
 
     def __init__(self) -> None:
-        self._places: OrderedDict[int, Place] = OrderedDict()
-        self._numbers: dict[Place, int] = {}
+        self._points: OrderedDict[int, ObservationPoint] = OrderedDict()
+        self._numbers: dict[ObservationPoint, int] = {}
         self._last = 0
 
-    def number(self, place: Place) -> int:
-        """The number of a place."""
-        found = self._numbers.get(place)
+    def number(self, point: ObservationPoint) -> int:
+        """Return the number of a point."""
+        found = self._numbers.get(point)
         if found is None:
             self._last = found = self._last + 1
-            self._numbers[place] = found
-            self._places[found] = place
-            if len(self._places) > _SENDERS:
-                del self._numbers[self._places.popitem(last=False)[1]]
-        self._places.move_to_end(found)
+            self._numbers[point] = found
+            self._points[found] = point
+            if len(self._points) > _SENDERS:
+                del self._numbers[self._points.popitem(last=False)[1]]
+        self._points.move_to_end(found)
         return found
 
-    def place(self, number: int) -> Place | None:
-        """The place that has this number."""
-        return self._places.get(number)
+    def point(self, number: int) -> ObservationPoint | None:
+        """Return the point with this number."""
+        return self._points.get(number)
 
 
-class Sighting:
-    """One message of a publication: where it is in its passage, and how it began when it came, if it has a header.
+class ObservedMessage:
+    """One message of a publication: its position in its batch, and if it has a header, that as received.
 
-    When the passage is over (None), `position` is its number.
+    When the progress is over (None), `position` is its number.
     """
 
-    __slots__ = ("_head", "_passage", "_position")
+    __slots__ = ("_head", "_position", "_progress")
 
-    def __init__(self, passage: Passage | None, position: int, head: bytes) -> None:
-        self._passage = passage
+    def __init__(self, progress: BatchProgress | None, position: int, head: bytes) -> None:
+        self._progress = progress
         self._position = position
         self._head = head
 
-    def at(self, number: int) -> "Sighting":
-        """The same for when the passage is over; the number of the message is known."""
-        return Sighting(None, number, self._head)
+    def at(self, number: int) -> "ObservedMessage":
+        """Return the same for use after the batch, with the number of the message."""
+        return ObservedMessage(None, number, self._head)
 
-    def sender(self, source: int) -> Sender:
-        """The sender, and the message's seq if it has a header."""
+    def sender(self, source: int) -> MessageSender:
+        """Return the sender, and the message's seq if it has a header."""
         if len(self._head) == HEAD:
-            return Sender(source, _HEADER.unpack(self._head)[0], SEQ)
-        return Sender(source)
+            return MessageSender(source, _HEADER.unpack(self._head)[0], SEQ)
+        return MessageSender(source)
 
     def detail(self) -> Mapping[str, Any]:
-        """Its number among those of its publication that this relay received; seq and stamp if it has a header."""
-        passage, position = self._passage, self._position
-        detail: dict[str, Any] = {"number": passage.number_at(position) if passage is not None else position}
+        """Return its number among those of its publication in this relay; seq and stamp if it has a header."""
+        progress, position = self._progress, self._position
+        detail: dict[str, Any] = {
+            "number": progress.number_at(position) if progress is not None else position
+        }
         if len(self._head) == HEAD:
             detail["seq"], seconds, nanoseconds = _HEADER.unpack(self._head)
             detail["stamp"] = f"{seconds}.{nanoseconds:09}"

@@ -1,13 +1,13 @@
-"""What the relay tells control about monitors: the first of each kind and second in full, the rest counted.
+"""The relay's reports about monitors to control: the first of each kind and second in full, the rest counted.
 
 Invariants:
-- Of each monitor, kind and distinction (the category of a verdict, the text of a log line) one event a second is
-  told in full; the others of that second are one event with a count, whose detail is what they share. Nothing that
-  happened is left out of the counts.
-- Each is told with the sender of the message (caller id and host), and which message of the publication it was.
-- Distinctions are bounded (`_DISTINCT`); beyond, what happens is counted under the kind alone.
-- Counters follow the events that they count, and once a second those of which no event was told.
-- While there is no control, at most `_KEPT` events wait; how many more there were is said.
+- For each monitor, kind and distinction (the category of a verdict, the text of a log line), one event a second is
+  reported in full. The others of that second are one event with a count, whose detail is what they have in common. The
+  counts include every event.
+- Each report has the sender of the message (caller id and host), and the message's number in its publication.
+- The number of distinctions is bounded (`_DISTINCT`); beyond it, events are counted under the kind alone.
+- Counters follow the events that they count. Once a second, those without a reported event are sent.
+- While there is no control, at most `_KEPT` events wait; the number of further ones is reported.
 """
 
 from collections import deque
@@ -16,12 +16,12 @@ from types import MappingProxyType
 from typing import Any
 
 from appliance.channel.messages import MonitorEvent, MonitorRow, MonitorsCounted, MonitorsReported
-from appliance.relay.loop import Loop, Timer
-from appliance.relay.monitors.observation_points import Place, Sighting
+from appliance.relay.loop import EventLoop, LoopTimer
+from appliance.relay.monitors.observation_points import ObservationPoint, ObservedMessage
 from appliance.relay.report import Reporter
 
 SHOWN = 1024
-"""Bytes of a message that are told, before and after."""
+"""The reported bytes of a message, before and after."""
 
 _TEXT = 4096
 _DISTINCT = 100
@@ -34,13 +34,13 @@ _INTEGERS = range(-(1 << 63), 1 << 64)
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 _Key = tuple[str, str, str, str, str, str]
-"""Kind, monitor, key of the incarnation, resource, host, distinction: clients of one host are folded together."""
+"""Kind, monitor, key of the incarnation, resource, host, distinction: clients of one host are counted together."""
 
 
 class Observations:
-    """Collects events of monitors and sends them in batches; `rows()` gives the counters of all monitors."""
+    """The events of monitors, sent in batches; `rows()` returns the counters of all monitors."""
 
-    def __init__(self, loop: Loop, reporter: Reporter, rows: Callable[[], Iterable[MonitorRow]]) -> None:
+    def __init__(self, loop: EventLoop, reporter: Reporter, rows: Callable[[], Iterable[MonitorRow]]) -> None:
         self._loop = loop
         self._reporter = reporter
         self._rows = rows
@@ -51,14 +51,14 @@ class Observations:
         self._shared: dict[_Key, Mapping[str, Any]] = {}
         self._waiting: deque[MonitorEvent] = deque()
         self._lost = 0
-        self._timer: Timer | None = None
+        self._timer: LoopTimer | None = None
         self._counted: list[MonitorRow] = []
 
     def note(
         self,
         kind: str,
         monitor: str,
-        place: Place,
+        point: ObservationPoint,
         time: int,
         text: str,
         *,
@@ -68,35 +68,35 @@ class Observations:
         before: bytes = b"",
         after: bytes = b"",
         size: int = 0,
-        sighting: Sighting | None = None,
+        observed: ObservedMessage | None = None,
     ) -> None:
-        """Something happened at `place`, to the message that was sighted.
+        """Note that something happened at `point`, to the `observed` message.
 
-        `shared` is the detail of the count of all that have this distinction.
+        `shared` is the detail of the count of all events with this distinction.
         """
         text = text[:_TEXT]
-        key = self._known(kind, monitor, place, distinction, shared)
-        self._said(key, place)
+        key = self._known(kind, monitor, point, distinction, shared)
+        self._said(key, point)
         if key in self._told:
             self._told[key] += 1
             self._last[key] = time
             return
         self._told[key] = 0
-        plain = _plain({**(detail or {}), **(sighting.detail() if sighting is not None else {})})
+        plain = _plain({**(detail or {}), **(observed.detail() if observed is not None else {})})
         self._add(
             MonitorEvent(
                 kind,
                 monitor,
-                place.key,
-                place.resource,
+                point.key,
+                point.resource,
                 time,
                 text,
                 plain,
                 before,
                 after,
                 size,
-                host=place.host,
-                caller_id=place.caller_id,
+                host=point.host,
+                caller_id=point.caller_id,
             )
         )
 
@@ -104,25 +104,25 @@ class Observations:
         self,
         kind: str,
         monitor: str,
-        place: Place,
+        point: ObservationPoint,
         time: int,
         count: int,
         *,
         distinction: str = "",
         shared: Mapping[str, Any] = _NOTHING,
     ) -> None:
-        """Count so many more at `place`, the last at this time; they are told as a count."""
-        key = self._known(kind, monitor, place, distinction, shared)
-        self._said(key, place)
+        """Count `count` more events, the last at this time, and report them as a count."""
+        key = self._known(kind, monitor, point, distinction, shared)
+        self._said(key, point)
         self._told[key] = self._told.get(key, 0) + count
         self._last[key] = max(time, self._last.get(key, 0))
 
-    def told(self, kind: str, monitor: str, place: Place, distinction: str = "") -> bool:
-        """Whether this has been told in this second, so that the next is only counted."""
-        return self._key(kind, monitor, place, distinction) in self._told
+    def was_reported(self, kind: str, monitor: str, point: ObservationPoint, distinction: str = "") -> bool:
+        """Whether such an event was reported in this second, so that the next one is only counted."""
+        return self._key(kind, monitor, point, distinction) in self._told
 
     def tick(self) -> None:
-        """A second is over: tell the counts, and the state of the monitors if it changed."""
+        """Send the counts of this second, and the state of the monitors if it changed."""
         for key, count in self._told.items():
             if count:
                 self._add(self._count_of(key, count))
@@ -134,7 +134,7 @@ class Observations:
         self.tell_counters()
 
     def repeat(self) -> None:
-        """There is a new control: it is told everything that waits, and all counters."""
+        """Send everything that waits, and all counters, to a new control."""
         self._counted = []
         self.flush()
 
@@ -153,21 +153,21 @@ class Observations:
             caller_id=self._callers[key],
         )
 
-    def _said(self, key: _Key, place: Place) -> None:
-        """The sender; of several clients of a host none is named in the count."""
-        if self._callers.setdefault(key, place.caller_id) != place.caller_id:
+    def _said(self, key: _Key, point: ObservationPoint) -> None:
+        """Note the sender; a count of several clients of a host names none."""
+        if self._callers.setdefault(key, point.caller_id) != point.caller_id:
             self._callers[key] = ""
 
-    def _key(self, kind: str, monitor: str, place: Place, distinction: str) -> _Key:
-        key = (kind, monitor, *place[:3], distinction[:_TEXT])
+    def _key(self, kind: str, monitor: str, point: ObservationPoint, distinction: str) -> _Key:
+        key = (kind, monitor, *point[:3], distinction[:_TEXT])
         beyond = key not in self._told and self._distinct.get((kind, monitor), 0) >= _DISTINCT
-        return (kind, monitor, *place[:3], "") if beyond else key
+        return (kind, monitor, *point[:3], "") if beyond else key
 
     def _known(
-        self, kind: str, monitor: str, place: Place, distinction: str, shared: Mapping[str, Any]
+        self, kind: str, monitor: str, point: ObservationPoint, distinction: str, shared: Mapping[str, Any]
     ) -> _Key:
-        """The key, which counts among the distinctions from now on."""
-        key = self._key(kind, monitor, place, distinction)
+        """Return the key, and count it among the distinctions."""
+        key = self._key(kind, monitor, point, distinction)
         if key[-1] and key not in self._told:
             self._distinct[kind, monitor] = self._distinct.get((kind, monitor), 0) + 1
             if shared:
@@ -183,13 +183,13 @@ class Observations:
             self._timer = self._loop.after(_FLUSH_SECONDS, self.flush)
 
     def flush(self) -> None:
-        """Send what waits to control, and the counters after it."""
+        """Send waiting events to control, then the counters."""
         self._timer = None
         while self._reporter.attached and self._waiting:
             events = [self._waiting.popleft() for _ in range(min(_AT_ONCE, len(self._waiting)))]
             self._reporter.send(MonitorsReported(events, self._lost))
             self._lost = 0
-        self.tell_counters()  # a drop that was told is counted, too
+        self.tell_counters()  # so that a reported drop is also counted
 
     def tell_counters(self) -> None:
         """Send the counters that have changed."""
@@ -202,7 +202,7 @@ class Observations:
 
 
 def _plain(detail: Mapping[str, Any]) -> dict[str, Any]:
-    """The detail as values that a link carries, each bounded."""
+    """Return the detail with bounded values that a link can carry."""
     return {str(name)[:200]: _value(value, 3) for name, value in list(detail.items())[:_VALUES]}
 
 

@@ -1,8 +1,8 @@
-"""What monitors did, counted and put into words for control: from outcomes to `observations`.
+"""Count the actions of monitors and describe them to control: from outcomes to `observations`.
 
-A drop is told of the monitor that dropped the message, a change of each monitor whose action changed its bytes. A
-change that several made is one record, under the last of them, that names all; it counts once for each of them, and
-once for the topic.
+A drop is reported for the monitor that dropped the message, a change for each monitor whose action changed its bytes.
+A change by several monitors is one record under the last of them, which names all. It counts once for each of them,
+and once for the topic.
 """
 
 from __future__ import annotations
@@ -12,16 +12,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from appliance.channel.messages import MonitorRow
-from appliance.relay.counts import Counts
-from appliance.relay.monitors.margin_counts import Margins
-from appliance.relay.monitors.observation_points import NOWHERE, Place, Senders, Sighting
+from appliance.relay.monitors.fast_path_counts import FastPathCounts
+from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoint, ObservedMessage, Senders
 from appliance.relay.monitors.observations import SHOWN, Observations
 from rosmop.run.explanations import of_change, of_drop, of_fault, of_published, of_verdict
 from rosmop.run.outcomes import Outcome, Verdict, named
 from rosmop.runtime.action_context import LogLine, Published
 
 if TYPE_CHECKING:
-    from rosmop.run.monitor import Monitor
+    from rosmop.run.monitor import MonitorInstance
 
 _EXPLAINED = 10
 
@@ -36,20 +35,18 @@ class _Counters:
 
 
 class Observer:
-    """Counts what monitors do, and tells the first of each second in full. `publish` sends what they publish.
+    """The reporter of monitors' actions: counts all, and reports the first event of each kind and second in full.
 
-    What those on trial would have done is told in kinds of its own, with `prefix`.
+    Actions that monitors in shadow mode would have taken are reported with `prefix` before their kind.
     """
 
     def __init__(
         self,
         observations: Observations,
         publish: Callable[[Published], None],
-        margins: Margins,
         senders: Senders,
         prefix: str = "",
     ) -> None:
-        self._margins = margins
         self.senders = senders
         self._explained = 0
         self._observations = observations
@@ -57,99 +54,108 @@ class Observer:
         self._prefix = prefix
         self._counters: dict[str, _Counters] = {}
         self._happened: dict[tuple[str, ...], int] = {}
-        self._again: dict[tuple[tuple[str, ...], Place], int] = {}
-        self._shown: set[Place] = set()
-        self._owed: list[Counts] = []
+        self._again: dict[tuple[tuple[str, ...], ObservationPoint], int] = {}
+        self._shown: set[ObservationPoint] = set()
+        self._owed: list[FastPathCounts] = []
 
     def keep(self, names: list[str], began: list[str], time: int) -> None:
-        """Other monitors are in force; those that began count anew, and not what happened to those before them."""
+        """Set the monitors in force; those that began count from zero."""
         self._sum_up(time)
         self._counters = {
             name: _Counters() if name in began else self._counters.get(name, _Counters()) for name in names
         }
 
-    def shows(self, place: Place) -> bool:
-        """Whether the next change at a place is told with the bytes before it."""
-        return place not in self._shown
+    def shows(self, point: ObservationPoint) -> bool:
+        """Whether the next change at a point is reported with the bytes before it."""
+        return point not in self._shown
 
-    def hides_drop(self, monitor: str, place: Place) -> bool:
-        """Whether the next drop of a monitor at a place is only counted."""
-        return self._observations.told("drop", monitor, place)
+    def hides_drop(self, monitor: str, point: ObservationPoint) -> bool:
+        """Whether the next drop of a monitor at a point is only counted."""
+        return self._observations.was_reported("drop", monitor, point)
 
-    def hides_verdict(self, verdict: Verdict, place: Place) -> bool:
-        """Whether the next such verdict at a place is only counted."""
-        return self._observations.told("verdict", verdict.monitor, place, named(verdict))
+    def hides_verdict(self, verdict: Verdict, point: ObservationPoint) -> bool:
+        """Whether the next such verdict at a point is only counted."""
+        return self._observations.was_reported("verdict", verdict.monitor, point, named(verdict))
 
     def asks(self, verdict: Verdict, source: int) -> bool:
-        """Whether a verdict is told in full, and so explained: as many as `_EXPLAINED` in a second are."""
-        place = self.senders.place(source) or NOWHERE
+        """Whether a verdict is reported in full and so explained; at most `_EXPLAINED` in a second are."""
+        point = self.senders.point(source) or NOWHERE
         kind = f"{self._prefix}verdict"
         if (
-            self._observations.told(kind, verdict.monitor, place, named(verdict))
+            self._observations.was_reported(kind, verdict.monitor, point, named(verdict))
             or self._explained >= _EXPLAINED
         ):
             return False
         self._explained += 1
         return True
 
-    def owe(self, counts: Counts) -> None:
-        """There are counts to be taken when the second is over."""
+    def collect_later(self, counts: FastPathCounts) -> None:
+        """Add counts that are taken when the second is over."""
         counts.begun = True
         self._owed.append(counts)
 
-    def told(self, outcome: Outcome, place: Place, sighting: Sighting | None = None) -> None:
-        """Tell what an outcome has besides its result, and publish what it publishes."""
+    def report(
+        self, outcome: Outcome, point: ObservationPoint, observed: ObservedMessage | None = None
+    ) -> None:
+        """Report an outcome, except its result, and publish its messages."""
         for earlier in outcome.before:
-            self.told(earlier, NOWHERE)
+            self.report(earlier, NOWHERE)
         if outcome.events:
             events = tuple(outcome.events)
             self._happened[events] = self._happened.get(events, 0) + 1
-        self._verdicts(outcome, place, sighting)
-        self._faults(outcome, place, sighting)
+        self._verdicts(outcome, point, observed)
+        self._faults(outcome, point, observed)
         for line in outcome.log:
-            self.said(line, place, outcome.time, sighting)
+            self.report_line(line, point, outcome.time, observed)
         for number, published in enumerate(outcome.published):
             self._observations.note(
                 f"{self._prefix}publish",
                 published.monitor,
-                _of_publication(place, published.topic),
+                _of_publication(point, published.topic),
                 outcome.time,
                 f"{published.type} on {published.topic}",
-                detail={"because_of": place.resource, **of_published(outcome, number, self._who)},
-                sighting=sighting,
+                detail={"because_of": point.resource, **of_published(outcome, number, self._who)},
+                observed=observed,
                 after=published.data[:SHOWN],
                 size=len(published.data),
             )
             self._publish(published)
 
-    def said(self, line: LogLine, place: Place, time: int, sighting: Sighting | None = None) -> None:
-        """Tell a line of output."""
+    def report_line(
+        self, line: LogLine, point: ObservationPoint, time: int, observed: ObservedMessage | None = None
+    ) -> None:
+        """Report a line of output."""
         self._observations.note(
             f"{self._prefix}log",
             line.monitor,
-            place,
+            point,
             time,
             line.text,
             distinction=f"{line.level} {line.text}",
             detail={"level": line.level},
-            sighting=sighting,
+            observed=observed,
         )
 
     def changed(
-        self, outcome: Outcome, place: Place, before: bytes, size: int, sighting: Sighting | None = None
+        self,
+        outcome: Outcome,
+        point: ObservationPoint,
+        before: bytes,
+        size: int,
+        observed: ObservedMessage | None = None,
     ) -> None:
-        """Tell a change with the bytes before and after; where one has been shown in this second it is counted."""
-        if place in self._shown:
-            key = (tuple(outcome.changed_by), place)
+        """Report a change with the bytes before and after; later changes in the same second are counted."""
+        if point in self._shown:
+            key = (tuple(outcome.changed_by), point)
             self._again[key] = self._again.get(key, 0) + 1
             return
-        self._shown.add(place)
+        self._shown.add(point)
         monitors = self._count_change(outcome.changed_by, 1)
         together = _together(outcome.changed_by)
         self._observations.note(
             f"{self._prefix}change",
             monitors[-1],
-            place,
+            point,
             outcome.time,
             f"{' and '.join(monitors)} changed a message",
             distinction=", ".join(together),
@@ -158,50 +164,61 @@ class Observer:
             before=before,
             after=bytes(outcome.buffer[:SHOWN]),
             size=size,
-            sighting=sighting,
+            observed=observed,
         )
 
     def dropped(
-        self, outcome: Outcome, place: Place, body: memoryview, sighting: Sighting | None = None
+        self,
+        outcome: Outcome,
+        point: ObservationPoint,
+        body: memoryview,
+        observed: ObservedMessage | None = None,
     ) -> None:
-        """Tell a drop."""
+        """Report a drop."""
         self._counter(outcome.dropped_by).drops += 1
         self._observations.note(
             f"{self._prefix}drop",
             outcome.dropped_by,
-            place,
+            point,
             outcome.time,
             outcome.reason or _why(outcome),
             detail=of_drop(outcome, self._who),
             before=bytes(body[:SHOWN]),
             size=len(body),
-            sighting=sighting,
+            observed=observed,
         )
 
-    def defect(self, error: Exception, place: Place, time: int, sighting: Sighting | None = None) -> str:
-        """Tell an exception that no action of a monitor explains; its words."""
+    def defect(
+        self, error: Exception, point: ObservationPoint, time: int, observed: ObservedMessage | None = None
+    ) -> str:
+        """Report an exception that no action of a monitor explains; return its text."""
         text = f"a defect of rosrv, please report it: {type(error).__name__}: {error}"
         self._observations.note(
-            f"{self._prefix}fault", "", place, time, text, distinction=type(error).__name__, sighting=sighting
+            f"{self._prefix}fault", "", point, time, text, distinction=type(error).__name__, observed=observed
         )
         return text
 
     def missed(
-        self, monitor: str, place: Place, time: int, text: str, sighting: Sighting | None = None
+        self,
+        monitor: str,
+        point: ObservationPoint,
+        time: int,
+        text: str,
+        observed: ObservedMessage | None = None,
     ) -> None:
-        """Tell that a monitor on trial was not given a message as others would be."""
+        """Report that a monitor in shadow mode did not get a message."""
         self._counter(monitor).missed += 1
         self._observations.note(
-            f"{self._prefix}missed", monitor, place, time, text, distinction=text, sighting=sighting
+            f"{self._prefix}missed", monitor, point, time, text, distinction=text, observed=observed
         )
 
     @property
     def incomplete(self) -> frozenset[str]:
-        """The monitors that missed something."""
+        """Return the monitors that missed something."""
         return frozenset(name for name, counters in self._counters.items() if counters.missed)
 
     def tick(self, time: int) -> None:
-        """A second is over: sum up."""
+        """Send the counts of this second; called once a second."""
         self._sum_up(time)
         self._shown.clear()
         self._explained = 0
@@ -212,13 +229,13 @@ class Observer:
             for event in events:
                 self._counter(_monitor(event)).events += count
         self._happened.clear()
-        for (events, place), count in self._again.items():
+        for (events, point), count in self._again.items():
             monitors = self._count_change(events, count)
             together = _together(events)
             self._observations.add(
                 f"{self._prefix}change",
                 monitors[-1],
-                place,
+                point,
                 time,
                 count,
                 distinction=", ".join(together),
@@ -227,47 +244,45 @@ class Observer:
         self._again.clear()
 
     def _count_change(self, events: Sequence[str], count: int) -> list[str]:
-        """Count messages that these events changed, once for each of their monitors; the monitors, in order."""
+        """Count messages that these events changed, once for each of their monitors; return these in order."""
         monitors = list(dict.fromkeys(_monitor(event) for event in events))
         for monitor in monitors:
             self._counter(monitor).changes += count
         return monitors
 
     def _settle(self) -> None:
-        """Take what lanes have counted: events, and drops and changes beyond the first."""
+        """Take the counts of lanes: events, and drops and changes beyond the first."""
         for owed in self._owed:
-            walker, place = owed.walker, owed.place
-            counts, changed, told = owed.take()
-            for number, count in enumerate(counts):
-                events, monitor = walker.events[number], walker.monitors[number]
-                self._happened[events] = self._happened.get(events, 0) + count.happened
-                if count.dropped:
-                    self._counter(monitor).drops += count.dropped
-                    self._observations.add(
-                        f"{self._prefix}drop", monitor, place, count.last_drop, count.dropped
-                    )
-            for verdict, (times, last) in zip(walker.verdicts, told, strict=True):
+            lane, point = owed.lane, owed.point
+            dropped, changed, told = owed.take()
+            for events, count in zip(lane.events, lane.happened(), strict=True):
+                self._happened[events] = self._happened.get(events, 0) + count
+            for monitor, (times, last) in zip(lane.monitors, dropped, strict=True):
+                if times:
+                    self._counter(monitor).drops += times
+                    self._observations.add(f"{self._prefix}drop", monitor, point, last, times)
+            for verdict, (times, last) in zip(lane.verdicts, told, strict=True):
                 if times:
                     self._counter(verdict.monitor).verdicts += times
                     self._observations.add(
                         f"{self._prefix}verdict",
                         verdict.monitor,
-                        place,
+                        point,
                         last,
                         times,
                         distinction=named(verdict),
                         shared={"category": verdict.category},
                     )
             for writers, messages in changed.items():
-                self._again[writers, place] = self._again.get((writers, place), 0) + messages
+                self._again[writers, point] = self._again.get((writers, point), 0) + messages
         self._owed.clear()
 
-    def rows(self, monitors: Iterable[Monitor], time: int) -> list[MonitorRow]:
-        """The state and counters of these monitors."""
+    def rows(self, monitors: Iterable[MonitorInstance], time: int) -> list[MonitorRow]:
+        """Return the state and counters of these monitors."""
         self._sum_up(time)
-        return [self._row(monitor, time) for monitor in monitors]
+        return [self._row(monitor) for monitor in monitors]
 
-    def _row(self, monitor: Monitor, time: int) -> MonitorRow:
+    def _row(self, monitor: MonitorInstance) -> MonitorRow:
         counters, slices = self._counter(monitor.name), monitor.slices
         return MonitorRow(
             monitor.name,
@@ -282,18 +297,17 @@ class Observer:
             monitor.faults,
             bool(self._prefix),
             counters.missed,
-            self._margins.rows(monitor.name, time),
             slices.live if slices is not None else 0,
             slices.limit if slices is not None else 0,
         )
 
-    def _verdicts(self, outcome: Outcome, place: Place, sighting: Sighting | None) -> None:
+    def _verdicts(self, outcome: Outcome, point: ObservationPoint, observed: ObservedMessage | None) -> None:
         for verdict in outcome.verdicts:
             self._counter(verdict.monitor).verdicts += 1
             self._observations.note(
                 f"{self._prefix}verdict",
                 verdict.monitor,
-                place,
+                point,
                 outcome.time,
                 named(verdict),
                 distinction=named(verdict),
@@ -301,35 +315,42 @@ class Observer:
                 detail=of_verdict(outcome, verdict, self._who),
                 after=bytes(outcome.buffer[:SHOWN]),
                 size=len(outcome.buffer),
-                sighting=sighting,
+                observed=observed,
             )
 
-    def _faults(self, outcome: Outcome, place: Place, sighting: Sighting | None) -> None:
+    def _faults(self, outcome: Outcome, point: ObservationPoint, observed: ObservedMessage | None) -> None:
         for fault in outcome.faults:
             where = fault.position
             self._observations.note(
                 f"{self._prefix}fault",
                 fault.monitor,
-                place,
+                point,
                 outcome.time,
                 f"{where}: {fault.text}",
                 distinction=str(where),
                 detail=of_fault(outcome, fault, self._who),
                 after=bytes(outcome.buffer[:SHOWN]),
                 size=len(outcome.buffer),
-                sighting=sighting,
+                observed=observed,
             )
 
     def _who(self, source: int) -> dict[str, str]:
-        place = self.senders.place(source)
-        return {} if place is None else {"node": place.caller_id, "host": place.host, "on": place.resource}
+        point = self.senders.point(source)
+        return {} if point is None else {"node": point.caller_id, "host": point.host, "on": point.resource}
 
     def _counter(self, monitor: str) -> _Counters:
         return self._counters.setdefault(monitor, _Counters())
 
 
+def dropped(body: memoryview, now: int, reason: str) -> Outcome:
+    """Return the outcome of a message that is dropped without having been judged."""
+    outcome = Outcome(body, now)
+    outcome.result, outcome.reason = "dropped", reason
+    return outcome
+
+
 def refusal(outcome: Outcome, part: str) -> str:
-    """What the client of a service reads."""
+    """Return the error text for the client of a service."""
     if outcome.reason:
         return outcome.reason
     said = f": {outcome.fatal.text}" if outcome.fatal is not None else _said(outcome)
@@ -343,21 +364,20 @@ def _why(outcome: Outcome) -> str:
 
 
 def _said(outcome: Outcome) -> str:
-    """What the monitor that dropped a message said last on it."""
+    """Return the last output of the monitor that dropped a message."""
     said = [line.text for line in outcome.log if line.monitor == outcome.dropped_by]
     return f": {said[-1]}" if said else ""
 
 
 def _monitor(event: str) -> str:
-    """The monitor of an event."""
     return event.partition(".")[0]
 
 
 def _together(events: Sequence[str]) -> list[str]:
-    """The events that changed a message, if it was more than one monitor."""
+    """Return the events that changed a message, if they belong to several monitors."""
     return list(events) if _monitor(events[0]) != _monitor(events[-1]) else []
 
 
-def _of_publication(place: Place, topic: str) -> Place:
-    """Where a publication is told that comes of a message at a place."""
-    return place._replace(key="", resource=topic)
+def _of_publication(point: ObservationPoint, topic: str) -> ObservationPoint:
+    """Return the point of a publication that a message at `point` caused."""
+    return point._replace(key="", resource=topic)

@@ -1,13 +1,12 @@
-"""A memory of fixed size that keeps the state of monitors over the death of a relay: a file that the supervisor opened.
+"""The layout of a file of fixed size that keeps the state of monitors when a relay dies; the supervisor opens it.
 
-Layout: the magic, a byte that says which half is valid (1, 2; 0: none), and the two halves. A half has a `head` (the
+It has a magic number, a byte that names the valid half (1, 2; 0: none), and two halves. A half has a `head` (the
 writer's data), a table and *sections*: two places for the `base` state of a group of monitors and two for its `cells`,
-with one byte that says which are valid. `lay_out` writes the half that is not valid and then the one byte; `write_base`
-and `write_cells` write the place that is not valid and then the one byte of their section. So a process that is killed
-anywhere leaves the state before or after, and nothing between: stores of one thread become visible in their order, and
-a byte is stored as a whole.
+with one byte that says which are valid. `lay_out` writes the invalid half and then the one byte; `write_base` and
+`write_cells` write the invalid place and then the byte of their section. So a process that is killed at any point
+leaves the state before or after a write: stores of one thread become visible in order, and a byte is stored as a whole.
 
-A power cut keeps no order: whoever reads asks the head whether the machine has started again since.
+After a power cut the order is lost: the reader checks by the head whether the machine has restarted since.
 """
 
 import mmap
@@ -22,25 +21,25 @@ MOST_SECTIONS = 100_000
 _START = 16
 _ROOT = len(MAGIC)
 _HEAD = struct.Struct("<II")  # length of the head, number of sections
-_ROW = struct.Struct("<III")  # of a section: where it begins in its half, room of `base`, bytes of `cells`
+_ROW = struct.Struct("<III")  # of a section: its start in its half, room for `base`, bytes of `cells`
 _LENGTH = struct.Struct("<I")
 _FLAGS = 16  # bytes before the places of a section: its byte, and the lengths of both bases from byte 8 on
 _BASE, _CELLS, _HAS_CELLS = 1, 2, 4
 _LEAST_ROOM, _MOST_SPARE = 256, 8192
 
 Memory = Any
-"""What is read and written by slices: a view of a mapped file."""
+"""The memory that slices read and write: a view of a mapped file."""
 
 
-class Kept(NamedTuple):
-    """What a memory has: the head, and of each section the base and, if they are later, the cells."""
+class StoredState(NamedTuple):
+    """The content of a memory: the head, and each section's base, with its cells if these are newer."""
 
     head: bytes
     sections: list[tuple[bytes, bytes | None]]
 
 
 class StateMemory:
-    """Writes into a memory; what was there stays valid until the first `lay_out` is complete."""
+    """Writes into a memory; its old content stays valid until the first `lay_out` is complete."""
 
     def __init__(self, memory: Memory) -> None:
         self._memory = memory
@@ -48,10 +47,7 @@ class StateMemory:
         self._sections: list[_Section] = []
 
     def lay_out(self, head: bytes, sections: Sequence[tuple[bytes, int]]) -> bool:
-        """Begin a half with these bases, each with room for so many bytes of cells.
-
-        False: there is no room for all of them, and nothing has changed.
-        """
+        """Write a new half with these bases and room for their cells; return False if there is not enough room."""
         half = (len(self._memory) - _START) // 2
         rows, at = [], _HEAD.size + len(head) + _ROW.size * len(sections)
         for base, cells in sections:
@@ -75,11 +71,11 @@ class StateMemory:
         return True
 
     def write_base(self, section: int, base: bytes) -> bool:
-        """Keep a whole state of a section; False where it has no room for it."""
+        """Keep a section's whole state; return False if the section has no room for it."""
         return self._sections[section].write_base(base)
 
     def write_cells(self, section: int, cells: bytes) -> None:
-        """Keep the cells of a section, as they have changed since its base."""
+        """Keep the cells of a section, which have changed since its base was written."""
         self._sections[section].write_cells(cells)
 
 
@@ -95,7 +91,7 @@ class _Section:
         self._size = cells
 
     def begin(self, base: bytes) -> None:
-        """Write the first base; nobody reads it before the half is valid."""
+        """Write the first base, before the half is valid."""
         self._put(0, base)
         self._memory[self._at] = self._flags = 0
 
@@ -121,15 +117,15 @@ class _Section:
 
 
 def mapped(descriptor: int, *, writable: bool) -> memoryview:
-    """The memory behind a descriptor, which is closed."""
+    """Map the memory behind a descriptor, and close the descriptor."""
     access = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
     memory = mmap.mmap(descriptor, 0, flags=mmap.MAP_SHARED, prot=access)
     os.close(descriptor)
     return memoryview(memory)
 
 
-def read(memory: Memory) -> Kept | None:
-    """What a memory has; None for one that has nothing valid. Raises `ValueError` for what nobody has written so."""
+def read(memory: Memory) -> StoredState | None:
+    """Return the content of a memory; None if nothing is valid. Raises `ValueError` if it is malformed."""
     if len(memory) < _START or bytes(memory[:_ROOT]) != MAGIC or memory[_ROOT] == 0:
         return None
     half = (len(memory) - _START) // 2
@@ -143,7 +139,7 @@ def read(memory: Memory) -> Kept | None:
             raise ValueError(f"the memory has {count} sections")
         head = bytes(_part(view, _HEAD.size, size))
         table = _HEAD.size + size
-        return Kept(
+        return StoredState(
             head, [_read(view, *_ROW.unpack_from(view, table + _ROW.size * row)) for row in range(count)]
         )
     except struct.error as error:

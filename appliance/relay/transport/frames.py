@@ -1,19 +1,17 @@
-"""Bytes in, whole TCPROS frames out: the walk every relayed message goes through.
+"""Find whole TCPROS frames in received bytes; every relayed message passes here.
 
-A frame is a 4-byte little-endian length and that many bytes. `FrameReceiver` hands out the buffer to receive
-into and returns all frames that are whole after each read as one `Batch`, walked once and not copied:
+A frame is a 4-byte little-endian length and that many bytes. `FrameReceiver` provides the buffer to receive into, and
+returns all whole frames after each read as one `Batch`, without copying them:
 
-- A batch has at most `MOST` frames of unequal length, since whoever takes it walks them; the rest of a read follows
-  (`FrameReceiver.more`), at once or when it is the publisher's turn again.
-- Small frames are received into a scratch area that all receivers of the process share, in the memory of the
-  monitors' module where there is one; only the torn frame at the end of a read, if there is one, is set aside until
-  the rest arrives.
-- A frame beyond `LARGE` gets an area of its own that is filled in place. An area of up to 8 MiB is used again
-  for the next large frame unless a queue has kept it; a larger one is anonymous memory, so that a length which
-  is declared and never sent costs address space only. While memory is short no area is kept.
+- A batch has at most `MOST` frames of unequal length, because its users visit each. The rest of a read follows
+  (`FrameReceiver.more`), at once or at the publisher's next turn.
+- Small frames are received into a scratch area that all receivers share, in the memory of the monitors' module if there
+  is one; only the incomplete frame at the end of a read is copied.
+- A frame beyond `LARGE` gets an area of its own. An area of up to 8 MiB is reused for the next large frame unless a
+  queue has kept it; a larger one is anonymous memory, so a declared length that is never sent costs only address space.
+  While memory is short, no area is kept.
 
-Frames are passed on whole, so a publisher that dies in the middle of one tears nobody's stream: what its
-subscribers have been sent always ends with a frame.
+Frames are passed on whole: the data sent to subscribers always ends with a whole frame.
 """
 
 import mmap
@@ -21,37 +19,38 @@ import struct
 from math import ceil, gcd
 from typing import Literal
 
-from appliance.relay.connections.memory import HostShare
+from appliance.relay.transport.memory import HostMemory
 from roswire.errors import LimitExceededError
 
 SMALL = 4 << 10
-"""Bytes of what is unfinished on a connection that are never refused."""
+"""Bytes of unfinished data on a connection that are never refused."""
 
 LARGE = 128 << 10
 SCRATCH = 512 << 10
-_KEEP_AREA = 8 << 20  # a frame of a camera: memory that is new for each one costs four times the rest
+_KEEP_AREA = 8 << 20  # a camera's frame: new memory for each frame costs four times the rest
 
 LITTLE = 8
-"""Little is an eighth of what it stands in: it is copied rather than that the whole is held for it."""
+"""Data below an eighth of its buffer is copied, so that the buffer can be freed."""
 
 MOST = 4096
 """Frames of unequal length in one batch."""
 
 _MANY = 4  # frames
 _FAR = 4096  # bytes
-_COLUMNS: dict[int, Literal["B", "H", "I"]] = {1: "B", 2: "H", 4: "I"}  # formats of so many bytes
+# `struct` formats by number of bytes
+_COLUMNS: dict[int, Literal["B", "H", "I"]] = {1: "B", 2: "H", 4: "I"}
 
 _LENGTH = struct.Struct("<I")
 _unpack_length = _LENGTH.unpack_from
 
 
 class Batch:
-    """Whole frames, one after the other, in a buffer that is used again unless they are kept.
+    """Consecutive whole frames in a buffer that is reused unless they are kept.
 
-    `last` is where the last of the `messages` frames begins, None if that has to be looked for; `stride` the bytes of
-    each of the frames if they are known to be equally long, else 0. `first` is the number of the first frame among
-    those of its publication. `judged` is when monitors were given them, by their clock; 0: they were not. `left` is the
-    number of messages at the end that monitors had no time for.
+    `last` is where the last of the `messages` frames begins (None: it must be searched for); `stride` is the bytes of
+    each frame if all are known to be equally long, else 0. `first` is the number of the first frame in its publication.
+    `judged` is when monitors got them, by their clock (0: they did not). `left` is the number of messages at the end
+    that monitors had no time for.
     """
 
     __slots__ = ("_kept", "_owned", "first", "judged", "last", "left", "messages", "stride", "view")
@@ -71,23 +70,23 @@ class Batch:
 
     @property
     def kept(self) -> bool:
-        """Whether somebody holds on to the frames."""
+        """Whether the frames are also used elsewhere."""
         return self._kept is not None
 
     def keep(self) -> memoryview:
-        """The frames in memory that stays as it is; copied at most once however many ask."""
+        """Return the frames in memory that does not change; copied at most once."""
         if self._kept is None:
             self._kept = self.view if self._owned else memoryview(bytes(self.view))
         return self._kept
 
     def rest(self, sent: int) -> memoryview:
-        """What is behind the first `sent` bytes, in memory that stays as it is: of its own if it is little."""
+        """Return the bytes after the first `sent`, in memory that does not change; copied if they are few."""
         if self._kept is None and LITTLE * (len(self.view) - sent) <= len(self.view):
             return memoryview(bytes(self.view[sent:]))
         return self.keep()[sent:]
 
     def within(self, size: float, most: int) -> int:
-        """How many of the first `most` frames begin within so many bytes."""
+        """Return how many of the first `most` frames begin within `size` bytes."""
         if size <= 0:
             return 0
         if len(self.view) <= size or most == 1:
@@ -97,7 +96,7 @@ class Batch:
         return min(most, boundary_at(self.view, ceil(size) - 1)[0] + 1)
 
     def head(self, count: int) -> "Batch":
-        """The first frames."""
+        """Return the first frames."""
         end = last = 0
         if self.stride:
             end, last = count * self.stride, (count - 1) * self.stride
@@ -118,13 +117,13 @@ class Batch:
         return tail
 
     def find_last(self) -> int:
-        """Where the last frame begins."""
+        """Return where the last frame begins."""
         if self.last is None:
             self.last = last_frame(self.view)
         return self.last
 
     def keep_last(self) -> "Batch":
-        """The last frame as a batch of its own, in memory that nobody else writes to; monitors may on its way."""
+        """Return the last frame as a batch with its own memory, which monitors may change."""
         if self._owned and self.messages == 1:
             self.keep()
             return self
@@ -133,9 +132,9 @@ class Batch:
 
 
 class Scratch:
-    """Where small frames are received; another area may be given between two reads.
+    """The area into which small frames are received; it may be replaced between two reads.
 
-    It begins with a page: the kernel copies faster from and to what is aligned.
+    It begins at a page boundary, because the kernel copies aligned data faster.
     """
 
     __slots__ = ("area",)
@@ -144,11 +143,11 @@ class Scratch:
         self.move(None)
 
     def move(self, area: memoryview | None) -> None:
-        """From the next read on use this area, or (None) one of its own."""
+        """Use this area from the next read on, or (None) a new one."""
         self.area = memoryview(mmap.mmap(-1, SCRATCH)) if area is None else area
 
     def hold(self, batch: Batch) -> Batch:
-        """Return the batch in the area, if it is large enough: monitors are faster there."""
+        """Return the batch copied into the area if that is large enough: monitors are faster there."""
         size = len(batch.view)
         if size > len(self.area):
             return batch
@@ -159,9 +158,9 @@ class Scratch:
 
 
 class FrameReceiver:
-    """Finds the frames of one connection: `buffer()`, receive into it, `received(count)`, deliver, again."""
+    """A receiver of frames. Repeat: call `buffer()`, receive into it, call `received(count)`, deliver."""
 
-    def __init__(self, scratch: Scratch, limit: int, share: HostShare) -> None:
+    def __init__(self, scratch: Scratch, limit: int, share: HostMemory) -> None:
         self._scratch = scratch
         self._limit = limit
         self._share = share
@@ -176,11 +175,11 @@ class FrameReceiver:
         self._aside = 0
 
     def buffer(self) -> memoryview:
-        """Where the next bytes of the connection go."""
+        """Return the buffer for the next bytes of the connection."""
         if self._area is not None:
             if self._delivered is not None and self._delivered.kept:
                 self._area = _new_area(self._target)
-                self._count(0)  # who keeps it counts it
+                self._count(0)  # the keeper of the batch counts it
             self._delivered = None
             return self._area[self._filled : self._target]
         torn, scratch = self._torn, self._scratch.area
@@ -190,9 +189,9 @@ class FrameReceiver:
         return scratch
 
     def received(self, count: int) -> Batch | None:
-        """The frames that are whole now that `count` more bytes are in the buffer.
+        """Return the frames that are complete with `count` more bytes in the buffer.
 
-        The batch is good until the next call of `buffer`. Raises `LimitExceededError` for a frame beyond the limit,
+        The batch is valid until the next call of `buffer`. Raises `LimitExceededError` for a frame beyond the limit,
         and when the publisher's host has no memory left for an unfinished one.
         """
         self._idle = False
@@ -202,11 +201,11 @@ class FrameReceiver:
 
     @property
     def more(self) -> bool:
-        """Whether there is more in what has been received: it is taken by `following`, before `buffer` is called."""
+        """Whether received frames are left: take them by `following` before calling `buffer`."""
         return self._unwalked is not None
 
     def following(self) -> Batch | None:
-        """Return the next frames of what has been received; raises as `received`."""
+        """Return the next received frames; raises as `received`."""
         unwalked, self._unwalked = self._unwalked, None
         if unwalked is None:
             return None
@@ -220,7 +219,7 @@ class FrameReceiver:
         return self._walk(area, size, owned=False)
 
     def set_aside(self) -> None:
-        """Keep what `following` takes in memory of its own, as other connections are read before that."""
+        """Copy the frames that `following` will take, because other connections are read before."""
         if self._unwalked is not None and not self._aside:
             self._unwalked = memoryview(bytearray(self._unwalked))
             self._aside = len(self._unwalked)
@@ -228,17 +227,17 @@ class FrameReceiver:
 
     @property
     def unfinished(self) -> int:
-        """The bytes that have come of a large frame that is not whole."""
+        """Return the number of received bytes of an incomplete large frame."""
         return self._filled
 
-    def rest(self) -> None:
-        """A second is over: an area that no large frame has come into since the last call is given up."""
+    def trim_buffer(self) -> None:
+        """Free an area without a large frame since the last call; called once a second."""
         if self._idle and not self._filled and self._area is not None:
             self.abandon()
         self._idle = True
 
     def abandon(self) -> None:
-        """The connection is gone: nothing unfinished counts any more."""
+        """Free everything: the connection is gone."""
         self._count(0)
         self._share.add(-self._aside)
         self._unwalked, self._aside = None, 0
@@ -251,7 +250,7 @@ class FrameReceiver:
             self._counted = size
 
     def _walk(self, buffer: memoryview, end: int, *, owned: bool) -> Batch | None:
-        """All whole frames in `buffer[:end]`; the torn one after them is set aside."""
+        """Return all whole frames in `buffer[:end]`; keep the incomplete one after them."""
         limit = self._limit
         need = 0
         stride, messages = equal_frames(buffer, end)
@@ -287,16 +286,16 @@ class FrameReceiver:
         return Batch(buffer[:position], messages, last, owned=owned, stride=stride)
 
     def _begin_area(self, need: int, start: memoryview) -> None:
-        """Go on with a frame of `need` bytes, of which `start` has come, in an area of its own."""
+        """Go on in an area of its own with a frame of `need` bytes, of which `start` has come."""
         area = _new_area(need)
         area[: len(start)] = start
         self._area, self._target, self._filled = area, need, len(start)
         self._count(len(start))
 
     def _received_in_area(self, area: memoryview, count: int) -> Batch | None:
-        """One frame at a time: reads end where the frame ends, or where one as long as the last would."""
+        """Receive one frame at a time: reads end where the frame ends, or where an equally long one would."""
         self._filled += count
-        if self._filled > self._counted:  # what has been filled once stays there with the area
+        if self._filled > self._counted:  # memory that was filled once stays with the area
             self._count(self._filled)
         if self._filled < 4:
             return None
@@ -321,9 +320,9 @@ class FrameReceiver:
 
 
 def equal_frames(buffer: memoryview, end: int) -> tuple[int, int]:
-    """How long the frames at the start of `buffer[:end]` are, and how many, if they are many and all equally long.
+    """Return the length and number of the frames in `buffer[:end]`, if they are many and all equally long.
 
-    (0, 0) if not. To see it in one look at the lengths is cheaper than to walk from frame to frame.
+    (0, 0) if not. Comparing all lengths at once is cheaper than going from frame to frame.
     """
     if end < 4:
         return 0, 0
@@ -336,14 +335,14 @@ def equal_frames(buffer: memoryview, end: int) -> tuple[int, int]:
         return 0, 0  # a whole frame that is shorter follows
     width = gcd(stride, 4)
     column, step = buffer[:whole].cast(_COLUMNS[width]), stride // width
-    for part in range(4 // width):  # of each length, beside that of the frame before
+    for part in range(4 // width):  # of each length, compared with that of the frame before
         if column[part + step :: step] != column[part:-step:step]:
             return 0, 0
     return stride, count
 
 
 def last_frame(view: memoryview) -> int:
-    """Where the last of the whole frames in `view` begins."""
+    """Return where the last of the whole frames in `view` begins."""
     position = last = 0
     while position < len(view):
         last = position
@@ -352,7 +351,7 @@ def last_frame(view: memoryview) -> int:
 
 
 def boundary_at(view: memoryview, offset: int) -> tuple[int, int]:
-    """The frame that byte `offset` of `view` is in: how many frames end at or before it, and where it ends.
+    """Return how many frames end at or before byte `offset` of `view`, and where the frame with that byte ends.
 
     `view` begins with a frame. When `offset` is exactly between two frames, the end is `offset` itself.
     """
@@ -368,7 +367,7 @@ def boundary_at(view: memoryview, offset: int) -> tuple[int, int]:
 
 
 def _new_area(size: int) -> memoryview:
-    """Memory for one large frame: from the heap, which is warm, or, beyond `_KEEP_AREA`, not there until filled."""
+    """Return memory for one large frame: of the heap, or beyond `_KEEP_AREA` anonymous memory."""
     return memoryview(bytearray(size) if size <= _KEEP_AREA else mmap.mmap(-1, size))
 
 

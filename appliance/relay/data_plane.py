@@ -1,62 +1,55 @@
-"""The relay: carries out what control states, and puts peers, topics and services together.
+"""The data plane of a relay: carries out control's messages, and connects peers with topics and services.
 
-It decides nothing. Control's messages change the `StatedTable` and what hangs on it; a peer is served when
-the table has a grant for the address it comes from, the `callerid` it claims and the topic (or service) it
-asks for.
+It makes no decisions. Control's messages change the `GrantTable`. A peer is served if the table has a grant for its
+address, its `callerid` and the topic or service in its header.
 
 Invariants:
-- A connection that is served stands on a statement in the table; the withdrawal of that statement cuts it.
-- Without a link to control everything goes on as stated before; nothing new is granted.
-- What control states after the first specifications, or those that it begins with, is carried out when they are in
-  force, in order.
+- Each served connection has a grant in the table; withdrawing the grant cuts the connection.
+- Without a link to control everything continues as stated; nothing new is granted.
+- Messages after the first specifications wait until these are in force, and are then carried out in order.
 """
 
-import os
 import socket
-from collections import deque
 from collections.abc import Iterator, Mapping
 
 from appliance.channel import messages
-from appliance.quotas.pool import Standing
-from appliance.relay.bounds import Limits
+from appliance.quotas.pool import QuotaClass
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
-from appliance.relay.connections.frames import Scratch
 from appliance.relay.connections.headers import kept
-from appliance.relay.connections.listening_ports import Ports
-from appliance.relay.connections.loop_channel import Link
-from appliance.relay.connections.memory import Memory
+from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
+from appliance.relay.connections.listening_ports import ListeningPorts
 from appliance.relay.connections.own_service import OwnService
-from appliance.relay.connections.pending_connections import Anteroom
-from appliance.relay.connections.rate_limit import Flows
-from appliance.relay.connections.relayed_topic import RelayedTopic
+from appliance.relay.connections.own_topic import OwnTopicPublisher
+from appliance.relay.connections.pending_connections import PendingConnections
+from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
 from appliance.relay.connections.service_client import ServiceClient, ServiceTraffic
-from appliance.relay.connections.sockets import tune
 from appliance.relay.connections.subscriber import Subscriber
-from appliance.relay.connections.upstream import Publisher
-from appliance.relay.connections.visitor import Farewell, Visitor
+from appliance.relay.connections.upstream import PublisherConnection
 from appliance.relay.context import RelayContext
-from appliance.relay.granted import StatedTable, Statement
-from appliance.relay.loop import Loop
-from appliance.relay.monitors.interceptor import Middle
-from appliance.relay.monitors.observation_points import Place
-from appliance.relay.monitors.own import OwnPublisher
-from appliance.relay.recorder_ring import Recorded
+from appliance.relay.grant_table import GrantTable, PeerGrant, Statement
+from appliance.relay.loop import EventLoop
+from appliance.relay.monitors.interceptor import Interceptor
+from appliance.relay.monitors.observation_points import ObservationPoint
+from appliance.relay.monitors.topic_pipeline import TopicPipeline
+from appliance.relay.recorder_ring import RecorderRing
+from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
-from appliance.relay.topic_taps import Looks
+from appliance.relay.topic_taps import TopicTaps
+from appliance.relay.transport.loop_channel import LoopLink
+from appliance.relay.transport.rate_limit import RateLimits
 
 _TIDIED = 16  # topics between two readings of the processor time
-_Grant = tuple[str, str, str, str, str]  # kind, key, name of the topic or service, host, caller id
 
 
-class Engine:
-    """One relay, without the process around it."""
+class DataPlane:
+    """Topics, services and peers of one relay, without the process around it."""
 
-    def __init__(self, loop: Loop, limits: Limits) -> None:
+    def __init__(self, loop: EventLoop, limits: RelayLimits) -> None:
         self._loop = loop
         self._limits = limits
         self._reporter = Reporter(limits)
-        self._table = StatedTable()
-        self.middle = Middle(
+        self._table = GrantTable()
+        self.interceptor = Interceptor(
             loop,
             self._reporter,
             budget=limits.budget / 1000,
@@ -65,56 +58,53 @@ class Engine:
             holder=self._holder,
             payer=self._table.payer,
         )
-        self.memory = Memory.of(limits, self._table.standing)
-        self._context = RelayContext(
-            loop, limits, self._reporter, self.memory, Scratch(), self.middle, self._table.payer
-        )
-        self._anteroom = Anteroom(loop.clock, self._table.standing, self.memory.headers)
-        self.ports = Ports(
+        self._context = RelayContext.of(loop, limits, self._reporter, self.interceptor, self._table)
+        self.memory = self._context.memory
+        self._pending = PendingConnections(loop.clock, self._table.quota_class, self.memory.headers)
+        self.ports = ListeningPorts(
             loop,
             limits,
-            standing=self._table.standing,
+            quota_class=self._table.quota_class,
             payer=self._table.payer,
             arrived=self._arrived,
             turned_away=lambda key, host, reason: self._reporter.refused(key, NOTHING, host, "", reason),
-            make_room=self._make_place,
+            make_room=self._make_connection_room,
         )
-        self.topics: dict[tuple[str, str], tuple[RelayedTopic, Publisher | OwnPublisher]] = {}
-        self._own: dict[str, OwnPublisher] = {}
+        self.topics: dict[tuple[str, str], tuple[RelayedTopic, Upstream]] = {}
+        self._own: dict[str, OwnTopicPublisher] = {}
         self._own_headers: dict[str, dict[str, str]] = {}
         self._own_service = OwnService(loop, self._reporter.send)
         self.clients: set[ServiceClient] = set()
-        self._by_grant: dict[_Grant, set[Subscriber | ServiceClient]] = {}
+        self._by_grant: dict[PeerGrant, set[Subscriber | ServiceClient]] = {}
         self._services: dict[tuple[str, str], ServiceTraffic] = {}
-        self.visitors: set[Visitor] = set()
-        self.waiting: dict[str, set[Visitor]] = {}
-        self.farewells: set[Farewell] = set()
-        self._link: Link | None = None
+        self.incoming_connections: set[IncomingConnection] = set()
+        self.waiting: dict[str, set[IncomingConnection]] = {}
+        self.refused_connections: set[RefusedConnection] = set()
+        self._link: LoopLink | None = None
         self._last_rows: list[messages.TopicTraffic] = []
-        self._flows = Flows(loop.clock)
-        self._looks = Looks(self._reporter.send)
-        self._recorded: Recorded | None = None
-        self._later: deque[tuple[messages.Message, tuple[int, ...]]] = deque()
+        self._flows = RateLimits(loop.clock)
+        self._topic_taps = TopicTaps(self._reporter.send)
+        self._recorded: RecorderRing | None = None
         self._tidying: Iterator[None] = iter(())
         loop.after(limits.report_every, self._tick)
 
-    def attach(self, link: Link | None) -> None:
-        """Speak to this control from now on; what is stated stays until it restates."""
+    def attach(self, link: LoopLink | None) -> None:
+        """Report to this control from now on; the earlier statements stay valid until it restates."""
         self._link = link
         self._reporter.attach(link)
-        self._looks.end_all()
+        self._topic_taps.end_all()
         self._own_service.control_gone()
 
-    def record(self, recorded: Recorded) -> None:
-        """Leave what publishers say from their next connection on with the flight recorder."""
+    def record(self, recorded: RecorderRing) -> None:
+        """Record the messages of publishers from their next connection on."""
         self._recorded = recorded
 
-    def take(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
-        """Carry out one message of control."""
-        if self.middle.preparing or self._later:
-            self._later.append((message, descriptors))
-        else:
-            self._carry_out(message, descriptors)
+    def take(self, message: messages.Message, descriptors: tuple[int, ...]) -> bool:
+        """Carry out one message of control; return True if it has to wait for specifications."""
+        if self.interceptor.preparing:
+            return True
+        self._carry_out(message, descriptors)
+        return False
 
     def _carry_out(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
         if isinstance(message, messages.StateBegan):
@@ -126,13 +116,13 @@ class Engine:
         elif isinstance(message, messages.UpstreamFound | messages.UpstreamRefused):
             self._upstream_answered(message)
         elif isinstance(message, messages.SpecificationsStated):
-            self.middle.state(message)
+            self.interceptor.state(message)
         elif isinstance(message, messages.MonitorSwitched):
-            self.middle.switch(message.name, message.enabled)
+            self.interceptor.switch(message.name, message.enabled)
         elif isinstance(message, messages.MonitorResumed):
-            self._ask_for_latched(self.middle.resume(message.name))
+            self._ask_for_latched(self.interceptor.resume(message.name))
         elif isinstance(message, messages.LookWanted | messages.LookEnded):
-            self._look(message)
+            self._tap(message)
         elif isinstance(message, messages.OwnHeaderStated | messages.OwnPublished):
             self._own_topic(message)
         elif isinstance(message, messages.OwnServiceAnswered):
@@ -144,21 +134,17 @@ class Engine:
             self._withdrawn(message)
 
     def close(self) -> None:
-        """Cut everything."""
-        self.middle.close()
-        for _message, descriptors in self._later:
-            for descriptor in descriptors:
-                os.close(descriptor)
-        self._later.clear()
+        """Close all connections."""
+        self.interceptor.close()
         self.ports.close_all()
         for topic, publisher in self.topics.values():
             topic.cut_all("the relay ends")
             publisher.close()
         for client in list(self.clients):
             client.cut("the relay ends")
-        for visitor in self.visitors:
-            visitor.close()
-        for farewell in list(self.farewells):
+        for incoming in self.incoming_connections:
+            incoming.close()
+        for farewell in list(self.refused_connections):
             farewell.close()
 
     # --- what control states ------------------------------------------------------------------------------
@@ -173,7 +159,7 @@ class Engine:
         elif isinstance(message, messages.GrantInstalled):
             self._limit_subscriber(message)
         if self.waiting and message.key in self.waiting:
-            self._judge_waiting(message.key)
+            self._recheck_waiting(message.key)
 
     def _restated(self, epoch: int) -> None:
         for message in self._table.end(epoch):
@@ -182,15 +168,17 @@ class Engine:
         for topic, publisher in self.topics.values():
             publisher.ask_again()
             topic.repeat()
-        self.middle.observations.repeat()
+        self.interceptor.observations.repeat()
 
     def _withdrawn(self, message: messages.Message) -> None:
         if isinstance(message, messages.NodeWithdrawn):
             self.ports.close(message.key)
             for key, topic in [entry for entry in self.topics if entry[0] == message.key]:
                 self._remove_topic(key, topic, "the publisher's node is gone")
-            for visitor in [visitor for visitor in self.visitors if visitor.key == message.key]:
-                self._visitor_failed(visitor, "")
+            for incoming in [
+                incoming for incoming in self.incoming_connections if incoming.key == message.key
+            ]:
+                self._incoming_failed(incoming, "")
             self._cut_clients("the service's node is gone", message.key)
             self._forget_services(message.key)
         elif isinstance(message, messages.PublicationWithdrawn):
@@ -203,7 +191,7 @@ class Engine:
         elif isinstance(message, messages.ClientRevoked):
             self._cut_by(("service", message.key, message.service, message.host, message.caller_id))
 
-    def _cut_by(self, grant: _Grant) -> None:
+    def _cut_by(self, grant: PeerGrant) -> None:
         for peer in list(self._by_grant.get(grant, ())):
             peer.cut("its grant is revoked")
 
@@ -240,15 +228,17 @@ class Engine:
             recorded=self._recorded,
             over=self._loop.over,
         )
-        publisher: Publisher | OwnPublisher
+        publisher: Upstream
         if node is not None and node.monitors:
-            publisher = self._own[topic] = OwnPublisher(relayed, lambda: self._header_of(topic))
+            publisher = self._own[topic] = OwnTopicPublisher(relayed, lambda: self._header_of(topic))
             relayed.upstream = publisher
             relayed.monitor(None, wanted=True)
         else:
-            publisher = Publisher(self._context, relayed, lambda header: self.middle.objection(topic, header))
+            publisher = PublisherConnection(
+                self._context, relayed, lambda header: self.interceptor.objection(topic, header)
+            )
             relayed.upstream = publisher
-            self._let_monitor(relayed)
+            self._attach_monitors(relayed)
         self.topics[key, topic] = (relayed, publisher)
 
     def _limit_topic(self, message: messages.PublicationPlaced) -> None:
@@ -258,7 +248,7 @@ class Engine:
         relayed.flow.set(own, together)
 
     def _limit_subscriber(self, message: messages.GrantInstalled) -> None:
-        """Limit the connections of this grant so from now on."""
+        """Apply a grant's rate limit to its present connections."""
         flow = self._flows.of(message.limit, message.topic, message.host, message.caller_id)
         grant = ("topic", message.key, message.topic, message.host, message.caller_id)
         for subscriber in self._by_grant.get(grant, ()):
@@ -266,7 +256,7 @@ class Engine:
                 subscriber.flow = flow
 
     def _make_room(self, host: str, size: int) -> None:
-        """A host wants to have a message latched: those that have more than it would have make room."""
+        """Free memory for a latched message: hosts that would hold more than this one give up theirs."""
         latched, share = self.memory.latched, self.memory.latched.of(host)
         while share.refusal(size):
             greatest, held = max(latched.holders(), key=lambda holder: holder[1], default=("", 0))
@@ -276,39 +266,41 @@ class Engine:
                 return
             largest.give_up_latched()
 
-    def _let_monitor(self, relayed: RelayedTopic) -> None:
-        """Messages of a topic go through the monitors if one stands there, and past them otherwise."""
-        middle, topic = self.middle, relayed.topic
-        place = Place(relayed.key, topic, relayed.host, relayed.name)
-        through = middle.lane(place).through if middle.stands(topic) else None
-        relayed.monitor(through, wanted=middle.wants(topic))
+    def _attach_monitors(self, relayed: RelayedTopic) -> None:
+        """Send a topic's messages through its monitors, or past them if it has none."""
+        interceptor, topic = self.interceptor, relayed.topic
+        through = None
+        if interceptor.intercepts(topic):
+            point = ObservationPoint(relayed.key, topic, relayed.host, relayed.name)
+            through = TopicPipeline(interceptor, point).through
+        relayed.monitor(through, wanted=interceptor.wants(topic))
 
     def _holder(self, host: str) -> str:
-        """A host that has a registration is told apart; all others are one."""
-        return host if self._table.standing(host) is Standing.REGISTERED else ""
+        """Return the host if it has a registration; all others count as one."""
+        return host if self._table.quota_class(host) is QuotaClass.REGISTERED else ""
 
     def _monitors_changed(self, topics: frozenset[str] | None) -> None:
-        monitors = self.middle.monitors
+        monitors = self.interceptor.monitors
         self._context.scratch.move(None if monitors is None else monitors.area)
         for relayed, publisher in list(self.topics.values()):
-            publisher.judge_again()
-            if isinstance(publisher, Publisher):
-                self._let_monitor(relayed)
+            publisher.recheck()
+            if isinstance(publisher, PublisherConnection):
+                self._attach_monitors(relayed)
         for client in list(self.clients):
-            client.judge_again()
+            client.recheck()
         self._ask_for_latched(topics)
-        while self._later and not self.middle.preparing:
-            self._carry_out(*self._later.popleft())
+        if self._link is not None and not self.interceptor.preparing:
+            self._link.go_on()
 
     def _ask_for_latched(self, topics: frozenset[str] | None) -> None:
-        """What monitors kept back of a latching publisher may go through now: it gives it to a new connection.
+        """Have latching publishers send messages again that monitors held back.
 
-        Only of these topics (None: all); what did not change would judge the same message twice.
+        Only on these topics (None: all), because other monitors would judge the same message twice.
         """
         for relayed, publisher in list(self.topics.values()):
             concerned = topics is None or relayed.topic in topics
-            if concerned and relayed.lacks_latched and isinstance(publisher, Publisher):
-                publisher.give_again()
+            if concerned and relayed.lacks_latched:
+                publisher.request_latched()
 
     def _own_topic(self, message: messages.OwnHeaderStated | messages.OwnPublished) -> None:
         if isinstance(message, messages.OwnPublished):
@@ -322,11 +314,11 @@ class Engine:
         }
 
     def _header_of(self, topic: str) -> dict[str, str] | None:
-        """The connection header of what the appliance publishes: of the monitors' definitions, or as control says."""
-        return self.middle.header_of(topic) or self._own_headers.get(topic)
+        """Return the connection header of a topic of the appliance, from the monitors' definitions or from control."""
+        return self.interceptor.header_of(topic) or self._own_headers.get(topic)
 
     def _publish(self, topic: str, data: bytes) -> None:
-        """Between two messages, or in the middle of a batch of another topic: never of this one."""
+        """Publish on a topic of the appliance; never during a batch of the same topic."""
         publisher = self._own.get(topic)
         if publisher is not None:
             publisher.publish(data)
@@ -337,11 +329,11 @@ class Engine:
         relayed, publisher = self.topics.pop((key, topic))
         if self._own.get(topic) is publisher:
             del self._own[topic]
-        publisher.close()  # nothing more comes to those that are still connected
+        publisher.close()  # its remaining subscribers get nothing more
         self._cut_members(relayed, reason)
 
     def _cut_members(self, relayed: RelayedTopic, reason: str) -> None:
-        """Close the connections for a topic that is gone, a quantum at a time: there may be thousands."""
+        """Close the connections of a removed topic, a quantum at a time: there may be thousands."""
         for member in relayed.members:
             member.cut(reason)
             if self._loop.over():
@@ -360,40 +352,34 @@ class Engine:
         else:
             placed[1].refused()
 
-    def _look(self, message: messages.LookWanted | messages.LookEnded) -> None:
+    def _tap(self, message: messages.LookWanted | messages.LookEnded) -> None:
         if isinstance(message, messages.LookWanted):
             topics = [topic for topic, _publisher in self.topics.values() if topic.topic == message.topic]
-            self._looks.begin(message, topics)
+            self._topic_taps.begin(message, topics)
         else:
-            self._looks.end(message.number)
+            self._topic_taps.end(message.number)
 
     # --- peers --------------------------------------------------------------------------------------------
 
     def _arrived(self, key: str, sock: socket.socket, host: str) -> None:
-        try:
-            tune(sock)
-        except OSError:
-            sock.close()
-            self.ports.left(host)
-            return
-        visitor = Visitor(
+        incoming = IncomingConnection(
             self._context,
             sock,
             key,
             host,
             payer=self._table.payer(host),
-            anteroom=self._anteroom,
+            pending=self._pending,
             introduced=self._introduced,
-            failed=self._visitor_failed,
+            failed=self._incoming_failed,
         )
-        self.visitors.add(visitor)
+        self.incoming_connections.add(incoming)
 
-    def _make_place(self, host: str) -> bool:
-        """End a connection so that one of this host has room: of a peer that waits, else of the host that has most."""
-        if self._anteroom.make_room(host):
+    def _make_connection_room(self, host: str) -> bool:
+        """End a connection for this host: one that is not served, else one of the host that has the most."""
+        if self._pending.make_room(host):
             return True
         pool = self.ports.connected
-        if self._table.standing(host) is not Standing.REGISTERED:
+        if self._table.quota_class(host) is not QuotaClass.REGISTERED:
             return False
         largest, most = max(pool.holders(), key=lambda holder: holder[1], default=("", 0))
         if most <= pool.held(host) + 1:
@@ -409,145 +395,136 @@ class Engine:
         for relayed, _publisher in self.topics.values():
             yield from [member for member in relayed.members if isinstance(member, Subscriber)]
 
-    def _visitor_failed(self, visitor: Visitor, reason: str) -> None:
-        """It is gone. What one asked for without a grant is recorded, although it did not wait for the answer."""
-        visitor.close()
-        self._forget_visitor(visitor)
-        self.ports.left(visitor.host)
-        fields = visitor.fields
+    def _incoming_failed(self, incoming: IncomingConnection, reason: str) -> None:
+        """Forget a peer that is gone; report what it asked for without a grant."""
+        incoming.close()
+        self._forget_incoming(incoming)
+        self.ports.left(incoming.host)
+        fields = incoming.fields
         if fields and not reason and not self._not_all_is_stated():
-            reason = missing(self._table, visitor.key, visitor.host, fields)
+            reason = missing(self._table, incoming.key, incoming.host, fields)
         if reason:
             caller_id = fields.get("callerid", "")
-            self._reporter.refused(visitor.key, asked_for(fields), visitor.host, caller_id, reason)
+            self._reporter.refused(incoming.key, asked_for(fields), incoming.host, caller_id, reason)
 
-    def _introduced(self, visitor: Visitor) -> None:
+    def _introduced(self, incoming: IncomingConnection) -> None:
         if self._link is not None:
             self._link.catch_up()
-        if visitor in self.visitors:
-            self._judge(visitor, patient=True)
+        if incoming in self.incoming_connections:
+            self._judge(incoming, patient=True)
 
-    def _judge(self, visitor: Visitor, *, patient: bool) -> None:
-        """Serve the visitor, or refuse it; a `patient` one waits for what the table does not have yet."""
-        fields, rest = visitor.fields, visitor.rest
+    def _judge(self, incoming: IncomingConnection, *, patient: bool) -> None:
+        """Serve the peer or refuse it; if `patient`, wait for grants that the table does not have yet."""
+        fields, rest = incoming.fields, incoming.rest
         reason = flaw(fields, rest)
         if not reason:
-            reason = missing(self._table, visitor.key, visitor.host, fields)
+            reason = missing(self._table, incoming.key, incoming.host, fields)
             if reason and (patient or self._not_all_is_stated()):
-                visitor.wait(self._limits.grant_seconds, lambda: self._judge(visitor, patient=False))
-                self.waiting.setdefault(visitor.key, set()).add(visitor)
+                incoming.wait(self._limits.grant_seconds, lambda: self._judge(incoming, patient=False))
+                self.waiting.setdefault(incoming.key, set()).add(incoming)
                 return
-        self._forget_visitor(visitor)
-        sock = visitor.take()
+        self._forget_incoming(incoming)
+        sock = incoming.take()
         if reason:
-            self._refuse(visitor, asked_for(fields), fields.get("callerid", ""), sock, reason)
+            kind, name = asked_for(fields)
+            asked = (kind, incoming.key, name, incoming.host, fields.get("callerid", ""))
+            self._refuse(asked, sock, reason)
         elif "topic" in fields:
-            self._subscribe(visitor, sock, kept(fields))
+            self._subscribe(incoming, sock, kept(fields))
         else:
-            self._serve_client(visitor, sock, kept(fields), rest)
+            self._serve_client(incoming, sock, kept(fields), rest)
 
     def _not_all_is_stated(self) -> bool:
-        """Whether a grant that is missing may still be stated, however long that takes."""
-        return self._table.restating or self.middle.preparing
+        """Whether control may still state a grant that is missing."""
+        return self._table.restating or self.interceptor.preparing
 
-    def _judge_waiting(self, key: str) -> None:
-        """Something new is stated of this incarnation: peers that can be served now are."""
-        for visitor in list(self.waiting.get(key, ())):
-            if not missing(self._table, key, visitor.host, visitor.fields):
-                self._judge(visitor, patient=True)
+    def _recheck_waiting(self, key: str) -> None:
+        """Serve the waiting peers that the latest statements about this incarnation allow."""
+        for incoming in list(self.waiting.get(key, ())):
+            if not missing(self._table, key, incoming.host, incoming.fields):
+                self._judge(incoming, patient=True)
 
-    def _forget_visitor(self, visitor: Visitor) -> None:
-        self.visitors.discard(visitor)
-        waiting = self.waiting.get(visitor.key)
+    def _forget_incoming(self, incoming: IncomingConnection) -> None:
+        self.incoming_connections.discard(incoming)
+        waiting = self.waiting.get(incoming.key)
         if waiting is not None:
-            waiting.discard(visitor)
+            waiting.discard(incoming)
             if not waiting:
-                del self.waiting[visitor.key]
+                del self.waiting[incoming.key]
 
     def _serve_client(
-        self, visitor: Visitor, sock: socket.socket, fields: Mapping[str, str], rest: bytes
+        self, incoming: IncomingConnection, sock: socket.socket, fields: Mapping[str, str], rest: bytes
     ) -> None:
-        service = self._table.service(visitor.key, fields["service"])
-        caller_id = bound_name(self._table, visitor.key, visitor.host, fields)
-        if service is None or caller_id is None:  # `missing` has looked
+        service = self._table.service(incoming.key, fields["service"])
+        caller_id = bound_name(self._table, incoming.key, incoming.host, fields)
+        if service is None or caller_id is None:  # excluded by `missing`
             return
-        node = self._table.node(visitor.key)
+        node = self._table.node(incoming.key)
         traffic = self._services.setdefault((service.key, service.service), ServiceTraffic())
-
-        grant = ("service", service.key, service.service, visitor.host, caller_id)
-
-        def refuse(sock: socket.socket, reason: str) -> None:
-            self._forget(grant, client)
-            self._refuse(visitor, ("service", service.service), caller_id, sock, reason)
-
-        def ended() -> None:
-            self._forget(grant, client)
-            self.ports.left(visitor.host)
-
         client = ServiceClient(
             self._context,
             sock,
             service,
-            visitor.host,
+            incoming.host,
             fields,
             caller_id=caller_id,
             traffic=traffic,
-            refuse=refuse,
-            ended=ended,
+            refuse=self._peer_refused,
+            ended=self._peer_ended,
             own=self._own_service if node is not None and node.monitors else None,
         )
         self.clients.add(client)
-        self._by_grant.setdefault(grant, set()).add(client)
+        self._by_grant.setdefault(client.grant, set()).add(client)
         client.start(rest)
 
-    def _subscribe(self, visitor: Visitor, sock: socket.socket, fields: Mapping[str, str]) -> None:
-        relayed, _publisher = self.topics[visitor.key, fields["topic"]]
-        grant = ("topic", visitor.key, relayed.topic, visitor.host, fields["callerid"])
-
-        def refuse(sock: socket.socket, reason: str) -> None:
-            self._forget(grant, subscriber)
-            self._refuse(visitor, ("topic", relayed.topic), fields["callerid"], sock, reason)
-
-        def ended() -> None:
-            self._forget(grant, subscriber)
-            self.ports.left(visitor.host)
-
+    def _subscribe(
+        self, incoming: IncomingConnection, sock: socket.socket, fields: Mapping[str, str]
+    ) -> None:
+        relayed, _publisher = self.topics[incoming.key, fields["topic"]]
+        refuse, ended = self._peer_refused, self._peer_ended
         subscriber = Subscriber(
-            self._context, sock, relayed, visitor.host, fields, refuse=refuse, ended=ended
+            self._context, sock, relayed, incoming.host, fields, refuse=refuse, ended=ended
         )
-        stated = self._table.grant(visitor.key, relayed.topic, visitor.host, subscriber.caller_id)
+        stated = self._table.grant(incoming.key, relayed.topic, incoming.host, subscriber.caller_id)
         if stated is not None:
             subscriber.flow = self._flows.of(stated.limit, relayed.topic, stated.host, stated.caller_id)
-        self._by_grant.setdefault(grant, set()).add(subscriber)
+        self._by_grant.setdefault(subscriber.grant, set()).add(subscriber)
         relayed.join(subscriber)
 
-    def _forget(self, grant: _Grant, peer: Subscriber | ServiceClient) -> None:
+    def _peer_ended(self, peer: Subscriber | ServiceClient) -> None:
+        self._forget(peer)
+        self.ports.left(peer.host)
+
+    def _peer_refused(self, peer: Subscriber | ServiceClient, sock: socket.socket, reason: str) -> None:
+        self._forget(peer)
+        self._refuse(peer.grant, sock, reason)
+
+    def _forget(self, peer: Subscriber | ServiceClient) -> None:
         if isinstance(peer, ServiceClient):
             self.clients.discard(peer)
-        peers = self._by_grant.get(grant, set())
+        peers = self._by_grant.get(peer.grant, set())
         peers.discard(peer)
         if not peers:
-            self._by_grant.pop(grant, None)
+            self._by_grant.pop(peer.grant, None)
 
-    def _refuse(
-        self, visitor: Visitor, asked: tuple[str, str], caller_id: str, sock: socket.socket, reason: str
-    ) -> None:
-        """Tell the peer why and close; it counts for its host until then."""
-        self._reporter.refused(visitor.key, asked, visitor.host, caller_id, reason)
+    def _refuse(self, asked: PeerGrant, sock: socket.socket, reason: str) -> None:
+        """Send the peer the reason and close; until then it counts for its host."""
+        kind, key, name, host, caller_id = asked
+        self._reporter.refused(key, (kind, name), host, caller_id, reason)
 
-        def ended(farewell: Farewell) -> None:
-            self.farewells.discard(farewell)
-            self._anteroom.leave(farewell)
-            self.ports.left(visitor.host)
+        def ended(farewell: RefusedConnection) -> None:
+            self.refused_connections.discard(farewell)
+            self._pending.leave(farewell)
+            self.ports.left(host)
 
-        payer = self._table.payer(visitor.host)
-        farewell = Farewell(self._loop, sock, reason, self._limits.farewell, ended, payer=payer)
+        payer = self._table.payer(host)
+        farewell = RefusedConnection(self._loop, sock, reason, self._limits.farewell, ended, payer=payer)
         if farewell.live:
-            self.farewells.add(farewell)
-            self._anteroom.enter(farewell, visitor.host)
+            self.refused_connections.add(farewell)
+            self._pending.enter(farewell, host)
 
     def _rows(self) -> list[messages.TopicTraffic]:
-        """What went through since the last call."""
+        """Return the traffic since the last call."""
         rows = [row for topic, _publisher in self.topics.values() if (row := topic.traffic()) is not None]
         rows += [
             row
@@ -558,29 +535,28 @@ class Engine:
         return rows
 
     def _tick(self) -> None:
-        """A second is over."""
+        """Do what is due once a second."""
         self._tidying = self._tidy()
         self._go_on_tidying()
 
     def _go_on_tidying(self) -> None:
-        """Tidy up for a quantum at a time: there may be thousands of topics."""
+        """Tidy up, a quantum at a time: there may be thousands of topics."""
         for _ in self._tidying:
             if self._loop.over():
                 self._loop.after(0, self._go_on_tidying)
                 return
         self._own_service.tidy()
-        self.middle.tick()
+        self.interceptor.tick()
         self._reporter.tick(self._rows, self.memory.held())
         self._loop.after(self._limits.report_every, self._tick)
 
     def _tidy(self) -> Iterator[None]:
         for number, (topic, publisher) in enumerate(list(self.topics.values())):
             topic.tidy()
-            if isinstance(publisher, Publisher):
-                publisher.look()
+            publisher.check_stall()
             if not number % _TIDIED:
                 yield
         for number, client in enumerate(list(self.clients)):
-            client.look()
+            client.check_stall()
             if not number % _TIDIED:
                 yield

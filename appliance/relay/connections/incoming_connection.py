@@ -1,29 +1,28 @@
-"""An accepted connection until its header is known, and the reasons to turn it away.
+"""Accepted connections until their headers are known, and refused connections.
 
 Invariants:
-- A peer has `header_seconds` and `header_bytes` for its header; until then it costs one socket and what it
-  has sent, which is counted (`anteroom`): without room for that it is turned away.
-- A refused peer gets a TCPROS header with `error=<reason>` as from any publisher or service, and `farewell`
-  seconds to read it: its connection is shut for writing first, because closing over unread data would reset
-  it and destroy the reason on its way.
+- A peer has `header_seconds` and `header_bytes` for its header. Until then it costs one socket and the bytes it has
+  sent, which are counted (`pending_connections`); without memory for them it is refused.
+- A refused peer gets a TCPROS header with `error=<reason>` as from any publisher or service, and `farewell` seconds to
+  read it. Its connection is shut for writing first: closing over unread data would reset it and lose the reason.
 """
 
 import socket
 from collections.abc import Callable, Mapping
 
-from appliance.relay.connections.pending_connections import Anteroom
-from appliance.relay.connections.sockets import Stream
+from appliance.relay.connections.pending_connections import PendingConnections
 from appliance.relay.context import RelayContext
-from appliance.relay.loop import Loop
+from appliance.relay.loop import EventLoop
+from appliance.relay.transport.sockets import BufferedSocket
 from roswire.errors import PeerError
 from roswire.tcpros import HeaderParser, encode_header
 
 
-class Visitor:
-    """A peer that has connected to a relay port and has not said yet what it wants.
+class IncomingConnection:
+    """An accepted connection whose header is not complete.
 
-    `introduced(visitor)` is called when its header (`fields`) and what followed it (`rest`) are there;
-    `failed(visitor, reason)` when there will be none. Either ends this stage.
+    `introduced(self)` is called when its header (`fields`) and the bytes after it (`rest`) have come, `failed(self,
+    reason)` when no header will come. Either ends this stage.
     """
 
     def __init__(
@@ -34,9 +33,9 @@ class Visitor:
         host: str,
         *,
         payer: str,
-        anteroom: Anteroom,
-        introduced: Callable[["Visitor"], None],
-        failed: Callable[["Visitor", str], None],
+        pending: PendingConnections,
+        introduced: Callable[["IncomingConnection"], None],
+        failed: Callable[["IncomingConnection", str], None],
     ) -> None:
         self.key = key
         self.host = host
@@ -46,35 +45,35 @@ class Visitor:
         self._limits = limits = context.limits
         self._introduced = introduced
         self._failed = failed
-        self._anteroom = anteroom
+        self._pending = pending
         self._parser = HeaderParser(limits.header_bytes)
         self._timer = context.loop.after(limits.header_seconds, self._late)
-        self._stream = Stream(
+        self._stream = BufferedSocket(
             context.loop, sock, self._received, lambda _reason: failed(self, ""), payer=payer
         )
         self._received_bytes = 0
-        anteroom.enter(self, host)
+        pending.enter(self, host)
 
     def take(self) -> socket.socket:
-        """Hand the socket over."""
+        """Return the socket, which the caller owns from now on."""
         self._timer.cancel()
-        self._anteroom.leave(self)
+        self._pending.leave(self)
         return self._stream.take()
 
     def wait(self, seconds: float, callback: Callable[[], None]) -> None:
-        """Neither served nor refused yet: call back, unless it is taken or gone by then."""
+        """Call back later, unless the connection is taken or closed by then."""
         self._timer.cancel()
         self._timer = self._loop.after(seconds, callback)
         self._stream.read(False)
 
     def close(self) -> None:
-        """Cut the connection."""
+        """Close the connection."""
         self._timer.cancel()
-        self._anteroom.leave(self)
+        self._pending.leave(self)
         self._stream.close()
 
     def make_room(self) -> None:
-        """Somebody else has more right to its place."""
+        """End the connection for a peer that has a better claim to its place."""
         self._failed(self, "it waited longest when there was no room for others")
 
     def _received(self, data: bytes) -> None:
@@ -82,7 +81,7 @@ class Visitor:
             self._failed(self, "")
             return
         self._received_bytes += len(data)
-        too_much = self._anteroom.hold(self, self._received_bytes)
+        too_much = self._pending.hold(self, self._received_bytes)
         if too_much:
             self._failed(self, too_much)
             return
@@ -99,23 +98,23 @@ class Visitor:
         self._failed(self, f"it did not send a connection header within {self._limits.header_seconds:g} s")
 
 
-class Farewell:
-    """A refused peer that is told why; `ended(self)` when its connection is closed."""
+class RefusedConnection:
+    """A refused peer that has yet to read the reason; `ended(self)` is called when its connection is closed."""
 
     def __init__(
         self,
-        loop: Loop,
+        loop: EventLoop,
         sock: socket.socket,
         reason: str,
         seconds: float,
-        ended: Callable[["Farewell"], None],
+        ended: Callable[["RefusedConnection"], None],
         *,
         payer: str,
     ) -> None:
         self.live = True
         self._ended = ended
         self._timer = loop.after(seconds, self.close)
-        self._stream = Stream(
+        self._stream = BufferedSocket(
             loop, sock, self._received, lambda _reason: self.close(), payer=payer, drained=self._told
         )
         self._stream.send(encode_header({"error": reason}))
@@ -123,7 +122,7 @@ class Farewell:
             self._told()
 
     def make_room(self) -> None:
-        """Somebody else has more right to its place."""
+        """End the connection for a peer that has a better claim to its place."""
         self.close()
 
     def close(self) -> None:

@@ -1,21 +1,21 @@
-"""How the relay sets up its sockets, and a byte stream over one that never blocks."""
+"""The options of the relay's sockets, and a buffered socket that never blocks."""
 
 import contextlib
 import errno
 import socket
 from collections.abc import Callable
 
-from appliance.relay.loop import HANGUP, READ, WRITE, Loop
+from appliance.relay.loop import HANGUP, READ, WRITE, EventLoop
 
-# Not every process may choose cubic; every kernel lets an unprivileged one have reno. Where bbr is the default,
-# large messages over loopback and a bridge go at about half the rate of either.
+# Not every process may choose cubic; every kernel allows reno to an unprivileged one. With bbr, the default of some
+# systems, large messages over loopback and a bridge are about half as fast as with either.
 _CONGESTION = (b"cubic", b"reno")
 _KEEPALIVE = ((socket.TCP_KEEPIDLE, 60), (socket.TCP_KEEPINTVL, 10), (socket.TCP_KEEPCNT, 9))
 _READ_SIZE = 64 << 10
 
 
 def tune(sock: socket.socket) -> None:
-    """Non-blocking, no Nagle delay, keepalive, the first congestion control that the kernel lets us choose."""
+    """Make a socket non-blocking, without Nagle's delay, with keepalive and the first allowed congestion control."""
     sock.setblocking(False)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -28,14 +28,14 @@ def tune(sock: socket.socket) -> None:
 
 
 def congestion_control() -> str:
-    """The congestion control that the relay's sockets get."""
+    """Return the congestion control of the relay's sockets."""
     with socket.socket() as sock:
         tune(sock)
         return sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16).rstrip(b"\0").decode()
 
 
 def begin_connect(host: str, port: int) -> socket.socket:
-    """A socket that is connecting to `host`, an address, never a name; raises `OSError` when it cannot."""
+    """Return a socket that is connecting to the address `host`. Raises `OSError` when it cannot."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         socket.inet_pton(family, host)
@@ -53,17 +53,17 @@ def begin_connect(host: str, port: int) -> socket.socket:
     return sock
 
 
-class Stream:
-    """A connected (or connecting) socket with what is still to be written, for everything but the fast path.
+class BufferedSocket:
+    """A connected (or connecting) socket with a write buffer, for everything except the fast path.
 
-    `received(data)` is called with what arrives and with b"" once at the end; `opened()` when a connecting
-    socket is connected; `drained()` whenever the last byte waiting has been taken by the kernel;
-    `broken(reason)` once, when the socket fails. After `close` or `take` nothing is called. `payer` is charged.
+    `received(data)` is called with what arrives and with b"" once at the end; `opened()` when a connecting socket is
+    connected; `drained()` whenever the kernel has taken the last waiting byte; `broken(reason)` once, when the socket
+    fails. After `close` or `take` nothing is called. `payer` is charged.
     """
 
     def __init__(
         self,
-        loop: Loop,
+        loop: EventLoop,
         sock: socket.socket,
         received: Callable[[bytes], None],
         broken: Callable[[str], None],
@@ -85,11 +85,11 @@ class Stream:
 
     @property
     def backlog(self) -> int:
-        """Bytes that the kernel has not taken yet."""
+        """Return the bytes that the kernel has not taken yet."""
         return len(self._outgoing)
 
     def send(self, data: bytes) -> None:
-        """Write, now or when the socket takes it."""
+        """Write now, or when the socket takes it."""
         if not self._live:
             return
         if not self._outgoing and self._opened is None:
@@ -106,24 +106,24 @@ class Stream:
             self._watch()
 
     def read(self, wanted: bool) -> None:
-        """Go on or stop reading; the end of the connection is noticed either way."""
+        """Switch reading on or off; the end of the connection is noticed either way."""
         if self._live and wanted != self._reading:
             self._reading = wanted
             self._watch()
 
     def finish(self) -> None:
-        """No more will be written: the peer sees the end after what is waiting."""
+        """Shut the socket for writing; the peer sees the end after the waiting bytes."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_WR)
 
     def take(self) -> socket.socket:
-        """Give the socket away; what was written must have drained."""
+        """Return the socket, which the caller owns from now on; no bytes may be waiting."""
         self._live = False
         self._loop.unwatch(self._socket.fileno())
         return self._socket
 
     def close(self) -> None:
-        """Close the socket; what is waiting is lost."""
+        """Close the socket; waiting bytes are lost."""
         if self._live:
             self._live = False
             self._loop.discard(self._socket)

@@ -1,19 +1,19 @@
-"""One batch on its way through the monitors: what was taken, and what goes on.
+"""The progress of one batch through the monitors.
 
-Messages that nobody dropped or replaced leave in the buffer they came in; `run` is where those begin that have not
-been cut off yet, `pieces` what goes on before them.
+Messages that are neither dropped nor replaced leave in the buffer in which they came. `pieces` is the output so far,
+and `run` the start of the messages behind it that are not in `pieces` yet.
 """
 
 import struct
 
-from appliance.relay.connections.frames import Batch
+from appliance.relay.transport.frames import Batch
 
 _LENGTH = struct.Struct("<I")
 _MOST_TURNS = 64
 
 
-class Passage:
-    """A batch of a publication, received at `time` (nanoseconds)."""
+class BatchProgress:
+    """The progress of a batch, received at `time` (nanoseconds), through the monitors."""
 
     __slots__ = (
         "_batch", "_gone", "_turns", "end", "messages", "pieces", "position", "run", "stride", "time",
@@ -34,7 +34,7 @@ class Passage:
         self._turns = 1
 
     def number_at(self, position: int) -> int:
-        """The number of the message at a position among those of its publication."""
+        """Return the number of the message at a position among those of its publication."""
         if self.stride:
             return self._batch.first + position // self.stride
         number, walked = self._batch.first, 0
@@ -44,27 +44,27 @@ class Passage:
         return number
 
     def turns(self) -> int:
-        """How many messages to take one by one: the more, the longer none could be taken together."""
+        """Return how many messages to take one by one; the number doubles while none can be taken together."""
         turns = self._turns
         self._turns = min(2 * turns, _MOST_TURNS)
         return turns
 
     def walked(self, position: int, run: int, gone: int) -> None:
-        """Messages up to `position` were taken together; `gone` of them were dropped, the last before `run`."""
+        """Note messages up to `position`, of which `gone` were dropped, the last one before `run`."""
         if position > self.position:
             self._turns = 1
         self.position, self.run = position, run
         self._gone += gone
 
     def cut(self, position: int, following: int) -> None:
-        """The message between these is dropped."""
+        """Remove the message between these positions."""
         self._gone += 1
         if position > self.run:
             self.pieces.append(self.view[self.run : position])
         self.run = following
 
     def replace(self, position: int, following: int, buffer: bytes | bytearray | memoryview) -> None:
-        """The message between these has another size now."""
+        """Put a message of another size between these positions."""
         if position > self.run:
             self.pieces.append(self.view[self.run : position])
         self.pieces += (_LENGTH.pack(len(buffer)), buffer)
@@ -77,7 +77,7 @@ class Passage:
         self._batch, self.messages, self.end = batch.head(taken), taken, self.position
 
     def result(self) -> Batch | None:
-        """What goes on; None when nothing does."""
+        """Return the messages that go on; None if none does."""
         if not self.run:
             return self._batch
         left = self.messages - self._gone

@@ -1,7 +1,4 @@
-"""Every bound of the data plane, named, in one place.
-
-The defaults are beyond a large robot (100 nodes, 1,000 topics).
-"""
+"""The limits of the data plane. The defaults exceed a large robot (100 nodes, 1,000 topics)."""
 
 from dataclasses import dataclass
 
@@ -9,47 +6,47 @@ MIB = 1 << 20
 
 
 @dataclass(frozen=True)
-class Limits:
+class RelayLimits:
     """Bounds of one relay process; lengths in bytes, times in seconds."""
 
     connections: int = 16_384
     """Subscribers and clients connected at once, those that have not sent their header yet included."""
 
     connections_per_host: int = 8_192
-    """The same, of one host: a robot whose nodes all live on one machine has one connection a subscription."""
+    """The same for one host: a robot with all nodes on one machine has one connection for each subscription."""
 
     header_bytes: int = 64 << 10
     """A TCPROS connection header, its length field not counted."""
 
     header_seconds: float = 10.0
-    """From accepting a connection to its whole header."""
+    """From accepting a connection to receiving its whole header."""
 
     grant_seconds: float = 2.0
-    """A peer whose grant is not there yet is kept waiting so long before it is refused."""
+    """How long a peer waits for a missing grant before it is refused."""
 
     message_bytes: int = 256 * MIB
     """One message, request or response; a peer that declares more is cut. At least 1 MiB."""
 
     queue_messages: int = 1000
-    """Messages that wait for one slow subscriber; the oldest are dropped beyond."""
+    """Messages that wait for one slow subscriber; beyond, the oldest are dropped."""
 
     queue_bytes: int = 64 * MIB
-    """The same in bytes. A message in the middle of being sent does not count: it is never dropped."""
+    """The same in bytes. A message that is sent in part does not count: it is never dropped."""
 
     queue_grace: float = 0.05
-    """While *every* subscriber of a topic is behind, and for no longer, its publisher is not read."""
+    """How long at most a publisher is not read while *every* subscriber of its topic is behind."""
 
     memory_bytes: int = 1024 * MIB
-    """Of the whole process: half for unfinished messages, a quarter each for queues and latched ones."""
+    """The memory of the whole process: half for unfinished messages, a quarter each for queues and latched ones."""
 
     header_memory_bytes: int = 64 * MIB
-    """Headers that are not whole, or wait for a grant, of the whole process; the first 4 KiB of each do not count."""
+    """Bytes of all headers that are incomplete or wait for a grant; the first 4 KiB of each do not count."""
 
     budget: float = 10.0
     """Milliseconds of processor time that monitors may take for one message, request or reply."""
 
     stall_seconds: float = 10.0
-    """A connection in the middle of a large message, of which nothing comes (or goes) for so long, is cut."""
+    """How long the transfer of a large message may make no progress before its connection is cut."""
 
     connect_seconds: float = 3.0
     """To connect to a publisher or a service, and from there to a publisher's header."""
@@ -58,25 +55,25 @@ class Limits:
     """From connecting to a service to its header: a server that is busy may let its clients wait, as in plain ROS."""
 
     answer_seconds: float = 10.0
-    """For control's answer to `UpstreamWanted`; then it is asked again."""
+    """How long to wait for control's answer to `UpstreamWanted` before asking again."""
 
     retry_first: float = 0.1
-    """Wait before a lost publisher is asked for again; doubled with each failure."""
+    """Wait before control is asked for a lost publisher again; doubled with each failure."""
 
     retry_longest: float = 5.0
     """The longest wait between two tries."""
 
     linger: float = 2.0
-    """A publisher's connection is kept so long after its last subscriber left."""
+    """How long a publisher's connection is kept after its last subscriber left."""
 
     farewell: float = 2.0
-    """A refused peer has so long to read the reason before its connection is closed."""
+    """How long a refused peer may take to read the reason before its connection is closed."""
 
     report_every: float = 1.0
-    """Between two `TrafficReported`, and the time over which equal refusals are folded."""
+    """Time between two `TrafficReported`, in which equal refusals are counted together."""
 
     refusals: int = 100
-    """Different refusals reported one by one in that time; the rest are counted together."""
+    """Different refusals that are reported one by one in that time; the rest are counted together."""
 
     def __post_init__(self) -> None:
         if self.message_bytes < MIB:

@@ -1,11 +1,11 @@
-"""Keeps the state of a relay's monitors in memory that outlives the process, and finds what an earlier process left.
+"""Keep the state of a relay's monitors in memory that outlives the process, and read that of earlier processes.
 
 Invariants:
 - The state after a batch is written before a message of the batch is passed on, and before a monitor's message is
-  published: a subscriber never sees an effect of a state that is lost.
-- State that did not change is not written.
-- A state is used again only where nothing can have happened in between: it was written since the machine started, or
-  before the appliance ended in order; and the machine's clock was not set meanwhile. Otherwise it is `lost`, and why.
+  published: no subscriber sees an effect of a lost state.
+- Unchanged state is not written.
+- A state is reused only if nothing can have happened since: it was written since the machine started, or before an
+  orderly end of the appliance, and the machine's clock was not set. Otherwise it is `lost`, with the reason.
 """
 
 import time
@@ -20,57 +20,57 @@ from appliance.relay.monitors.state_memory import Memory, StateMemory, read
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
-    from rosmop.run.monitor import Group
-    from rosmop.run.state import KeptGroup
+    from rosmop.run.monitor import MonitorGroup
+    from rosmop.run.state import GroupSnapshot
     from rosmop.run.state_of_slices import SliceParts
 
 _UNREADABLE = "the memory of its state cannot be read"
 _NO_ROOM = "the states of all monitors together are more than is kept"
-_STEP = 1_000_000_000  # nanoseconds: a clock that is further off was set
+_STEP = 1_000_000_000  # nanoseconds: a larger difference means that the clock was set
 
 
 class _GroupHead(msgspec.Struct, array_like=True):
-    """The monitors of a section, and what its cells are (`CellNames`)."""
+    """The monitors of a section, and the layout of its cells (`CellNames`)."""
 
     monitors: list[str]
     cells: msgspec.Raw
 
 
 class _Head(msgspec.Struct, array_like=True):
-    """Who wrote a memory: since which start of the machine, by which clock, and when (ns)."""
+    """The writer of a memory: the machine's boot, its clock, and the time (ns)."""
 
     boot: str
     offset: int
     written: int
     groups: list[_GroupHead]
     lost: str = ""
-    """Why the state of no monitor is kept."""
+    """Why no monitor's state is kept; empty if it is."""
 
 
 @dataclass(slots=True)
-class Recovered:
-    """The states that earlier processes left, the newest last, and why the others are lost ("": those of all)."""
+class RecoveredState:
+    """The states that earlier processes left, the newest last, and why others are lost (key "": all)."""
 
-    groups: "list[KeptGroup]" = field(default_factory=list)
+    groups: "list[GroupSnapshot]" = field(default_factory=list)
     lost: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(eq=False, slots=True)
 class _Entry:
-    """A group of monitors and its section; `base` and `cells` are what was written last."""
+    """A group of monitors and its section; `base` and `cells` are as last written."""
 
-    group: "Group"
+    group: "MonitorGroup"
     section: int = 0
     base: bytes = b""
     cells: bytes | None = None
     refused: bool = False
-    """There is no room for it: it is lost when the process ends."""
+    """Whether there is no room for the state, so that it is lost when the process ends."""
     slices: "list[tuple[str, SliceParts, list[bytes]]]" = field(default_factory=list)
-    """Of each parametric specification its parts, which have the sections behind this one, and as they were written."""
+    """For each parametric specification: its parts, which have the next sections, and their bytes as last written."""
 
 
-class Keeper:
-    """The memory of one relay; `earlier` are those of the appliance's life before, read while `own` has nothing."""
+class StateKeeper:
+    """The memory of one relay; `earlier` memories of the last appliance are read while `own` is empty."""
 
     def __init__(self, given: StateGiven, own: Memory, earlier: Sequence[Memory] = ()) -> None:
         self._given = given
@@ -82,25 +82,25 @@ class Keeper:
 
     @property
     def offset(self) -> int:
-        """The clock of monitors: this and the machine's monotonic clock, in nanoseconds."""
+        """Return the difference between the clock of monitors and the machine's monotonic clock, in nanoseconds."""
         return self._given.offset
 
     # --- what an earlier process left ---
 
-    def recovered(self) -> Recovered | None:
-        """What earlier processes left; None: nothing was kept before."""
-        found = Recovered()
+    def recovered(self) -> RecoveredState | None:
+        """Return the states that earlier processes left; None if nothing was kept."""
+        found = RecoveredState()
         heads = sorted(self._readable(found), key=lambda each: each[0].written)
         for head, sections in heads:
             reason = self._distrust(head)
             if head.lost:
                 found.lost[""] = head.lost
-            lost = msgspec.msgpack.encode(reason), None  # also for what older memories have of these monitors
+            lost = msgspec.msgpack.encode(reason), None  # replaces their states in older memories
             for group, section in zip(head.groups, sections, strict=False):
                 found.groups.append((group.monitors, bytes(group.cells), *(lost if reason else section)))
         return found if heads or found.lost else None
 
-    def _readable(self, found: Recovered) -> Iterator[tuple[_Head, list[tuple[bytes, bytes | None]]]]:
+    def _readable(self, found: RecoveredState) -> Iterator[tuple[_Head, list[tuple[bytes, bytes | None]]]]:
         for memory in self._left:
             try:
                 kept = read(memory)
@@ -110,7 +110,7 @@ class Keeper:
                 found.lost[""] = f"{_UNREADABLE}: {error}"
 
     def _distrust(self, head: _Head) -> str:
-        """Why a state cannot be used again; empty if it can."""
+        """Return why a state cannot be used again; empty if it can."""
         given = self._given
         if head.boot == given.boot:
             set_by = abs(head.offset - given.offset)
@@ -124,25 +124,25 @@ class Keeper:
     # --- what is kept ---
 
     def take(self, monitors: "MonitorSet") -> None:
-        """Keep the state of these from now on."""
+        """Keep the state of these monitors from now on."""
         self._monitors = monitors
         self._entries = [_Entry(group, slices=_parts(monitors, group)) for group in monitors.groups]
         self._by_way = {way: entry for entry in self._entries for way in entry.group.ways}
         self._lay_out()
 
     def take_nothing(self) -> None:
-        """There are no monitors: what was kept of others is not theirs when they come again."""
+        """Keep no state, because there are no monitors."""
         self._monitors, self._entries, self._by_way = None, [], {}
         self._lay_out()
 
     def keep(self, way: str) -> None:
-        """Keep the state of those that have judged messages on a topic (`EventCode.way`)."""
+        """Keep the state of the monitors that have judged messages on a topic (`EventCode.way`)."""
         entry = self._by_way.get(way)
         if entry is not None:
             self._keep(entry)
 
     def keep_all(self) -> None:
-        """Keep the state of all."""
+        """Keep the state of all monitors."""
         for entry in self._entries:
             self._keep(entry)
 
@@ -170,7 +170,7 @@ class Keeper:
                 self._lay_out()
 
     def _keep_slices(self, entry: _Entry) -> bool:
-        """Write the parts of slices that have changed; False where one has no room."""
+        """Write the parts of slices that have changed; return False if one has no room."""
         first, fits = entry.section + 1, True
         for _, parts, written in entry.slices:
             for number, data in parts.changed().items():
@@ -179,7 +179,7 @@ class Keeper:
             first += len(written)
         return fits
 
-    def _base(self, group: "Group") -> bytes:
+    def _base(self, group: "MonitorGroup") -> bytes:
         assert self._monitors is not None  # noqa: S101  the group is of its
         return self._monitors.state_of(group)
 
@@ -218,12 +218,12 @@ class Keeper:
         return msgspec.msgpack.encode(head)
 
 
-def _parts(monitors: "MonitorSet", group: "Group") -> "list[tuple[str, SliceParts, list[bytes]]]":
+def _parts(monitors: "MonitorSet", group: "MonitorGroup") -> "list[tuple[str, SliceParts, list[bytes]]]":
     return [(name, parts, parts.all()) for name, parts in monitors.slice_parts(group)]
 
 
 def _sections(entry: _Entry) -> list[tuple[bytes, int]]:
-    """The sections of a group: its state with the bytes of its cells, and the parts of its slices."""
+    """Return the sections of a group: its state, with the bytes of its cells, and the parts of its slices."""
     home = entry.group.home
     own = [(entry.base, 0 if home is None else home.size)]
     return own + [(data, 0) for _, _, written in entry.slices for data in written]

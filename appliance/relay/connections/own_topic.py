@@ -1,0 +1,50 @@
+"""The upstream of a topic that the appliance itself publishes: it has a header and no connection."""
+
+from collections.abc import Callable
+
+from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
+from appliance.relay.transport.frames import Batch
+from roswire.tcpros import encode_frame
+
+
+class OwnTopicPublisher(Upstream):
+    """The `Upstream` of one topic that the appliance publishes; `header()` is None if no specification publishes it."""
+
+    def __init__(self, topic: RelayedTopic, header: Callable[[], dict[str, str] | None]) -> None:
+        self._topic = topic
+        self._header = header
+        self._current: dict[str, str] | None = None
+        self._wanted = False
+
+    def connect(self) -> None:
+        """Open the topic at once if its header is known."""
+        self._wanted = True
+        if self._current is None:
+            self.recheck()
+
+    def release(self) -> None:
+        """Close the topic, as it has no subscriber."""
+        self._wanted = False
+        if self._current is not None:
+            self._current = None
+            self._topic.upstream_closed()
+
+    def recheck(self) -> None:
+        """Give subscribers the header of the specifications that are in force now."""
+        header = self._header() if self._wanted else None
+        if header == self._current:
+            return
+        self._current = header
+        if header is None:
+            self._topic.upstream_closed()
+        else:
+            self._topic.upstream_opened(header)
+
+    def publish(self, data: bytes) -> None:
+        """Send a monitor's message to the present subscribers."""
+        if self._current is not None:
+            self._topic.published(Batch(memoryview(encode_frame(data)), 1, 0, owned=True))
+
+    def close(self) -> None:
+        """Stop publishing."""
+        self._current = None

@@ -1,0 +1,209 @@
+"""The state that control wants: incarnations, publications, services, and the grants for them.
+
+The table answers two questions, "is there a grant for this peer?" and "what is at this port?", and turns a restatement
+into withdrawals.
+
+Invariants:
+- Nothing is served that is not in the table.
+- Between `StateBegan` and `StateEnded` everything stated before is valid, so a restart of control interrupts no
+  connection; `StateEnded` withdraws what was not stated again. A `StateBegan` that is followed by another one (control
+  died before the end) withdraws nothing.
+- Withdrawing an incarnation withdraws its publications, services and grants.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from appliance.channel import messages
+from appliance.quotas.pool import QuotaClass
+from appliance.relay.loop import ANYBODY, UNKNOWN
+
+Statement = (
+    messages.NodePlaced
+    | messages.PublicationPlaced
+    | messages.ServicePlaced
+    | messages.GrantInstalled
+    | messages.ClientGranted
+)
+PeerGrant = tuple[str, str, str, str, str]
+"""The grant of a peer: `topic` or `service`, key of the incarnation, name of the topic or service, host, caller id."""
+_Fact = tuple[str, ...]
+
+
+class _About(NamedTuple):
+    """A kind of fact: its message, the message that withdraws it, and the fields that identify it."""
+
+    stated: type[Statement]
+    withdrawn: type[messages.Message]
+    fields: tuple[str, ...]
+
+
+_ABOUT = {
+    "node": _About(messages.NodePlaced, messages.NodeWithdrawn, ("key",)),
+    "publication": _About(messages.PublicationPlaced, messages.PublicationWithdrawn, ("key", "topic")),
+    "service": _About(messages.ServicePlaced, messages.ServiceWithdrawn, ("key", "service")),
+    "grant": _About(messages.GrantInstalled, messages.GrantRevoked, ("key", "topic", "host", "caller_id")),
+    "client": _About(messages.ClientGranted, messages.ClientRevoked, ("key", "service", "host", "caller_id")),
+}
+_KINDS: dict[type, str] = {
+    type_: kind for kind, about in _ABOUT.items() for type_ in (about.stated, about.withdrawn)
+}
+
+
+@dataclass(frozen=True)
+class ServiceEndpoint:
+    """The address of a service, and the node that offers it."""
+
+    key: str
+    service: str
+    host: str
+    port: int
+    node: str
+    """The name of the node that offers it."""
+
+
+class GrantTable:
+    """Control's statements, in a table that can be restated."""
+
+    def __init__(self) -> None:
+        self._facts: dict[_Fact, messages.Message] = {}
+        self._by_key: dict[str, dict[_Fact, None]] = {}
+        self._hosts: Counter[str] = Counter()
+        self._named: set[str] = set()  # hosts that the policy names, by the last statement
+        self._clients: dict[_Fact, dict[str, None]] = {}  # names, by service and host
+        self._restated: set[_Fact] | None = None
+        self._epoch = 0
+
+    @property
+    def restating(self) -> bool:
+        """Whether a restatement is under way."""
+        return self._restated is not None
+
+    def begin(self, epoch: int) -> None:
+        """Begin a restatement."""
+        self._restated = set()
+        self._epoch = epoch
+
+    def end(self, epoch: int) -> list[messages.Message]:
+        """End the restatement: withdraw the facts that were not restated, and return these withdrawals."""
+        if self._restated is None or epoch != self._epoch:
+            return []
+        gone = [fact for fact in self._facts if fact not in self._restated]
+        self._restated = None
+        withdrawals = [_ABOUT[kind].withdrawn(*about) for kind, *about in gone]
+        for message in withdrawals:
+            self.withdraw(message)
+        return withdrawals
+
+    def state(self, message: Statement) -> None:
+        """Add or replace a fact."""
+        fact = _fact(message)
+        self._take_out(fact)
+        self._facts[fact] = message
+        self._by_key.setdefault(fact[1], {})[fact] = None
+        self._hosts[_host(fact, message)] += 1
+        self._name(message)
+        if isinstance(message, messages.ClientGranted):
+            self._clients.setdefault(fact[:4], {})[message.caller_id] = None
+        if self._restated is not None:
+            self._restated.add(fact)
+
+    def withdraw(self, message: messages.Message) -> None:
+        """Remove a fact; an unknown one is ignored."""
+        if isinstance(message, messages.NodeWithdrawn):
+            for fact in list(self._by_key.get(message.key, ())):
+                self._forget(fact)
+        else:
+            self._forget(_fact(message))
+
+    def quota_class(self, host: str) -> QuotaClass:
+        """Return the quota class of a host: registered, if it has a node or a grant."""
+        return QuotaClass.REGISTERED if host in self._hosts else QuotaClass.UNKNOWN
+
+    def payer(self, host: str) -> str:
+        """Return the payer of this host's processor time: the host itself, or its class."""
+        if host not in self._hosts:
+            return UNKNOWN
+        return host if host in self._named else ANYBODY
+
+    def node(self, key: str) -> messages.NodePlaced | None:
+        """Return the incarnation with this key."""
+        node = self._facts.get(("node", key))
+        return node if isinstance(node, messages.NodePlaced) else None
+
+    def publication(self, key: str, topic: str) -> messages.PublicationPlaced | None:
+        """Return the publication of a topic by an incarnation."""
+        publication = self._facts.get(("publication", key, topic))
+        return publication if isinstance(publication, messages.PublicationPlaced) else None
+
+    def service(self, key: str, service: str) -> ServiceEndpoint | None:
+        """Return an incarnation's service."""
+        placed = self._facts.get(("service", key, service))
+        if not isinstance(placed, messages.ServicePlaced):
+            return None
+        node = self.node(key)
+        return ServiceEndpoint(key, service, placed.host, placed.port, key if node is None else node.name)
+
+    def grant(self, key: str, topic: str, host: str, caller_id: str) -> messages.GrantInstalled | None:
+        """Return the grant of this subscriber for this topic of that incarnation."""
+        grant = self._facts.get(("grant", key, topic, host, caller_id))
+        return grant if isinstance(grant, messages.GrantInstalled) else None
+
+    def may_call(self, key: str, service: str, host: str, caller_id: str) -> bool:
+        """Whether this client may call this service of that incarnation."""
+        return ("client", key, service, host, caller_id) in self._facts
+
+    def client_of(self, key: str, service: str, host: str) -> str | None:
+        """Return a name under which this host may call this service; None if there is none."""
+        return next(iter(self._clients.get(("client", key, service, host), ())), None)
+
+    def _name(self, message: Statement) -> None:
+        """Note whether the policy names the host of a statement."""
+        if isinstance(message, messages.NodePlaced | messages.ServicePlaced):
+            return
+        if isinstance(message, messages.PublicationPlaced):
+            node = self.node(message.key)
+            host = "" if node is None else node.host
+        else:
+            host = message.host
+        if message.named:
+            self._named.add(host)
+        else:
+            self._named.discard(host)
+
+    def _forget(self, fact: _Fact) -> None:
+        self._take_out(fact)
+        if self._restated is not None:
+            self._restated.discard(fact)
+
+    def _take_out(self, fact: _Fact) -> None:
+        message = self._facts.pop(fact, None)
+        if message is not None:
+            of_key = self._by_key[fact[1]]
+            del of_key[fact]
+            if not of_key:
+                del self._by_key[fact[1]]
+            host = _host(fact, message)
+            self._hosts[host] -= 1
+            if not self._hosts[host]:
+                del self._hosts[host]
+                self._named.discard(host)
+        if isinstance(message, messages.ClientGranted):
+            names = self._clients[fact[:4]]
+            del names[fact[4]]
+            if not names:
+                del self._clients[fact[:4]]
+
+
+def _fact(message: messages.Message) -> _Fact:
+    """Return what a statement, or its withdrawal, is about."""
+    kind = _KINDS.get(type(message))
+    if kind is None:
+        raise TypeError(f"{type(message).__name__} withdraws nothing")
+    return (kind, *(getattr(message, field) for field in _ABOUT[kind].fields))
+
+
+def _host(fact: _Fact, message: messages.Message) -> str:
+    """Return the host of a statement; empty if it has none."""
+    return message.host if isinstance(message, messages.NodePlaced) else fact[3] if len(fact) > 3 else ""

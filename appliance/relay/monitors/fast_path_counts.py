@@ -1,0 +1,52 @@
+"""Counts of what the fast path did without a report, until the second is over."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from appliance.relay.monitors.observation_points import ObservationPoint
+
+if TYPE_CHECKING:
+    from rosmop.run.fast_path import BatchResult, FastLane
+
+
+_Count = tuple[int, int]
+"""How often something happened, and when last (nanoseconds)."""
+
+
+class FastPathCounts:
+    """The counts of the fast path at one point since they were last taken."""
+
+    def __init__(self, lane: FastLane, point: ObservationPoint) -> None:
+        self.lane = lane
+        self.point = point
+        self.begun = False
+        """Whether counting has begun, and that was reported."""
+        self.changed: dict[int, int] = {}
+        """Where walks add up what was changed (`BatchOptions`)."""
+        self._clear()
+
+    def add(self, walked: BatchResult, time: int) -> int:
+        """Count the messages that a walk dropped; return their number."""
+        for number, count in enumerate(walked.dropped):
+            if count:
+                self._dropped[number] = self._dropped[number][0] + count, time
+        for number, count in enumerate(walked.told):
+            if count:
+                self._told[number] = self._told[number][0] + count, time
+        return sum(walked.dropped)
+
+    def take(self) -> tuple[list[_Count], dict[tuple[str, ...], int], list[_Count]]:
+        """Return and reset the counts of drops by event, of changed messages by the events that changed them, and of
+        all verdicts.
+        """
+        changed = {self.lane.writers(who): count for who, count in self.changed.items()}
+        dropped, told = self._dropped, self._told
+        self._clear()
+        return dropped, changed, told
+
+    def _clear(self) -> None:
+        self.begun = False
+        self.changed.clear()
+        self._dropped: list[_Count] = [(0, 0)] * len(self.lane.events)
+        self._told: list[_Count] = [(0, 0)] * len(self.lane.verdicts)

@@ -1,0 +1,133 @@
+"""A `Channel` served by the relay's loop."""
+
+import os
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
+from appliance.channel.messages import Message
+from appliance.relay.loop import READ, WRITE, EventLoop, LoopTimer
+
+
+class LoopLink:
+    """One end of a lifeline or link. `ended(reason)` is called once, when the link fails.
+
+    A message of another link, or a backlog beyond its limit, ends it like the other end's death. A restatement of
+    thousands of messages is carried out a quantum at a time, so that it delays nothing else.
+
+    When `received` returns True, that message and those behind it wait for `go_on`. Nothing more is read until then. So
+    waiting messages are bounded here by one `Channel.receive`, and at the other end by the limit of its backlog.
+    """
+
+    def __init__(
+        self,
+        loop: EventLoop,
+        channel: Channel,
+        received: Callable[[Any, tuple[int, ...]], bool | None],
+        ended: Callable[[str], None],
+    ) -> None:
+        self._loop = loop
+        self._channel = channel
+        self._received = received
+        self._ended = ended
+        self._events = READ
+        self._live = True
+        self._waits = False
+        self._end_of_link: str | None = None  # the reason, once the link has ended
+        self._arrived: deque[tuple[Any, tuple[int, ...]]] = deque()
+        self._slice: LoopTimer | None = None
+        loop.watch(channel.fileno(), READ, self._ready)
+
+    def send(self, message: Message) -> None:
+        """Send now, or when the other end reads; nothing is sent after the end."""
+        if not self._live:
+            return
+        try:
+            self._channel.send(message)
+        except (ChannelClosedError, ChannelFullError) as error:
+            self._end(str(error))
+        else:
+            self._watch()
+
+    def catch_up(self) -> None:
+        """Carry out everything that the other end has sent, unless messages wait."""
+        if self._live and not self._waits:
+            if self._end_of_link is None:
+                self._take_in()
+            self._finish()
+
+    def go_on(self) -> None:
+        """Carry out the messages that wait, and those that have come since."""
+        if self._waits:
+            self._waits = False
+            self._watch()
+            self.catch_up()
+
+    def close(self) -> None:
+        """Close this end; `ended` is not called."""
+        if self._live:
+            self._live = False
+            self._loop.unwatch(self._channel.fileno())
+            self._channel.close()
+            if self._slice is not None:
+                self._slice.cancel()
+            for _message, descriptors in self._arrived:
+                for descriptor in descriptors:
+                    os.close(descriptor)
+            self._arrived.clear()
+
+    def _ready(self, events: int) -> None:
+        if events & WRITE:
+            try:
+                self._channel.flush()
+            except ChannelClosedError as error:
+                self._end(str(error))
+                return
+            self._watch()
+        if events & ~WRITE:
+            self._take_in()
+            self._carry_out()
+
+    def _take_in(self) -> None:
+        """Read the messages that have come; at the end of the link, carry them out first."""
+        try:
+            self._arrived += self._channel.receive()
+        except (ChannelClosedError, msgspec.DecodeError) as error:
+            self._end_of_link = str(error)
+            self._loop.unwatch(self._channel.fileno())
+            self._finish()
+
+    def _carry_out(self) -> None:
+        while self._arrived and not self._waits:
+            arrived = self._arrived.popleft()
+            if self._received(*arrived):
+                self._arrived.appendleft(arrived)
+                self._waits = True
+                self._watch()
+            if self._loop.over():
+                break
+        if self._slice is not None:
+            self._slice.cancel()
+        more = self._arrived and not self._waits
+        self._slice = self._loop.after(0, self._carry_out) if more else None
+
+    def _finish(self) -> None:
+        """Carry out everything that need not wait, then end a link that has nothing more."""
+        while self._arrived and not self._waits:
+            self._carry_out()
+        if self._end_of_link is not None and not self._arrived:
+            self._end(self._end_of_link)
+
+    def _watch(self) -> None:
+        events = (0 if self._waits else READ) | (WRITE if self._channel.pending else 0)
+        if events != self._events and self._end_of_link is None:
+            self._events = events
+            self._loop.change(self._channel.fileno(), events)
+
+    def _end(self, reason: str) -> None:
+        if self._live:
+            self.close()
+            self._ended(reason)

@@ -1,0 +1,128 @@
+"""Divides the relay's memory among hosts.
+
+There are four pools: incomplete frames, requests and replies; queues for slow subscribers and clients; latched
+messages; connection headers. Frames count for the host that sends them, queues for the host that they wait for.
+Queues cannot use the memory of frames.
+
+Invariants, besides those of `Pool`:
+
+1. A host gets no more while it holds as much as is free. A single host can have half; each of *n* greedy hosts has one
+   part of *n* + 1, and one part stays free for the next host.
+2. Memory beyond a host's quota is freed when data of that host moves, or at the next check (once a second). Latched
+   messages are freed when a host with less wants to latch one.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+from appliance.quotas.pool import Pool, QuotaClass
+from appliance.quotas.table import RELAY_FRAMES, RELAY_HEADERS, RELAY_LATCHED, RELAY_QUEUES, QuotaRow
+from appliance.relay.relay_limits import RelayLimits
+
+
+class HostMemory:
+    """The memory of one host in a pool."""
+
+    __slots__ = ("_host", "_pool")
+
+    def __init__(self, pool: Pool[str], host: str) -> None:
+        self._pool = pool
+        self._host = host
+
+    @property
+    def used(self) -> int:
+        """Return the bytes of this host."""
+        return self._pool.held(self._host)
+
+    def add(self, size: int) -> None:
+        """Count `size` more bytes of this host (below 0: fewer)."""
+        if size > 0:
+            self._pool.charge(self._host, size)
+        elif size:
+            self._pool.give_back(self._host, -size)
+
+    def refusal(self, size: int = 1) -> str:
+        """Return why this host should not hold `size` more bytes; empty if it may."""
+        pool = self._pool
+        held, left = pool.held(self._host) + size, pool.bounds.whole - pool.total - size
+        if held > left:
+            return (
+                f"{self._host} would have {held} {pool.what}, and {max(left, 0)} would be left for all others;"
+                " a host may have as many as are left"
+            )
+        return pool.refusal(self._host, size)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no more data of this host should be kept."""
+        return bool(self.refusal())
+
+    @property
+    def plenty(self) -> bool:
+        """Whether less than half of the pool is in use."""
+        return self._pool.total * 2 < self._pool.bounds.whole
+
+
+class MemoryPool(Pool[str]):
+    """A pool of bytes, divided among hosts."""
+
+    def of(self, host: str) -> HostMemory:
+        """Return the memory of the host with this address."""
+        return HostMemory(self, host)
+
+
+@dataclass(frozen=True, slots=True)
+class RelayMemory:
+    """The four pools."""
+
+    frames: MemoryPool
+    queues: MemoryPool
+    latched: MemoryPool
+    headers: MemoryPool
+
+    @classmethod
+    def of(cls, limits: RelayLimits, quota_class: Callable[[str], QuotaClass]) -> "RelayMemory":
+        """Return the pools of one relay: `memory_bytes`, divided like the defaults of the table."""
+        rows = (RELAY_FRAMES, RELAY_QUEUES, RELAY_LATCHED)
+        together = sum(row.bounds.whole for row in rows)
+
+        def pool_of(row: QuotaRow, whole: int) -> MemoryPool:
+            return MemoryPool(row.thing.partition(" in ")[0], row.bounds.sized(whole), quota_class)
+
+        frames, queues, latched = (
+            pool_of(row, row.bounds.whole * limits.memory_bytes // together) for row in rows
+        )
+        return cls(frames, queues, latched, pool_of(RELAY_HEADERS, limits.header_memory_bytes))
+
+    def held(self) -> dict[str, int]:
+        """Return the bytes in each pool."""
+        return {pool.name: getattr(self, pool.name).total for pool in fields(self)}
+
+
+class HeldBytes:
+    """The bytes that one connection holds in a pool."""
+
+    def __init__(self, share: HostMemory) -> None:
+        self.share = share
+        self._size = 0
+
+    def set(self, size: int) -> None:
+        """Set how many bytes there are now."""
+        self.share.add(size - self._size)
+        self._size = size
+
+
+class StallDetector:
+    """A detector of unfinished transfers without progress for some seconds."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._held = 0
+        self._since = 0.0
+
+    def seen(self, held: int, now: float) -> bool:
+        """Set the bytes held now (0: nothing is unfinished); return whether they have been the same for too long."""
+        if not held or held != self._held:
+            self._held, self._since = held, now
+            return False
+        return now - self._since > self._seconds
