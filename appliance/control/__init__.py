@@ -1,1 +1,1 @@
-"""The control process: made of its parts, told by the supervisor, asked by operators."""
+"""The control process: it decides requests, holds the state, and answers operators."""

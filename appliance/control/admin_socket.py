@@ -1,4 +1,4 @@
-"""The admin socket: operators' tools ask, control answers."""
+"""Answer operators' tools on the admin socket."""
 
 import asyncio
 import contextlib
@@ -19,14 +19,14 @@ _OPERATOR = "operator"
 
 
 class AdminServer:
-    """Answers requests on the admin socket."""
+    """The server of the admin socket."""
 
     def __init__(self, administration: Administration) -> None:
         self._administration = administration
         self._decoder = msgspec.json.Decoder(admin.AnyRequest)
 
     async def start(self, sock: socket.socket) -> asyncio.Server:
-        """Serve the listening socket as long as the server that this returns is held."""
+        """Serve the listening socket; the caller must keep a reference to the returned server."""
         return await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -37,7 +37,7 @@ class AdminServer:
                 writer.write(admin.encode(answer) + b"\n")
                 await writer.drain()
         except (ValueError, ConnectionError) as error:
-            _log.warning("a tool spoke nonsense on the admin socket", error=str(error))
+            _log.warning("a tool sent an invalid request on the admin socket", error=str(error))
         finally:
             writer.close()
             with contextlib.suppress(ConnectionError):
@@ -54,7 +54,7 @@ class AdminServer:
 
 
 def _given_up(writer: asyncio.StreamWriter) -> bool:
-    """Whether the client closed the connection, or its direction: so it withdraws what it asked."""
+    """Whether the client closed the connection or its sending side, which withdraws its request."""
     if writer.is_closing():
         return True
     found = select.poll()

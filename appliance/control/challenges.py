@@ -1,12 +1,12 @@
-"""Challenges: what an order over REST is signed under, so that each proof is good once and not for long. No I/O.
+"""Issue challenges for signed REST orders, so that each proof is valid once and only for a short time. No I/O.
 
-A challenge is `ENDS.RANDOM.MAC` under a key of this process. Invariants:
+A challenge is `ENDS.RANDOM.MAC` with a MAC by a key of this process. Invariants:
 
-1. Nothing is kept of a challenge that was given: asking for them fills nothing.
-2. One is taken once. What was taken is remembered until the challenge has ended; at most `_MOST_TAKEN`, then none is
-   taken until some have ended.
-3. A new process has a new key: what was signed before a restart is refused after it, without a file to remember it in.
-4. Ends are of this process's monotonic clock: neither the asker's clock nor the machine's date has a say.
+1. Issued challenges are not stored, so requests for challenges cannot exhaust memory.
+2. A challenge is accepted once. Accepted ones are stored until they expire. While `_MOST_TAKEN` are stored, no others
+   are accepted.
+3. A new process has a new key, so an order signed before a restart is rejected after it.
+4. Expiry uses this process's monotonic clock, independent of the client's clock and the machine's date.
 """
 
 import hashlib
@@ -18,27 +18,27 @@ _MOST_TAKEN = 4096
 
 
 class ChallengeRefusedError(Exception):
-    """The challenge of a proof is not taken; the text says why."""
+    """The challenge of a proof is not accepted; the message has the reason."""
 
 
 class Challenges:
-    """Gives challenges, and takes each of them once; `now` is seconds of a monotonic clock."""
+    """The challenges of this process, each accepted once; `now` is in seconds of a monotonic clock."""
 
     def __init__(self) -> None:
         self._key = secrets.token_bytes(32)
-        self._taken: dict[str, float] = {}  # by their ends, for all live equally long
+        self._taken: dict[str, float] = {}  # with their ends
 
     def give(self, now: float) -> str:
-        """A new one, good for `SECONDS`."""
+        """Return a new challenge, valid for `SECONDS`."""
         begun = f"{now + SECONDS:.3f}.{secrets.token_urlsafe(16)}"
         return f"{begun}.{self._mac(begun)}"
 
     def take(self, challenge: str, now: float) -> None:
-        """Use it up. Raises `ChallengeRefusedError`."""
+        """Accept a challenge, once. Raises `ChallengeRefusedError`."""
         begun, _dot, mac = challenge.rpartition(".")
         if not hmac.compare_digest(mac.encode(), self._mac(begun).encode()):
             raise ChallengeRefusedError(
-                "the challenge is none that RVMaster gave since it started: ask for another one"
+                "RVMaster has not given this challenge since it started: ask for another one"
             )
         ends = float(begun.rpartition(".")[0])
         if ends <= now:

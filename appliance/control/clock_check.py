@@ -1,8 +1,8 @@
-"""Whether the times of the records can be believed: for status, metrics, and the log itself. It blocks nothing.
+"""Check whether the times of records are credible, for status, metrics and the log. Nothing is blocked.
 
-Four things are looked at: whether a time service keeps the machine's clock (the supervisor tells), whether the clock
-stands before the last record of the log, which it does after it was set back, also while the appliance was off,
-whether it went further than time has passed, and whether it stands before this program was made.
+Four conditions are checked: no time service keeps the machine's clock (the supervisor reports that); the clock is
+before the log's last record, because it was set back, perhaps while the appliance was off; the clock advanced more than
+the elapsed time; the clock is before the date of this program.
 """
 
 import asyncio
@@ -14,11 +14,11 @@ from appliance.channel.answers.status import ClockState
 from appliance.telemetry.audit_trail import AuditTrail
 
 _LOOK_SECONDS = 10.0
-_STEP_SECONDS = 2.0  # less is what a time service mends
+_STEP_SECONDS = 2.0  # smaller steps are normal corrections of a time service
 
 
-class Clock:
-    """Records each change once. `behind()` is how many seconds the clock stands before the last record; else 0."""
+class ClockCheck:
+    """The check of the clock, which records each change once. `behind()`: seconds before the last record, or 0."""
 
     def __init__(
         self,
@@ -26,7 +26,7 @@ class Clock:
         behind: Callable[[], float],
         started: Callable[[], float] = lambda: time.time() - time.clock_gettime(time.CLOCK_BOOTTIME),
     ) -> None:
-        """`started()` is when the machine was started, by its clock as it is now (seconds since the epoch)."""
+        """Begin; `started()` is the start of the machine by its present clock (seconds since the epoch)."""
         self._trail = trail
         self._behind = behind
         self._synchronised: bool | None = None
@@ -35,7 +35,7 @@ class Clock:
         self._seen = started()
 
     def told(self, synchronised: bool | None) -> None:
-        """What the supervisor sees now; None: it cannot."""
+        """Record a change in the supervisor's report of the time service; None if that is unknown."""
         before, self._synchronised = self._synchronised, synchronised
         if synchronised is False and before is not False:
             self._trail.happened(
@@ -47,18 +47,18 @@ class Clock:
             self._trail.happened("clock synchronised", text)
 
     def state(self) -> ClockState:
-        """As it is now."""
+        """Return the current state of the clock."""
         behind = self._behind()
         return ClockState(self._synchronised, behind if behind > _STEP_SECONDS else 0.0, before_program())
 
     async def watch(self) -> None:
-        """Look every ten seconds whether it was set."""
+        """Check the clock every ten seconds."""
         while True:
             self.look()
             await asyncio.sleep(_LOOK_SECONDS)
 
     def look(self) -> None:
-        """Record each step forward, and once that it was set back; it may be again when it has caught up."""
+        """Record each step forward. Record a step back once, until the clock has caught up with the last record."""
         before, self._seen = self._seen, self._started()
         ahead = self._seen - before
         if ahead > _STEP_SECONDS:

@@ -1,9 +1,9 @@
-"""What cannot be answered."""
+"""Define the errors of requests that cannot be answered."""
 
 
 class UnknownThingError(Exception):
-    """There is nothing of the name or number that was asked for."""
+    """The requested name or number does not exist."""
 
 
 class SenselessError(Exception):
-    """What was asked makes no sense."""
+    """The request makes no sense."""

@@ -1,4 +1,4 @@
-"""What is asked when evidence is exported: that the log is sealed now, and that it has the bundle's hash."""
+"""Answer the requests of an evidence export: seal the log now, and record the bundle's hash."""
 
 import asyncio
 
@@ -11,23 +11,25 @@ SEAL_SECONDS = 10.0
 
 
 class NotSealedError(Exception):
-    """The log's newest records cannot be sealed now; the text says why."""
+    """The log's newest records cannot be sealed now; the message has the reason."""
 
 
 class EvidenceOrders:
-    """Each method answers the request that it takes. They raise `NotSealedError`."""
+    """The answers to the requests of an evidence export. Its methods raise `NotSealedError`."""
 
     def __init__(self, log: AuditLog, trail: AuditTrail) -> None:
         self._log = log
         self._trail = trail
 
+    @admin.answers(admin.LogSealed)
     async def seal(self, _request: admin.LogSealed) -> Sealed:
-        """A signed checkpoint over all that was recorded."""
+        """Wait until a signed checkpoint seals all records."""
         await self._seal()
         return Sealed()
 
+    @admin.answers(admin.EvidenceExported, who=True)
     async def exported(self, request: admin.EvidenceExported, who: str) -> Sealed:
-        """Record a bundle that was made, under a signed checkpoint."""
+        """Record an exported bundle; return the id of the record once a signed checkpoint seals it."""
         record = self._trail.happened(
             "evidence exported",
             f"{request.records} records were exported as evidence",

@@ -1,4 +1,4 @@
-"""Control's end of the link to the forwarder of the audit log: for status, metrics, and the log itself."""
+"""Handle the reports of the log's forwarder, for status, metrics, and the audit log."""
 
 import asyncio
 
@@ -10,11 +10,11 @@ from appliance.channel.link import Link
 from appliance.configuration.settings import Syslog
 from appliance.telemetry.audit_trail import AuditTrail
 
-_PATIENCE_SECONDS = 10.0  # a receiver that is started again is no event
+_PATIENCE_SECONDS = 10.0  # the restart of a receiver is not recorded
 
 
-class Forwarded:
-    """The last report of the forwarder; `wanted` is what the configuration asks for."""
+class ForwarderLink:
+    """The link to the forwarder, with its last report; `wanted` is its configuration."""
 
     def __init__(self, wanted: Syslog, trail: AuditTrail) -> None:
         self._wanted = wanted
@@ -25,7 +25,7 @@ class Forwarded:
         self._failure_recorded = False
 
     def status(self) -> ForwardingState | None:
-        """For `rosrv status` and the metrics; None when nothing is to be forwarded."""
+        """Return the state for `rosrv status` and the metrics; None if the log is not to be forwarded."""
         if self._wanted.to is None:
             return None
         report = self._report or messages.ForwardingReported()
@@ -58,7 +58,7 @@ class Forwarded:
                 )
 
     def _still_failing(self) -> None:
-        assert self._report is not None  # noqa: S101  a report began this
+        assert self._report is not None  # noqa: S101  a report started the timer
         self._failure_recorded = True
         self._trail.happened(
             "forwarding failed",

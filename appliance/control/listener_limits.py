@@ -1,7 +1,7 @@
-"""Who is let in to the listeners of control, and under which limits: RVMaster's, the outer faces', the inner ones'.
+"""The limits of control's listeners, and the hosts that they serve: RVMaster's, peer-side and master-side endpoints.
 
-A stranger (an address that no rule of the policy names) is refused by the beginning of its body, which says what was
-asked for; while the real ROS Master is not hidden, everybody is refused.
+An unknown host (an address that no rule of the policy names) is refused after the beginning of its body, which names
+the call. While the ROS master is not hidden, every host is refused.
 """
 
 import asyncio
@@ -16,26 +16,27 @@ from appliance.master.calls.request_peek import asked_for
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.quotas.descriptors import connections_within
-from appliance.quotas.pool import Bounds, Standing
+from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.quotas.table import RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_REQUESTS
-from appliance.rpc.connection_table import Visitors
+from appliance.rpc.connection_table import ConnectionTable
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import AtOnce, Handler, HttpServer, Peer, Refusal, not_at_once
+from appliance.rpc.source_queues import NamedFirst
 from appliance.telemetry.audit_trail import AuditTrail
-from roswire.xmlrpc import Limits, build_fault
+from roswire.xmlrpc import XmlRpcLimits, build_fault
 
 
-class Doors:
-    """The limits and the visitors of all listeners; `policy()` is the one in force, `standing` says what hosts are."""
+class ListenerLimits:
+    """The limits and connections of all listeners; `policy()` is in force, `quota_class` classifies hosts."""
 
     def __init__(
         self,
         settings: Settings,
         trail: AuditTrail,
         policy: Callable[[], Policy],
-        standing: Callable[[Address], Standing],
+        quota_class: Callable[[Address], QuotaClass],
     ) -> None:
         limits = settings.limits
         self.http = HttpLimits(
@@ -44,16 +45,19 @@ class Doors:
             body_bytes=int(limits.body_bytes),
             idle_seconds=limits.idle_seconds,
         )
-        self.visitors = Visitors(
-            standing,
+        self.connection_table = ConnectionTable(
+            quota_class,
             connections=RVMASTER_CONNECTIONS.bounds.sized(
                 connections_within(limits.connections), limits.connections_per_host
             ),
-            standing_of_arrivals=partial(standing_of_arrival, policy, standing),
+            connection_class=partial(connection_class_of, policy, quota_class),
         )
-        self.turns = Turns(RVMASTER_REQUESTS.bounds, standing, lambda host: policy().alike(host), trail.pause)
-        self.time = ProcessorTime(partial(class_of, policy, standing))
-        self._own_visitors = Visitors(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
+        self.turns = Turns(
+            RVMASTER_REQUESTS.bounds, quota_class, lambda host: policy().alike(host), trail.pause
+        )
+        self.time = ProcessorTime(partial(class_of, policy, quota_class))
+        self.first = NamedFirst(policy)
+        self._own_connection_table = ConnectionTable(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
         self._own_turns = Turns(_SLOTS_FOR_ONE, _own_node)
         self._trail = trail
         self._policy = policy
@@ -69,42 +73,55 @@ class Doors:
         at_once: AtOnce = not_at_once,
         keep: bool = True,
     ) -> None:
-        """Serve a listener; one that is not `guarded` is reached by the appliance's own processes only."""
-        server = HttpServer(
-            sock.dup(),
+        """Serve a listener. Without `guarded`, only the appliance's own processes can reach it."""
+        server = self.server(sock.dup(), handler, guarded=guarded, at_once=at_once, keep=keep)
+        self._servers.append(server)
+        await server.start()
+
+    def server(
+        self,
+        sock: socket.socket,
+        handler: Handler,
+        *,
+        guarded: bool = True,
+        at_once: AtOnce = not_at_once,
+        keep: bool = True,
+    ) -> HttpServer:
+        """Return a server that shares the limits of all listeners; the caller starts and closes it."""
+        return HttpServer(
+            sock,
             handler,
             at_once=at_once,
             limits=self.http,
-            visitors=self.visitors if guarded else self._own_visitors,
+            connection_table=self.connection_table if guarded else self._own_connection_table,
             turns=self.turns if guarded else self._own_turns,
             time=self.time,
+            first=self.first if guarded else None,
             keep=keep,
             refuse=self.refuse if guarded else lambda _peer: None,
             troubled=self.troubled,
         )
-        self._servers.append(server)
-        await server.start()
 
     async def sweep(self) -> None:
-        """Close the connections of all listeners whose time is over; runs until cancelled."""
-        await asyncio.gather(self.visitors.sweep(), self._own_visitors.sweep())
+        """Close expired connections of all listeners; runs until cancelled."""
+        await asyncio.gather(self.connection_table.sweep(), self._own_connection_table.sweep())
 
     def close(self) -> None:
-        """Serve nobody any more."""
+        """Stop serving."""
         for server in self._servers:
             server.close()
 
     def refuse(self, peer: Peer) -> Refusal | None:
-        """What answers somebody who is not to be served at all; None for the others."""
+        """Return the refusal for a peer that is not served, or None."""
         if self._unhidden:
             fault = build_fault(1, f"the appliance does not serve: {self._unhidden}")
             return lambda _beginning: fault
-        # The rosout aggregator calls from this machine, which the policy need not name; whoever does is decided by it.
+        # The rosout aggregator calls from this machine, which the policy need not name.
         if peer.here or self._policy().knows(peer.host):
             return None
-        return partial(self._refuse_stranger, peer)
+        return partial(self._refuse_unknown, peer)
 
-    def _refuse_stranger(self, peer: Peer, beginning: bytes) -> bytes:
+    def _refuse_unknown(self, peer: Peer, beginning: bytes) -> bytes:
         asked = asked_for(peer, beginning)
         reason = f"no rule of the policy names {peer.text}"
         record = self._trail.happened(
@@ -121,21 +138,21 @@ class Doors:
         return build_fault(1, with_record(reason, record))
 
     def troubled(self, peer: Peer, reason: str) -> None:
-        """A peer went over a limit."""
+        """Record that a peer exceeded a limit."""
         self._trail.happened("limit exceeded", reason, decision="deny", host=peer.text)
 
     def probed(self, reason: str) -> None:
-        """The supervisor looked whether the ROS Master is hidden; `reason` is empty if it is."""
+        """Handle the supervisor's probe of whether the ROS master is hidden; `reason` is empty if it is."""
         if bool(reason) != bool(self._unhidden):
             event = "probe failed" if reason else "probe passed"
             self._trail.happened(event, reason or "the ROS Master is hidden")
         self._unhidden = reason
 
 
-def value_limits(settings: Settings) -> Limits:
-    """The bounds of XML-RPC values, as configured."""
+def value_limits(settings: Settings) -> XmlRpcLimits:
+    """Return the configured bounds of XML-RPC values."""
     limits = settings.limits
-    return Limits(
+    return XmlRpcLimits(
         body=int(limits.body_bytes),
         elements=limits.elements,
         depth=limits.nesting,
@@ -144,36 +161,39 @@ def value_limits(settings: Settings) -> Limits:
     )
 
 
+ClassOf = Callable[[Address], QuotaClass]
 _UNKNOWN, _ANYBODY = "unknown hosts", "hosts with a registration, by *"
 
 
-def class_of(policy: Callable[[], Policy], standing: Callable[[Address], Standing], host: Address) -> str:
-    """As whom a host has processor time: as the address or network that the policy names.
+def class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) -> str:
+    """Return the class that is charged for a host's processor time: the address or network that the policy names.
 
-    Hosts that only `*` names are as many as somebody has addresses: all are one, and those that have a registration.
+    Hosts can have many addresses: all that only `*` names are one class, and those with a registration another.
     """
     if host.is_loopback or policy().names(host):
         return policy().alike(host)
-    return _ANYBODY if standing(host) is Standing.REGISTERED else _UNKNOWN
+    return _ANYBODY if quota_class(host) is QuotaClass.REGISTERED else _UNKNOWN
 
 
-def standing_of_arrival(
-    policy: Callable[[], Policy], standing: Callable[[Address], Standing], host: Address
-) -> Standing:
-    """Return a host's standing for connections that wait to be opened.
+def connection_class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) -> QuotaClass:
+    """Return a host's quota class for connections.
 
-    Hosts that only `*` names and that have no registration count as strangers: all of them wait in one class of
-    processor time, so their connections must not use the places of hosts that the policy names.
+    Hosts that only `*` names share processor time as one host, so their connections must not use the quotas of hosts
+    that the policy names. Without a registration they count as unknown, and with one as named: any host that `*` names
+    can register a node, so the part for registered hosts is kept for those that the policy names.
     """
-    return Standing.STRANGER if class_of(policy, standing, host) == _UNKNOWN else standing(host)
+    found = class_of(policy, quota_class, host)
+    if found == _UNKNOWN:
+        return QuotaClass.UNKNOWN
+    return QuotaClass.NAMED if found == _ANYBODY else quota_class(host)
 
 
-# The appliance's own nodes and the ROS Master come from one address, and nobody else reaches those listeners.
+# The appliance's own nodes and the ROS master share one address, and other hosts cannot reach their listeners.
 _FOR_ONE, _BYTES_FOR_ONE, _SLOTS_FOR_ONE = (
-    Bounds(whole=bounds.whole, host=bounds.whole, strangers=0, kept=0)
+    Bounds(whole=bounds.whole, host=bounds.whole, unknown=0, kept=0)
     for bounds in (RVMASTER_CONNECTIONS.bounds, RVMASTER_BYTES.bounds, RVMASTER_REQUESTS.bounds)
 )
 
 
-def _own_node(_host: Address) -> Standing:
-    return Standing.REGISTERED
+def _own_node(_host: Address) -> QuotaClass:
+    return QuotaClass.REGISTERED

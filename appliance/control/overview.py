@@ -1,6 +1,6 @@
-"""The graph as an operator sees it: nodes, topics, services, who is connected to whom, how much flows.
+"""Describe the graph for operators: nodes, topics, services, connections, traffic.
 
-Everything is read from the registry and the relay's reports at one moment. The appliance's own nodes are left out.
+All values are a snapshot of the registry and the relay's reports, without the appliance's own nodes.
 """
 
 from msgspec.structs import asdict
@@ -13,8 +13,8 @@ from appliance.specifications.allocation import SERVICE, TOPIC
 
 
 def graph_of(parts: Parts) -> Graph:
-    """The graph now."""
-    registry = parts.registry
+    """Return the present graph."""
+    registry = parts.core.registry
     shown = [
         incarnation
         for incarnation in registry.all()
@@ -41,7 +41,7 @@ def _node(incarnation: Incarnation) -> Node:
 
 
 def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> list[Topic]:
-    relay, connections = parts.relay, _connections(parts.relay, TOPIC, names)
+    relay, connections = parts.endpoints.relay, _connections(parts.endpoints.relay, TOPIC, names)
     publishers: dict[str, list[Publisher]] = {}
     subscribers: dict[str, list[str]] = {}
     for incarnation in live:
@@ -57,8 +57,8 @@ def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> lis
     return [
         Topic(
             name,
-            parts.registry.type_of(name),
-            mediated=parts.mediation.carries_topic(name),
+            parts.core.registry.type_of(name),
+            mediated=parts.core.mediation.carries_topic(name),
             publishers=publishers.get(name, []),
             subscribers=subscribers.get(name, []),
             connections=connections.get(name, []),
@@ -68,13 +68,13 @@ def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> lis
 
 
 def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> list[Service]:
-    relay, connections = parts.relay, _connections(parts.relay, SERVICE, names)
+    relay, connections = parts.endpoints.relay, _connections(parts.endpoints.relay, SERVICE, names)
     return [
         Service(
             **asdict(relay.carried.flow(incarnation.key, registration.resource)),
             name=registration.resource,
             node=incarnation.name,
-            mediated=parts.mediation.carries_service(registration.resource),
+            mediated=parts.core.mediation.carries_service(registration.resource),
             connections=connections.get(registration.resource, []),
         )
         for incarnation in live
@@ -84,7 +84,7 @@ def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> l
 
 
 def _connections(relay: RelayControl, kind: str, names: dict[str, str]) -> dict[str, list[Connection]]:
-    """Who is connected, by topic or service."""
+    """Return the connections by topic or service."""
     found: dict[str, list[Connection]] = {}
     for connection in relay.carried.connections.values():
         if connection.kind == kind and connection.key in names:

@@ -1,11 +1,10 @@
-"""The policy in force: loading, revisions, rollback, and the time limit of an unconfirmed change.
+"""Keep the policy in force: load it, store revisions, roll back, and limit the time of an unconfirmed change.
 
-A new policy is checked, run against its own tests and compiled before anything changes; a bad one changes nothing
-and says everything that is wrong with it. Every policy that came into force is a revision in the store.
+A new policy is checked, run against its own tests and compiled before it takes effect; an invalid one changes nothing,
+and all findings are reported. Every policy that came into force is a revision in the store.
 
-Operators' changes are made one at a time, and one that names the revision it is meant for is refused when another is in
-force by then. A change is answered when it is on the disk and the relays have carried it out: who was told that
-something is taken back can rely on it that nothing of it goes through any more.
+Operators' changes are made one at a time; a change for another revision than the one in force is rejected. A change is
+answered when it is on disk and the relays have carried it out: revoked traffic no longer passes.
 """
 
 import asyncio
@@ -25,7 +24,7 @@ from appliance.channel.answers import policy_answers as answers
 from appliance.channel.answers.policy_answers import Loaded
 from appliance.control.errors import UnknownThingError
 from appliance.policy.host_sets import Network
-from appliance.policy.judgement import Known, judge
+from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
@@ -38,12 +37,12 @@ from appliance.telemetry.audit_trail import AuditTrail
 _log = structlog.get_logger()
 _KEPT = (
     "this is revision {0.revision}, which {0.who} brought into force while the appliance ran. To give it up, start with"
-    " the version and configuration that took it, say `rosrv policy reload` there, and start anew"
+    " the version and configuration that took it, run `rosrv policy reload` there, and start again"
 )
 
 
 class PolicyRefusedError(Exception):
-    """The policy was not taken; `findings` has every reason, as `file:line:column: error: text`."""
+    """The policy is rejected; `findings` has every reason, as `file:line:column: error: text`."""
 
     def __init__(self, findings: list[str]) -> None:
         super().__init__("\n".join(findings))
@@ -59,14 +58,14 @@ def _said(error: OSError | UnicodeDecodeError) -> str:
 
 
 class RevisionChangedError(Exception):
-    """Another revision came into force than the one the change was meant for; the text says which."""
+    """The revision in force is not the one that the change is for; the message has both numbers."""
 
     def __init__(self, expected: int, found: int) -> None:
         super().__init__(f"revision {found} is in force, not {expected}: look at it before you change it")
 
 
 class Policies(Revisions[RevisionRow]):
-    """Keeps the policy in force. What operators ask of it is answered by the method that takes the request."""
+    """The policy in force with its revisions; it answers the requests about them."""
 
     refusal = PolicyRefusedError
     outdated = RevisionChangedError
@@ -83,11 +82,10 @@ class Policies(Revisions[RevisionRow]):
         carried_out: Callable[[], Awaitable[None]],
         site_keys: Sequence[str],
     ) -> None:
-        """`hosts()` is what `host:NAME` means now; `hosts_changed` is to be called when it means another thing.
+        """Prepare; `hosts()` returns the addresses for `host:NAME`; call `hosts_changed` when they change.
 
-        `changed(before, policy)` decides again what is live, and says how much was revoked; `carried_out()` waits until
-        the relays have done what they were told. Where there are `site_keys`, whatever comes into force is signed with
-        one of them.
+        `changed(before, policy)` decides all live rights again, and returns the number of revocations. `carried_out()`
+        waits until the relays have carried out all orders. With `site_keys`, one of them must sign every policy.
         """
         nothing = RevisionRow(0, "", "", 0.0, "", "")
         super().__init__(store, store.revisions, store.save_revision, nothing, "confirm")
@@ -102,14 +100,14 @@ class Policies(Revisions[RevisionRow]):
 
     @property
     def current(self) -> Policy:
-        """The policy in force."""
+        """Return the policy in force."""
         if self._current is None:
             raise RuntimeError("no policy is loaded yet")
         return self._current
 
     @property
     def differs_from_file(self) -> bool:
-        """Whether the policy in force is another than the file now has."""
+        """Whether the policy in force differs from the file."""
         try:
             return self._read() != (self.current.text, self.in_force.signature)
         except PolicyRefusedError:
@@ -118,8 +116,8 @@ class Policies(Revisions[RevisionRow]):
     def start(self, *, restarted: bool) -> None:
         """Bring a policy into force at start. Raises `PolicyRefusedError`.
 
-        After a crash of control (`restarted`) it is the one that was in force. At the appliance's start it is the
-        file, unless an operator's own revision (a rollback, REST) was in force when it stopped.
+        After a crash of control (`restarted`) it is the policy that was in force. At the appliance's start it is the
+        file, unless an operator's own revision (a rollback, REST) was in force when the appliance stopped.
         """
         if self._find_last(restarted=restarted):
             last = self.in_force
@@ -139,29 +137,30 @@ class Policies(Revisions[RevisionRow]):
 
     @contextlib.asynccontextmanager
     async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
-        """Around an operator's change; it is on the disk and carried out afterwards."""
+        """Surround an operator's change; at the end wait until it is on disk and carried out."""
         async with super()._changing(expected):
             yield
             await self.store.settled()
             await self._carried_out()
 
+    @admin.answers(admin.PolicyReload, who=True)
     async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
-        """Read the file again: check, test, swap, decide again what is live.
+        """Read the file again: check, test and load it, and decide all live rights again.
 
-        Raises `PolicyRefusedError`, and `RevisionChangedError` when another revision came into force meanwhile. The
-        revision is the disk's, whoever asked for it: `who` is for the record.
+        The author of the revision is always `disk`; `who` is only recorded. Raises `PolicyRefusedError`, and
+        `RevisionChangedError` if another revision came into force in between.
         """
         by, within = DISK if who == "operator" else who, request.confirm_within
         async with self._changing(request.expected):
             policy, signature = await self._prepared(self._read, str(self.file), by)
             return self._keep(policy, signature, who=DISK, note="reloaded from disk", by=by, within=within)
 
+    @admin.answers(admin.PolicyLoad, who=True)
     async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
-        """Bring a text that is not the file's into force, as `reload` does.
+        """Bring a given text into force instead of the file, like `reload`.
 
-        What was loaded so already, and is in force, stays as it is: the same text twice is one revision.
-        Raises `PolicyRefusedError`, `RevisionChangedError`. Its rules are cited as `revision N:line`, for the file
-        says something else.
+        Loading the same text again makes no new revision. Rules are cited as `revision N:line`, because the file
+        differs. Raises `PolicyRefusedError` and `RevisionChangedError`.
         """
         given, within = (request.text, request.signature), request.confirm_within
         async with self._changing(request.expected):
@@ -172,29 +171,31 @@ class Policies(Revisions[RevisionRow]):
             return self._keep(policy, signature, who=who, note=request.note or "posted", within=within)
 
     def hosts_changed(self) -> int:
-        """Compile the policy in force again, for hosts were enrolled or revoked; how much was taken back."""
+        """Compile the policy in force again, because hosts changed; return the number of revocations."""
         before = self.current
         try:
             self._current = self._judged(before.text, self.in_force.signature, before.file, self.known)
-        except PolicyRefusedError as error:  # the same text: only a defect could make it wrong
+        except PolicyRefusedError as error:  # a defect: the same text was valid before
             _log.error("the policy does not know the new hosts", findings=error.findings)
             return 0
         return self._changed(before, self._current)
 
+    @admin.answers(admin.PolicyRollback, who=True)
     async def roll_back(self, request: admin.PolicyRollback, who: str) -> Loaded:
-        """Bring a kept revision into force. Raises `PolicyRefusedError`, `RevisionChangedError`."""
+        """Bring a kept revision into force. Raises `PolicyRefusedError` and `RevisionChangedError`."""
         async with self._changing(request.expected):
             return await self.rollback(request.revision, who=who)
 
     async def rollback(self, revision: int | None, *, who: str) -> Loaded:
-        """Bring a kept revision into force (None: the one before this).
+        """Bring a kept revision into force (None: the previous one).
 
-        Raises `PolicyRefusedError`, and `RevisionChangedError` when another came into force while it was read.
+        Raises `PolicyRefusedError`, and `RevisionChangedError` if another one came into force while it was read.
         """
         row = await self._wanted(revision)
         policy = self._judged(row.text, row.signature, row.file, self.known)
         return self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
 
+    @admin.answers(admin.PolicyConfirm, who=True)
     async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
         """Keep an unconfirmed change, if there is one. Raises `RevisionChangedError`."""
         async with self._changing(request.expected):
@@ -204,20 +205,31 @@ class Policies(Revisions[RevisionRow]):
                 self._trail.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
             return answers.PolicyConfirmed(waited, self.revision)
 
+    @admin.answers(admin.PolicyRevisions)
     async def revisions(self, _request: admin.PolicyRevisions) -> answers.PolicyRevisionList:
-        """The kept revisions."""
+        """Return the kept revisions."""
         rows = [self._described(row) for row in await self._kept()]
         return answers.PolicyRevisionList(msgspec.convert(rows, list[answers.PolicyRevision]))
 
+    @admin.answers(admin.PolicyWanted)
     async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
-        """A revision, and with what its text is judged. Raises `UnknownThingError`."""
-        number = self.revision if request.revision is None else request.revision
+        """Return a revision and the context in which its text is checked. Raises `UnknownThingError`."""
+        row = await self._kept_revision(self.revision if request.revision is None else request.revision)
+        return await asyncio.to_thread(self._text, row, self.known)
+
+    @admin.answers(admin.PolicyRevisionWanted)
+    async def one_revision(self, request: admin.PolicyRevisionWanted) -> answers.RevisionText:
+        """Return a revision with its text. Raises `UnknownThingError`."""
+        row = await self._kept_revision(request.revision)
+        return msgspec.convert(self._described(row), answers.RevisionText)
+
+    async def _kept_revision(self, number: int) -> RevisionRow:
         row = self.in_force if number == self.revision else await self._find(number)
         if row is None:
             raise UnknownThingError(f"there is no revision {number}")
-        return await asyncio.to_thread(self._text, row, self.known)
+        return row
 
-    def _text(self, row: RevisionRow, known: Known) -> answers.PolicyKnown:
+    def _text(self, row: RevisionRow, known: PolicyContext) -> answers.PolicyKnown:
         return answers.PolicyKnown(
             **self._described(row),
             policy_file=str(self.file),
@@ -228,12 +240,12 @@ class Policies(Revisions[RevisionRow]):
         )
 
     @property
-    def known(self) -> Known:
-        """What a policy means now: the hosts and the robot."""
-        return Known(dict(self._hosts()), self._robot, site_keys=self._site_keys)
+    def known(self) -> PolicyContext:
+        """Return the context of a policy: hosts, robot and site keys."""
+        return PolicyContext(dict(self._hosts()), self._robot, site_keys=self._site_keys)
 
-    def with_cases(self, known: Known) -> Known:
-        """The same with the test cases beside the file, which are read now: a new policy is judged with them."""
+    def with_cases(self, known: PolicyContext) -> PolicyContext:
+        """Return this context with the test cases from the file beside the policy."""
         cases = self.file.with_name(f"{self.file.name}.tests.yaml")
         text = error = None
         try:
@@ -247,7 +259,7 @@ class Policies(Revisions[RevisionRow]):
     # --- inside ---
 
     async def _prepared(self, read: Callable[[], tuple[str, str]], file: str, who: str) -> tuple[Policy, str]:
-        """Read (text and signature), compiled and tested in a thread: a long policy keeps no node waiting."""
+        """Read, compile and test a policy in a thread, so that it does not delay nodes; return it and its signature."""
         before = self.revision
         try:
             while True:
@@ -258,7 +270,7 @@ class Policies(Revisions[RevisionRow]):
         except PolicyRefusedError as error:
             self._refused(error, who)
             raise
-        if self.revision != before:  # a signal, or a confirmation that did not come in time
+        if self.revision != before:  # changed by a signal, or a late confirmation
             raise RevisionChangedError(before, self.revision)
         return policy, signature
 
@@ -271,17 +283,19 @@ class Policies(Revisions[RevisionRow]):
         )
 
     def _read(self) -> tuple[str, str]:
-        """The file's text and signature."""
+        """Return the file's text and signature. Raises `PolicyRefusedError`."""
         try:
             return read_given_text(self.file), read_signature(self.file)
         except (OSError, UnicodeDecodeError) as error:
             raise PolicyRefusedError([f"{self.file}: the policy cannot be read: {_said(error)}"]) from error
 
-    def _tested(self, read: Callable[[], tuple[str, str]], file: str, known: Known) -> tuple[Policy, str]:
+    def _tested(
+        self, read: Callable[[], tuple[str, str]], file: str, known: PolicyContext
+    ) -> tuple[Policy, str]:
         text, signature = read()
         return self._judged(text, signature, file, self.with_cases(known)), signature
 
-    def _judged(self, text: str, signature: str, file: str, known: Known) -> Policy:
+    def _judged(self, text: str, signature: str, file: str, known: PolicyContext) -> Policy:
         try:
             return judge(text, file, known, signature).accepted()
         except PolicyError as error:

@@ -1,4 +1,4 @@
-"""How the appliance stands: its status, its graph, what is live, what is measured. Nothing is changed by a look."""
+"""Answer queries about the appliance: status, graph, live registrations, measurements. They change nothing."""
 
 import asyncio
 import time
@@ -34,70 +34,79 @@ from appliance.control.monitor_states import monitors_of, monitors_status
 from appliance.control.overview import graph_of
 from appliance.control.policies import Policies
 from appliance.control.supervisor_link import Surroundings
-from appliance.hosts.enrolment import Hosts
+from appliance.hosts.enrolment import HostEnrolment
 from appliance.master.graph.registry import Kind, Life
-from appliance.policy.live_rights import Live
+from appliance.policy.live_rights import LiveRight
 from appliance.policy.sections import DECIDERS
+from appliance.telemetry.audit_trail import AuditTrail
 
 MOST_MESSAGES = 20
 LONGEST_LOOK = 10.0
-"""Seconds."""
+"""The longest time in seconds that a query waits for messages."""
 
 ONE_LOOK = 60.0
-"""Seconds in which the looks of one person into one topic are one record."""
+"""The seconds in which all queries of one token for one topic are one record."""
 
 _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
 
 @dataclass(frozen=True)
-class Looks:
-    """Each method answers the request that it takes.
+class Queries:
+    """The answers to queries.
 
-    `audit()` is how the audit log stands, `clock()` the machine's clock, `recorder()` the flight recorder, `live()`
-    what a change of the policy may end, `switched_off()` what does not act.
+    `audit()`, `clock()` and `recorder()` return the states of the audit log, the machine's clock and the flight
+    recorder; `live()` the rights that a change of the policy may end; `switched_off()` the disabled protection.
     """
 
     parts: Parts
+    trail: AuditTrail
     policies: Policies
-    hosts: Hosts
+    hosts: HostEnrolment
     surroundings: Surroundings
     audit: Callable[[], AuditState]
     clock: Callable[[], ClockState]
     recorder: Callable[[], RecorderState | None]
     queued_deliveries: Callable[[], int]
-    live: Callable[[], list[Live]]
+    live: Callable[[], list[LiveRight]]
     switched_off: Callable[[], list[SwitchedOff]]
     started: float = field(default_factory=time.time)
     _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
+    @admin.answers(admin.StatusWanted)
     async def status(self, _request: admin.StatusWanted) -> Status:
-        """Processes, policy, registry, relay, firewall."""
+        """Return the status of all parts of the appliance."""
         return self._status()
 
+    @admin.answers(admin.InventoryWanted)
     async def inventory(self, _request: admin.InventoryWanted) -> Inventory:
-        """What runs, and what it uses of the kernel."""
-        from appliance.configuration.inventory import inventory  # noqa: PLC0415  only when it is asked for
+        """Return the parts of the appliance, and the kernel features in use."""
+        from appliance.configuration.inventory import inventory  # noqa: PLC0415  only for this query
 
         found = await asyncio.to_thread(inventory)
         around = self.surroundings
+        sandbox = {process.role: process.sandbox for process in around.processes if process.sandbox}
         used = InUse(
             firewall=around.firewall.report.backend,
             esp=self.hosts.status().esp,
-            walls={process.role: process.walls for process in around.processes if process.walls},
+            sandbox=sandbox,
             lacks=sorted({lack for process in around.processes for lack in process.lacks}),
+            walls=sandbox,
         )
         return msgspec.structs.replace(found, in_use=used)
 
+    @admin.answers(admin.GraphWanted)
     async def graph(self, _request: admin.GraphWanted) -> Graph:
-        """Nodes, topics and services, and what flows."""
+        """Return nodes, topics and services with their traffic."""
         return graph_of(self.parts)
 
+    @admin.answers(admin.MonitorsWanted)
     async def monitors(self, request: admin.MonitorsWanted) -> Monitors:
-        """All monitors with state and counters."""
+        """Return all monitors with state and counters."""
         return monitors_of(self.parts.monitors, self.parts.monitor_calls.rv_state(), texts=request.texts)
 
+    @admin.answers(admin.TopicLook, who=True)
     async def topic_look(self, request: admin.TopicLook, who: str) -> TopicMessages:
-        """The next messages of a topic. Raises `UnknownThingError`, `SenselessError` and `TooManyLooksError`."""
+        """Return the next messages of a topic. Raises `UnknownThingError`, `SenselessError` and `TooManyTapsError`."""
         if not 1 <= request.messages <= MOST_MESSAGES or not 0 < request.seconds <= LONGEST_LOOK:
             raise SenselessError(f"ask for 1 to {MOST_MESSAGES} messages, within {LONGEST_LOOK:g} seconds")
         topic = next((topic for topic in graph_of(self.parts).topics if topic.name == request.topic), None)
@@ -108,10 +117,10 @@ class Looks:
                 f"the messages of {topic.name} go past the appliance (relaying: monitored), which cannot show them"
             )
         self._record_look(topic.name, who)
-        seen = await self.parts.relay.look(
+        seen = await self.parts.endpoints.relay.look(
             topic.name, request.messages, request.seconds, latched=request.latched
         )
-        registry = self.parts.registry
+        registry = self.parts.core.registry
         rows = []
         for message in seen:
             node = registry.by_key(message.key)
@@ -126,14 +135,14 @@ class Looks:
         )
 
     def _record_look(self, topic: str, who: str) -> None:
-        """Once for whoever looks on: a plot in the console is one look."""
+        """Record only the first of equal queries within `ONE_LOOK`: a plot in the console polls."""
         now = time.monotonic()
         for key in [key for key, since in self._shown.items() if now - since >= ONE_LOOK]:
             del self._shown[key]
         if (who, topic) in self._shown:
             return
         self._shown[who, topic] = now
-        self.parts.trail.happened(
+        self.trail.happened(
             "topic looked into",
             f"messages of {topic} are shown, for {ONE_LOOK:g} seconds from now",
             category="topic",
@@ -142,17 +151,21 @@ class Looks:
             seconds=ONE_LOOK,
         )
 
+    @admin.answers(admin.MetricsWanted)
     async def metrics(self, _request: admin.MetricsWanted) -> Measures:
-        """The status, and everything that is counted."""
-        return measures_of(self.parts, self._status(), self.hosts.rows(), self.queued_deliveries())
+        """Return the status and all counters."""
+        return measures_of(
+            self.parts, self.trail.meter, self._status(), self.hosts.rows(), self.queued_deliveries()
+        )
 
+    @admin.answers(admin.RegistrationsWanted)
     async def registrations(self, _request: admin.RegistrationsWanted) -> Registrations:
-        """Everything live that a change of the policy may end."""
+        """Return all live rights that a change of the policy may end."""
         return Registrations([Registration(**live.fields()) for live in self.live()])
 
     def _status(self) -> Status:
-        parts, registry, relay = self.parts, self.parts.registry, self.parts.relay
-        # The appliance's own nodes are not of the robot, here as in the graph.
+        parts, registry, relay = self.parts, self.parts.core.registry, self.parts.endpoints.relay
+        # As in the graph, the appliance's own nodes are not counted.
         lives = [incarnation.life for incarnation in registry.all() if not incarnation.own]
         named = {
             (registration.kind, registration.resource)
@@ -165,14 +178,14 @@ class Looks:
             master=self.surroundings.master,
             processes=self.surroundings.processes,
             isolation=self.surroundings.firewall.isolation,
-            relaying="all" if parts.mediation.relay_all else "monitored",
-            mediation="full" if parts.mediation.stand_ins else "monitored",
+            relaying="all" if parts.core.mediation.relay_all else "monitored",
+            mediation="full" if parts.core.mediation.stand_ins else "monitored",
             firewall=self.surroundings.firewall.report,
             probe=self.surroundings.probe,
             policy=self._policy(),
             ipsec=self.hosts.status(),
             monitors=monitors_status(parts.monitors),
-            rosmaster="reachable" if parts.rosmaster.whole else "being rebuilt",
+            rosmaster="reachable" if parts.endpoints.rosmaster.whole else "being rebuilt",
             relay=relay.presence,
             nodes=lives.count(Life.LIVE),
             shadows=lives.count(Life.SHADOW),

@@ -1,42 +1,42 @@
-"""What the policy and the registry know of a host: which share of a finite thing is its own (`appliance/quotas`)."""
+"""Find the quota class of a host, from the policy and the registry (`appliance/quotas`)."""
 
 from collections.abc import Callable
 
 from appliance.channel.answers.recording_answers import APPLIANCE, ROBOT, UNKNOWN
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 
 
-class HostStanding:
-    """The standing of hosts, by the policy in force at that moment and by what is registered.
+class HostQuotaClass:
+    """The quota class of hosts, by the policy in force and by their registrations.
 
-    `policy()` is the one in force; `registrations(host)` is how many registrations a host has.
+    `policy()` is the policy in force; `registrations(host)` is the number of a host's registrations.
     """
 
     def __init__(self, policy: Callable[[], Policy], registrations: Callable[[Address], int]) -> None:
         self._policy = policy
         self._registrations = registrations
 
-    def __call__(self, host: Address) -> Standing:
-        """The standing of this host now."""
+    def __call__(self, host: Address) -> QuotaClass:
+        """Return the present quota class of a host."""
         if self._registrations(host):
-            return Standing.REGISTERED
-        # The policy need not name the appliance itself, whose own nodes call from loopback.
+            return QuotaClass.REGISTERED
+        # The policy need not name loopback, from which the appliance's own nodes call.
         if host.is_loopback or self._policy().knows(host):
-            return Standing.NAMED
-        return Standing.STRANGER
+            return QuotaClass.NAMED
+        return QuotaClass.UNKNOWN
 
-    def of_text(self, host: str) -> Standing:
-        """The same of a host as records have it; what is no address is nobody's that could be a stranger."""
+    def of_text(self, host: str) -> QuotaClass:
+        """Return the quota class of a host in a record; a text that is not an address counts as named."""
         try:
             return self(address_of(host))
         except ValueError:
-            return Standing.NAMED
+            return QuotaClass.NAMED
 
 
 def charged_to(policy: Policy, host: str) -> str:
-    """By what name recordings of a host's acts are charged: see `recorder.plan`."""
+    """Return the name that recordings of a host's acts are charged to (see `recorder.plan`)."""
     try:
         address = address_of(host)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Control's end of the link to the flight recorder: what operators ask of it, and what the audit log has of it."""
+"""Pass operators' orders to the flight recorder, and record them and the recorder's reports."""
 
 import asyncio
 import time
@@ -21,24 +21,24 @@ from appliance.channel.link import Link
 from appliance.configuration.settings import RecorderRules
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.recorder.recording_plan import RecordingPlan
-from appliance.recorder.recording_store import MOST_LENT
+from appliance.recorder.recording_store import MOST_TEMPORARY
 from appliance.telemetry.audit_trail import AuditTrail
 
 _PATIENCE_SECONDS = 10.0
 _LONGEST_NOTE = 300
 _MOST_TOPICS = 20
 _LONGEST_NAME = 500
-_M = TypeVar("_M", messages.RecordingBegun, messages.RecordingRemoved, messages.MemoryLent)
+_M = TypeVar("_M", messages.RecordingStarted, messages.RecordingRemoved, messages.MemoryLent)
 
 
 class RecorderAwayError(Exception):
-    """The recorder does not run, or cannot do what it was asked."""
+    """The recorder does not run, or cannot carry out the order."""
 
 
 class RecordingOrders:
-    """Each method with a request answers it. They raise `RecorderAwayError`, `UnknownThingError`, `SenselessError`.
+    """The link to the recorder. Its methods raise `RecorderAwayError`, `UnknownThingError` and `SenselessError`.
 
-    `in_force()` are the revisions that a recording is described with. `plan` says which recording has an act of a host.
+    `in_force()` returns the revisions of policy and specifications. `plan` finds the recording that covers an event.
     """
 
     def __init__(
@@ -54,12 +54,12 @@ class RecordingOrders:
         self._in_force = in_force
         self.link = Link(self._heard)
         self._kept: dict[str, Recording] = {}
-        self._lent: dict[str, Recording] = {}  # the last ones of the memory
-        self._begun: str | None = None  # the id of the one that is being made, if somebody was told it
+        self._lent: dict[str, Recording] = {}  # temporary recordings of the memory
+        self._begun: str | None = None  # the id of the recording in progress, if it was returned to a client
         self._notes: set[asyncio.Future[None]] = set()
 
     def state(self) -> RecorderState | None:
-        """For `rosrv status` and the metrics; None when nothing is recorded."""
+        """Return the state for `rosrv status` and the metrics; None if the recorder is off."""
         if not self._rules.enabled:
             return None
         sizes = [recording.size for recording in self._kept.values()]
@@ -67,19 +67,22 @@ class RecordingOrders:
 
     # --- what operators ask -------------------------------------------------------------------------------
 
+    @admin.answers(admin.RecordingsWanted)
     async def recordings(self, _request: admin.RecordingsWanted) -> Recordings:
-        """Those that are kept, the oldest first."""
+        """Return the kept recordings, oldest first."""
         self._require()
         rules, kept = self._rules, [self._kept[name] for name in sorted(self._kept)]
         return Recordings(kept, list(rules.topics), list(rules.never), rules.before)
 
+    @admin.answers(admin.RecordingWanted)
     async def recording(self, request: admin.RecordingWanted) -> Recording:
-        """One of them."""
+        """Return one recording."""
         self._require()
         return self._find(request.id)
 
+    @admin.answers(admin.RecordNow, who=True)
     async def now(self, request: admin.RecordNow, who: str) -> RecordingBegun:
-        """Record, whatever happens."""
+        """Begin a recording now, without a trigger."""
         self._require()
         before = self._rules.before if request.before is None else request.before
         after = self._rules.after if request.after is None else request.after
@@ -92,7 +95,7 @@ class RecordingOrders:
         return RecordingBegun(begun.id, begun.ends)
 
     async def called(self, call: messages.OwnServiceCalled) -> messages.OwnServiceAnswered:
-        """A node that the policy lets calls the service: record; the recording's id, or why there is none."""
+        """Begin a recording for a node's service call; the answer has the recording's id, or the reason for none."""
         try:
             self._require()
             text = f"{call.caller_id} of {call.host} called {call.service}"
@@ -111,8 +114,8 @@ class RecordingOrders:
 
     async def _begin(
         self, what: TriggerKind, reason: str, text: str, who: str, span: tuple[float, float], **caller: Any
-    ) -> messages.RecordingBegun:
-        """Have it recorded, of so many seconds before now and after, once it is on record who wants that."""
+    ) -> messages.RecordingStarted:
+        """Record who ordered a recording, then begin it; `span` has the seconds before and after now."""
         before, after = span
         record = self._trail.happened(
             "recording ordered", reason, who=who, before=before, after=after, **caller
@@ -120,17 +123,20 @@ class RecordingOrders:
         charged_to = self._plan.charged_to(str(caller["host"])) if "host" in caller else OPERATORS
         trigger = Trigger(time.time_ns(), what, record, text[:_LONGEST_NOTE], charged_to)
         begun = await self._ask(
-            lambda number: messages.RecordingWanted(number, trigger, before, after), messages.RecordingBegun
+            lambda number: messages.RecordingRequested(number, trigger, before, after),
+            messages.RecordingStarted,
         )
         self._plan.opened(charged_to, begun.id, begun.began, begun.ends)
         return begun
 
+    @admin.answers(admin.RecordingFetch, who=True)
     async def fetch(self, request: admin.RecordingFetch, who: str) -> Recording:
-        """Say that somebody takes its messages, which he reads where they lie."""
+        """Record who fetches a recording, whose messages the api reads from the disk."""
         return await self._given_out(request.id, "recording fetched", f"by {who}", who)
 
+    @admin.answers(admin.RecordingRead, who=True)
     async def read(self, request: admin.RecordingRead, who: str) -> Recording:
-        """Say that somebody reads some of its messages; what is read again within seconds is counted."""
+        """Record who reads messages of a recording; repetitions within seconds are counted."""
         topics = request.topics
         if len(topics) > _MOST_TOPICS or any(len(topic) > _LONGEST_NAME for topic in topics):
             raise SenselessError(f"at most {_MOST_TOPICS} topics at once, of {_LONGEST_NAME} characters each")
@@ -140,7 +146,7 @@ class RecordingOrders:
     async def _given_out(
         self, recording_id: str, event: str, reason: str, who: str, *, reads: bool = False, **detail: Any
     ) -> Recording:
-        """The recording, once it is on record who has messages of it."""
+        """Record who gets the messages of a recording, wait until that is on disk, and return the recording."""
         self._require()
         recording = self._find(recording_id)
         self._trail.happened(
@@ -155,11 +161,12 @@ class RecordingOrders:
         )
         failure = await self._trail.durable()
         if failure is not None:
-            raise RecorderAwayError(f"nobody can fetch anything while that is not on record: {failure}")
+            raise RecorderAwayError(f"nothing can be fetched while that cannot be recorded: {failure}")
         return recording
 
+    @admin.answers(admin.RecordingOfMemory, who=True)
     async def of_memory(self, request: admin.RecordingOfMemory, who: str) -> Recording:
-        """What is in memory, to be fetched as a recording that is not kept."""
+        """Return the messages in memory, as a temporary recording."""
         self._require()
         now = time.time_ns()
         since, until = request.since or 0, now if request.until is None else request.until
@@ -174,11 +181,12 @@ class RecordingOrders:
         lent = await self._ask(
             lambda number: messages.MemoryWanted(number, trigger, since, until), messages.MemoryLent
         )
-        self._lent = dict([*self._lent.items(), (lent.recording.id, lent.recording)][-MOST_LENT:])
+        self._lent = dict([*self._lent.items(), (lent.recording.id, lent.recording)][-MOST_TEMPORARY:])
         return lent.recording
 
+    @admin.answers(admin.RecordingRemove, who=True)
     async def remove(self, request: admin.RecordingRemove, who: str) -> Recording:
-        """Take it away."""
+        """Remove a recording."""
         self._require()
         removed = await self._ask(
             lambda number: messages.RecordingRemovalWanted(number, request.id, who), messages.RecordingRemoved
@@ -204,7 +212,7 @@ class RecordingOrders:
         return known[recording_id]
 
     async def _ask(self, order: Callable[[int], messages.Message], kind: type[_M]) -> _M:
-        """The recorder's answer of this kind to an order, which is given a number."""
+        """Send an order with a new number; return the recorder's answer, which must be of this kind."""
         try:
             answer: _M | messages.RecordingRefused = await self.link.ask(order, _PATIENCE_SECONDS)
         except ChannelClosedError:
@@ -213,7 +221,7 @@ class RecordingOrders:
             raise RecorderAwayError("the flight recorder did not answer") from None
         if isinstance(answer, messages.RecordingRefused):
             raise (UnknownThingError if answer.unknown else RecorderAwayError)(answer.reason)
-        assert isinstance(answer, kind)  # noqa: S101  what such an order is answered with
+        assert isinstance(answer, kind)  # noqa: S101  the only other answer to such an order
         return answer
 
     # --- what the recorder says ---------------------------------------------------------------------------
@@ -248,14 +256,14 @@ class RecordingOrders:
                 )
                 self._note(recording.id)
                 self.link.answered(message.number, message)
-            case messages.RecordingBegun(_number, recording_id):
+            case messages.RecordingStarted(_number, recording_id):
                 self._begun = recording_id
                 self.link.answered(message.number, message)
             case messages.MemoryLent(number) | messages.RecordingRefused(number):
                 self.link.answered(number, message)
 
     def _note(self, recording_id: str) -> None:
-        """Have the recorder know, once it is on disk, that the audit log has what it told of a recording."""
+        """Notify the recorder once the record of its report is on disk."""
 
         async def note() -> None:
             if await self._trail.durable() is None:

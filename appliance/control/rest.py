@@ -1,14 +1,14 @@
-"""Control's end of the link to the api: takes what REST asks, one request after the other, and what it did.
+"""Carry out the REST requests that the api passes on, one by one, and record REST calls.
 
-Invariants, so that an api that is flooded or has fallen to a stranger cannot hold RVMaster up:
+Invariants, so that a flooded or compromised api cannot block RVMaster:
 
-1. At most `_MOST_WAITING` requests wait; one more is answered `busy` at once. Between two of them the loop serves
-   nodes. Those that wait for others (`WaitingRequest`, at most `_MOST_SLOW`) hold up nobody else.
-2. What is not of the link ends it; an api that does not read its answers loses the link.
-3. Nothing that can be asked here makes an access token, and no decision of RVMaster depends on the api.
-4. What no client waits for any more is withdrawn before it takes effect (`appliance/base/withdrawal.py`).
-5. Everything is asked in the name of a token that was shown and whose role may; a change is what the client asked for,
-   with its proof (`rest_proof.py`). What is not is refused and recorded, by control itself.
+1. At most `_MOST_WAITING` requests wait; further ones are answered `busy` at once. Between two requests the loop serves
+   nodes. Requests that wait for another process (`WaitingRequest`, at most `_MOST_SLOW`) do not delay others.
+2. An invalid message ends the link, and so does an api that does not read its answers.
+3. REST requests cannot make access tokens, and RVMaster's decisions do not depend on the api.
+4. A request is withdrawn if its client is gone before it takes effect (`appliance/base/withdrawal.py`).
+5. Every request needs a token whose role allows it, and every change needs the client's own request, with its proof if
+   required (`rest_proof.py`). Control itself denies and records all others.
 """
 
 import asyncio
@@ -41,29 +41,29 @@ from appliance.channel.messages.api import (
     TokensStated,
 )
 from appliance.control.administration import Administration
-from appliance.control.rest_proof import Askers, UnprovenError
-from appliance.control.token_orders import Tokens
+from appliance.control.rest_proof import RequestAuthenticator, UnprovenError
+from appliance.control.token_orders import TokenOrders
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
 _MOST_WAITING = 64
 _TEXT = 300
 _DENIED = (401, 403, 421, 429)
-_METHODS = ("POST", "PUT", "PATCH", "DELETE")  # refused in whatever way, nothing was changed
+_METHODS = ("POST", "PUT", "PATCH", "DELETE")  # if rejected, they changed nothing
 _MOST_SLOW = 16
 
 
 class RestLink:
-    """Serves whichever api is there.
+    """The link to the api.
 
-    `served(pin)` hears by what hosts recognise it. `require_proof`: a change is made for a signed request only, not for
-    a bare token.
+    `served(pin)` is called with the pin by which hosts recognise the api. `require_proof`: a change needs a signed
+    request; a bare token is not enough.
     """
 
     def __init__(
         self,
         administration: Administration,
-        tokens: Tokens,
+        tokens: TokenOrders,
         trail: AuditTrail,
         *,
         served: Callable[[str], None],
@@ -71,18 +71,18 @@ class RestLink:
     ) -> None:
         self._administration = administration
         self._tokens = tokens
-        self._askers = Askers(tokens, require_proof=require_proof)
+        self._askers = RequestAuthenticator(tokens, require_proof=require_proof)
         self._trail = trail
         self._link = Link(self._received, self._lost)
         self._waiting: deque[RequestMade] = deque()
-        self._withdrawn: dict[int, bool] = {}  # of the requests of the present link that are not answered
+        self._withdrawn: dict[int, bool] = {}  # by number, until answered (present link)
         self._worker: asyncio.Task[None] | None = None  # of the present link
         self._slow: set[asyncio.Task[None]] = set()
-        self._workers: set[asyncio.Task[None]] = set()  # that, and those of links that ended amid a request
+        self._workers: set[asyncio.Task[None]] = set()  # also those of ended links
         self._served = served
 
     def attach(self, channel: Channel) -> None:
-        """An api is there: serve it, and tell it the tokens."""
+        """Serve a new api process, and send it the tokens."""
         self._link.attach(channel)
         self._worker = None
         self._waiting.clear()
@@ -123,7 +123,7 @@ class RestLink:
             await asyncio.sleep(0)
 
     def _begin(self, channel: Channel | None, made: RequestMade) -> None:
-        """Serve beside the others what waits for charon, the signer, the recorder or a topic's messages."""
+        """Serve concurrently a request that waits for charon, the signer, the recorder or a topic's messages."""
         if len(self._slow) >= _MOST_SLOW:
             text = "too many requests that take a while are under way: try again"
             self._send_answer(made.number, AdminAnswer(False, error=text, trouble="busy"))
@@ -155,7 +155,7 @@ class RestLink:
         except UnprovenError as error:
             self._refused(made, error)
             return AdminAnswer(False, error=str(error), trouble="forbidden")
-        except Exception as error:  # noqa: BLE001  a defect of one request is that request's failure
+        except Exception as error:  # noqa: BLE001  a defect fails only this request
             _log.exception("a request of the api failed", request=type(made.request).__name__)
             return AdminAnswer(False, error=f"a defect of rosrv: {type(error).__name__}", trouble="failed")
 
@@ -192,7 +192,7 @@ class RestLink:
         )
 
     def state_tokens(self) -> None:
-        """Tell the api what tokens may be used."""
+        """Send the api the usable tokens."""
         self._send(TokensStated(self._tokens.usable()))
 
     def _send_answer(self, number: int, answer: AdminAnswer[Any]) -> None:
@@ -207,7 +207,7 @@ class RestLink:
             _log.error("the api does not read its answers: its link is closed")
 
     def _lost(self, wrong: str) -> None:
-        """The link is gone; `wrong` is what the api did to lose it, empty when it ended: the supervisor says why."""
+        """Forget the requests of the api; `wrong` is its protocol error, empty if the process ended."""
         self._waiting.clear()
         if wrong:
             _log.error("the api's link is closed; another one is started", reason=wrong)

@@ -1,28 +1,29 @@
-"""Whose asking a request over REST is: found out in control, from what the client showed, never from the api's word.
+"""Authenticate REST requests in control by the client's credentials, never by the api's claim.
 
-The api is the process that browsers and scripts talk to; a stranger may have taken it over. Invariants:
+The api is the process that browsers and scripts talk to, and may be compromised. Invariants:
 
-1. Nothing is told or done in the name of a token without the token itself, or its reading key, beside the request:
-   names are not asked for. An api that fell has nothing of a token that it was not shown since.
-2. A change comes with the HTTP request that asked for it, and is what that request means (`rest_meaning.py`).
-3. A change by a reading key comes with a proof: the request signed by the token's signing key, under a challenge of
-   this process that is good once. An api that fell can carry such an order or drop it; it cannot change a byte of
-   it, repeat it, or make one.
-4. A bare token is proof for whatever whoever saw it says: the setting `api_require_proof` takes none for a change.
-5. What is refused here is recorded by whoever calls, and nothing of it was done.
+1. Every request must contain its token, or the token's reading key. A compromised api can use only tokens that it has
+   received since.
+2. A change comes with the client's HTTP request, and must equal the order derived from it (`channel/rest_meaning.py`).
+3. A change by a reading key needs a proof: the request signed with the token's signing key, with a challenge of this
+   process that is valid once. A compromised api can drop such an order; it cannot change, repeat or make one.
+4. A bare token authorises all requests of anyone who has seen it, but no changes with the setting `api_require_proof`.
+5. A request denied here has no effect; the caller records it.
 """
 
 import asyncio
 import hashlib
 import time
 
+import msgspec
+
 from appliance.audit.record import Severity
 from appliance.channel import admin
 from appliance.channel.answers.token_answers import Challenge, TokenRole, may
-from appliance.channel.messages.api import Asked, RequestMade
+from appliance.channel.messages.api import ClientRequest, RequestMade
+from appliance.channel.rest_meaning import NoOrderError, filled_in, meant
 from appliance.control.challenges import SECONDS, ChallengeRefusedError, Challenges
-from appliance.control.rest_meaning import NoOrderError, meant
-from appliance.control.token_orders import Tokens
+from appliance.control.token_orders import TokenOrders
 from appliance.signing.request_signing import (
     HEADER,
     BadProofError,
@@ -39,7 +40,7 @@ _ITSELF = "the host itself"
 
 
 class UnprovenError(Exception):
-    """Nothing is done; the text says why. `who` is the token's name where it was shown."""
+    """The request is denied; the message has the reason. `who` is the name of the shown token, if any."""
 
     def __init__(self, text: str, who: str = "", severity: Severity = Severity.WARNING) -> None:
         super().__init__(text)
@@ -47,23 +48,23 @@ class UnprovenError(Exception):
         self.severity = severity
 
 
-class Askers:
-    """Finds out who asks; `require_proof`: a bare token changes nothing."""
+class RequestAuthenticator:
+    """The authentication of requests by their tokens; `require_proof`: a bare token is not enough for changes."""
 
-    def __init__(self, tokens: Tokens, *, require_proof: bool) -> None:
+    def __init__(self, tokens: TokenOrders, *, require_proof: bool) -> None:
         self._tokens = tokens
         self._require_proof = require_proof
         self._challenges = Challenges()
-        # Of tokens without keys: SHA-256 of texts that scrypt has found right, by id; it runs once at a time.
+        # For tokens without keys: SHA-256 of the texts that scrypt has accepted, by id; scrypt runs once at a time.
         self._checked: dict[str, bytes] = {}
         self._checking = asyncio.Lock()
 
     def challenge(self) -> Challenge:
-        """What the next order is signed under, and how long it is good."""
+        """Return a challenge for an order, and its lifetime."""
         return Challenge(self._challenges.give(time.monotonic()), SECONDS)
 
     async def asker(self, made: RequestMade) -> str:
-        """The name of the token in whose name this is asked. Raises `UnprovenError`."""
+        """Return the name of the request's token, or another author if none is needed. Raises `UnprovenError`."""
         role = _role_for(made.request)
         if role is None:
             return "" if isinstance(made.request, admin.MetricsWanted) else _ITSELF
@@ -77,7 +78,7 @@ class Askers:
         return row.name
 
     async def _holder(self, shown: str) -> TokenRow:
-        """The token that was shown, itself or by its reading key, and can be used now."""
+        """Return the usable token that was shown, or whose reading key was. Raises `UnprovenError`."""
         parsed = parse_token(shown)
         token_id = parsed[0] if parsed is not None else reading_id(shown)
         row = self._tokens.usable_row(token_id) if token_id is not None else None
@@ -86,7 +87,7 @@ class Askers:
                 good = row.keys is not None and reading_hash(shown) == row.keys.reading
             else:
                 good = await self._is_token(shown, parsed[1], row)
-            if good and self._tokens.usable_row(row.id) is not None:  # it may have ended meanwhile
+            if good and self._tokens.usable_row(row.id) is not None:  # it may have ended since
                 return row
         raise UnprovenError("no token that can be used was shown")
 
@@ -114,14 +115,14 @@ class Askers:
             text = f"a bare token changes nothing here (api_require_proof): sign the order ({HEADER})"
             raise UnprovenError(text, row.name)
         try:
-            order = meant(asked, made.request)
+            order = filled_in(meant(asked), made.request)
         except NoOrderError as error:
             raise UnprovenError(f"not what was asked: {error}", row.name, Severity.ALARM) from None
         if order != made.request:
             text = f"{asked.method} {asked.target[:200]} does not mean this order"
             raise UnprovenError(text, row.name, Severity.ALARM)
 
-    def _require_proof_of(self, asked: Asked, row: TokenRow) -> None:
+    def _require_proof_of(self, asked: ClientRequest, row: TokenRow) -> None:
         if row.keys is None:
             raise UnprovenError("this token is of a version without proofs: make another one", row.name)
         try:
@@ -142,8 +143,8 @@ class Askers:
 
 
 def _role_for(request: admin.RestRequest) -> TokenRole | None:
-    """The least role of a token that may ask this; None where no token is needed."""
-    if isinstance(request, admin.MonitorReload) and request.prune:
-        return "admin"  # removes what an admin loaded
+    """Return the least role whose token authorises this request; None if no token is needed."""
     operation = admin.operation_of(request)
-    return operation.role if operation is not None else "admin"
+    if operation is None or operation.role is None:
+        return None if operation is not None else "admin"
+    return operation.least(msgspec.structs.asdict(request))[0]

@@ -1,4 +1,4 @@
-"""The group `robot`: the machine the appliance is put next to, as it is seen from inside."""
+"""Find the addresses of the group `robot`: the machine beside the appliance, as seen from inside its isolation."""
 
 import ipaddress
 import socket
@@ -12,7 +12,7 @@ _ROUTES = Path("/proc/net/route")
 
 
 def robot_addresses(settings: Settings) -> list[Address]:
-    """Loopback with `isolation: none`; else the gateway of the default route."""
+    """Return loopback with `isolation: none`, else the gateway of the default route."""
     if settings.isolation == "none":
         return [ipaddress.ip_address("127.0.0.1"), ipaddress.ip_address("::1")]
     gateway = _default_gateway()
@@ -20,13 +20,13 @@ def robot_addresses(settings: Settings) -> list[Address]:
 
 
 def own_address(settings: Settings) -> str:
-    """The address at which the robot reaches the appliance when it listens on all of them."""
+    """Return the address at which the robot reaches the appliance if it listens on all addresses."""
     robots = robot_addresses(settings)
     return "127.0.0.1" if settings.isolation == "none" or not robots else _towards(robots[0])
 
 
 def master_address(settings: Settings) -> str:
-    """The same for nodes: without a default route, the address in the first network that is attached."""
+    """Return `own_address`; without a default route, the address in the first attached network, if any."""
     if settings.isolation != "none" and not robot_addresses(settings):
         for network, gateway in _routes():
             if int(network) and not int(gateway) and network not in settings.ipsec.pool:
@@ -35,9 +35,9 @@ def master_address(settings: Settings) -> str:
 
 
 def _towards(peer: Address) -> str:
-    """The address that packets to a peer leave with."""
+    """Return the source address of packets to a peer."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.connect((str(peer), 9))  # a datagram socket that connects sends nothing: it only picks a route
+        sock.connect((str(peer), 9))  # connecting a datagram socket only selects a route
         return str(sock.getsockname()[0])
 
 
@@ -46,7 +46,7 @@ def _default_gateway() -> Address | None:
 
 
 def _routes() -> list[tuple[ipaddress.IPv4Address, ipaddress.IPv4Address]]:
-    """Network and gateway of each route of the kernel."""
+    """Return network and gateway of each route in the kernel."""
 
     def address(field: str) -> ipaddress.IPv4Address:
         return ipaddress.IPv4Address(struct.pack("<I", int(field, 16)))

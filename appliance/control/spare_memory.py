@@ -1,8 +1,8 @@
-"""Memory that control has no use for any more goes back to the system.
+"""Return unused memory of control to the system.
 
-A large value is read and written in threads, and glibc keeps what it freed there for the thread that had it: up to
-64 MiB of each. Having every large block mapped by itself would give it back at once, but twice as slow: each page would
-be made anew for each copy. So it is given back a little later.
+Large values are read and written in threads, and glibc keeps up to 64 MiB of freed memory per thread. Mapping every
+large block separately would return the memory at once, but takes twice as long, because the pages are allocated again
+for each copy. So the memory is returned a little later.
 """
 
 import asyncio
@@ -16,21 +16,21 @@ MUCH = 32 << 20
 
 
 def resident() -> int:
-    """Bytes of memory that this process has."""
+    """Return the resident memory of this process in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def give_back() -> None:
-    """Give the system what the allocator keeps; other threads of Python run meanwhile."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's; another C library keeps less
+    """Return the allocator's free memory to the system; other Python threads run meanwhile."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # only glibc has it; other C libraries keep less
     if trim is not None:
         trim(0)
 
 
 class SpareMemory:
-    """Gives memory back while the process has `MUCH` more than the least it has had.
+    """A watcher that returns memory while the process has over `MUCH` bytes more than its minimum.
 
-    So it goes on where that much is in use: what comes free of it later is kept by the allocator until it is asked.
+    It repeats even if that memory is in use, because the allocator keeps memory that is freed later.
     """
 
     def __init__(
@@ -41,13 +41,13 @@ class SpareMemory:
         self._least = size()
 
     async def watch(self) -> None:
-        """Look every few seconds; runs until cancelled."""
+        """Check every few seconds; runs until cancelled."""
         while True:
             await asyncio.sleep(_LOOK_SECONDS)
             await self.look()
 
     async def look(self) -> None:
-        """Give back what is spare, if it may be much."""
+        """Return free memory if there may be more than `MUCH` bytes of it."""
         size = self._size()
         self._least = min(self._least, size)
         if size > self._least + MUCH:

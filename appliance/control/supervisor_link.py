@@ -1,4 +1,4 @@
-"""Control's end of its lifeline: what the supervisor tells it, and what it asks of the supervisor."""
+"""Exchange messages with the supervisor over control's lifeline."""
 
 import asyncio
 import socket
@@ -11,18 +11,18 @@ from appliance.channel import messages
 from appliance.channel.answers.status import FirewallState, ProcessInfo
 from appliance.channel.channel import Channel, ChannelClosedError
 
-ROUTES_AT_ONCE = 32  # strangers make control ask, and the supervisor takes only so many questions
+ROUTES_AT_ONCE = 32  # unknown hosts cause these queries, and the supervisor accepts a limited number
 
 Heard = Callable[[Any, tuple[int, ...]], None]
-"""Is given a message of the supervisor and the descriptors that came with it."""
+"""Handles a message of the supervisor and the descriptors that came with it."""
 
 _log = structlog.get_logger()
 
 
 class Surroundings:
-    """What the supervisor told control last; `probe` is empty before the first, then `passed` or the reason.
+    """The last reports of the supervisor; `probe` is empty before the first one, then `passed` or the reason.
 
-    `master` is where nodes find their master, as they are told; empty before control is ready.
+    `master` is the URI at which nodes find their master; empty before control is ready.
     """
 
     def __init__(self) -> None:
@@ -33,10 +33,9 @@ class Surroundings:
 
 
 class ControlLifeline:
-    """The lifeline. `stopping` is set at the end, `enclosed(answer)` hears whether tunnels are open. A start may wait
-    for the compiler: `compiler(channel)` is given each link to it at once.
-
-    What else is for other parts of control is handed to them, in order, from `hear` on.
+    """The lifeline. `stopping` is set when the supervisor stops control or is gone. `enclosed(answer)` is called when
+    the supervisor has opened or closed tunnels, and `compiler(channel)` at once for each link to the compiler, because
+    the start may wait for it. Other messages are passed on, in order, after `hear` was called.
     """
 
     def __init__(
@@ -53,44 +52,44 @@ class ControlLifeline:
         self.surroundings = Surroundings()
         self.sockets: dict[str, socket.socket] = {}
         self.restored = asyncio.Event()
-        # Whether whoever started the appliance knew what `Ready` said before this life
+        # Whether the caller that started the appliance already received `Ready` from an earlier control
         self.announced = False
-        self._routes: dict[str, list[asyncio.Future[str | None]]] = {}  # what is asked and not answered
+        self._routes: dict[str, list[asyncio.Future[str | None]]] = {}  # unanswered queries
         self._free_questions = asyncio.Semaphore(ROUTES_AT_ONCE)
         self._endpoints: list[asyncio.Future[messages.EndpointFound]] = []
         self._early: list[tuple[Any, tuple[int, ...]]] = []
         self._heard: Heard = lambda *said: self._early.append(said)
 
     def attach(self) -> None:
-        """Begin to listen; `restored` is set when all kept sockets are here."""
+        """Begin to receive messages; `restored` is set when all kept sockets have arrived."""
         self.channel.attach(asyncio.get_running_loop(), self._received, self._closed)
 
     def hear(self, heard: Heard) -> None:
-        """Hand out what came before control was ready for it, and from now on what comes."""
+        """Pass all earlier and all later messages to `heard`."""
         early, self._early, self._heard = self._early, [], heard
         for said in early:
             heard(*said)
 
     def say(self, message: messages.Message) -> None:
-        """Tell the supervisor something."""
+        """Send the supervisor a message."""
         self._send(message, ())
 
     def keep(self, name: str, sock: socket.socket) -> None:
-        """Have the supervisor keep a listening socket over our death."""
+        """Have the supervisor keep a listening socket, so that it survives a crash of control."""
         self._send(messages.SocketKept(name), (sock.fileno(),))
 
     def drop(self, name: str) -> None:
-        """A kept socket is needed no longer."""
+        """Have the supervisor drop a kept socket."""
         self.say(messages.SocketDropped(name))
 
     async def route_to(self, host: str) -> str | None:
-        """The machine's address that `host` reaches the appliance at; None: the one it used.
+        """Return the machine's address at which `host` reaches the appliance; None: the address that it used.
 
-        Asked once for all who wait for the same host, and for `ROUTES_AT_ONCE` hosts at once; others wait.
+        Concurrent calls for a host share one query. At most `ROUTES_AT_ONCE` queries are open; other calls wait.
         """
         if host not in self._routes:
             await self._free_questions.acquire()
-            if host in self._routes:  # somebody else has asked meanwhile
+            if host in self._routes:  # another call has sent the query meanwhile
                 self._free_questions.release()
             else:
                 self._routes[host] = []
@@ -100,7 +99,7 @@ class ControlLifeline:
         return await future
 
     async def endpoint(self) -> messages.EndpointFound:
-        """Where hosts of other networks reach the appliance, as the supervisor sees it now."""
+        """Return the address, found by the supervisor, at which hosts of other networks reach the appliance."""
         future: asyncio.Future[messages.EndpointFound] = asyncio.get_running_loop().create_future()
         self._endpoints.append(future)
         self.say(messages.EndpointWanted())
@@ -149,7 +148,7 @@ class ControlLifeline:
     def _answered(
         self, message: messages.TunnelsEnclosed | messages.EndpointFound | messages.RouteFound
     ) -> None:
-        """What control has asked for."""
+        """Pass an answer to the calls that wait for it."""
         match message:
             case messages.TunnelsEnclosed():
                 self._enclosed(message)

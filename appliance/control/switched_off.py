@@ -1,21 +1,20 @@
-"""What is switched off and should act: monitors that are disabled or in shadow mode, audit-only sections of the policy.
+"""List switched-off protection: monitors that are disabled or in shadow mode, audit-only sections of the policy.
 
-Each of them is easily forgotten. It is listed with its age, and when it was off for longer than `forgotten_after` it is
-recorded once, as an alarm. A monitor that comes back by itself counts only when its time is over and it is still off.
-Ages count the time for which the appliance runs: a clock that is set, or stands wrong after a start, ends no age.
+Switched-off protection is easily forgotten. It is listed with its age, and after `forgotten_after` it is recorded once,
+as an alarm. The age of a monitor that comes back automatically grows only if it is still off after that time. Ages
+count the time for which the appliance runs, so they do not depend on the system clock.
 """
 
 import asyncio
 import time
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
 
 import msgspec
 
 from appliance.channel.answers.status import SwitchedOff
 from appliance.control.policies import Policies
 from appliance.policy.sections import DECIDERS
-from appliance.specifications.specifications import Monitors
+from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -23,46 +22,38 @@ _SETTING = "switched off"
 _LOOK_SECONDS = 60.0
 
 
-class Off(NamedTuple):
-    """Something that does not act; `name` is the monitor's or section's, `what` a sentence without its end."""
-
-    about: Literal["monitors", "policy"]
-    name: str
-    what: str
-    again: str
-    """What brings it back."""
-    until: float | None = None
-
-
 class _Age(msgspec.Struct):
-    """`since` is seconds since the epoch, `seconds` for how long the appliance ran since; `told`: it was recorded."""
+    """An age: its begin in seconds since the epoch, the running time since then, and whether it was recorded."""
 
     since: float
     seconds: float = 0.0
     told: bool = False
 
 
-def off_now(monitors: Monitors, policies: Policies) -> Iterator[Off]:
-    """Everything that an operator switched off."""
+def off_now(monitors: SpecificationManager, policies: Policies) -> Iterator[SwitchedOff]:
+    """Yield all switched-off protection, with the present time as its begin."""
+    now = time.time()
     for name, to in monitors.switches.switched_off().items():
         if to is False:
             again, until = f"rosrv monitor enable {name}", monitors.returns.until(name)
-            yield Off("monitors", name, f"monitor {name} is disabled", again, until)
+            yield SwitchedOff("monitors", name, f"monitor {name} is disabled", again, now, until, False)
         else:
-            yield Off("monitors", name, f"monitor {name} is in shadow mode", f"rosrv monitor promote {name}")
+            what, again = f"monitor {name} is in shadow mode", f"rosrv monitor promote {name}"
+            yield SwitchedOff("monitors", name, what, again, now, None, False)
     policy = policies.current
     for decider in DECIDERS:
         if policy.audit_only(decider.categories[0]):
             what = f"section [{decider.name}] of the policy is audit-only"
-            yield Off("policy", decider.name, what, "take `audit-only` out of the policy, and load it")
+            again = "take `audit-only` out of the policy, and load it"
+            yield SwitchedOff("policy", decider.name, what, again, now, None, False)
 
 
 class SwitchedOffWatch:
-    """Keeps the ages over restarts."""
+    """The ages of switched-off protection, which survive restarts."""
 
     def __init__(
         self,
-        monitors: Monitors,
+        monitors: SpecificationManager,
         policies: Policies,
         store: StateStore,
         trail: AuditTrail,
@@ -74,30 +65,23 @@ class SwitchedOffWatch:
         self._ages = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=dict[str, _Age])
 
     def rows(self) -> list[SwitchedOff]:
-        """Everything that is off now."""
+        """Return all protection that is switched off now."""
         self._look(0.0)
         return [
-            SwitchedOff(
-                off.about,
-                off.name,
-                off.what,
-                off.again,
-                self._ages[off.what].since,
-                off.until,
-                self._ages[off.what].told,
-            )
+            msgspec.structs.replace(off, since=age.since, forgotten=age.told)
             for off in off_now(self._monitors, self._policies)
+            for age in [self._ages[off.what]]
         ]
 
     async def watch(self) -> None:
-        """Look each minute."""
+        """Check every minute."""
         while True:
             before = time.monotonic()
             await asyncio.sleep(_LOOK_SECONDS)
             self.look(time.monotonic() - before)
 
     def look(self, seconds: float) -> None:
-        """So many seconds have passed: record what was forgotten."""
+        """Add `seconds` to the ages, and record protection that was forgotten."""
         self._look(seconds)
         if self._ages:
             self._save()
@@ -116,11 +100,10 @@ class SwitchedOffWatch:
             )
 
     def _look(self, seconds: float) -> None:
-        """Begin the ages of what is off since, end those of what is not, and let the others grow."""
+        """Begin new ages, end those of restored protection, and add `seconds` to all ages that grow."""
         off = {one.what: one for one in off_now(self._monitors, self._policies)}
         if off.keys() != self._ages.keys():
-            now = time.time()
-            self._ages = {what: self._ages.get(what) or _Age(now) for what in off}
+            self._ages = {what: self._ages.get(what) or _Age(one.since) for what, one in off.items()}
             self._save()
         for what, one in off.items():
             if one.until is None or one.until + _LOOK_SECONDS < time.time():

@@ -1,7 +1,6 @@
-"""The access tokens of REST: made, listed and revoked here, and nowhere else.
+"""Make, list and revoke the access tokens of REST.
 
-The api is told what it needs to recognise a token (never the secret). Every token that is made or revoked is
-recorded. What operators ask is answered by the method that takes it.
+The api gets data to recognise a token, but never the secret. Every creation and revocation of a token is recorded.
 """
 
 import time
@@ -17,18 +16,18 @@ from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
 
 FIRST_NAME = "first"
-_UNTOLD = "first token untold"  # the setting that says that nobody may know it yet
+_UNTOLD = "first token untold"  # the setting while the first token was not shown yet
 DEFAULT_SECONDS = 90 * 86_400.0
 LONGEST_SECONDS = 3650 * 86_400.0
 _MOST = 1000
 
 
 class TokenRefusedError(Exception):
-    """The token cannot be made or revoked; the text says why."""
+    """The token cannot be made or revoked; the message has the reason."""
 
 
-class Tokens:
-    """All tokens. `changed()` is called when what may be used has changed."""
+class TokenOrders:
+    """All tokens. `changed()` is called when the usable tokens have changed."""
 
     def __init__(self, store: StateStore, trail: AuditTrail, changed: Callable[[], None]) -> None:
         self._store = store
@@ -37,12 +36,13 @@ class Tokens:
         self._untold = bool(store.settings().get(_UNTOLD))
         self._changed = changed
 
+    @admin.answers(admin.TokenList)
     async def listed(self, _request: admin.TokenList) -> answers.Tokens:
-        """Every token that was made, the oldest first."""
+        """Return all tokens, also ended ones, oldest first."""
         return answers.Tokens([answers.Token(*_fields(row)) for row in self._rows.values()])
 
     def usable(self) -> list[TokenKept]:
-        """What the api recognises tokens by; it looks at `expires` itself."""
+        """Return the data by which the api recognises tokens; it checks `expires` itself."""
         now = time.time()
         return [
             TokenKept(
@@ -59,12 +59,12 @@ class Tokens:
         ]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
-        """The token with this id, if it can be used now."""
+        """Return the token with this id, if it is usable now."""
         row = self._rows.get(token_id)
         return row if row is not None and row.usable(time.time()) else None
 
     async def first(self) -> str | None:
-        """The text of the first token, if there never was one; of another, if nobody was told that one (`told`)."""
+        """Return the text of a new first token if no token exists, or if the first one was never shown (`told`)."""
         if self._rows and not self._untold:
             return None
         self._untold = True
@@ -74,13 +74,14 @@ class Tokens:
         return (await self.add(admin.TokenAdd(FIRST_NAME, "admin", DEFAULT_SECONDS))).token
 
     def told(self) -> None:
-        """Whoever started the appliance has the first token."""
+        """Note that the first token was shown to the person who started the appliance."""
         if self._untold:
             self._untold = False
             self._store.save_setting(_UNTOLD, "")
 
+    @admin.answers(admin.TokenAdd)
     async def add(self, request: admin.TokenAdd) -> answers.NewToken:
-        """Make a token; its text is given here and never again. Raises `TokenRefusedError`, `StoreError`."""
+        """Make a token; only the answer has its text. Raises `TokenRefusedError` and `StoreError`."""
         name, seconds, now = request.name, request.seconds, time.time()
         if not 0 < seconds <= LONGEST_SECONDS:
             raise TokenRefusedError(f"a token ends after at most {LONGEST_SECONDS / 86_400:.0f} days")
@@ -104,13 +105,14 @@ class Tokens:
         )
         try:
             await self._store.settled()
-        except StoreError:  # nobody is told its text: it is not to stand in the way of the next of its name
+        except StoreError:  # the text was not shown: the token must not block its name
             self._end(row)
             raise
         return answers.NewToken(*_fields(row), token=text)
 
+    @admin.answers(admin.TokenRevoke)
     async def revoke(self, request: admin.TokenRevoke) -> answers.Token:
-        """End a token now. Raises `TokenRefusedError`."""
+        """End a token now. Raises `TokenRefusedError` and `StoreError`."""
         name, now = request.name, time.time()
         row = self._named(name, now)
         if row is None:

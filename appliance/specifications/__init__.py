@@ -1,1 +1,1 @@
-"""The specifications of monitors in force: checked, kept, given to the relays."""
+"""The specifications in force: compiled, stored, sent to the relays."""

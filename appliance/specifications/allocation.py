@@ -1,16 +1,15 @@
-"""Which relay process carries which topic and service, and has which file of specifications.
+"""The relay process of each topic, service and file of specifications.
 
-Files whose specifications share topics, services or variables, or publish onto each other's topics, are a *group* and
-stay together with everything they touch, so that every message meets all its monitors in one process. A topic or
-service without a specification goes by its name.
+Files whose specifications share topics, services or variables, or publish on each other's topics, are a *group*. A
+group and everything it uses are on one relay, so every message meets all its monitors there. The relay of a topic or
+service without a specification depends on its name.
 
 Invariants:
 
 1. A topic (a service) is carried by exactly one relay at any time, for all its publishers.
-2. What is carried stays where it is for as long as it can: a plan moves as few running monitors as possible, then as
-   few topics and services that are carried now. Only then loads are evened out.
-3. In one plan no relay both gives up and gets monitored topics: one that gets some has their monitors before it carries
-   them, and one that gives some up keeps their monitors until it carries them no longer.
+2. A plan moves as few running monitors as possible, then as few carried topics and services, and then balances loads.
+3. In a plan no relay both gives up and gets monitored topics: a relay has the monitors before it carries the topics,
+   and keeps them until it carries them no longer.
 4. The allocation survives the death of control, as connections in the relays do.
 """
 
@@ -20,7 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from appliance.specifications.specification_files import Checked
+from appliance.specifications.specification_files import CheckedSpecifications
 
 TOPIC, SERVICE = "topic", "service"
 Resource = tuple[str, str]
@@ -28,21 +27,21 @@ Resource = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
-    """Files that stay together, with how many specifications each has, and what they touch."""
+class FileGroup:
+    """Files that stay together, the number of specifications in each, and what they use."""
 
     files: Mapping[str, int]
     resources: frozenset[Resource]
 
     @property
     def specifications(self) -> int:
-        """How many monitors there are."""
+        """Return the number of monitors."""
         return sum(self.files.values())
 
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A topic or service that is carried now, from one relay to another."""
+    """A carried topic or service that moves to another relay."""
 
     kind: str
     name: str
@@ -51,43 +50,43 @@ class Move:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """An allocation that can be adopted: files and resources by relay, what moves, and the monitors that move."""
+class AllocationPlan:
+    """A possible allocation: files and resources by relay, what moves, and the monitors that move."""
 
     files: Mapping[str, int] = field(default_factory=dict)
     resources: Mapping[Resource, int] = field(default_factory=dict)
     moves: tuple[Move, ...] = ()
     moved_files: frozenset[str] = frozenset()
     losing: frozenset[int] = frozenset()
-    """Relays that give up monitors, or topics and services that may have had some."""
+    """Relays that give up monitors, or topics and services that may have had monitors."""
 
 
 class Allocation:
-    """The allocation in force over so many relays; `save(text)` keeps it."""
+    """The allocation in force over `relays` relays; `save(text)` stores it."""
 
     def __init__(self, relays: int, save: Callable[[str], None] = lambda _text: None) -> None:
         self.relays = relays
         self._save = save
-        self._plan = Plan()
+        self._plan = AllocationPlan()
 
     def of(self, kind: str, name: str) -> int:
-        """The relay of a topic or service."""
+        """Return the relay of a topic or service."""
         return self._of(self._plan.resources, (kind, name))
 
     def of_file(self, file: str) -> int:
-        """The relay that has a file of specifications."""
+        """Return the relay of a file of specifications."""
         return self._plan.files.get(file, 0)
 
     @property
     def resources(self) -> set[Resource]:
-        """The topics and services that have a place of their own, not by their name."""
+        """Return the topics and services that are placed explicitly, and not by their name."""
         return set(self._plan.resources)
 
     def restore(self, text: str) -> bool:
-        """Take the allocation that was kept; False if it is of another number of relays, or unreadable."""
+        """Restore a stored allocation; return False if it is unreadable or has another number of relays."""
         try:
             kept = json.loads(text)
-            plan = Plan(
+            plan = AllocationPlan(
                 {str(name): int(relay) for name, relay in kept["files"]},
                 {(str(kind), str(name)): int(relay) for kind, name, relay in kept["resources"]},
             )
@@ -98,8 +97,8 @@ class Allocation:
         self._plan = plan
         return True
 
-    def plan(self, checked: Checked, carried: Collection[Resource] = ()) -> Plan:
-        """The allocation for these specifications, while these topics and services are carried."""
+    def plan(self, checked: CheckedSpecifications, carried: Collection[Resource] = ()) -> AllocationPlan:
+        """Plan the allocation for these specifications, while these topics and services are carried."""
         carried = set(carried)
         groups = groups_of(checked)
         homes = self._homes(groups, carried)
@@ -110,8 +109,8 @@ class Allocation:
             plan = self._planned(groups, homes, carried)
         return plan
 
-    def _homes(self, groups: Sequence[Group], carried: Collection[Resource]) -> list[int]:
-        """For each group the relay where it costs least."""
+    def _homes(self, groups: Sequence[FileGroup], carried: Collection[Resource]) -> list[int]:
+        """Return the cheapest relay for each group."""
         homes: list[int] = []
         loads = [0] * self.relays
         for group in groups:
@@ -123,9 +122,9 @@ class Allocation:
         return homes
 
     def _one_way(
-        self, groups: Sequence[Group], homes: Sequence[int], carried: Collection[Resource]
+        self, groups: Sequence[FileGroup], homes: Sequence[int], carried: Collection[Resource]
     ) -> list[int]:
-        """The same, but all groups for which something moves are on one relay: nothing leaves it."""
+        """Return the relays with all moving groups on one relay, so that nothing leaves it."""
         moving = [
             self._cost(group, home, carried) != (0, 0) for group, home in zip(groups, homes, strict=True)
         ]
@@ -141,15 +140,17 @@ class Allocation:
         target = min(range(self.relays), key=cost)
         return [target if moves else home for moves, home in zip(moving, homes, strict=True)]
 
-    def _planned(self, groups: Sequence[Group], homes: Sequence[int], carried: set[Resource]) -> Plan:
-        """The plan with these groups on these relays."""
+    def _planned(
+        self, groups: Sequence[FileGroup], homes: Sequence[int], carried: set[Resource]
+    ) -> AllocationPlan:
+        """Return the plan with these groups on these relays."""
         before = self._plan
         files: dict[str, int] = {}
         resources: dict[Resource, int] = {}
         for group, relay in zip(groups, homes, strict=True):
             files.update(dict.fromkeys(group.files, relay))
             resources.update(dict.fromkeys(group.resources, relay))
-        for resource in carried:  # what no specification touches stays where it is
+        for resource in carried:  # resources that no specification touches stay
             here = self._of(before.resources, resource)
             if resource not in resources and here != self._by_name(resource):
                 resources[resource] = here
@@ -161,10 +162,10 @@ class Allocation:
         moved = frozenset(name for name, relay in files.items() if before.files.get(name, relay) != relay)
         losing = {before.files[name] for name in moved}
         losing |= {move.source for move in moves if (move.kind, move.name) in before.resources}
-        return Plan(files, resources, moves, moved, frozenset(losing))
+        return AllocationPlan(files, resources, moves, moved, frozenset(losing))
 
-    def adopt(self, plan: Plan) -> None:
-        """This is the allocation from now on."""
+    def adopt(self, plan: AllocationPlan) -> None:
+        """Put a plan into force and store it."""
         self._plan = plan
         kept = {
             "relays": self.relays,
@@ -173,8 +174,8 @@ class Allocation:
         }
         self._save(json.dumps(kept))
 
-    def _cost(self, group: Group, relay: int, carried: Collection[Resource]) -> tuple[int, int]:
-        """The monitors, and the carried topics and services, that would have to move there."""
+    def _cost(self, group: FileGroup, relay: int, carried: Collection[Resource]) -> tuple[int, int]:
+        """Return how many monitors, and how many carried topics and services, would move to a relay."""
         here = self._plan.files
         return sum(count for name, count in group.files.items() if here.get(name, relay) != relay), sum(
             resource in carried and self._of(self._plan.resources, resource) != relay
@@ -189,8 +190,8 @@ class Allocation:
         return zlib.crc32(resource[1].encode()) % self.relays
 
 
-def groups_of(checked: Checked) -> list[Group]:
-    """The groups, the largest first; in the order of their files' names where they are as large."""
+def groups_of(checked: CheckedSpecifications) -> list[FileGroup]:
+    """Return the groups, the largest first; equally large ones in the order of their files' names."""
     touched: dict[str, set[Resource]] = {file: set() for file in checked.monitors.values()}
     for name, file in checked.monitors.items():
         touched[file] |= {(TOPIC, topic) for topic in checked.topics[name]}
@@ -199,7 +200,7 @@ def groups_of(checked: Checked) -> list[Group]:
         touched[file] |= {(TOPIC, topic) for topic in topics}
     counts = Counter(checked.monitors.values())
     groups = [
-        Group(
+        FileGroup(
             {file: counts[file] for file in files},
             frozenset(resource for file in files for resource in touched[file]),
         )
@@ -208,8 +209,8 @@ def groups_of(checked: Checked) -> list[Group]:
     return sorted(groups, key=lambda group: (-group.specifications, sorted(group.files)))
 
 
-def _join(touched: Mapping[str, Iterable[Resource]], checked: Checked) -> list[set[str]]:
-    """Files that are connected by a topic, a service or a variable, however indirectly."""
+def _join(touched: Mapping[str, Iterable[Resource]], checked: CheckedSpecifications) -> list[set[str]]:
+    """Return the sets of files that a topic, a service or a variable connects, also indirectly."""
     group = {file: {file} for file in touched}
 
     def join(one: str, other: str) -> None:

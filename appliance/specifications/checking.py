@@ -1,11 +1,11 @@
-"""Specifications compiled as a whole: in the process `compiler` for control, and where `check` is called."""
+"""Compile whole sets of specifications: for control in the process `compiler`, by `check` in the caller's process."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
 
 from appliance.channel.messages import Contents, PartNames
 from appliance.specifications.specification_files import (
-    Checked,
+    CheckedSpecifications,
     Sources,
     SpecificationsRefusedError,
     checked,
@@ -25,22 +25,22 @@ from roswire.standard import standard_definitions
 _LONGEST = 32 << 20  # bytes: half of what a channel takes
 
 
-def check(sources: Sources, site_keys: Sequence[str]) -> Checked:
-    """Compile everything here. Raises `SpecificationsRefusedError` with all that is wrong; takes a moment.
+def check(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+    """Compile everything in this process. Raises `SpecificationsRefusedError` with all errors.
 
-    Where there are `site_keys`, each text must be signed with one of them.
+    With `site_keys`, each text must be signed with one of them.
     """
     if not sources.files:
-        return Checked()
+        return CheckedSpecifications()
     require_bounded(sources)
     return checked(contents(sources.files, sources.definitions), sources, site_keys)
 
 
 def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
-    """What is in these files, with these definitions. Raises `SpecificationsRefusedError` with all that is wrong."""
+    """Compile these files with these definitions. Raises `SpecificationsRefusedError` with all errors."""
     try:
         definitions = _standard().extended(Definitions.from_files(texts))
-        monitors = MonitorSet.of(compiled_from(files, definitions, margins=True))
+        monitors = MonitorSet.of(compiled_from(files, definitions))
     except SpecificationError as error:
         raise SpecificationsRefusedError([str(finding) for finding in error.findings]) from error
     except DefinitionError as error:
@@ -89,17 +89,17 @@ def _places(monitors: MonitorSet) -> dict[str, str]:
 
 
 def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
-    """What each of these relays runs of a set (`Contents.compiled`). Raises `SpecificationsRefusedError`."""
+    """Return the parts of a set (`Contents.compiled`) that these relays run. Raises `SpecificationsRefusedError`."""
     whole = decoded(compiled)
     try:
-        return [_bounded(encoded_part(part_of(whole, names.monitors, names.trials))) for names in wanted]
+        return [_bounded(encoded_part(part_of(whole, names.monitors, names.shadows))) for names in wanted]
     except StepDiffersError as error:
         text = f"the code of a step is not what its automaton says: {error}; {DEFECT}"
         raise SpecificationsRefusedError([text]) from error
 
 
 def _bounded(data: bytes) -> bytes:
-    """What travels to control and to relays. Raises `SpecificationsRefusedError`."""
+    """Return the data if a channel can carry it. Raises `SpecificationsRefusedError`."""
     if len(data) > _LONGEST:
         text = f"compiled, they take {len(data) >> 20} MiB; {_LONGEST >> 20} are allowed: load fewer of them"
         raise SpecificationsRefusedError([text])

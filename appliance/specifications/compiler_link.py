@@ -1,9 +1,9 @@
-"""Control's end of the link to the compiler: the process that reads specifications, which control does not.
+"""Control's link to the compiler process, which parses specifications for it.
 
-It is asked for when there is something to be read, and ends by itself when there is no more. What is too much for it
-ends it, and is refused: the specifications in force stay.
+The process is started on demand and ends when it is idle. Specifications that exceed its limits end it and are refused;
+those in force stay.
 
-Orders come before dry runs: a dry run begins while no order is being compiled, one at a time, and an order ends it.
+Orders precede dry runs: one dry run at a time begins while no order is compiled, and an order ends it.
 """
 
 import asyncio
@@ -16,25 +16,25 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.link import Link
 from appliance.specifications.specification_files import (
-    Checked,
+    CheckedSpecifications,
     Sources,
     SpecificationsRefusedError,
     checked,
     require_bounded,
 )
 
-_START_SECONDS = 60.0  # of a machine that has much else to start
-_WORK_SECONDS = 180.0  # of a machine that does much else; the compiler bounds its processor time
-_LOOK_SECONDS = 1.0  # between two looks whether the client of the order still waits
+_START_SECONDS = 60.0  # on a machine that is busy starting
+_WORK_SECONDS = 180.0  # on a busy machine; the compiler bounds its processor time
+_LOOK_SECONDS = 1.0  # between two checks whether the client of the order still waits
 _ENDED = (
     "the compiler ended while it read them, maybe of the memory or time that they take; the log says more"
 )
 _ENDED_BY_ORDER = "the dry run was ended, because an order needed the compiler: try again"
-_TRIES = 2  # one that is asked may just have ended because nobody had asked it
+_TRIES = 2  # an idle compiler may end just when it is asked
 
 
 class SpecificationCompiler:
-    """`wanted()` has the process started."""
+    """Control's end of the link; `wanted()` has the compiler process started."""
 
     def __init__(self, wanted: Callable[[], None]) -> None:
         self._wanted = wanted
@@ -48,22 +48,22 @@ class SpecificationCompiler:
         self._dry_run = False  # whether one is being compiled
 
     def call(self) -> None:
-        """Have it come, for there is going to be something to read."""
+        """Start the compiler, because there will soon be something to compile."""
         if self._link.channel is None and not self._called:
             self._there.clear()
             self._called = True
             self._wanted()
 
     def attach(self, channel: Channel) -> None:
-        """It is there."""
+        """Use the compiler process that has started."""
         self._link.attach(channel)
         self._called = False
         self._there.set()
 
-    async def check(self, sources: Sources, site_keys: Sequence[str]) -> Checked:
-        """As `checking.check`. Raises `SpecificationsRefusedError`, also when the compiler does not answer."""
+    async def check(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+        """Compile for an order. Raises `SpecificationsRefusedError`, also when the compiler does not answer."""
         if not sources.files:
-            return Checked()
+            return CheckedSpecifications()
         require_bounded(sources)
         with self._order():
             answer = await self._asked(
@@ -71,10 +71,10 @@ class SpecificationCompiler:
             )
         return checked(answer.contents, sources, site_keys)
 
-    async def try_out(self, sources: Sources, site_keys: Sequence[str]) -> Checked:
+    async def try_out(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
         """Compile for a dry run. Raises as `check`, also when an order ended it."""
         if not sources.files:
-            return Checked()
+            return CheckedSpecifications()
         require_bounded(sources)
         async with self._one_dry_run:
             await self._no_order.wait()
@@ -91,7 +91,7 @@ class SpecificationCompiler:
         return checked(answer.contents, sources, site_keys)
 
     async def parts(self, compiled: bytes, wanted: list[messages.PartNames]) -> list[bytes]:
-        """As `checking.parts`. Raises `SpecificationsRefusedError`, also when the compiler does not answer."""
+        """Compile the parts of relays. Raises `SpecificationsRefusedError`, also when the compiler does not answer."""
         with self._order():
             answer: messages.PartsMade = await self._asked(
                 lambda number: messages.PartsWanted(number, compiled, wanted)
@@ -100,7 +100,7 @@ class SpecificationCompiler:
 
     @contextlib.contextmanager
     def _order(self) -> Iterator[None]:
-        """An order is being compiled: end a dry run, and let none begin."""
+        """End a dry run, and let no other begin while an order is compiled."""
         self._orders += 1
         self._no_order.clear()
         if self._dry_run:
@@ -115,7 +115,7 @@ class SpecificationCompiler:
     async def _asked(
         self, question: Callable[[int], messages.Message], *, goes_on: Callable[[], bool] = lambda: True
     ) -> Any:
-        """Return the answer; another compiler is asked if this one had just ended, while `goes_on()`."""
+        """Return the answer, while `goes_on()`; if the compiler has just ended, ask the next one."""
         for _ in range(_TRIES):
             try:
                 self.call()
@@ -139,7 +139,7 @@ class SpecificationCompiler:
         raise SpecificationsRefusedError([_ENDED])
 
     async def _answer(self, question: Callable[[int], messages.Message]) -> Any:
-        """Ask, and end the compiler when the order is withdrawn meanwhile. Raises as `Link.ask`."""
+        """Ask, and end the compiler if the order is withdrawn meanwhile. Raises as `Link.ask`."""
         asking = asyncio.ensure_future(self._link.ask(question, _WORK_SECONDS))
         try:
             while not (await asyncio.wait((asking,), timeout=_LOOK_SECONDS))[0]:

@@ -1,23 +1,30 @@
-"""What specifications would mean for the topics that are published now. No I/O.
+"""Compare specifications with the topics that are published now. No I/O.
 
-A specification that gives a topic another type than its publisher has cuts that topic: the relay cannot read the
-messages, and carries none. A topic that no node publishes may be a name with a wrong letter. Both are found before the
-specifications come into force, for what a change adds: what is in force already is not judged again.
+A specification with another type than the publisher's would cut the topic, since the relay cannot read its messages. A
+topic that no node publishes may be misspelled. A change is checked for both before it comes into force.
 """
 
 from collections.abc import Collection, Iterable, Mapping
 from typing import NamedTuple
 
 from appliance.base.validation_messages import meant
-from appliance.specifications.specification_files import Checked
+from appliance.specifications.specification_files import CheckedSpecifications
 
-Published = Mapping[str, Mapping[str, str]]
-"""Which nodes publish a topic, each with the type that it registered."""
+
+class LiveType(NamedTuple):
+    """The type that a node registered, and the md5sum in its header; empty if no relay has seen the header."""
+
+    name: str
+    md5sum: str = ""
+
+
+Published = Mapping[str, Mapping[str, LiveType]]
+"""The nodes that publish a topic, and the type that each publishes."""
 
 _ANY = "*"
 
 
-class Judged(NamedTuple):
+class TopicFindings(NamedTuple):
     """`conflicts` are topics that would be cut, `warnings` the rest; both as `file:line:column: severity: text`."""
 
     conflicts: list[str]
@@ -25,20 +32,20 @@ class Judged(NamedTuple):
 
 
 def judge_topics(
-    coming: Checked,
-    present: Checked,
+    coming: CheckedSpecifications,
+    present: CheckedSpecifications,
     published: Published,
     *,
     shadow: Collection[str],
     forced: bool,
     promoted: Collection[str] = (),
-) -> Judged:
+) -> TopicFindings:
     """Compare topics that specifications add, or give another type, with what nodes publish.
 
-    Monitors in `shadow` mode cut nothing: they are not given messages that they cannot read. `forced`: conflicts are
+    Monitors in `shadow` mode cut nothing: they do not get messages that they cannot read. With `forced`, conflicts are
     warnings. Monitors that are `promoted` from shadow mode are judged again.
     """
-    found = Judged([], [])
+    found = TopicFindings([], [])
     acting = [name for name in coming.monitors if name not in shadow]
     heard, known, read = (
         _heard(coming, coming.monitors),
@@ -48,13 +55,13 @@ def judge_topics(
     again = _heard(coming, promoted)
     sent = {topic for name in acting for topic in coming.published_by.get(coming.monitors[name], frozenset())}
     for topic in sorted(heard | coming.publications.keys()):
-        place, ours = coming.places[topic], coming.types[topic]
-        if present.types.get(topic) != ours or topic in again:
+        place, ours = coming.places[topic], LiveType(coming.types[topic], coming.md5sum(topic))
+        if LiveType(present.types.get(topic, ""), present.md5sum(topic)) != ours or topic in again:
             consequence = _CUT if topic in read else _MIXED if topic in sent else _UNREAD
             error = consequence is not _UNREAD and not forced
             for node, theirs in published.get(topic, {}).items():
-                if theirs not in (_ANY, ours):
-                    text = f"{node} publishes {topic} as {theirs}, not as {ours}: {consequence}"
+                if difference := _difference(theirs, ours):
+                    text = f"{node} publishes {topic} as {difference}: {consequence}"
                     (found.conflicts if error else found.warnings).append(
                         f"{place}: {'error' if error else 'warning'}: {text}"
                     )
@@ -70,6 +77,18 @@ _MIXED = f"subscribers would get messages of two types; {_FORCE}"
 _UNREAD = "monitors in shadow mode are not given its messages"
 
 
-def _heard(checked: Checked, names: Iterable[str]) -> set[str]:
-    """The topics that these monitors have events on."""
+def _difference(theirs: LiveType, ours: LiveType) -> str:
+    """Return how the types differ, or an empty string. As in ROS, `*` fits all, and the md5sum decides."""
+    if theirs.name not in (_ANY, ours.name):
+        return f"{theirs.name}, not as {ours.name}"
+    if {theirs.md5sum, ours.md5sum} & {"", _ANY} or theirs.md5sum == ours.md5sum:
+        return ""
+    return f"{ours.name} with md5sum {theirs.md5sum}, not {ours.md5sum} ({_DEFINITION})"
+
+
+_DEFINITION = "give the specifications the robot's definition: msg/ beside them"
+
+
+def _heard(checked: CheckedSpecifications, names: Iterable[str]) -> set[str]:
+    """Return the topics that these monitors have events on."""
     return {topic for name in names for topic in checked.topics[name]}

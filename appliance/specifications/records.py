@@ -1,4 +1,4 @@
-"""What monitors did, as the relay reports it: audit records, and counts for the metrics."""
+"""Audit records and counts of the relays' reports about monitors."""
 
 import datetime
 from collections import Counter
@@ -18,7 +18,7 @@ _EVENTS = {
     "log": ("monitor log", Severity.INFO),
     "publish": ("monitor published", Severity.INFO),
 }
-_TRIED = {f"trial {kind}": kind for kind in (*_EVENTS, "missed")}
+_SHADOW_KINDS = {f"shadow {kind}": kind for kind in (*_EVENTS, "missed")}
 _NOT_DONE = ("drop", "change", "publish")
 KINDS = tuple(_EVENTS)
 _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severity.ALARM}
@@ -26,11 +26,11 @@ _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severit
 
 @dataclass(frozen=True, slots=True)
 class MonitorRecords:
-    """Makes records of reports; `fields(topic, data)` reads a message.
+    """The maker of records from reports; `fields(topic, data)` reads a message.
 
-    `counts` has how often each kind happened, by monitor: a change that several made, for each of them. `at` has how
-    often messages of a topic were dropped or changed. What monitors on trial would have done are kinds of their own.
-    Each of `told` hears of every event.
+    `counts` has the number of events of each kind, by monitor; a change by several monitors counts for each. `at` has
+    the number of dropped or changed messages of each topic. Actions that monitors in shadow mode would have taken are
+    kinds of their own. Each of `told` is called for every event.
     """
 
     trail: AuditTrail
@@ -40,7 +40,7 @@ class MonitorRecords:
     at: Counter[tuple[str, str]] = field(default_factory=Counter, init=False)
 
     def reported(self, events: list[MonitorEvent], lost: int) -> None:
-        """A batch of the relay."""
+        """Record a batch of a relay's events."""
         for event in events:
             for monitor in _monitors(event):
                 self.counts[event.kind, monitor] += event.count or 1
@@ -56,10 +56,10 @@ class MonitorRecords:
     def _record(self, event: MonitorEvent) -> None:
         name, severity = _EVENTS.get(event.kind, ("monitor log", Severity.INFO))
         detail: dict[str, Any] = {"monitor": event.monitor}
-        tried = _TRIED.get(event.kind)
-        if tried is not None:
-            name, severity = "trial observed", Severity.INFO
-            detail |= {"trial": True, "would": tried}
+        shadowed = _SHADOW_KINDS.get(event.kind)
+        if shadowed is not None:
+            name, severity = "shadow observed", Severity.INFO
+            detail |= {"shadow": True, "would": shadowed}
         detail["happened"] = datetime.datetime.fromtimestamp(event.time / 1e9, datetime.UTC).isoformat()
         if event.kind == "log":
             severity = _LEVELS.get(str(event.detail.get("level")), severity)
@@ -75,8 +75,8 @@ class MonitorRecords:
         if event.count:
             detail["count"] = event.count
             text = f"{event.count} more in the same second" + (f": {text}" if text else "")
-        if tried is not None:
-            text = f"on trial, not done: {text}" if tried in _NOT_DONE else f"on trial: {text}"
+        if shadowed is not None:
+            text = f"in shadow mode, not done: {text}" if shadowed in _NOT_DONE else f"in shadow mode: {text}"
         self.trail.happened(
             name,
             text,
@@ -91,6 +91,6 @@ class MonitorRecords:
 
 
 def _monitors(event: MonitorEvent) -> set[str]:
-    """The monitors that did it."""
+    """Return the monitors of an event."""
     together = event.detail.get("changed_by", ())
     return {event.monitor, *(str(other).partition(".")[0] for other in together)}

@@ -1,34 +1,57 @@
-"""Has the relays take the specifications: each those files that are its own, all of them or none.
+"""Have all relays take new specifications, each its own files, or none.
 
-A load is tried first: every relay that gives nothing up is told what it is to have, before anything is carried
-elsewhere; so is one that comes meanwhile. When all have taken it, what moves is withdrawn where it was, the allocation
-changes, and it is placed where its monitors are now: no message goes past its monitors. Those that give something up
-are told then; a load is over when they have said so (`all_taken`). A monitor whose file moves loses its state, which is
-with the relay that it was on: what acts by a state holds its topics then.
+First, relays that give nothing up get their new specifications. When all have taken them, topics that move are
+withdrawn from their relay, the allocation changes, and they are placed on the relay that has their monitors: no message
+bypasses its monitors. Then the relays that gave something up get their specifications; the load is complete when these
+have answered (`all_taken`). A monitor whose file moves loses its state, which stays with the former relay; if its
+actions depend on its state, it holds its topics.
 """
 
 import asyncio
 import itertools
 import time
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Protocol
 
 from appliance.audit.record import Severity
-from appliance.base.withdrawal import take_effect
+from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import messages
-from appliance.specifications.allocation import Allocation, Plan
-from appliance.specifications.relay_needs import Relays
-from appliance.specifications.specification_files import Checked, Sources, SpecificationsRefusedError
+from appliance.channel.messages import Message
+from appliance.specifications.allocation import Allocation, AllocationPlan, Move, Resource
+from appliance.specifications.specification_files import (
+    CheckedSpecifications,
+    Sources,
+    SpecificationsRefusedError,
+)
 from appliance.telemetry.audit_trail import AuditTrail
 
-TRIAL: Literal["on trial"] = "on trial"
-Switch = bool | Literal["on trial"]
-"""Whether what a monitor does is done; on trial it is only told."""
+SHADOW: Literal["shadow"] = "shadow"
+Switch = bool | Literal["shadow"]
+"""Whether the actions of a monitor take effect; in shadow mode they are only reported."""
 
 _RELAY_SECONDS = 15.0
-_TRIES = 5  # while nodes that are affected register and go
+_TRIES = 5  # while affected nodes come and go
 _SILENT = f"a relay does not answer within {_RELAY_SECONDS:g} s"
+
+
+class Relays(Protocol):
+    """The relays, as the specifications use them."""
+
+    def send(self, message: Message, relay: int) -> bool:
+        """Send to a relay; return False if it is not connected."""
+
+    async def carried_out(self) -> None:
+        """Wait until every relay has carried out its messages."""
+
+    def carried_now(self) -> set[Resource]:
+        """Return the topics and services of live nodes."""
+
+    def withdraw(self, moves: Sequence[Move]) -> None:
+        """Stop carrying these, before the new allocation is adopted."""
+
+    def place(self, moves: Sequence[Move]) -> None:
+        """Carry these on their new relays, after the allocation was adopted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,65 +60,66 @@ class Revision:
 
     number: int = 0
     sources: Sources = field(default_factory=Sources)
-    checked: Checked = field(default_factory=Checked)
-    trials: frozenset[str] = frozenset()
-    """The monitors that are on trial."""
+    checked: CheckedSpecifications = field(default_factory=CheckedSpecifications)
+    shadows: frozenset[str] = frozenset()
+    """The monitors in shadow mode."""
 
 
 Parts = Callable[[bytes, list[messages.PartNames]], Awaitable[list[bytes]]]
-"""What each of some relays runs of a set that was compiled. Raises `SpecificationsRefusedError`."""
+"""Returns the parts of a compiled set that some relays run. Raises `SpecificationsRefusedError`."""
 
 
 @dataclass(slots=True)
 class Rollout:
-    """What the relays were told and what they said; `states(checked)` says of each monitor whether it is in force.
+    """The specifications that the relays got and their answers; `states(checked)` maps each monitor to whether it is
+    in force.
 
-    Relays are told what the compiler made for them alone (`parts`), before anything is said of it.
-    `rows` has state and counters of the monitors, as far as their relays have told.
+    Each relay gets only its own part of the compiled set (`parts`), before the specifications are stated. `rows` has
+    state and counters of the monitors, as far as their relays have reported.
     """
 
     allocation: Allocation
     trail: AuditTrail
     on_fault: Literal["drop", "pass"]
-    states: Callable[[Checked], Mapping[str, Switch]]
+    states: Callable[[CheckedSpecifications], Mapping[str, Switch]]
     relays: Relays
     slices: int
     parts: Parts
     rows: dict[str, messages.MonitorRow] = field(default_factory=dict)
     _now: Revision = field(default_factory=Revision)
-    # What relays run of what is in force, and of what is being tried.
-    _parts: dict[tuple[bytes, messages.PartNames], bytes] = field(default_factory=dict)
+    # The parts that relays run of the specifications in force, and of those being tried.
+    compiled_parts: dict[tuple[bytes, messages.PartNames], bytes] = field(default_factory=dict)
     _known: set[int] = field(default_factory=set)  # relays that had specifications before
-    _fresh: set[int] = field(default_factory=set)  # relays that have not answered since they are there
-    _coming: tuple[Revision, Plan] | None = None  # being tried
-    # Of those that gave something up.
+    _fresh: set[int] = field(default_factory=set)  # relays that have not answered since they connected
+    _coming: tuple[Revision, AllocationPlan] | None = None  # being tried
+    # Answers awaited from relays that gave something up.
     _answers: dict[int, asyncio.Future[list[str]]] = field(default_factory=dict)
-    # By relay and statement.
+    # Answers by relay and statement.
     _waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = field(default_factory=dict)
-    # Relays may outlive control: no number comes again.
+    # Relays may outlive control, so no number may be repeated.
     _numbers: Iterator[int] = field(default_factory=lambda: itertools.count(time.monotonic_ns()))
     _refusals: dict[int, list[str]] = field(default_factory=dict)
-    _began: set[str] = field(default_factory=set)  # by what is being changed
+    _began: set[str] = field(default_factory=set)  # by the present change
     _held: dict[int, dict[str, str]] = field(default_factory=dict)
     _rows: dict[int, list[messages.MonitorRow]] = field(default_factory=dict)
 
     @property
     def refused(self) -> list[str]:
-        """Why a relay does not take what is in force; empty when all do."""
+        """Return why relays refuse the specifications in force; empty if none does."""
         return [finding for findings in self._refusals.values() for finding in findings]
 
     @property
     def held(self) -> set[str]:
-        """The monitors that hold their topics."""
+        """Return the monitors that hold their topics."""
         return set(self.why_held)
 
     @property
     def why_held(self) -> dict[str, str]:
-        """The monitors that hold their topics, and why their state was lost (empty: it was not)."""
+        """Return the monitors that hold their topics, and why their state was lost (empty: it was not)."""
         return {name: why for names in self._held.values() for name, why in names.items()}
 
     async def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
-        """These are in force. After a crash of control (`restarted`) the relays go on with what they have.
+        """Begin with these in force; after a crash of control (`restarted`), relays keep their specifications.
 
         Raises `SpecificationsRefusedError`.
         """
@@ -103,12 +127,12 @@ class Rollout:
         if restarted:
             self._known = set(range(self.allocation.relays))
         carried = self.allocation.resources if restarted and self.allocation.restore(kept) else ()
-        # what was kept may be of a change that control did not survive: then it is made to fit, as little as can be
+        # the stored allocation may be from a change that control did not survive: adapt it as little as possible
         self.allocation.adopt(self.allocation.plan(now.checked, carried))
         await self._make(now, self.allocation.of_file)
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
-        """What a relay is told before anything else; one that follows another must hold what is to be held."""
+        """Return a relay's first message; a restarted relay must hold topics as its monitors require."""
         restarted = relay in self._known
         self._known.add(relay)
         (self._fresh.add if restarted else self._fresh.discard)(relay)
@@ -120,47 +144,46 @@ class Rollout:
         return self._statement(self._now, relay, self.allocation.of_file, restarted=restarted, ahead=True)
 
     def relay_of(self, monitor: str) -> int:
-        """The relay that has a monitor."""
+        """Return the relay of a monitor."""
         return self.allocation.of_file(self._now.checked.monitors[monitor])
 
     def tell(self, monitor: str, message: messages.Message) -> bool:
-        """Tell the relay that has a monitor; False when it is not there."""
+        """Send to the relay of a monitor; return False if it is not connected."""
         return self.relays.send(message, self.relay_of(monitor))
 
     async def carried_out(self) -> None:
-        """Wait until the relays have done what they were told: what comes after the answer is judged by it."""
+        """Wait until the relays have carried out their orders, so that these apply to later messages."""
         await self.relays.carried_out()
 
     def resumed(self, monitor: str) -> None:
-        """A monitor holds its topics no longer."""
+        """Note that a monitor holds its topics no longer."""
         for names in self._held.values():
             names.pop(monitor, None)
 
     # --- a change ---
 
     def began(self, names: Iterable[str]) -> list[str]:
-        """Those of these monitors that are in their initial state since the last change, moved ones among them."""
+        """Return which of these monitors have begun again at the last change, including moved ones."""
         return [name for name in names if name in self._began]
 
     async def take(self, coming: Revision) -> list[str]:
-        """Have every relay take these; the monitors that began anew because they moved.
-
-        Relays that are away are told when they are there. Raises `SpecificationsRefusedError`: nothing has changed.
+        """Have every relay take these specifications; return the monitors that began again because they moved. Absent
+        relays get them when they return. After `SpecificationsRefusedError` nothing has changed.
         """
         plan = self.allocation.plan(coming.checked, self.relays.carried_now())
         self._began = set()
         for _ in range(_TRIES):
             await self._try(coming, plan)
-            tried, plan = plan, self.allocation.plan(coming.checked, self.relays.carried_now())
-            if plan == tried:
+            shadowed, plan = plan, self.allocation.plan(coming.checked, self.relays.carried_now())
+            if plan == shadowed:
                 return self._settle(coming, plan)
-            for relay in plan.losing - tried.losing:
+            for relay in plan.losing - shadowed.losing:
                 self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
         self._restate()
         raise SpecificationsRefusedError(["topics that would have to move come and go meanwhile; try again"])
 
     async def all_taken(self) -> None:
-        """Wait until the relays that gave something up have what is in force, or one of them fails to (`refused`)."""
+        """Wait until the relays that gave something up have the new specifications, or one refuses them (`refused`)."""
         answers, self._answers = self._answers, {}
         if answers:
             await asyncio.wait(answers.values(), timeout=_RELAY_SECONDS)
@@ -169,14 +192,18 @@ class Rollout:
                 self._refusals[relay] = [_SILENT]
                 self._stop_waiting(relay)
 
-    async def _try(self, coming: Revision, plan: Plan) -> None:
+    async def _try(self, coming: Revision, plan: AllocationPlan) -> None:
         await self._make(coming, _of(plan))
-        take_effect()  # relays that give nothing up go on with what they are told now
+        try:
+            take_effect()  # relays that give nothing up use the new ones from now on
+        except WithdrawnError:
+            self._forget()
+            raise
         answers: dict[int, asyncio.Future[list[str]]] = {}
         self._coming = (coming, plan)
         for relay in range(self.allocation.relays):
             if relay in plan.losing:
-                continue  # it goes on with what it has until its topics are withdrawn
+                continue  # it continues with its specifications until its topics are withdrawn
             statement = self._statement(coming, relay, _of(plan), plan.moved_files)
             self._ask(relay, statement, answers)
         try:
@@ -195,7 +222,7 @@ class Rollout:
         statement: messages.SpecificationsStated,
         answers: dict[int, asyncio.Future[list[str]]],
     ) -> None:
-        """Tell a relay, and have its answer among these if it is there."""
+        """Send to a relay that is connected, and add its awaited answer."""
         if self.relays.send(statement, relay):
             answers[relay] = asyncio.get_running_loop().create_future()
             self._waiting[relay, statement.statement] = answers[relay]
@@ -207,10 +234,10 @@ class Rollout:
             return [f"{_SILENT}; try again"]
         return [finding for findings in said for finding in findings]
 
-    def _settle(self, coming: Revision, plan: Plan) -> list[str]:
-        """Between two messages of every relay's link: nothing is awaited here.
+    def _settle(self, coming: Revision, plan: AllocationPlan) -> list[str]:
+        """Put the revision into force between two messages of every relay's link, so without an `await`.
 
-        Those that have it already say so again.
+        Relays that have it already confirm it again.
         """
         self._now = coming
         self.relays.withdraw(plan.moves)
@@ -222,7 +249,7 @@ class Rollout:
                 self._ask(relay, statement, self._answers)
             else:
                 self.relays.send(statement, relay)
-        self.relays.place(plan.moves)  # nothing to one that has just been asked: the plan goes one way
+        self.relays.place(plan.moves)  # nothing to a relay that has just been asked: the plan goes one way
         self._merge_rows()
         moved = [name for name, file in coming.checked.monitors.items() if file in plan.moved_files]
         if plan.moves:
@@ -230,7 +257,7 @@ class Rollout:
         return moved
 
     def _merge_rows(self) -> None:
-        """State and counters of the monitors, each as the relay tells it that has the monitor."""
+        """Take each monitor's state and counters from the relay that has the monitor."""
         self.rows = {
             row.name: row
             for relay, rows in self._rows.items()
@@ -238,7 +265,7 @@ class Rollout:
             if self.allocation.of_file(row.file) == relay
         }
 
-    def _say_moved(self, plan: Plan, monitors: list[str]) -> None:
+    def _say_moved(self, plan: AllocationPlan, monitors: list[str]) -> None:
         names = [move.name for move in plan.moves]
         anew = f"; {', '.join(monitors)} began in the initial state there" if monitors else ""
         self.trail.happened(
@@ -257,20 +284,22 @@ class Rollout:
             self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
 
     async def _make(self, revision: Revision, of_file: Callable[[str], int]) -> None:
-        """Have the compiler make what the relays run of these, as far as it is not there."""
+        """Have the compiler make the missing parts of these specifications that the relays run."""
         compiled = revision.checked.compiled
         wanted = {_names(revision, relay, of_file) for relay in range(self.allocation.relays)}
-        missing = [names for names in wanted if names.monitors and (compiled, names) not in self._parts]
+        missing = [
+            names for names in wanted if names.monitors and (compiled, names) not in self.compiled_parts
+        ]
         made = await self.parts(compiled, missing) if missing else []
         for names, part in zip(missing, made, strict=True):
-            self._parts[compiled, names] = part
+            self.compiled_parts[compiled, names] = part
 
     def _forget(self) -> None:
-        """Keep what the relays run of what is in force."""
+        """Drop all parts except those in force."""
         compiled, relays = self._now.checked.compiled, range(self.allocation.relays)
         names = [_names(self._now, relay, self.allocation.of_file) for relay in relays]
-        self._parts = {
-            key: part for key, part in self._parts.items() if key[0] == compiled and key[1] in names
+        self.compiled_parts = {
+            key: part for key, part in self.compiled_parts.items() if key[0] == compiled and key[1] in names
         }
 
     def _statement(
@@ -287,21 +316,21 @@ class Rollout:
         names = _names(revision, relay, of_file)
         return messages.SpecificationsStated(
             revision.number,
-            self._parts[revision.checked.compiled, names] if names.monitors else b"",
+            self.compiled_parts[revision.checked.compiled, names] if names.monitors else b"",
             {name: states[name] is not False for name in names.monitors},
             restarted,
             self.on_fault,
             tuple(name for name in names.monitors if files[name] in moved),
             next(self._numbers),
             ahead,
-            names.trials,
+            names.shadows,
             self.slices,
         )
 
     # --- what the relays say ---
 
     def received(self, message: messages.Message, relay: int) -> None:
-        """A message of a relay about its monitors."""
+        """Process a message of a relay about its monitors."""
         match message:
             case messages.SpecificationsTaken():
                 self._taken(relay, message)
@@ -312,7 +341,7 @@ class Rollout:
                 self._merge_rows()
 
     def lost(self, relay: int) -> None:
-        """A relay is gone: what it has not answered is refused, since it may have died of it."""
+        """Refuse the specifications that a lost relay has not answered, since they may have killed it."""
         for at, statement in [entry for entry in self._waiting if entry[0] == relay]:
             self._answer(at, statement, ["a relay process ended while it took them: try again"])
 
@@ -338,7 +367,7 @@ class Rollout:
         self._answer(relay, statement, [])
 
     def _say_held(self, relay: int, taken: messages.SpecificationsTaken) -> None:
-        """Record those that hold their topics from now on because their state is lost, and what lets them go on."""
+        """Record monitors that hold their topics because their state is lost, and the command that resumes them."""
         before = self._held.get(relay, {})
         for name, why in taken.because.items():
             if before.get(name) != why:
@@ -373,10 +402,10 @@ class Rollout:
 
 
 def _names(revision: Revision, relay: int, of_file: Callable[[str], int]) -> messages.PartNames:
-    """The monitors that a relay has."""
+    """Return the monitors of a relay."""
     mine = tuple(name for name, file in revision.checked.monitors.items() if of_file(file) == relay)
-    return messages.PartNames(mine, tuple(name for name in mine if name in revision.trials))
+    return messages.PartNames(mine, tuple(name for name in mine if name in revision.shadows))
 
 
-def _of(plan: Plan) -> Callable[[str], int]:
+def _of(plan: AllocationPlan) -> Callable[[str], int]:
     return lambda file: plan.files.get(file, 0)

@@ -1,7 +1,4 @@
-"""Files of specifications: read from the folder, checked as a whole, named by what is in them.
-
-What was compiled for the check is what relays run.
-"""
+"""Files of specifications: the folder, their signatures, and their compiled contents."""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -25,7 +22,7 @@ _LONGEST = (
 
 
 class SpecificationsRefusedError(Exception):
-    """Specifications were not taken; `findings` has every reason, as `file:line:column: error: text`."""
+    """Specifications are refused; `findings` has every reason, as `file:line:column: error: text`."""
 
     def __init__(self, findings: list[str]) -> None:
         super().__init__("\n".join(findings))
@@ -43,7 +40,7 @@ class Sources(msgspec.Struct, frozen=True):
     signatures: dict[str, str] = {}
 
     def with_files(self, new: "Sources") -> "Sources":
-        """These, with others added or in the place of those of the same name; in the order of names."""
+        """Return the sources with files added or replaced by name, sorted."""
         fresh = new.files.keys() | new.definitions.keys()
         signatures = {name: text for name, text in self.signatures.items() if name not in fresh}
         signatures |= {name: text for name, text in new.signatures.items() if text and name in fresh}
@@ -54,7 +51,7 @@ class Sources(msgspec.Struct, frozen=True):
         )
 
     def without(self, files: set[str]) -> "Sources":
-        """These without some files; definitions stay."""
+        """Return the sources without some files; definitions stay."""
         left, signatures = (
             {name: text for name, text in texts.items() if name not in files}
             for texts in (self.files, self.signatures)
@@ -62,7 +59,7 @@ class Sources(msgspec.Struct, frozen=True):
         return Sources(left, self.definitions, signatures)
 
     def signers(self, site_keys: Sequence[str]) -> list[str]:
-        """The keys that signed these; none where there are no keys.
+        """Return the keys that signed the sources; none without site keys.
 
         Raises `SpecificationsRefusedError` with every file and definition that none of them signed.
         """
@@ -79,7 +76,7 @@ class Sources(msgspec.Struct, frozen=True):
         return sorted(found)
 
     def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
-        """The names of files that these add, change and remove; definitions as `msg/package/Type.msg`."""
+        """Return the names of added, changed and removed files; definitions as `msg/package/Type.msg`."""
         old, new = before.named(), self.named()
         return (
             [name for name in new if name not in old],
@@ -88,20 +85,26 @@ class Sources(msgspec.Struct, frozen=True):
         )
 
     def named(self) -> dict[str, str]:
-        """All texts by their names below the folder: those of definitions begin with `msg/`."""
+        """Return all texts by their names below the folder; those of definitions begin with `msg/`."""
         return self.files | {f"msg/{name}": text for name, text in self.definitions.items()}
 
 
-class Checked(messages.Contents, frozen=True):
+class CheckedSpecifications(messages.Contents, frozen=True):
     """Specifications that may come into force; `signed_by` are the keys of the site that signed them."""
 
     signed_by: list[str] = []  # noqa: RUF012  each struct gets one of its own
 
     def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
-        """A message of a topic (its first bytes) as fields and values; None if its type is not known."""
+        """Parse a message of a topic (its first bytes); None if its type is not known."""
         name = self.types.get(topic)
         definitions = _definitions(name, self.texts.get(name, "")) if name is not None else None
         return read_fields(definitions, name, data) if name is not None and definitions is not None else None
+
+    def md5sum(self, topic: str) -> str:
+        """Return the md5sum of a topic's type; empty if its definition is not known."""
+        name = self.types.get(topic, "")
+        definitions = _definitions(name, self.texts.get(name, ""))
+        return "" if definitions is None else definitions.md5sum(name)
 
     def of_topic(self, topic: str) -> bool:
         """Whether a monitor has an event on a topic."""
@@ -120,13 +123,13 @@ def _definitions(name: str, text: str) -> Definitions | None:
         return None
 
 
-def checked(contents: messages.Contents, sources: Sources, site_keys: Sequence[str]) -> Checked:
-    """What the compiler found in these, once they are signed. Raises `SpecificationsRefusedError`."""
-    return Checked(**msgspec.structs.asdict(contents), signed_by=sources.signers(site_keys))
+def checked(contents: messages.Contents, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+    """Return the compiler's result if the texts are signed. Raises `SpecificationsRefusedError`."""
+    return CheckedSpecifications(**msgspec.structs.asdict(contents), signed_by=sources.signers(site_keys))
 
 
 def require_bounded(sources: Sources) -> None:
-    """Raises `SpecificationsRefusedError` where they are too many, or too long."""
+    """Raise `SpecificationsRefusedError` if there are too many sources, or too long ones."""
     if len(sources.files) > _MOST_FILES:
         raise SpecificationsRefusedError(
             [f"{len(sources.files)} files of specifications; {_MOST_FILES} at most"]
@@ -141,7 +144,7 @@ def require_bounded(sources: Sources) -> None:
 
 
 def read_folder(folder: Path) -> Sources:
-    """The `.rv` files of a folder and the definitions in its `msg/`, with their signatures.
+    """Read the `.rv` files of a folder and the definitions in its `msg/`, with their signatures.
 
     Raises `SpecificationsRefusedError`.
     """
@@ -165,7 +168,7 @@ def _read_folder(folder: Path) -> Sources:
             if package in {folder, folder / "msg"}:
                 place = f"{folder}/msg/package/{path.name}"
                 raise SpecificationsRefusedError(
-                    [f"{path}: a definition belongs into the folder of its package: {place}"]
+                    [f"{path}: a definition belongs in the folder of its package: {place}"]
                 )
             name = f"{package.name}/{path.name}"
             definitions[name], paths[name] = _read(path), path
@@ -173,7 +176,7 @@ def _read_folder(folder: Path) -> Sources:
 
 
 def signatures_of(paths: Mapping[str, Path]) -> dict[str, str]:
-    """The signatures beside these files, by the same names; of those that have one."""
+    """Return the signatures beside these files, by name."""
     found = {name: read_signature(path) for name, path in paths.items()}
     return {name: text for name, text in found.items() if text}
 
@@ -183,3 +186,49 @@ def _read(path: Path) -> str:
         return read_given_text(path, "utf-8-sig")
     except UnicodeDecodeError as error:
         raise SpecificationsRefusedError([f"{path}: is not UTF-8 text: {error.reason}"]) from error
+
+
+_Stamp = tuple[str, int, int, int, int]
+
+
+class SpecificationFolder:
+    """The content of a folder; empty without a folder.
+
+    It is read only if a file has changed, because each status and list compares it with the specifications in force.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
+        self._stamps: list[_Stamp] | None = None
+        self._found: Sources | None = None
+
+    def read(self) -> Sources:
+        """Read all files. Raises `SpecificationsRefusedError`."""
+        return read_folder(self.path) if self.path is not None else Sources()
+
+    def looked_at(self) -> Sources | None:
+        """Return the present content; None if it cannot be used. Unchanged files are not read again."""
+        if self.path is None:
+            return Sources()
+        stamps = _stamps(self.path)
+        if stamps is None or stamps != self._stamps:
+            try:
+                self._found = self.read()
+            except SpecificationsRefusedError:
+                self._found = None
+            self._stamps = stamps
+        return self._found
+
+
+def _stamps(folder: Path) -> list[_Stamp] | None:
+    """Return stamps that change when a file changes; None if they cannot be read."""
+    try:
+        paths = [folder, *folder.glob("*.rv*"), *(folder / "msg").rglob("*")]
+        return sorted(_stamp(path) for path in paths)
+    except OSError:
+        return None
+
+
+def _stamp(path: Path) -> _Stamp:
+    about = path.stat()
+    return str(path), about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns

@@ -1,44 +1,50 @@
-"""Revisions of the specifications as the store keeps them; each with the switches that its monitors had last."""
+"""Stored revisions of the specifications, with the last switches of their monitors."""
 
 from collections.abc import Awaitable, Callable, Sequence
 
 import msgspec
 
 from appliance.specifications.rollout import Switch
-from appliance.specifications.specification_files import Checked, Sources, SpecificationsRefusedError
+from appliance.specifications.specification_files import (
+    CheckedSpecifications,
+    Sources,
+    SpecificationsRefusedError,
+)
 from appliance.store.revisions import DISK
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 
-Check = Callable[[Sources, Sequence[str]], Awaitable[Checked]]
-"""What these are, with the keys of the site. Raises `SpecificationsRefusedError`."""
+Check = Callable[[Sources, Sequence[str]], Awaitable[CheckedSpecifications]]
+"""Checks these sources with the keys of the site. Raises `SpecificationsRefusedError`."""
 
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
-"""Stands for the one before the first."""
+"""Stands for the revision before the first."""
 
 
-class Kept(Sources, frozen=True):
-    """A revision as it is in the store; `switches` are those of its monitors when it was replaced."""
+class StoredSpecifications(Sources, frozen=True):
+    """A stored revision; `switches` are those of its monitors when it was replaced."""
 
     switches: dict[str, Switch] = {}  # noqa: RUF012  each struct gets one of its own
 
 
 def text_of(sources: Sources) -> str:
-    """How they are kept."""
+    """Return the stored form."""
     return msgspec.json.encode(sources).decode()
 
 
-def kept_in(row: MonitorRevisionRow) -> Kept:
-    """What was in force, and how it was switched."""
-    return msgspec.json.decode(row.sources, type=Kept)
+def kept_in(row: MonitorRevisionRow) -> StoredSpecifications:
+    """Return a stored revision's texts and switches."""
+    return msgspec.json.decode(row.sources, type=StoredSpecifications)
 
 
 def sources_of(row: MonitorRevisionRow) -> Sources:
-    """What was in force."""
+    """Return a stored revision's texts."""
     return msgspec.json.decode(row.sources, type=Sources)
 
 
-async def check_kept(check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]) -> Checked:
-    """Compile what was in force. A newer version of the appliance may refuse it; then there is a way back."""
+async def check_kept(
+    check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]
+) -> CheckedSpecifications:
+    """Compile a stored revision; if a newer version refuses it, the error names the way back."""
     try:
         return await check(sources_of(row), site_keys)
     except SpecificationsRefusedError as error:
@@ -50,9 +56,9 @@ async def check_kept(check: Check, row: MonitorRevisionRow, site_keys: Sequence[
 
 
 def forget_revision(store: StateStore, now: float) -> int | None:
-    """Have the next start take the folder; the revision that is given up, None if it was the folder's already.
+    """Have the next start take the folder; return the revision that is given up, None if it was the folder's already.
 
-    For an appliance that does not run.
+    Only for an appliance that is not running.
     """
     last = next(iter(store.monitor_revisions(1)), NOTHING)
     if last.who == DISK:

@@ -1,74 +1,73 @@
-"""Which monitors are enabled, disabled or in shadow mode (`TRIAL`). No I/O.
+"""Which monitors are enabled, disabled or in shadow mode (`SHADOW`). No I/O.
 
-A monitor that no operator has switched is as `--enable` says: `all` are enabled, or `none`, or those that are named, or
-all are in shadow mode (`shadow`). A switch goes with its monitor: another one that is loaded later under the same name
-starts as if it had not been switched. Monitors that share variables are in shadow mode together (apart from disabled
-ones).
+`--enable` sets the monitors that no operator has switched: it enables `all`, `none` or the named ones, or puts all into
+shadow mode (`shadow`). A switch ends with its monitor; a monitor that is loaded later under the same name has none.
+Monitors that share variables are in shadow mode together (except disabled ones).
 """
 
 from collections.abc import Mapping
 
-from appliance.specifications.rollout import TRIAL, Switch
-from appliance.specifications.specification_files import Checked, SpecificationsRefusedError
+from appliance.specifications.rollout import SHADOW, Switch
+from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
 from rosmop.form.connected_groups import sharing
 
 
 class Switches:
-    """`said` are the switches that were made, `states` what all in force are; `enable` is what the start says."""
+    """The switches that were made (`said`), and the states of all monitors in force; `enable` is the start option."""
 
     def __init__(self, enable: str) -> None:
-        self._all: Switch = TRIAL if enable == "shadow" else enable == "all"
+        self._all: Switch = SHADOW if enable == "shadow" else enable == "all"
         words = {"all", "none", "shadow"}
         self.named = set() if enable in words else {name.strip() for name in enable.split(",")}
         self.said: dict[str, Switch] = {}
         self.states: dict[str, Switch] = {}
 
     def enabled(self, name: str) -> bool:
-        """Whether what a monitor does is done."""
+        """Whether a monitor is enabled, so that its actions take effect."""
         return self.states.get(name) is True
 
-    def on_trial(self, name: str) -> bool:
+    def in_shadow(self, name: str) -> bool:
         """Whether a monitor is in shadow mode: it gets copies, and what it would have done is recorded."""
-        return self.states.get(name) == TRIAL
+        return self.states.get(name) == SHADOW
 
-    def tried(self) -> list[str]:
-        """The monitors in shadow mode."""
-        return [name for name, state in self.states.items() if state == TRIAL]
+    def shadowed(self) -> list[str]:
+        """Return the monitors in shadow mode."""
+        return [name for name, state in self.states.items() if state == SHADOW]
 
     def switched_off(self) -> dict[str, Switch]:
-        """The monitors that an operator disabled or put into shadow mode, by order and not by configuration."""
+        """Return the monitors that an operator (not the configuration) disabled or put into shadow mode."""
         return {name: to for name, to in self.said.items() if to is not True and self.states.get(name) == to}
 
-    def states_of(self, checked: Checked) -> dict[str, Switch]:
-        """What these monitors are, or would be; what shares variables with a monitor on trial is on trial, too."""
+    def states_of(self, checked: CheckedSpecifications) -> dict[str, Switch]:
+        """Return the states of these monitors: one in shadow mode takes those that share its variables with it."""
         states = {name: self._own(name) for name in checked.monitors}
-        if TRIAL in states.values():
+        if SHADOW in states.values():
             for group in sharing(checked.uses):
-                if any(states[name] == TRIAL for name in group):
-                    states |= {name: TRIAL for name in group if states[name] is True}
+                if any(states[name] == SHADOW for name in group):
+                    states |= {name: SHADOW for name in group if states[name] is True}
         return states
 
     def _own(self, name: str) -> Switch:
         """Return how a monitor is switched, apart from those that it shares variables with."""
         return self.said.get(name, self._all or name in self.named)
 
-    def enforce(self, checked: Checked) -> list[str]:
-        """These are in force now; which of them are on trial only because of others."""
+    def enforce(self, checked: CheckedSpecifications) -> list[str]:
+        """Put these into force; return the monitors that are in shadow mode only because of others."""
         self.said = {name: to for name, to in self.said.items() if name in checked.monitors}
         self.states = self.states_of(checked)
-        drawn_in = [name for name, to in self.states.items() if to == TRIAL and self._own(name) != TRIAL]
-        self.said |= dict.fromkeys(drawn_in, TRIAL)
+        drawn_in = [name for name, to in self.states.items() if to == SHADOW and self._own(name) != SHADOW]
+        self.said |= dict.fromkeys(drawn_in, SHADOW)
         return drawn_in
 
 
-def require_whole(states: Mapping[str, Switch], checked: Checked) -> None:
-    """Raises `SpecificationsRefusedError` where monitors in force share variables with some that are on trial."""
+def require_whole(states: Mapping[str, Switch], checked: CheckedSpecifications) -> None:
+    """Raise `SpecificationsRefusedError` if monitors in force share variables with monitors in shadow mode."""
     for group in sharing(checked.uses):
-        tried = sorted(name for name in group if states[name] == TRIAL)
+        shadowed = sorted(name for name in group if states[name] == SHADOW)
         others = sorted(name for name in group if states[name] is True)
-        if tried and others:
+        if shadowed and others:
             text = (
-                f"{', '.join(tried)} in shadow mode and {', '.join(others)} in force do not go together,"
+                f"{', '.join(shadowed)} in shadow mode and {', '.join(others)} in force do not go together,"
                 " because they share variables: name them all"
             )
             raise SpecificationsRefusedError([text])

@@ -1,1 +1,1 @@
-"""Starts, watches and restarts the processes of the appliance, each with the privileges it needs."""
+"""Start, watch and restart the processes of the appliance, each with only the privileges it needs."""

@@ -1,9 +1,8 @@
-"""The first code of every child: `python -m appliance.supervisor.child_entry ROLE PLAN`.
+"""Start a child process: `python -m appliance.supervisor.child_entry ROLE PLAN`.
 
-It gives up what the role must not have, checks that what the role needs can be reached by the role's
-user (and says which file it is when not), and then becomes the role: it calls the entry point of one of
-our own, or executes somebody else's program. A failure on the way is told on the lifeline as `Failed`,
-in words for the person who started it.
+It drops the privileges that the role must not have, checks that the role's user can reach the needed files, and then
+calls the role's entry point or executes its external program. It reports a failure to the supervisor over the lifeline
+as `Failed`, with a text for operators.
 """
 
 import contextlib
@@ -23,12 +22,12 @@ from appliance.channel.channel import Channel
 from appliance.channel.messages import Failed, Lifeline, Walled
 from appliance.supervisor import privileges
 from appliance.supervisor.sandbox import landlock, seccomp
-from appliance.supervisor.sandbox.sandbox_plan import Walls
+from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
 from appliance.supervisor.users import Account
 
 
-class Plan(msgspec.Struct, frozen=True):
-    """How a child is to be started: JSON in its arguments (nothing in it is secret)."""
+class LaunchPlan(msgspec.Struct, frozen=True):
+    """How to start a child: JSON in its arguments (without secrets)."""
 
     parent: int
     lifeline: int
@@ -36,7 +35,7 @@ class Plan(msgspec.Struct, frozen=True):
     home: str
     network: bool
     files: int
-    walls: Walls
+    sandbox: SandboxPlan
     entry: str | None = None
     index: int | None = None
     path: str | None = None
@@ -49,18 +48,18 @@ class Plan(msgspec.Struct, frozen=True):
 
 
 def title_of(role: str, index: int | None) -> str:
-    """What a process is called in lists of processes: its role, and its number from the second on."""
+    """Return the title of a process: its role, and a number unless it is the first one."""
     return role if not index else f"{role}-{index + 1}"
 
 
 class UnreachableError(Exception):
-    """The role's user cannot get at something the role needs."""
+    """Report a needed file that the role's user cannot reach."""
 
 
 def main() -> None:
     """Become the role that the arguments name."""
     role, text = sys.argv[1:3]
-    plan = msgspec.json.decode(text, type=Plan)
+    plan = msgspec.json.decode(text, type=LaunchPlan)
     setproctitle.setproctitle(f"rosrv: {title_of(role, plan.index)}")
     try:
         secret = os.open(plan.secret, os.O_RDONLY | os.O_CLOEXEC) if plan.secret is not None else None
@@ -73,20 +72,20 @@ def main() -> None:
         _fail(plan.lifeline, f"{role} cannot be started: {error}")
 
 
-def _prepare(plan: Plan) -> None:
-    # Ctrl-C on the terminal is for the supervisor: it stops the children in order.
+def _prepare(plan: LaunchPlan) -> None:
+    # Ctrl-C on the terminal is for the supervisor, which stops the children in order.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     privileges.raise_file_limit(plan.files)
-    privileges.be_ended_early(plan.ended_early)
+    privileges.raise_oom_score(plan.ended_early)
     if not plan.network:
         _leave_network_if_allowed()
-    privileges.drop(plan.account, parent=plan.parent, capabilities=plan.capabilities)
+    privileges.drop_privileges(plan.account, parent=plan.parent, capabilities=plan.capabilities)
     _require(plan.account, plan.home, os.R_OK | os.W_OK | os.X_OK)
     if plan.path is not None:
         _require(plan.account, plan.path, os.R_OK)
     os.chdir(plan.home)
-    _raise_walls(plan)
+    _enter_sandbox(plan)
 
 
 def _leave_network_if_allowed() -> None:
@@ -95,21 +94,21 @@ def _leave_network_if_allowed() -> None:
             privileges.leave_network()
 
 
-def _raise_walls(plan: Plan) -> None:
-    """Raise them, and tell the supervisor what this kernel lacks: a missing wall is seen, and ends no robot's drive.
+def _enter_sandbox(plan: LaunchPlan) -> None:
+    """Enter the sandbox, and report to the supervisor the limits that this kernel lacks; the process runs without them.
 
-    But for a process without network, which must not make a socket. Raises `SeccompError`.
+    Raises `SeccompError` only for a role without network, which must not make a socket.
     """
     lacks = []
     abi = 0
     try:
-        abi = landlock.raise_wall(plan.walls)
+        abi = landlock.restrict(plan.sandbox)
     except landlock.LandlockError as error:
         lacks.append(str(error))
     lacks += landlock.lacking(abi)
-    calls = "listed" if plan.walls.listed else "usual"
+    calls = "listed" if plan.sandbox.allowlist else "usual"
     try:
-        seccomp.raise_wall(plan.walls)
+        seccomp.load_filter(plan.sandbox)
     except seccomp.SeccompError as error:
         if not plan.network:
             raise
@@ -125,19 +124,19 @@ def _require(account: Account, path: str, mode: int) -> None:
         return
     raise UnreachableError(
         f"{path} cannot be used by user {account.name} (uid {account.uid}): "
-        f"it and every folder above it must let that user in"
+        f"give that user access to it and to every folder above it"
     )
 
 
-def _call(role: str, plan: Plan, secret: int | None) -> None:
+def _call(role: str, plan: LaunchPlan, secret: int | None) -> None:
     assert plan.entry is not None  # noqa: S101  a plan has either argv or entry
     _require(plan.account, str(Path(appliance.__file__).parent), os.R_OK | os.X_OK)
     module, _, function = plan.entry.partition(":")
-    from appliance.supervisor.logs import configure_logs  # noqa: PLC0415  not for somebody else's program
+    from appliance.supervisor.logs import configure_logs  # noqa: PLC0415  not for an external program
 
     configure_logs(role)
     entry = getattr(importlib.import_module(module), function)
-    gc.freeze()  # what is imported stays
+    gc.freeze()  # imported modules stay
     arguments: list[int | Path | None] = [plan.lifeline]
     if plan.index is not None:
         arguments.append(plan.index)
@@ -149,10 +148,10 @@ def _call(role: str, plan: Plan, secret: int | None) -> None:
     entry(*arguments)
 
 
-def _execute(plan: Plan) -> None:
+def _execute(plan: LaunchPlan) -> None:
     _require(plan.account, plan.argv[0], os.R_OK | os.X_OK)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    os.set_inheritable(plan.lifeline, False)  # its end tells the supervisor that the program has taken over
+    os.set_inheritable(plan.lifeline, False)  # its end shows the supervisor that the program runs
     os.execve(plan.argv[0], plan.argv, plan.environment)  # noqa: S606  a fixed list, no shell
 
 

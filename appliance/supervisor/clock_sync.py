@@ -1,6 +1,6 @@
-"""Whether a time service keeps the machine's clock, as the kernel says it (adjtimex(2); nothing is set).
+"""Ask the kernel whether a time service keeps the clock (adjtimex(2); nothing is set).
 
-The supervisor asks: the walls around the other processes forbid the call.
+The supervisor asks, because the sandboxes of other processes deny the call.
 """
 
 import ctypes
@@ -10,7 +10,7 @@ _LARGE_ENOUGH = 512  # bytes; the kernel writes 208
 
 
 class Timex(ctypes.Structure):
-    """The beginning of the kernel's `struct timex`; modes 0 reads."""
+    """The beginning of the kernel's `struct timex`; with `modes` 0 the kernel only reads."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -27,7 +27,7 @@ _libc = ctypes.CDLL(None)
 
 
 def clock_is_synchronised() -> bool | None:
-    """Whether it is; None: this machine's kernel does not tell us, which some containers forbid it."""
+    """Whether the clock is synchronised; None if the kernel denies the call, as in some containers."""
     timex = Timex()
     if _libc.adjtimex(ctypes.pointer(timex)) < 0:
         return None

@@ -1,5 +1,5 @@
-"""Why the appliance does not start or must stop, in words for the person who started it."""
+"""The error that stops the appliance."""
 
 
 class StartError(Exception):
-    """The appliance cannot start or go on; the message says what, where and what to do."""
+    """Report that the appliance cannot start or go on; the message says what, where and what to do."""

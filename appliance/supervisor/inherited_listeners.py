@@ -1,9 +1,8 @@
-"""The listening sockets that outlive control.
+"""Keep listening sockets open while control restarts.
 
-Control opens the ports that nodes know and gives each to the supervisor under a name; when control dies
-the ports stay open here, connections wait in the kernel's queue, and the next control gets every one
-back. Nothing is ever accepted or read here. Names are control's; they are checked and counted so that a
-control gone wrong cannot grow the supervisor.
+Control opens the ports that nodes use and sends each socket to the supervisor under a name. When control dies, the
+ports stay open, connections wait in the kernel's queue, and the next control gets all sockets back. Nothing is accepted
+or read here. Names are checked and counted, so a faulty control cannot fill the supervisor's memory.
 """
 
 import os
@@ -14,12 +13,12 @@ from collections.abc import Iterator
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:/\[\]-]{0,199}")
 
 
-class RefusedSocketError(ValueError):
-    """A socket that is not kept; the message says why."""
+class ListenerRejectedError(ValueError):
+    """Report a socket that is not kept; the message says why."""
 
 
-class KeptSockets:
-    """Listening sockets by name. Owns the descriptors it holds."""
+class InheritedListeners:
+    """Listening sockets by name; this object owns their descriptors."""
 
     def __init__(self, *, limit: int = 10_000) -> None:
         self._limit = limit
@@ -32,40 +31,40 @@ class KeptSockets:
         return iter(list(self._sockets.items()))
 
     def keep(self, name: str, descriptor: int) -> None:
-        """Keep `descriptor` (now owned here, also when it is refused) under `name`; replaces an earlier one.
+        """Keep `descriptor` under `name`, in place of an earlier one; close it if it is rejected.
 
-        Raises `RefusedSocketError` for a bad name, something that does not listen, or one too many.
+        Raises `ListenerRejectedError` for an invalid name, a socket that does not listen, or one too many.
         """
         try:
             self._check(name, descriptor)
-        except RefusedSocketError:
+        except ListenerRejectedError:
             os.close(descriptor)
             raise
         self.drop(name)
         self._sockets[name] = descriptor
 
     def drop(self, name: str) -> None:
-        """Close a kept socket; a name that is not known is nothing to do."""
+        """Close a socket, if it is known."""
         descriptor = self._sockets.pop(name, None)
         if descriptor is not None:
             os.close(descriptor)
 
     def close(self) -> None:
-        """Close all of them."""
+        """Close all sockets."""
         for name in list(self._sockets):
             self.drop(name)
 
     def _check(self, name: str, descriptor: int) -> None:
         if not _NAME.fullmatch(name):
-            raise RefusedSocketError(f"{name[:80]!r} is not a name for a kept socket")
+            raise ListenerRejectedError(f"{name[:80]!r} is not a name for a kept socket")
         if name not in self._sockets and len(self._sockets) >= self._limit:
-            raise RefusedSocketError(
+            raise ListenerRejectedError(
                 f"{self._limit} sockets are kept already; {name!r} would be one too many"
             )
         try:
             with socket.socket(fileno=os.dup(descriptor)) as sock:
                 listens = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1
         except OSError as error:
-            raise RefusedSocketError(f"{name!r} is not a socket: {error.strerror}") from error
+            raise ListenerRejectedError(f"{name!r} is not a socket: {error.strerror}") from error
         if not listens:
-            raise RefusedSocketError(f"{name!r} does not listen")
+            raise ListenerRejectedError(f"{name!r} does not listen")

@@ -1,15 +1,12 @@
-"""What surrounds the processes: the namespace they live in, the firewall around ROSMaster, the probe of it.
+"""Build, check and remove the isolation of the processes: their network namespace and the firewall.
 
-Built before the first process starts and taken away after the last one ended. All calls block for as
-long as the kernel takes (tens of milliseconds; the probe up to some seconds), so a running supervisor
-makes them in a thread, one at a time.
-
-Invariants:
+It is built before the first process starts and removed after the last one has ended. All calls block (tens of
+milliseconds, the probe some seconds), so a running supervisor makes them in a thread, one at a time.
 
 1. No process starts before the firewall is in force.
-2. A port that another local user can reach, or a probe that cannot be made, counts as open: `probe` says why.
-3. Rules that somebody took away are put back, and that is said; so are those that could not be put in force before.
-4. What `remove` took away stays away: it waits for a call that is under way, and none puts anything back after it.
+2. A hidden port counts as open if another local user can reach it or it cannot be probed; `probe` returns the reason.
+3. Missing rules are installed again and logged, also rules that the kernel rejected before.
+4. After `remove` nothing is installed again: it waits for a running call, and later calls fail.
 """
 
 import contextlib
@@ -30,63 +27,73 @@ from appliance.network import interfaces
 from appliance.network.close_ports import local_port_range
 from appliance.network.esp import Esp, choose_esp, lend_tun
 from appliance.network.firewall.firewall import Firewall
-from appliance.network.firewall.firewall_rules import FirewallSettings, Forwarder, OwnNode, PortRange
-from appliance.network.host_namespace import bridges, is_contained, lives_on_the_machines_network
+from appliance.network.firewall.firewall_rules import (
+    FirewallSettings,
+    ForwarderAccess,
+    OwnNodeAccess,
+    PortRange,
+)
 from appliance.network.isolation import Isolation, IsolationSettings
-from appliance.network.namespaces import Namespace, NetworkError
+from appliance.network.namespaces import (
+    Namespace,
+    NetworkError,
+    bridges,
+    is_contained,
+    lives_on_the_machines_network,
+)
 from appliance.network.probe import probe_port
-from appliance.network.public_address import Endpoint, only_address
+from appliance.network.public_address import PublicAddress, only_address
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.users import account_of
 
 _TUNNELS = "rosrv-ipsec"  # the user of charon
-_PATIENCE_SECONDS = 5.0  # of an end with a call that hangs
+_PATIENCE_SECONDS = 5.0  # of `remove` with a call that hangs
 
 log = structlog.get_logger()
 
 
 @dataclass(frozen=True)
-class Ports:
-    """The ports that the surroundings are about; `inner` and `own` are known when control is ready."""
+class AppliancePorts:
+    """The ports that the firewall handles; `inner` and `own` are known when control is ready."""
 
     master: int
     rosmaster: int
     nodes: range
-    own_node: range  # where the appliance's own node serves messages
+    own_node: range  # for messages of the appliance's own node
     inner: int | None = None
     api: int | None = None  # None: there is no REST
     api_networks: tuple[str, ...] = ()  # who may connect to it besides this machine
-    own: int | None = None  # control's, for the own node
+    own: int | None = None  # the master of the own node
     syslog: tuple[str, str, int] | None = None  # protocol, address and port of the audit log's receiver
 
 
-class Enclosure:
-    """No isolation: the processes live where the supervisor lives, open to everybody there."""
+class NoIsolation:
+    """No isolation: the processes share the supervisor's namespace, without a firewall."""
 
     kind = "none"
     probes = False
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
-        """Be where the processes live, for the length of a block that does not await."""
+        """Enter the namespace of the processes for a block that does not await."""
         yield
 
     def build(self) -> None:
-        """Make it. Raises `StartError`; nothing is left behind then."""
+        """Build the isolation. Raises `StartError`; nothing is left then."""
 
     def remove(self) -> None:
-        """Take it away."""
+        """Remove the isolation."""
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
-        """Control's inner face, and the master for the appliance's own nodes, are at these ports now.
+        """Close the ports of control's master-side endpoint and of the own node's master to other users.
 
-        Raises `NetworkError` when others cannot be kept out.
+        Raises `NetworkError`.
         """
 
     def open_tunnels(self, pool: str, address: str) -> Esp:  # noqa: ARG002  the same everywhere
-        """Take addresses of `pool` through IPsec only from now on, and have `address`; where ESP runs.
+        """Accept addresses of `pool` through IPsec only, and add `address`; return where ESP runs.
 
-        Raises `NetworkError` when clear text cannot be kept out, or ESP can run nowhere.
+        Raises `NetworkError` if clear text cannot be blocked, or ESP cannot run.
         """
         raise NetworkError(
             f"isolation {self.kind} has no firewall that would keep tunnelled addresses from being forged:"
@@ -94,59 +101,62 @@ class Enclosure:
         )
 
     def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
-        """The machine's address by which `host` reaches the appliance; None: the one it used."""
+        """Return the machine's address by which `host` reaches the appliance; None: the address that it used."""
         return None
 
-    def endpoint(self) -> Endpoint:
-        """Where hosts of other networks reach the appliance. Raises `NetworkError` when that cannot be told."""
+    def endpoint(self) -> PublicAddress:
+        """Return where hosts of other networks reach the appliance. Raises `NetworkError` if that is not known."""
         raise NetworkError(f"isolation {self.kind} has no tunnels: use isolation netns or container")
 
     def report(self) -> FirewallState:
-        """How it stands, for `rosrv status`."""
+        """Return the state of the firewall for `rosrv status`."""
         return FirewallState()
 
     def probe(self) -> str | None:
-        """None when no other user can reach what must be hidden, else what was seen."""
+        """Return why a hidden port may be reachable by other users, or None."""
         return None
 
 
-class Contained(Enclosure):
-    """The namespace the supervisor was started in (a container's), with the firewall in force."""
+class ContainerIsolation(NoIsolation):
+    """The isolation in a container: the supervisor's own namespace, with the firewall."""
 
     kind = "container"
     probes = True
 
     def __init__(
-        self, ports: Ports, backend: Literal["auto", "iptables", "nft"], namespace: Namespace | None = None
+        self,
+        ports: AppliancePorts,
+        backend: Literal["auto", "iptables", "nft"],
+        namespace: Namespace | None = None,
     ) -> None:
         self._ports = ports
         self._namespace = namespace or Namespace.own()
         self._backend = backend
         self.firewall: Firewall | None = None
-        self._tunnels: tuple[str, Esp] | None = None  # the pool of their addresses
+        self._tunnels: tuple[str, Esp] | None = None  # the pool, and where ESP runs
         self._own: str | None = None  # the appliance's address in the tunnels
-        self._owed = False  # rules that are not in force yet, for the kernel refused them
+        self._owed = False  # the kernel rejected the last rules
         self._changing = threading.RLock()
         self._ending = False
 
     @contextlib.contextmanager
     def _standing(self) -> Iterator[None]:
-        """Have the rules to oneself. Raises `NetworkError` once they are taken away."""
+        """Lock the rules. Raises `NetworkError` after they are removed."""
         with self._changing:
             self._require_standing()
             yield
 
     def _require_standing(self) -> None:
         if self._ending:
-            raise NetworkError("the firewall is taken away: the appliance ends")
+            raise NetworkError("the firewall is removed: the appliance ends")
 
     @contextlib.contextmanager
     def _taking_away(self) -> Iterator[None]:
-        """Have the rules to oneself for the last time; a call that hangs is not waited for without end."""
+        """Lock the rules for the last time; wait a limited time for a call that hangs."""
         self._ending = True
         held = self._changing.acquire(timeout=_PATIENCE_SECONDS)
         if not held:
-            log.error("a look at the firewall hangs; it is taken away all the same")
+            log.error("a check of the firewall hangs; it is removed all the same")
         try:
             yield
         finally:
@@ -172,7 +182,7 @@ class Contained(Enclosure):
             )
 
     def remove(self) -> None:
-        """Take every rule away again, and the address that the tunnels end at."""
+        """Remove every rule, and the address of the tunnels."""
         if self.firewall is None:
             return
         with self._taking_away():
@@ -184,7 +194,7 @@ class Contained(Enclosure):
                 log.error("rules of the firewall may be left", error=str(error))
 
     def _end_tunnels(self, own: str) -> None:
-        """Take away their address, and what a charon that was killed has left in the kernel."""
+        """Remove the tunnels' address, and what a killed charon left in the kernel."""
         try:
             self._namespace.run(lambda: clear_leftovers(own.partition("/")[0]))
             interfaces.delete_address(self._namespace, "lo", own)
@@ -192,7 +202,7 @@ class Contained(Enclosure):
             log.error("something of the tunnels may be left", error=str(error))
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
-        """Close them to everybody but rosmaster's user, and rosout's."""
+        """Close both ports to all users but those of rosmaster and rosout."""
         with self._standing():
             if self.firewall is not None and (inner_port, own_port) != (self._ports.inner, self._ports.own):
                 self._ports = replace(self._ports, inner=inner_port, own=own_port)
@@ -201,7 +211,7 @@ class Contained(Enclosure):
                 self._owed = False
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """Close the pool to clear text first; only then it has a way in."""
+        """Close the pool to clear text before it becomes reachable."""
         with self._standing():
             if self.firewall is None:
                 raise NetworkError("the firewall is not in force")
@@ -222,8 +232,8 @@ class Contained(Enclosure):
             self._own = own
             return esp
 
-    def endpoint(self) -> Endpoint:
-        """The only address here, if there is but one: of several, the right one is known outside only."""
+    def endpoint(self) -> PublicAddress:
+        """Return the container's only address. With several, it is unknown which one outside hosts reach."""
         found = only_address(self._namespace, without=("lo", USER_SPACE_INTERFACE))
         if is_contained() and not lives_on_the_machines_network():
             reason = f"{found.reason}, in a container: from outside its machine it may be another"
@@ -231,7 +241,7 @@ class Contained(Enclosure):
         return found
 
     def report(self) -> FirewallState:
-        """Back end, rules with counters; rules that are gone are put back first."""
+        """Return back end and rules with counters; install missing rules first."""
         with self._standing():
             if self.firewall is None:
                 return FirewallState()
@@ -239,14 +249,14 @@ class Contained(Enclosure):
             if self._owed or not report.intact:
                 gone = [rule.purpose for rule in report.rules if not rule.in_force]
                 self._require_standing()
-                log.critical("rules of the firewall are not in force and are put back", rules=gone)
+                log.critical("rules of the firewall are missing and installed again", rules=gone)
                 self.firewall.install(self._settings())
                 self._owed = False
                 report = self.firewall.report()
         return FirewallState(report.backend, list(report.not_used), list(report.rules))
 
     def probe(self) -> str | None:
-        """Try to reach ROSMaster and the inner face as another local user."""
+        """Try to reach the hidden ports as another local user."""
         ports = {
             "ROSMaster": self._ports.rosmaster,
             "the inner node face": self._ports.inner,
@@ -273,7 +283,7 @@ class Contained(Enclosure):
             rosmaster_uid=account_of("rosmaster").uid,
             rosmaster_port=self._ports.rosmaster,
             inner_port=self._ports.inner,
-            own_node=OwnNode(
+            own_node=OwnNodeAccess(
                 uid=account_of("rosrv-rosout").uid,
                 relay_uid=account_of("rosrv-relay").uid,
                 address=OWN_NODE_ADDRESS,
@@ -294,27 +304,30 @@ class Contained(Enclosure):
         )
 
     def _api_networks(self) -> tuple[str, ...]:
-        """Besides those that were configured, the hosts in tunnels: there they renew their certificates."""
+        """Return the configured networks and the pool of the tunnels, where hosts renew their certificates."""
         return (*self._ports.api_networks, *([self._tunnels[0]] if self._tunnels else []))
 
     def _neighbours(self) -> tuple[str, ...]:
-        """Addresses that only the machine itself may bear, where the appliance's side can tell."""
+        """Return the addresses that only the machine itself may have on its link to the appliance."""
         return ()
 
-    def _forwarder(self) -> Forwarder | None:
+    def _forwarder(self) -> ForwarderAccess | None:
         if self._ports.syslog is None:
             return None
         protocol, address, port = self._ports.syslog
-        return Forwarder(account_of("rosrv-syslog").uid, address, port, datagrams=protocol == "udp")
+        return ForwarderAccess(account_of("rosrv-syslog").uid, address, port, datagrams=protocol == "udp")
 
 
-class InNamespace(Contained):
-    """A namespace of its own on a bare host; RVMaster's port, the nodes' and that of REST are forwarded to it."""
+class NetnsIsolation(ContainerIsolation):
+    """The isolation on a bare host: a separate namespace with forwarded ports for RVMaster, nodes and REST."""
 
     kind = "netns"
 
     def __init__(
-        self, ports: Ports, backend: Literal["auto", "iptables", "nft"], isolation: Isolation | None = None
+        self,
+        ports: AppliancePorts,
+        backend: Literal["auto", "iptables", "nft"],
+        isolation: Isolation | None = None,
     ) -> None:
         super().__init__(ports, backend)
         nodes = PortRange(ports.nodes.start, ports.nodes.stop - 1)
@@ -323,23 +336,23 @@ class InNamespace(Contained):
             forwarded.append(PortRange.one(ports.api))
         self._isolation = isolation or Isolation(Namespace.own(), IsolationSettings(ports=tuple(forwarded)))
         self._namespace = self._isolation.namespace
-        self._others: dict[str, list[str]] = {}  # what was said last
+        self._others: dict[str, list[str]] = {}  # logged last
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
-        """Be in the namespace, with the calling thread."""
+        """Move the calling thread into the namespace."""
         with self._namespace.entered():
             yield
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """As in a container; then IKE and ESP are forwarded to the namespace."""
+        """Do as in a container, then forward IKE and ESP to the namespace."""
         with self._standing():
             esp = super().open_tunnels(pool, address)
             self._isolation.forward_tunnels()
             return esp
 
     def build(self) -> None:
-        """Make the namespace, its way to the host's networks, and the firewall. Raises `StartError`."""
+        """Make the namespace, its link to the host's networks, and the firewall. Raises `StartError`."""
         try:
             self._isolation.up()
         except NetworkError as error:
@@ -347,7 +360,7 @@ class InNamespace(Contained):
         super().build()
 
     def remove(self) -> None:
-        """Take firewall and namespace away and put the host's settings back."""
+        """Remove firewall and namespace, and restore the host's settings."""
         with self._taking_away():
             super().remove()
             try:
@@ -356,38 +369,38 @@ class InNamespace(Contained):
                 log.error("the namespace may be left; the next start clears it", error=str(error))
 
     def _api_networks(self) -> tuple[str, ...]:
-        # The host's own loopback arrives under the address of its end of the link.
+        # Connections from the host's loopback arrive under the address of its end of the link.
         return (*self._neighbours(), *super()._api_networks())
 
     def _neighbours(self) -> tuple[str, ...]:
         return tuple(ends.host for ends in self._isolation.ends.values())
 
     def route_to(self, host: str) -> str | None:
-        """The host's address by which the peer reaches it; a peer in a tunnel reaches the appliance itself."""
-        # Control says what it was told; only an address goes on from here.
+        """Return the host's address by which `host` reaches the appliance; None for a host in a tunnel."""
+        # `host` comes from control: accept an address only.
         address = ipaddress.ip_address(host)
         if self._tunnels is not None and address in ipaddress.ip_network(self._tunnels[0]):
             return None
         return self._isolation.host_address_for(host)
 
-    def endpoint(self) -> Endpoint:
-        """The machine's address towards its default route, else its only one."""
+    def endpoint(self) -> PublicAddress:
+        """Return the machine's address towards its default route, else its only one."""
         return self._isolation.endpoint()
 
     def report(self) -> FirewallState:
-        """As in a container, and the rules on the host; those that are gone are put back, too."""
+        """Report as in a container, with the rules on the host; install missing ones again."""
         with self._standing():
             rules = self._isolation.rules()
             gone = [rule.purpose for rule in rules if not rule.in_force]
             if gone:
                 self._require_standing()
-                log.critical("rules on the host were taken away and are put back", rules=gone)
+                log.critical("rules on the host are missing and installed again", rules=gone)
                 self._isolation.put_rules_back()
                 rules = self._isolation.rules()
             return msgspec.structs.replace(super().report(), forwarding=list(rules), **self._look_at_others())
 
     def _look_at_others(self) -> dict[str, list[str]]:
-        """What programs such as Docker do to forwarded packets on the host; it is said when it changes."""
+        """Return the rules of programs such as Docker for forwarded packets, and log changes of them."""
         try:
             found = {
                 "translations": list(self._isolation.translations()),
@@ -407,15 +420,17 @@ class InNamespace(Contained):
         return found
 
 
-def enclosure_of(isolation: str, ports: Ports, backend: Literal["auto", "iptables", "nft"]) -> Enclosure:
-    """The surroundings that a configuration asks for; nothing is built yet."""
+def isolation_for(
+    isolation: str, ports: AppliancePorts, backend: Literal["auto", "iptables", "nft"]
+) -> NoIsolation:
+    """Return the isolation of a configuration; nothing is built yet."""
     if isolation == "container":
-        return Contained(ports, backend)
-    return InNamespace(ports, backend) if isolation == "netns" else Enclosure()
+        return ContainerIsolation(ports, backend)
+    return NetnsIsolation(ports, backend) if isolation == "netns" else NoIsolation()
 
 
 def _require_own_network() -> None:
-    """Raise `StartError` in a container that shares the machine's network: the firewall would be the machine's."""
+    """Raise `StartError` in a container with the machine's network: the firewall would be the machine's."""
     shared = lives_on_the_machines_network()
     if is_contained() and (shared or bridges()):
         raise StartError(

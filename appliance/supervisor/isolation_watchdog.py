@@ -1,11 +1,10 @@
-"""Looks after the enclosure while the appliance runs: probes it, keeps control informed of it.
+"""Check the isolation while the appliance runs, and report to control.
 
-What the enclosure does takes time, so each call is made in a thread, one after the other (a few that only look); the
-supervisor's loop goes on meanwhile. The threads are daemons: one that hangs does not keep the appliance
-from ending.
+Calls of the isolation take time, so each runs in a daemon thread, one after the other (for routes a few at once). A
+thread that hangs does not keep the appliance from ending.
 
-Invariant: whatever is raised on the way (no file, no process, no memory, an answer that cannot be read) is a
-finding with its reason. It never ends the looking, and never leaves control with an older, better one.
+Every exception (a missing file or process, no memory, an unreadable answer) becomes a finding with its reason. So the
+checks never stop, and control never keeps an outdated better finding.
 """
 
 import asyncio
@@ -20,7 +19,7 @@ from appliance.channel import messages
 from appliance.channel.answers.status import FirewallState
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor import signals
-from appliance.supervisor.isolation_lifecycle import Enclosure
+from appliance.supervisor.isolation_lifecycle import NoIsolation
 
 PROBE_SECONDS = 60.0
 _ROUTES_AT_ONCE = 4
@@ -30,46 +29,50 @@ T = TypeVar("T")
 log = structlog.get_logger()
 
 
-class Guard:
-    """The enclosure as the supervisor sees it; `tell` gives a message to control."""
+class IsolationWatchdog:
+    """The isolation as the supervisor uses it; `tell` sends a message to control."""
 
     def __init__(
-        self, enclosure: Enclosure, tell: Callable[[messages.Message], None], *, every: float = PROBE_SECONDS
+        self,
+        isolation: NoIsolation,
+        tell: Callable[[messages.Message], None],
+        *,
+        every: float = PROBE_SECONDS,
     ) -> None:
-        self.enclosure = enclosure
+        self.isolation = isolation
         self._tell = tell
         self._every = every
         self._one_at_a_time = asyncio.Lock()
-        self._few_at_a_time = asyncio.Semaphore(_ROUTES_AT_ONCE)  # routes are only looked up
+        self._few_at_a_time = asyncio.Semaphore(_ROUTES_AT_ONCE)  # route queries change nothing
         self._probe: messages.Message | None = None
-        self._report = messages.FirewallReported(isolation=enclosure.kind, report=FirewallState())
+        self._report = messages.FirewallReported(isolation=isolation.kind, report=FirewallState())
 
     def news(self) -> list[messages.Message]:
-        """What a new control has to know."""
+        """Return the messages for a new control."""
         return [self._report] if self._probe is None else [self._report, self._probe]
 
     async def look(self) -> str | None:
-        """Probe, look at the rules, tell control; the reason when something is open that must be hidden."""
+        """Probe, check the rules and report to control; return why a hidden port is open, or None."""
         async with self._one_at_a_time:
             reason = await self._find_fault()
         self._found(reason)
         return reason
 
     def _found(self, reason: str | None) -> None:
-        """Keep what was found, and tell control."""
+        """Keep a finding, and report it to control."""
         if reason is not None:
             log.critical("the appliance must not serve", reason=reason)
             self._probe = messages.ProbeFailed(reason)
-        elif self.enclosure.probes:
+        elif self.isolation.probes:
             self._probe = messages.ProbePassed()
         for message in self.news():
             self._tell(message)
 
     async def control_ready(self, inner_port: int, own_port: int) -> str | None:
-        """Close control's inner ports to others and look whether they are; the reason when not."""
+        """Close control's inner ports to other users, and check that; return the reason of a failure, or None."""
         try:
             async with self._one_at_a_time:
-                await in_thread(lambda: self.enclosure.control_ready(inner_port, own_port))
+                await in_thread(lambda: self.isolation.control_ready(inner_port, own_port))
         except Exception as error:  # noqa: BLE001  see the invariant
             reason = f"control's inner ports cannot be closed to others: {_words(error)}"
             self._found(reason)
@@ -77,52 +80,52 @@ class Guard:
         return await self.look()
 
     async def open_tunnels(self, pool: str, address: str) -> messages.TunnelsEnclosed:
-        """Close a pool of addresses to clear text; where ESP runs, or why there can be no tunnels."""
+        """Close a pool of addresses to clear text; return where ESP runs, or why there can be no tunnels."""
         try:
             async with self._one_at_a_time:
-                esp = await in_thread(lambda: self.enclosure.open_tunnels(pool, address))
-                report = await in_thread(self.enclosure.report)
+                esp = await in_thread(lambda: self.isolation.open_tunnels(pool, address))
+                report = await in_thread(self.isolation.report)
         except Exception as error:  # noqa: BLE001  see the invariant
             return messages.TunnelsEnclosed(None, _words(error))
-        self._report = messages.FirewallReported(isolation=self.enclosure.kind, report=report)
+        self._report = messages.FirewallReported(isolation=self.isolation.kind, report=report)
         self._tell(self._report)
         log.info("addresses are taken through tunnels only", pool=pool, esp=esp)
         return messages.TunnelsEnclosed(esp)
 
     async def route_to(self, host: str) -> str | None:
-        """The machine's address by which `host` reaches the appliance; None when its own route is right."""
+        """Return the machine's address by which `host` reaches the appliance; None: the address that it used."""
         try:
             async with self._few_at_a_time:
-                return await in_thread(lambda: self.enclosure.route_to(host))
+                return await in_thread(lambda: self.isolation.route_to(host))
         except Exception as error:  # noqa: BLE001  see the invariant
             log.warning("no route to a host", host=host, error=_words(error))
             return None
 
     async def endpoint(self) -> messages.EndpointFound:
-        """Where hosts of other networks reach the appliance, or why that cannot be told."""
+        """Return where hosts of other networks reach the appliance, or why that is not known."""
         try:
-            found = await in_thread(self.enclosure.endpoint)
+            found = await in_thread(self.isolation.endpoint)
         except Exception as error:  # noqa: BLE001  see the invariant
             return messages.EndpointFound(None, _words(error))
         return messages.EndpointFound(found.address, found.reason)
 
     async def run(self) -> None:
-        """Look every minute."""
+        """Check every minute."""
         while True:
             await asyncio.sleep(self._every)
             await self.look()
 
     async def _find_fault(self) -> str | None:
         try:
-            report = await in_thread(self.enclosure.report)
-            self._report = messages.FirewallReported(isolation=self.enclosure.kind, report=report)
-            return await in_thread(self.enclosure.probe)
+            report = await in_thread(self.isolation.report)
+            self._report = messages.FirewallReported(isolation=self.isolation.kind, report=report)
+            return await in_thread(self.isolation.probe)
         except Exception as error:  # noqa: BLE001  see the invariant
             return f"the state of the firewall cannot be told: {_words(error)}"
 
 
 def _words(error: Exception) -> str:
-    """What a person is told; what nobody thought of is shown whole in the log."""
+    """Return the text for an operator; log an unexpected exception with its traceback."""
     if isinstance(error, NetworkError | ValueError):
         return str(error)
     log.error("fault while looking at the surroundings", exc_info=error)
@@ -130,7 +133,7 @@ def _words(error: Exception) -> str:
 
 
 async def in_thread(function: Callable[[], T]) -> T:
-    """What `function` returns or raises, called in a daemon thread of its own."""
+    """Call `function` in a daemon thread of its own; return its result or raise its exception."""
     loop = asyncio.get_running_loop()
     outcome: asyncio.Future[T] = loop.create_future()
 

@@ -1,6 +1,6 @@
-"""Logs of the supervisor and its children: on standard error, for people on a terminal, else as JSON.
+"""Configure the logs of all processes: on standard error, readable on a terminal, otherwise JSON.
 
-What is logged with the standard library's `logging` looks the same.
+Messages of the standard library's `logging` have the same form.
 """
 
 import logging
@@ -8,7 +8,7 @@ import sys
 from typing import Any, cast
 
 _rich = sys.modules.pop("rich", None)
-sys.modules["rich"] = cast(Any, None)  # structlog loads it where it is, for tracebacks that we do not want
+sys.modules["rich"] = cast(Any, None)  # otherwise structlog loads it for tracebacks, which are not wanted
 import structlog  # noqa: E402  see above
 
 del sys.modules["rich"]
@@ -20,7 +20,7 @@ _transform = structlog.tracebacks.ExceptionDictTransformer(show_locals=False)
 
 
 def configure_logs(process: str) -> None:
-    """Log to standard error; every line says which process wrote it."""
+    """Log to standard error; every line has the name of its process."""
     human = sys.stderr.isatty()
     shared: list[structlog.typing.Processor] = [
         structlog.contextvars.merge_contextvars,

@@ -1,12 +1,12 @@
-"""The files in which relays keep the state of their monitors (`relay/monitors/state_memory.py`).
+"""Provide the files in which relays keep the state of their monitors (`relay/monitors/state_memory.py`).
 
-Nothing is read of them here but whether they have anything. Each life of the appliance has a folder with a file for
-each relay; the kernel keeps what is in them when all processes die. Every relay may read the files of earlier lives,
-because a monitor may be on another relay now. These go when a later life is complete: each of its relays has written
-its own file. So an appliance that is killed while it starts loses nothing.
+Each run of the appliance has a folder with one file per relay; the kernel keeps their content when all processes die.
+This module reads only whether a file has content. Every relay may read the files of earlier runs, because a monitor may
+now be on another relay. Earlier folders are removed when each relay of a later run has written its file, so an
+appliance that is killed during its start loses nothing.
 
-At an orderly end all is written to the disk, and then a file that says so, and when. Only then is a state used again
-after the machine was started again.
+An orderly end writes everything to disk, and then a file with the time. After a reboot the state is used only if this
+file exists.
 """
 
 import os
@@ -27,22 +27,22 @@ SIZE = 32 << 20
 """Bytes of each file."""
 
 _ENDED = "ended"
-_MOST_LIVES = 4  # that are kept where none is complete: what is older is hardly of use
+_MOST_LIVES = 4  # kept if none is complete
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
-_HEAD = 9  # bytes: the magic, and whether anything is written behind it
+_HEAD = 9  # bytes: the magic, and whether content follows
 
 log = structlog.get_logger()
 
 
 class _Ended(msgspec.Struct):
-    """How the appliance ended last: in which start of the machine, and when (ns since the epoch)."""
+    """The last orderly end: the id of the boot, and the time (ns since the epoch)."""
 
     boot: str
     at: int
 
 
 class MonitorMemory:
-    """One file for each relay, and those of the life before."""
+    """The files of this run, one for each relay, and those of earlier runs."""
 
     def __init__(self, state: Path, relays: int) -> None:
         self._folder = state / FOLDER
@@ -71,8 +71,8 @@ class MonitorMemory:
                 self._own.append(os.memfd_create(f"rosrv-monitors-{index}", os.MFD_CLOEXEC))
                 os.ftruncate(self._own[-1], SIZE)
 
-    def given_to(self, role: str, index: int) -> Iterator[tuple[StateGiven, int]]:
-        """What a process gets at its start."""
+    def messages_for(self, role: str, index: int) -> Iterator[tuple[StateGiven, int]]:
+        """Yield the messages and descriptors for a process that starts."""
         if role != "relay":
             return
         ended = self._ended
@@ -81,7 +81,7 @@ class MonitorMemory:
         yield StateGiven(True, self._boot, self._offset, ended.boot, ended.at), self._own[index]
 
     def close(self) -> None:
-        """All relays have ended: see that what they kept outlives the machine's power."""
+        """Write the state to disk, after all relays have ended."""
         try:
             for descriptor in self._own:
                 os.fsync(descriptor)
@@ -93,7 +93,7 @@ class MonitorMemory:
         self._own, self._earlier = [], []
 
     def _take_ended(self) -> _Ended:
-        """How the life before ended; what is kept from now on is not of that."""
+        """Return the last orderly end, and remove its file."""
         path = self._folder / _ENDED
         try:
             ended = msgspec.json.decode(path.read_bytes(), type=_Ended)
@@ -106,9 +106,10 @@ class MonitorMemory:
         return ended
 
     def _lives(self) -> list[Path]:
-        """The folders of earlier lives, the oldest first, without those that are of no use any more."""
+        """Remove folders that are no longer needed; return the others, the oldest first."""
         kept: list[Path] = []
-        for life in sorted((path for path in self._folder.iterdir() if path.is_dir()), reverse=True):
+        runs = [path for path in self._folder.iterdir() if path.is_dir() and path.name.isdecimal()]
+        for life in sorted(runs, reverse=True):
             written = [_is_written(path) for path in life.iterdir()]
             if not any(written) or len(kept) == _MOST_LIVES or (kept and _is_complete(kept[-1])):
                 shutil.rmtree(life)
@@ -122,7 +123,7 @@ def _is_complete(life: Path) -> bool:
 
 
 def _this_boot() -> str:
-    """What names this start of the machine; where the kernel does not say, something that no other life has."""
+    """Return the id of this boot; a random one if the kernel has none."""
     try:
         return _BOOT.read_text("ascii").strip()
     except OSError:
@@ -135,7 +136,7 @@ def _is_written(path: Path) -> bool:
 
 
 def _made(path: Path) -> int:
-    """A new file, all of whose bytes have a place. Raises `OSError`."""
+    """Create a file with all its blocks allocated. Raises `OSError`."""
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
     descriptor = os.open(path, flags, 0o600)
     try:

@@ -1,4 +1,4 @@
-"""Whether a port is free, and who has it when it is not."""
+"""Check whether a port is free, and find the process that has it."""
 
 import errno
 import socket
@@ -11,7 +11,7 @@ from appliance.supervisor.errors import StartError
 
 
 def free_port() -> int:
-    """A loopback port that nobody listens on now."""
+    """Return a free loopback port."""
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         port: int = sock.getsockname()[1]
@@ -19,10 +19,7 @@ def free_port() -> int:
 
 
 def first_free(ports: range) -> int:
-    """The first of these loopback ports that nobody has, and that no connection of an earlier owner keeps.
-
-    Raises `OSError` when there is none.
-    """
+    """Return the first of these loopback ports without a listener or an old connection. Raises `OSError`."""
     for port in ports:
         with socket.socket() as sock:
             try:
@@ -34,7 +31,7 @@ def first_free(ports: range) -> int:
 
 
 def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
-    """That many neighbouring ports `within`, the highest that overlap none `taken`. Raises `StartError`."""
+    """Return the highest `count` adjacent ports `within` that do not overlap `taken`. Raises `StartError`."""
     stop = within.stop
     while stop - count >= within.start:
         wanted = range(stop - count, stop)
@@ -49,7 +46,7 @@ def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
 
 
 def require_free(host: str, port: int) -> None:
-    """Raise `StartError` when nobody could listen on this address, and say who does where that is known."""
+    """Raise `StartError` if the address cannot be listened on; it names the process that has the port, if known."""
     if port == 0:
         return
     try:

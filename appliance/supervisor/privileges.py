@@ -1,14 +1,13 @@
-"""What a child gives up before it runs a line of its own.
+"""Drop privileges of a child before its own code runs.
 
-Invariants, in the order in which they are made true by `drop`:
+After `drop_privileges`:
 
-1. The child dies with the supervisor (`PR_SET_PDEATHSIG`), also when that was killed before the request
-   was made.
-2. No supplementary groups, no capability in any of the five sets but those that the role is given (ambient, so
-   that its own children have them too), no way to gain another (`no_new_privs`).
-3. Files it makes are its own (`umask 077`).
+1. The child dies with the supervisor (`PR_SET_PDEATHSIG`), also if that died earlier.
+2. It has no supplementary groups, only the role's capabilities (ambient, so its children have them too), and cannot
+   gain others (`no_new_privs`).
+3. Only its user can read the files that it makes (`umask 077`).
 
-As a caller who is not root only 1 and 3 and `no_new_privs` apply; there is nothing else to give up.
+Without root only 1, 3 and `no_new_privs` apply.
 """
 
 import contextlib
@@ -34,10 +33,9 @@ _CAPABILITY_VERSION_3 = 0x20080522
 
 
 def die_with_parent(parent: int) -> None:
-    """Ask the kernel to kill this process when `parent`, which must be the parent, dies.
+    """Make the kernel kill this process when its parent `parent` dies; exit if it died already.
 
-    To be called after the change of user, which clears the request. Exits at once when the parent is
-    gone already.
+    Call this after the change of user, which clears the setting.
     """
     prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
@@ -45,7 +43,7 @@ def die_with_parent(parent: int) -> None:
 
 
 def raise_file_limit(wanted: int) -> int:
-    """Raise the limit on open files to `wanted`, or as far as it may be raised; returns what it is now."""
+    """Raise the limit on open files to `wanted`, or as far as permitted; return the new limit."""
     _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard == resource.RLIM_INFINITY or hard >= wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
@@ -58,10 +56,10 @@ def raise_file_limit(wanted: int) -> int:
     return wanted
 
 
-def be_ended_early(score: int) -> None:
-    """Where memory is short be ended before others by so much (`oom_score_adj`); never later than it is now.
+def raise_oom_score(score: int) -> None:
+    """Raise `oom_score_adj`, so the kernel kills this process earlier if memory is short; never lower it.
 
-    To be called before the change of user, which closes the file. Where /proc is read-only the kernel goes by size.
+    Call this before the change of user, which then may not write the file. With a read-only /proc nothing changes.
     """
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "r+") as file:  # noqa: PTH123  as below
         if score > int(file.read()):
@@ -69,12 +67,12 @@ def be_ended_early(score: int) -> None:
 
 
 def leave_network() -> None:
-    """Move this process into an empty network namespace of its own. Raises `OSError` when refused."""
+    """Move this process into an empty network namespace. Raises `OSError`."""
     _call("unshare(CLONE_NEWNET)", _CLONE_NEWNET)
 
 
-# What the supervisor itself does with each; all others are given up before it starts anything.
-SUPERVISORS = {
+# The supervisor's use of each; it drops all others before it starts anything.
+SUPERVISOR_CAPABILITIES = {
     "CHOWN": 0,  # give each role its part of the state directory
     "DAC_OVERRIDE": 1,  # and look into it
     "FOWNER": 3,
@@ -85,17 +83,17 @@ SUPERVISORS = {
     "NET_BIND_SERVICE": 10,  # give it to charon: ports 500 and 4500
     "NET_ADMIN": 12,  # firewall
     "NET_RAW": 13,  # its iptables back end
-    "SYS_PTRACE": 19,  # say who has a port, find what a crash left in the namespace
+    "SYS_PTRACE": 19,  # find the process that has a port, and processes that a crash left in the namespace
     "SYS_ADMIN": 21,  # namespaces
     "SYS_RESOURCE": 24,  # limit on open files
 }
 
 
-def keep_supervisors() -> None:
-    """Give up every capability that is not in `SUPERVISORS`; what is not held now is not gained."""
+def drop_unused_capabilities() -> None:
+    """Drop every capability that is not in `SUPERVISOR_CAPABILITIES`."""
     if os.geteuid() != 0:
         return
-    kept = sum(1 << number for number in SUPERVISORS.values())
+    kept = sum(1 << number for number in SUPERVISOR_CAPABILITIES.values())
     _empty_bounding_set(but=kept)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; then the same of the upper 32 numbers
@@ -105,14 +103,11 @@ def keep_supervisors() -> None:
     _call("capset", header, sets)
 
 
-def drop(account: Account, *, parent: int, capabilities: Sequence[str] = ()) -> None:
-    """Become `account` for good, with these capabilities of `SUPERVISORS`; see the invariants above.
-
-    Raises `OSError` when the kernel refuses.
-    """
+def drop_privileges(account: Account, *, parent: int, capabilities: Sequence[str] = ()) -> None:
+    """Become `account` for good, with these of `SUPERVISOR_CAPABILITIES`. Raises `OSError`."""
     os.umask(0o077)
     if os.geteuid() == 0:
-        kept = sum(1 << SUPERVISORS[name] for name in capabilities)
+        kept = sum(1 << SUPERVISOR_CAPABILITIES[name] for name in capabilities)
         _empty_bounding_set(but=kept)
         os.setgroups([])
         os.setresgid(account.gid, account.gid, account.gid)
@@ -125,8 +120,8 @@ def drop(account: Account, *, parent: int, capabilities: Sequence[str] = ()) -> 
 
 
 def _empty_bounding_set(*, but: int = 0) -> None:
-    # Without CAP_SETPCAP (a container may withhold it) the bounding set stays. With no_new_privs it
-    # gives nothing: it only ever limited what an execve may add.
+    # Without CAP_SETPCAP (in some containers) the bounding set stays. With no_new_privs it has no effect: it only
+    # limits what an execve may add.
     with open(_LAST_CAPABILITY_FILE) as file:  # noqa: PTH123  pathlib is not loaded in this early stage
         last = int(file.read())
     for capability in range(last + 1):
@@ -139,23 +134,23 @@ def _empty_bounding_set(*, but: int = 0) -> None:
 
 
 def _reduce_capabilities(kept: int) -> None:
-    """Have exactly the capabilities of this bit set, and let them pass to programs that are executed."""
+    """Keep exactly the capabilities of this bit set, also for executed programs."""
     prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     low, high = kept & 0xFFFFFFFF, kept >> 32
     _call("capset", header, (ctypes.c_uint32 * 6)(low, low, low, high, high, high))
-    for capability in SUPERVISORS.values():
+    for capability in SUPERVISOR_CAPABILITIES.values():
         if kept >> capability & 1:
             prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_RAISE, capability)
 
 
 def prctl(option: int, first: int, second: int = 0) -> None:
-    """`prctl(2)`. Raises `OSError`."""
+    """Call `prctl(2)`. Raises `OSError`."""
     _call(f"prctl({option})", ctypes.c_int(option), *map(ctypes.c_ulong, (first, second, 0, 0)))
 
 
 def _call(what: str, *arguments: Any) -> None:
-    """A call of the C library, `what` as the error says it: `name(option)`. Raises `OSError`."""
+    """Call a function of the C library; `what` is `name(option)` for the error. Raises `OSError`."""
     function = ctypes.CDLL(None, use_errno=True)[what.partition("(")[0]]
     if function(*arguments) != 0:
         number = ctypes.get_errno()

@@ -1,8 +1,7 @@
-"""One life of one process: from its start to its death, with its end of the lifeline.
+"""Run one process from its start to its death, with the supervisor's end of its lifeline.
 
-The supervisor is told what happens through callbacks; what to do about it (restart, stop) is not
-decided here. A process is never waited for: the kernel reports its death on a pid descriptor, which no
-reuse of the number can fool.
+Events go to the supervisor through callbacks, and it decides about restarts. The kernel reports a death on a pid
+descriptor, which a reuse of the process id cannot confuse.
 """
 
 import asyncio
@@ -25,10 +24,10 @@ import msgspec
 import appliance
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.messages import Lifeline, LinkOpened, Message, Ping, Walled
-from appliance.network.patience import Progress
-from appliance.supervisor.child_entry import Plan
+from appliance.network.hang_detection import ProcessActivity
+from appliance.supervisor.child_entry import LaunchPlan
 
-# Starting is mostly loading: killed too early on a slow machine, it would begin anew. So who gets on is waited for.
+# A start is mostly loading, which a kill would only repeat: a process that progresses gets more time.
 FIRST_ANSWER_SECONDS = 60.0
 LONGEST_START_SECONDS = 1800.0
 ANSWER_SECONDS = 5.0
@@ -36,29 +35,31 @@ _PROGRAM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 
 @dataclass(frozen=True)
-class Reports:
-    """What the supervisor wants to hear of a life."""
+class ProcessCallbacks:
+    """Callbacks of the supervisor for the events of a process."""
 
-    received: Callable[["Life", Any, tuple[int, ...]], None]
-    violated: Callable[["Life", str], None]
-    died: Callable[["Life", int], None]
+    received: Callable[["ProcessHandle", Any, tuple[int, ...]], None]
+    violated: Callable[["ProcessHandle", str], None]
+    died: Callable[["ProcessHandle", int], None]
 
 
-def hangs(silent: float, *, starting: bool, still: float) -> bool:
-    """Whether a process counts as hanging that did not answer for so many seconds, `still` of them without progress.
+def is_hanging(silent: float, *, starting: bool, still: float) -> bool:
+    """Whether a process hangs that did not answer for `silent` seconds, `still` of them without progress.
 
-    While it starts, `silent` are the seconds since its start: it may take long as long as it gets on.
+    During a start, `silent` counts from the start; a start that progresses may take long.
     """
     if starting:
         return silent > LONGEST_START_SECONDS or (silent > FIRST_ANSWER_SECONDS and still > ANSWER_SECONDS)
     return silent > ANSWER_SECONDS
 
 
-class Life:
+class ProcessHandle:
     """A running process."""
 
-    def __init__(self, role: str, index: int, plan: Plan, lifeline: socket.socket, reports: Reports) -> None:
-        """Start the process; `lifeline` is the supervisor's end, `plan.lifeline` the child's (both open)."""
+    def __init__(
+        self, role: str, index: int, plan: LaunchPlan, lifeline: socket.socket, reports: ProcessCallbacks
+    ) -> None:
+        """Start the process; `lifeline` is the supervisor's end, `plan.lifeline` the child's; both are open."""
         self.role = role
         self.index = index
         self.ready = False
@@ -66,15 +67,15 @@ class Life:
         self.since = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         self.started = time.monotonic()
         self.answered: float | None = None
-        self.walls: Walled | None = None
-        self.congestion = ""  # of a relay's sockets
-        self.reason = ""  # why it cannot serve, in its own words
-        self.output: tuple[str, ...] = ()  # the last lines of the program that it ran
+        self.sandbox: Walled | None = None
+        self.congestion = ""  # the congestion control of a relay's sockets
+        self.reason = ""  # why it cannot serve, from the process itself
+        self.output: tuple[str, ...] = ()  # the last lines of its program
         self._asked = 0
         self._reports = reports
         self._loop = asyncio.get_running_loop()
         self._process = subprocess.Popen(
-            # -s: its home is a part of the state, no place to take code from
+            # -s: no code from its home, which is a part of the state
             [
                 sys.executable,
                 "-P",
@@ -91,8 +92,13 @@ class Life:
             start_new_session=True,
         )
         self.pid = self._process.pid
-        self._progress = Progress(self.pid)
-        self._pidfd = os.pidfd_open(self.pid)
+        self._progress = ProcessActivity(self.pid)
+        try:
+            self._pidfd = os.pidfd_open(self.pid)
+        except OSError:  # too many open files: nothing would watch the process
+            self._process.kill()
+            self._process.wait()
+            raise
         self._loop.add_reader(self._pidfd, self._dead)
         self._channel: Channel | None = Channel(lifeline, Lifeline, longest=1 << 20)
         self._channel.attach(
@@ -101,22 +107,22 @@ class Life:
 
     @property
     def alive(self) -> bool:
-        """Whether its death has not been seen yet."""
+        """Whether its death is not known yet."""
         return self._pidfd >= 0
 
     @property
-    def enclosed(self) -> tuple[str, list[str]]:
-        """The walls it is in, in words, and what this kernel lacks of them."""
-        if self.walls is None:
+    def sandbox_state(self) -> tuple[str, list[str]]:
+        """Return the sandbox in words, and what this kernel lacks of it."""
+        if self.sandbox is None:
             return "", []
-        calls = {"listed": "listed calls", "usual": "usual calls"}.get(self.walls.calls)
-        files = f"Landlock {self.walls.landlock}" if self.walls.landlock else None
+        calls = {"listed": "listed calls", "usual": "usual calls"}.get(self.sandbox.calls)
+        files = f"Landlock {self.sandbox.landlock}" if self.sandbox.landlock else None
         return ", ".join(filter(None, (calls, files))) or "none", [
-            lack[:200] for lack in self.walls.lacks[:8]
+            lack[:200] for lack in self.sandbox.lacks[:8]
         ]
 
     def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
-        """Tell the process something; nothing happens when it is gone (its death is reported by itself)."""
+        """Send a message, unless the process is gone (its death is reported separately)."""
         if self._channel is None:
             return
         try:
@@ -127,36 +133,36 @@ class Life:
             self._reports.violated(self, f"does not read its lifeline: {error}")
 
     def ping(self) -> None:
-        """Ask whether it is alive."""
+        """Request an answer."""
         self._asked += 1
         self.send(Ping(self._asked))
 
-    def heard(self) -> None:
-        """Note that it is alive."""
+    def note_answer(self) -> None:
+        """Note an answer."""
         self.answered = time.monotonic()
 
-    def forgive(self, seconds: float) -> None:
-        """Do not count `seconds` in which the supervisor itself did not run (a suspended machine)."""
+    def discount_pause(self, seconds: float) -> None:
+        """Do not count `seconds` in which the supervisor did not run (a suspended machine)."""
         self.started += seconds
         if self.answered is not None:
             self.answered += seconds
 
     @property
-    def silent_too_long(self) -> bool:
-        """Whether it has not answered for so long that it counts as hanging."""
+    def is_hanging(self) -> bool:
+        """Whether it hangs."""
         now = time.monotonic()
-        # One of ours may answer once and then read policy and specifications, which takes as long as it takes.
+        # A role of the appliance may answer once, and then take long to load policy and specifications.
         starting = self.answered is None or not (self.ready or self.is_program)
         since = self.started if self.answered is None or starting else self.answered
-        return hangs(now - since, starting=starting, still=self.still_seconds)
+        return is_hanging(now - since, starting=starting, still=self.stalled_seconds)
 
     @property
-    def still_seconds(self) -> float:
-        """Seconds since it was last seen to get on with what it does, or to wait for a processor or a disk."""
-        return self._progress.still_seconds()
+    def stalled_seconds(self) -> float:
+        """Return the seconds since the process last progressed, or waited for a processor or a disk."""
+        return self._progress.stalled_seconds()
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
-        """Send it a signal."""
+        """Send the process a signal."""
         if not self.alive:
             return
         with suppress(ProcessLookupError):
@@ -167,9 +173,8 @@ class Life:
         self._reports.violated(self, f"sent what no process may send: {reason}")
 
     def _lifeline_closed(self) -> None:
-        # A program that has taken over from the launcher, or a process that is about to be reported
-        # dead. One of ours that merely closed its lifeline could never be stopped in order, and does
-        # not answer: it is killed.
+        # An external program now runs, or a death will be reported soon. A role of the appliance that only closed its
+        # lifeline could not be stopped in order: it is killed.
         self._channel = None
         if not self.is_program:
             self.kill()
@@ -177,7 +182,7 @@ class Life:
     def _dead(self) -> None:
         self._loop.remove_reader(self._pidfd)
         if self._channel is not None:
-            # Its last words (why it could not start) may still be unread.
+            # The process's last message (why it could not start) may be unread.
             channel, self._channel = self._channel, None
             with suppress(ChannelClosedError, msgspec.DecodeError):
                 for message, descriptors in channel.receive():
@@ -189,8 +194,8 @@ class Life:
         self._reports.died(self, code)
 
 
-def link(one: Life, other: Life) -> None:
-    """Give two processes the two ends of a fresh link."""
+def link_processes(one: ProcessHandle, other: ProcessHandle) -> None:
+    """Send the two ends of a new link to two processes."""
     here, there = socket.socketpair()
     with here, there:
         one.send(LinkOpened(role=other.role, index=other.index), (here.fileno(),))
@@ -202,15 +207,15 @@ def _environment(home: str) -> dict[str, str]:
     return {
         **kept,
         "HOME": home,
-        "TMPDIR": home,  # of SQLite: no other folder may be written
+        "TMPDIR": home,  # for SQLite: no other folder is writable
         "PATH": _PROGRAM_PATH,
         "PYTHONPATH": str(Path(appliance.__file__).parent.parent),
-        "PYDANTIC_DISABLE_PLUGINS": "__all__",  # it looks for them in all that is installed
+        "PYDANTIC_DISABLE_PLUGINS": "__all__",  # pydantic would search all installed packages for plugins
     }
 
 
 def program_environment(home: str, extra: dict[str, str]) -> dict[str, str]:
-    """The environment of a program that is not ours: nothing of the caller's but language and time zone."""
+    """Return the environment of an external program; it inherits only language and time zone."""
     environment = _environment(home)
     del environment["PYTHONPATH"], environment["PYDANTIC_DISABLE_PLUGINS"]
     return {**environment, **extra}

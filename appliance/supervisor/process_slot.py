@@ -1,4 +1,4 @@
-"""A place in the table of processes that is to be filled at all times, and how long it stays empty after a death."""
+"""Keep the slot of a process in the table of processes, and compute the delay of its restarts."""
 
 import asyncio
 import os
@@ -7,86 +7,86 @@ from dataclasses import dataclass
 
 import msgspec
 
-from appliance.supervisor.child_entry import Plan
-from appliance.supervisor.process_handle import Life, program_environment
+from appliance.supervisor.child_entry import LaunchPlan
+from appliance.supervisor.process_handle import ProcessHandle, program_environment
 from appliance.supervisor.roles import Facts, Role
-from appliance.supervisor.sandbox.folders import furnished
+from appliance.supervisor.sandbox.folders import with_system_files
 from appliance.supervisor.users import account_of
 
-LOUD_AFTER = 5  # short lives in a row
+FAILING_AFTER = 5  # short runs in a row
 _BACKOFF = (0.0, 0.2, 0.5, 1.0)
-_LONGEST_DELAY = 60.0  # of what the others go on without
-LONG_LIFE_SECONDS = 10.0
+_LONGEST_DELAY = 60.0  # of dispensable roles
+STABLE_SECONDS = 10.0
 
 
 @dataclass
-class Post:
-    """A role, or one of several of it, and who fills it now."""
+class ProcessSlot:
+    """The place of one process of a role: the running process, or its next start."""
 
     role: Role
     index: int
-    life: Life | None = None
-    lives: int = 0
-    short_lives: int = 0  # in a row
+    process: ProcessHandle | None = None
+    starts: int = 0
+    short_runs: int = 0  # in a row
     due: asyncio.TimerHandle | None = None
-    wanted: bool = False  # of a role on demand: asked for since this life began
-    since: str = ""  # when its last life began
-    reason: str = ""  # why its last life ended: in its own words, if it had any
-    output: tuple[str, ...] = ()  # the last lines of what it ran
+    wanted: bool = False  # for a role on demand: requested since this start
+    since: str = ""  # the last start
+    reason: str = ""  # why the last run ended, from the process itself if it said so
+    output: tuple[str, ...] = ()  # the last lines of its program
 
     @property
-    def is_vacant(self) -> bool:
-        """Nobody fills it, and nobody is about to."""
-        return self.life is None and self.due is None
+    def is_free(self) -> bool:
+        """Whether no process runs and no start is due."""
+        return self.process is None and self.due is None
 
     @property
-    def keeps_dying(self) -> bool:
-        """Its last lives were short, so many that somebody must be told."""
-        return self.short_lives >= LOUD_AFTER
+    def is_failing(self) -> bool:
+        """Whether operators must know that the last runs were all short."""
+        return self.short_runs >= FAILING_AFTER
 
     @property
     def is_late(self) -> bool:
-        """Nodes cannot connect before it is ready, and it is not."""
+        """Whether nodes cannot connect because this process is not ready."""
         role = self.role
         waited_for = (
             role.program is None and role.after is None and not role.on_demand and not role.dispensable
         )
-        return waited_for and (self.life is None or not self.life.ready)
+        return waited_for and (self.process is None or not self.process.ready)
 
-    def bury(self, life: Life) -> float:
-        """Note the death of who filled it; the seconds that it lived."""
-        self.life = None
-        self.since = life.since
-        lived = time.monotonic() - life.started
-        self.short_lives = self.short_lives + 1 if lived < LONG_LIFE_SECONDS else 0
+    def record_death(self, process: ProcessHandle) -> float:
+        """Note the end of the process; return the seconds that it ran."""
+        self.process = None
+        self.since = process.since
+        lived = time.monotonic() - process.started
+        self.short_runs = self.short_runs + 1 if lived < STABLE_SECONDS else 0
         return lived
 
     def recovers(self) -> bool:
-        """Forget that its lives kept ending when this one has lasted; whether that is so now."""
-        lasts = self.life is not None and time.monotonic() - self.life.started >= LONG_LIFE_SECONDS
-        if not (lasts and self.keeps_dying):
+        """Reset the failures once a process runs long enough; return whether that happened now."""
+        lasts = self.process is not None and time.monotonic() - self.process.started >= STABLE_SECONDS
+        if not (lasts and self.is_failing):
             return False
-        self.short_lives, self.reason, self.output = 0, "", ()
+        self.short_runs, self.reason, self.output = 0, "", ()
         return True
 
     def delay(self) -> float:
-        """Return the seconds until it is to be filled again: none after a long life, more after each short one."""
-        if self.keeps_dying and self.role.dispensable:
-            return min(2.0 ** (self.short_lives - LOUD_AFTER + 1), _LONGEST_DELAY)
-        return _BACKOFF[min(max(self.short_lives - 1, 0), len(_BACKOFF) - 1)]
+        """Return the seconds until the next start: 0 after a long run, more after each short one."""
+        if self.is_failing and self.role.dispensable:
+            return min(2.0 ** (self.short_runs - FAILING_AFTER + 1), _LONGEST_DELAY)
+        return _BACKOFF[min(max(self.short_runs - 1, 0), len(_BACKOFF) - 1)]
 
-    def plan(self, facts: Facts, lifeline: int) -> Plan:
-        """How its next life is to be started; `lifeline` is the child's end."""
+    def plan(self, facts: Facts, lifeline: int) -> LaunchPlan:
+        """Return the plan of the next start; `lifeline` is the child's end."""
         role = self.role
         home = str(facts.part(role.part))
-        plan = Plan(
+        plan = LaunchPlan(
             parent=os.getpid(),
             lifeline=lifeline,
             account=account_of(role.user, group=role.group),
             home=home,
             network=role.network,
             files=role.files,
-            walls=furnished(role.walls(facts), home, str(facts.config.parent)),
+            sandbox=with_system_files(role.sandbox(facts), home, str(facts.config.parent)),
             entry=role.entry,
             index=self.index if role.indexed else None,
             path=str(role.path(facts)) if role.path else None,

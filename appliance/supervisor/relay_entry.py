@@ -1,17 +1,17 @@
-"""Starts a relay with the limits of the configuration; the relay itself reads no configuration."""
+"""Start a relay with the limits of the configuration; the relay itself reads no configuration."""
 
 from pathlib import Path
 
 import msgspec
 
-from appliance.relay.bounds import Limits
 from appliance.relay.process import main as relay
+from appliance.relay.relay_limits import RelayLimits
 
 
 class _Section(msgspec.Struct):
-    """What of the settings is read here, as the supervisor has written it; a relay takes no part in the rest."""
+    """The part of the supervisor's settings that a relay needs."""
 
-    relay: Limits
+    relay: RelayLimits
 
 
 def main(lifeline_fd: int, index: int, config: Path) -> None:
@@ -19,9 +19,6 @@ def main(lifeline_fd: int, index: int, config: Path) -> None:
     relay(lifeline_fd, index, limits_of(config))
 
 
-def limits_of(config: Path) -> Limits:
-    """The limits that the `relay` section sets; the others keep their defaults.
-
-    Raises `OSError`, `msgspec.ValidationError`.
-    """
+def limits_of(config: Path) -> RelayLimits:
+    """Return the limits of the section `relay`. Raises `OSError`, `msgspec.ValidationError`."""
     return msgspec.json.decode(config.read_bytes(), type=_Section).relay

@@ -1,8 +1,8 @@
-"""The memory in which relays leave what they received last; it outlives them, as listening sockets outlive control.
+"""Keep the memory in which relays store the last messages; it survives a relay.
 
-A relay writes into its own. The recorder gets descriptors that only read, and nobody can make a memory smaller, so
-that reading it never fails. Nothing is ever read here. All of it is taken at the start: what is missing is missed then
-and not amid an incident, and a relay does not wait for the kernel to find pages.
+Each relay writes to its own ring. The recorder gets read-only descriptors, and no process can shrink a ring, so reading
+never fails. Nothing is read here. All memory is allocated at the start, so a lack of memory shows then and not during
+an incident, and a relay never waits for pages.
 """
 
 import fcntl
@@ -15,36 +15,36 @@ from pydantic import ByteSize
 
 from appliance.channel.messages import RingGiven
 from appliance.configuration.settings import RecorderRules
-from appliance.recorder.never import known_sums
+from appliance.recorder.excluded_topics import known_sums
 from appliance.supervisor.errors import StartError
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 _PAGE = 4096
 
 
-class Rings:
-    """One memory for each relay, together what `rules` say. Raises `StartError` (not so much is left), `OSError`."""
+class RecorderRings:
+    """One ring per relay, of the total size in `rules`. Raises `StartError` (not enough memory), `OSError`."""
 
     def __init__(self, rules: RecorderRules, relays: int) -> None:
         if rules.memory > (left := _left()):
             raise StartError(
-                f"recorder.memory: {ByteSize(rules.memory).human_readable()} are more than the machine has left "
-                f"({left.human_readable()}): give less, or end what else takes memory"
+                f"recorder.memory: {ByteSize(rules.memory).human_readable()} is more than the machine has free "
+                f"({left.human_readable()}): set less, or end programs that use memory"
             )
         size = int(rules.memory) // relays // _PAGE * _PAGE
         since, sums = time.time_ns(), known_sums(rules.never)
-        self._rings: list[tuple[RingGiven, int, int]] = []  # to be written and to be read
+        self._rings: list[tuple[RingGiven, int, int]] = []  # writable and readable descriptor
         for index in range(relays):
             writable = os.memfd_create(f"rosrv-ring-{index}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-            os.fchmod(writable, 0o600)  # else whoever has it to read opens it anew, to write
+            os.fchmod(writable, 0o600)  # otherwise a reader could open it again for writing
             os.posix_fallocate(writable, 0, size)
             fcntl.fcntl(writable, fcntl.F_ADD_SEALS, _SEALS)
             readable = os.open(f"/proc/self/fd/{writable}", os.O_RDONLY | os.O_CLOEXEC)
             given = RingGiven(index, since, rules.before, list(rules.topics), list(rules.never), sums)
             self._rings.append((given, writable, readable))
 
-    def given_to(self, role: str, index: int) -> Iterator[tuple[RingGiven, int]]:
-        """What a process gets at its start."""
+    def messages_for(self, role: str, index: int) -> Iterator[tuple[RingGiven, int]]:
+        """Yield the messages and descriptors that a process gets at its start."""
         for given, writable, readable in self._rings:
             if role == "recorder":
                 yield given, readable
@@ -52,7 +52,7 @@ class Rings:
                 yield given, writable
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close all descriptors."""
         for _given, writable, readable in self._rings:
             os.close(writable)
             os.close(readable)
@@ -60,7 +60,7 @@ class Rings:
 
 
 def _left() -> ByteSize:
-    """What the machine can still give."""
+    """Return the machine's available memory."""
     [row] = [
         row
         for row in Path("/proc/meminfo").read_text("ascii").splitlines()

@@ -1,9 +1,6 @@
-"""Whether ROSMaster, which knows no lifeline, is alive: it is asked for its process id, as any ROS tool
-might.
+"""Check that `rosmaster`, which has no lifeline, is alive: call its `getPid`.
 
-Only that something comes back is looked at, not what. Where the firewall stands, only connections of
-control's user may reach ROSMaster, root's not; the firewall goes by who made the socket, so the socket
-is made as that user.
+Any answer counts. The firewall accepts only sockets of control's user, so the socket is made as that user.
 """
 
 import asyncio
@@ -26,9 +23,9 @@ _REQUEST = (
 
 
 async def answers(port: int, account: Account, inside: AbstractContextManager[None], seconds: float) -> bool:
-    """Whether the ROSMaster on this loopback port answers a call within `seconds`.
+    """Whether `rosmaster` on this loopback port answers a call within `seconds`.
 
-    `inside` is entered to be in its network namespace, for as long as it takes to make a socket.
+    `inside` enters its network namespace while the socket is made.
     """
     loop = asyncio.get_running_loop()
     with inside, _as_user(account):
@@ -44,8 +41,8 @@ async def answers(port: int, account: Account, inside: AbstractContextManager[No
 
 @contextmanager
 def _as_user(account: Account) -> Iterator[None]:
-    # fsuid is what the owner match of the firewall looks at; it belongs to this thread alone (seteuid
-    # would, for a moment, take root from the threads that look after the firewall).
+    # The firewall matches a socket's owner by fsuid, which is set for this thread alone. seteuid would take root from
+    # the threads that change the firewall.
     if os.geteuid() != 0:
         yield
         return

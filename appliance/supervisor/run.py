@@ -1,4 +1,4 @@
-"""One life of the appliance: what must be right before the first process starts, and what is left behind."""
+"""Run the appliance: prepare everything before the first process starts, and clean up after the last."""
 
 import asyncio
 import json
@@ -16,20 +16,20 @@ from appliance.network.close_ports import local_port_range
 from appliance.network.firewall.iptables import load_modules
 from appliance.supervisor import signals
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.isolation_lifecycle import Enclosure, Ports, enclosure_of
+from appliance.supervisor.isolation_lifecycle import AppliancePorts, NoIsolation, isolation_for
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.port_check import free_port, require_free, spare_ports
-from appliance.supervisor.privileges import keep_supervisors, raise_file_limit
+from appliance.supervisor.privileges import drop_unused_capabilities, raise_file_limit
 from appliance.supervisor.restore_mark import refuse_half_restored
-from appliance.supervisor.rings import Rings
+from appliance.supervisor.rings import RecorderRings
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.service_manager import ServiceManager
 from appliance.supervisor.state_directory import StateDirectory
 from appliance.supervisor.supervisor import ControlReady, Supervisor
 
-_LIVES_A_MINUTE = 64  # of a rosout that keeps dying; the connections of each keep its port for so long
+_LIVES_A_MINUTE = 64  # starts of a failing rosout; connections occupy each port for a minute
 _UNPRIVILEGED = range(1024, 65_536)
-_FILES = 65_536  # each kept socket, and once more while it is on its way to a new control
+_FILES = 65_536  # each kept socket, twice while it is sent to a new control
 
 log = structlog.get_logger()
 
@@ -41,11 +41,10 @@ def run_appliance(
     *,
     node_ports: range,
 ) -> None:
-    """Run the appliance until it is told to stop. Raises `StartError` when it cannot start or go on.
+    """Run the appliance until it is stopped. Raises `StartError` if it cannot start or go on.
 
-    `ready` is called once, with what control says and the settings, every port in them chosen, when nodes may
-    connect.
-    `node_ports` are those of the policy's `[Ports] range`: what the firewall limits and `netns` forwards.
+    `ready` is called once when nodes may connect, with control's message and the settings with all ports chosen.
+    `node_ports` is the policy's `[Ports] range`, which the firewall limits and `netns` forwards.
     """
     if settings.isolation == "none":
         log.warning(
@@ -65,7 +64,7 @@ def run_appliance(
             "node when it reconnects",
             mediation=settings.mediation,
         )
-    keep_supervisors()
+    drop_unused_capabilities()
     refuse_half_restored(settings.state)
     with signals.held():
         _run(settings, roles, ready, node_ports)
@@ -77,14 +76,14 @@ def _run(
     ready: Callable[[ControlReady, Settings], None],
     node_ports: range,
 ) -> None:
-    """From the state directory's lock to the last rule that is taken away, whatever signals come meanwhile."""
+    """Lock the state directory, run the appliance, and clean up, whatever signals arrive."""
     manager = ServiceManager.of(os.environ)
-    manager.starting("takes its state, builds its firewall")
+    manager.starting("locks its state, builds its firewall")
     state = StateDirectory(settings.state)
     try:
         settings = _with_ports(settings)
         master = settings.listen_address[1]
-        ports = Ports(
+        ports = AppliancePorts(
             master=master,
             rosmaster=settings.rosmaster_port,
             nodes=node_ports,
@@ -93,21 +92,21 @@ def _run(
             syslog=settings.audit.syslog.destination if settings.audit.syslog.to is not None else None,
             own_node=_ports_of_rosout(settings, node_ports),
         )
-        enclosure = enclosure_of(settings.isolation, ports, settings.firewall.backend)
+        isolation = isolation_for(settings.isolation, ports, settings.firewall.backend)
         state.prepare(roles)
         state.write_config(json.dumps(plain(settings)))
         raise_file_limit(_FILES)
-        enclosure.build()
+        isolation.build()
         try:
-            _supervise(settings, roles, state, enclosure, ready, manager=manager, rosout_ports=ports.own_node)
+            _supervise(settings, roles, state, isolation, ready, manager=manager, rosout_ports=ports.own_node)
         finally:
-            enclosure.remove()
+            isolation.remove()
     finally:
         state.close()
 
 
 def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
-    """Where rosout serves messages: known to the firewall before it starts, and not among those the kernel chooses."""
+    """Return the ports for rosout's messages, outside the range from which the kernel chooses ports."""
     chosen = local_port_range()
     taken = [settings.listen_address[1], settings.rosmaster_port]
     taken += [settings.api_address[1]] if settings.api_address else []
@@ -124,7 +123,7 @@ def _files_of_syslog(settings: Settings) -> tuple[Path, ...]:
 
 
 def _port_of_syslog(settings: Settings) -> int | None:
-    """The receiver's, if it is reached over TCP."""
+    """Return the receiver's TCP port, or None."""
     if settings.audit.syslog.to is None:
         return None
     protocol, _address, port = settings.audit.syslog.destination
@@ -132,7 +131,7 @@ def _port_of_syslog(settings: Settings) -> int | None:
 
 
 def _with_ports(settings: Settings) -> Settings:
-    """The settings with every port chosen that must be known before the first process starts."""
+    """Return the settings with all ports that must be known before the first process starts."""
     host, port = settings.listen_address
     if port == 0 and settings.isolation != "none":
         port = free_port()
@@ -143,7 +142,7 @@ def _with_ports(settings: Settings) -> Settings:
 
 
 def _api_with_port(settings: Settings) -> str:
-    """Where REST listens. Another port is taken only where nobody asked for this one, and that is said."""
+    """Return the address of REST. If the default port is in use, warn and choose a free one."""
     if settings.api_address is None:
         return settings.api
     host, port = settings.api_address
@@ -161,7 +160,7 @@ def _shown(host: str, port: int) -> str:
 
 
 def _listener(settings: Settings) -> socket.socket | None:
-    """The socket of REST. In a namespace of its own, who may connect is for the firewall: all addresses there."""
+    """Return the socket of REST. In a separate namespace it listens on all addresses; the firewall limits access."""
     if settings.api_address is None:
         return None
     host, port = settings.api_address
@@ -180,13 +179,13 @@ def _supervise(
     settings: Settings,
     roles: tuple[Role, ...],
     state: StateDirectory,
-    enclosure: Enclosure,
+    isolation: NoIsolation,
     ready: Callable[[ControlReady, Settings], None],
     *,
     manager: ServiceManager,
     rosout_ports: range,
 ) -> None:
-    with enclosure.inside():
+    with isolation.inside():
         require_free(*settings.listen_address)
         require_free("127.0.0.1", settings.rosmaster_port)
         api = _listener(settings)
@@ -213,9 +212,9 @@ def _supervise(
             admin=state.open_admin_socket(),
             ready=say_ready,
             relays=settings.relays,
-            enclosure=enclosure,
+            isolation=isolation,
             listeners={"api": api} if api is not None else {},
-            rings=Rings(settings.recorder, settings.relays) if settings.recorder.enabled else None,
+            rings=RecorderRings(settings.recorder, settings.relays) if settings.recorder.enabled else None,
             memory=MonitorMemory(state.path, settings.relays),
         )
         async with manager.watched():

@@ -1,10 +1,9 @@
-"""What systemd is told of the appliance, where systemd started it (`Type=notify`, `WatchdogSec`).
+"""Notify systemd of the state of the appliance (`Type=notify`, `WatchdogSec`).
 
-While the appliance starts, systemd is asked for more time: the supervisor itself gives up a start that gets nowhere.
+During the start, systemd gets requests for more time: the supervisor itself ends a start without progress.
 
-The protocol is sd_notify(3): a datagram of `KEY=value` lines to the socket that `NOTIFY_SOCKET` names. Without that
-variable nothing is said. The process that systemd started is the supervisor; its watchdog stands for the supervisor's
-loop, which itself watches the other processes.
+The protocol is sd_notify(3): datagrams of `KEY=value` lines to the socket in `NOTIFY_SOCKET`, if that is set. The
+watchdog covers the supervisor's loop, which itself watches the other processes.
 """
 
 import asyncio
@@ -18,7 +17,7 @@ _MORE = "EXTEND_TIMEOUT_USEC=120000000\n"
 
 
 class ServiceManager:
-    """The socket of the service manager, and how often it wants to hear; says nothing where there is none."""
+    """The service manager's socket and watchdog interval; does nothing without a socket."""
 
     def __init__(self, address: str | None, watchdog_seconds: float | None) -> None:
         self._address = None if address is None else address.replace("@", "\0", 1)
@@ -27,28 +26,28 @@ class ServiceManager:
 
     @classmethod
     def of(cls, environment: MutableMapping[str, str]) -> "ServiceManager":
-        """As the environment says; taken out of it, so that no process of ours speaks to systemd in its place."""
+        """Take socket and watchdog out of the environment, so that no child notifies systemd."""
         said = {
             name: environment.pop(name, None) for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
         }
         return cls(said["NOTIFY_SOCKET"], _seconds(said))
 
     def starting(self, status: str) -> None:
-        """It gets on with its start, and asks for time; `status` is what it does now."""
+        """Report progress of the start, and request more time; `status` is the present step."""
         self._say(f"{_MORE}STATUS={status}")
 
     def ready(self, status: str) -> None:
-        """The appliance serves; `status` is what `systemctl status` shows."""
+        """Report that the appliance serves; `systemctl status` shows `status`."""
         self._starting = False
         self._say(f"READY=1\nSTATUS={status}")
 
     def stopping(self) -> None:
-        """It ends in order."""
-        self._say("STOPPING=1\nSTATUS=ending its processes, then taking its firewall away")
+        """Report the orderly end."""
+        self._say("STOPPING=1\nSTATUS=ending its processes, then removing its firewall")
 
     @asynccontextmanager
     async def watched(self) -> AsyncIterator[None]:
-        """Say for the length of the block that the loop runs, twice in each time that the watchdog grants."""
+        """During the block, notify the watchdog twice per interval."""
         task = asyncio.create_task(self._live())
         try:
             yield
@@ -66,13 +65,13 @@ class ServiceManager:
         if self._address is None:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
-            # Nobody hears it: systemd then does what it does with a service that says nothing.
+            # If systemd does not get it, it treats the service as silent.
             notify.connect(self._address)
             notify.send(text.encode())
 
 
 def _seconds(said: Mapping[str, str | None]) -> float | None:
-    """Of the watchdog; None where it is meant for another process or is no number."""
+    """Return the watchdog interval; None if it is for another process or not a number."""
     text, pid = said["WATCHDOG_USEC"], said["WATCHDOG_PID"]
     if text is None or not text.isdigit() or int(text) == 0 or (pid is not None and pid != str(os.getpid())):
         return None

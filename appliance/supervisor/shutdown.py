@@ -1,4 +1,4 @@
-"""The end of the processes, in less than five seconds whatever they do: asked first, then SIGTERM, then SIGKILL."""
+"""End all processes in less than five seconds: a message first, then SIGTERM, then SIGKILL."""
 
 import asyncio
 import signal
@@ -8,7 +8,7 @@ from contextlib import suppress
 import structlog
 
 from appliance.channel.messages import Stop
-from appliance.supervisor.process_slot import Post
+from appliance.supervisor.process_slot import ProcessSlot
 
 _STOP_SECONDS = 3.0
 _TERMINATE_SECONDS = 0.3
@@ -17,46 +17,46 @@ _LAST_SECONDS = 1.0
 log = structlog.get_logger()
 
 
-async def end_all(posts: Sequence[Post], someone_died: asyncio.Event) -> None:
-    """End every process; those that outlive control when the others are gone.
+async def end_all(slots: Sequence[ProcessSlot], process_died: asyncio.Event) -> None:
+    """End every process; those that outlive control last.
 
-    `someone_died` is set after each death, when `Post.life` is None already. No post may be filled meanwhile.
+    `process_died` is set after each death, with the slot free. No process may start meanwhile.
     """
-    for post in posts:
-        if post.due is not None:
-            post.due.cancel()
-    await _end([post for post in posts if not post.role.outlives_control], _STOP_SECONDS, someone_died)
-    await _end(posts, _LAST_SECONDS, someone_died)
+    for slot in slots:
+        if slot.due is not None:
+            slot.due.cancel()
+    await _end([slot for slot in slots if not slot.role.outlives_control], _STOP_SECONDS, process_died)
+    await _end(slots, _LAST_SECONDS, process_died)
 
 
-async def _end(posts: Sequence[Post], seconds: float, someone_died: asyncio.Event) -> None:
-    for post in posts:
-        if post.life is None:
+async def _end(slots: Sequence[ProcessSlot], seconds: float, process_died: asyncio.Event) -> None:
+    for slot in slots:
+        if slot.process is None:
             continue
-        if post.life.is_program:
-            post.life.kill(signal.SIGTERM)
+        if slot.process.is_program:
+            slot.process.kill(signal.SIGTERM)
         else:
-            post.life.send(Stop())
-    if await _all_gone(posts, seconds, someone_died):
+            slot.process.send(Stop())
+    if await _all_gone(slots, seconds, process_died):
         return
-    _signal(posts, signal.SIGTERM)
-    if await _all_gone(posts, _TERMINATE_SECONDS, someone_died):
+    _signal(slots, signal.SIGTERM)
+    if await _all_gone(slots, _TERMINATE_SECONDS, process_died):
         return
-    _signal(posts, signal.SIGKILL)
-    await _all_gone(posts, _LAST_SECONDS, someone_died)
+    _signal(slots, signal.SIGKILL)
+    await _all_gone(slots, _LAST_SECONDS, process_died)
 
 
-def _signal(posts: Sequence[Post], number: signal.Signals) -> None:
-    for post in posts:
-        if post.life is not None:
-            log.warning("process did not end", role=post.role.name, pid=post.life.pid, signal=number.name)
-            post.life.kill(number)
+def _signal(slots: Sequence[ProcessSlot], number: signal.Signals) -> None:
+    for slot in slots:
+        if slot.process is not None:
+            log.warning("process did not end", role=slot.role.name, pid=slot.process.pid, signal=number.name)
+            slot.process.kill(number)
 
 
-async def _all_gone(posts: Sequence[Post], seconds: float, someone_died: asyncio.Event) -> bool:
+async def _all_gone(slots: Sequence[ProcessSlot], seconds: float, process_died: asyncio.Event) -> bool:
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
-            while any(post.life is not None for post in posts):
-                someone_died.clear()
-                await someone_died.wait()
-    return all(post.life is None for post in posts)
+            while any(slot.process is not None for slot in slots):
+                process_died.clear()
+                await process_died.wait()
+    return all(slot.process is None for slot in slots)

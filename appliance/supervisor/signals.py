@@ -1,10 +1,8 @@
-"""Signals that end a program, where ending in the middle would leave something on the machine.
+"""Block ending signals while the isolation is built or removed, so that nothing is left on the machine.
 
-They are blocked while the surroundings are made and taken away, and delivered to the supervisor's loop in between:
-
-1. What is sent while the surroundings are made is heard as soon as the loop runs, which then ends in order.
-2. What is sent while they are taken away asks for what is being done already: it is forgotten.
-3. A thread made here blocks them, too (`block`): else the kernel would give it what the main thread does not take.
+1. Signals during the build are delivered as soon as the supervisor's loop runs, which then ends in order.
+2. Signals during the removal are ignored: the end is already in progress.
+3. Threads block them too (`block`), otherwise the kernel would deliver them there.
 """
 
 import signal
@@ -16,7 +14,7 @@ _ENDING = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Let them wait for `heard`, and forget those that wait at the end of the block. In the main thread only."""
+    """Block the signals until `heard`, and ignore those pending at the end. For the main thread only."""
     before = block()
     try:
         yield
@@ -29,7 +27,7 @@ def held() -> Iterator[None]:
 
 @contextmanager
 def heard() -> Iterator[None]:
-    """Have those that waited, and all that come, delivered for the length of the block, to handlers that are there."""
+    """Deliver pending and new signals to the handlers during the block."""
     before = signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
     try:
         yield
@@ -38,5 +36,5 @@ def heard() -> Iterator[None]:
 
 
 def block() -> set[int]:
-    """Have the calling thread, and the threads and programs that it starts, not see them; what it blocked before."""
+    """Block the signals in the calling thread and its children; return what was blocked before."""
     return {int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)}

@@ -1,15 +1,15 @@
-"""The state directory: whose part is whose, who may look, and that only one appliance uses it at a time.
+"""Prepare the state directory: owners and modes of its parts, and a lock, so that only one appliance uses it.
 
-A directory that is there already is taken, and closed to others, only where it is empty or an appliance's:
-`--state /tmp` would close /tmp to everybody.
+An existing directory is used, and closed to other users, only if it is empty or already an appliance's state: otherwise
+`--state /tmp` would close /tmp to all users.
 
-state/            0711  root: others may pass through, not look around
-state/lock        0600  held while an appliance runs; names its process id
-state/admin.sock  0600  where the other verbs of `rosrv` find the running appliance
-state/monitors/   0700  root: what relays keep of the state of monitors (`monitor_memory.py`)
+state/            0711  root: others may pass through, not list
+state/lock        0600  locked while an appliance runs; contains its process id
+state/admin.sock  0600  for the other verbs of `rosrv`
+state/monitors/   0700  root: the state of monitors (`monitor_memory.py`)
 state/run/        0755  the resolved configuration for the children
-state/relay/      0700  rosrv-relay    and so on, one folder for each role, for its user only
-state/control/    2710  rosrv:rosrv-api  as root: new files get the group, which may read those that say so (audit log)
+state/relay/      0700  rosrv-relay    and so on, one folder per role, for its user only
+state/control/    2710  rosrv:rosrv-api  as root: new files get the group, for those it may read (audit log)
 """
 
 import contextlib
@@ -33,9 +33,9 @@ _SHOWN = 3
 
 
 def foreign(path: Path) -> str | None:
-    """Why the directory at `path` is not taken for an appliance's state; None: it is one, is empty, or is not there.
+    """Return why the directory at `path` is not an appliance's state; None if it is, or is empty or missing.
 
-    Raises `OSError` where that cannot be seen.
+    Raises `OSError`.
     """
     if not path.is_dir():
         return None
@@ -43,11 +43,13 @@ def foreign(path: Path) -> str | None:
     if not found or _has_lock(path) or (path / _RESTORED).is_file():
         return None
     more = " …" if len(found) > _SHOWN else ""
-    return f"{path} is no state directory of an appliance: it has {', '.join(found[:_SHOWN])}{more} in it"
+    return (
+        f"{path} is not the state directory of an appliance: it has {', '.join(found[:_SHOWN])}{more} in it"
+    )
 
 
 def _has_lock(path: Path) -> bool:
-    """Where everybody may write, anybody may make a file of that name."""
+    """Whether the folder has a lock file of its owner; in a shared folder any user may create a file of that name."""
     try:
         lock = (path / _LOCK).lstat()
     except FileNotFoundError:
@@ -56,10 +58,10 @@ def _has_lock(path: Path) -> bool:
 
 
 class StateDirectory:
-    """The state directory of one running appliance; holds its lock until `close`."""
+    """The state directory of a running appliance; holds the lock until `close`."""
 
     def __init__(self, path: Path) -> None:
-        """Make the directory where needed and take its lock. Raises `StartError`."""
+        """Create the directory if needed, and lock it. Raises `StartError`."""
         self.path = path.absolute()
         try:
             if (reason := foreign(self.path)) is not None:
@@ -76,13 +78,13 @@ class StateDirectory:
 
     @property
     def config(self) -> Path:
-        """Where the children find the resolved configuration."""
+        """Return the path of the resolved configuration for the children."""
         return self.path / "run" / "config.json"
 
     def prepare(self, roles: Collection[Role]) -> None:
-        """Give each role its part, without what an earlier life was killed over.
+        """Give each role its part, and remove unfinished files of killed writers.
 
-        Raises `StartError` where a part is somebody else's, or cannot be given away.
+        Raises `StartError` if a part belongs to another user, or its owner cannot be changed.
         """
         try:
             self._give_parts(roles)
@@ -91,13 +93,13 @@ class StateDirectory:
                 f"the parts of the state directory {self.path} cannot be given to the users of the processes: {error}; "
                 "a container needs CAP_CHOWN for that (cap_add in compose.yaml)"
             ) from error
-        # The lock is held and no process is started: nobody writes there.
+        # The lock is held and no process runs, so nothing writes there.
         place, mine = os.open(self.path, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC), os.geteuid()
         for user, part in {(mine, "run"), *((account_of(role.user).uid, role.part) for role in roles)}:
             with contextlib.suppress(
                 PermissionError
-            ):  # without CAP_SETUID no process starts, and that is told
-                os.seteuid(user)  # root may not look into what is others', in a container
+            ):  # without CAP_SETUID no process starts, which is reported
+                os.seteuid(user)  # in a container root may not read the folders of others
                 remove_unfinished(part, place)
                 os.seteuid(mine)
         os.close(place)
@@ -112,11 +114,11 @@ class StateDirectory:
                 self._folder(role.part, account.uid, account_of(role.readable_by).gid, 0o2710)
 
     def write_config(self, text: str) -> None:
-        """Write what the children read."""
+        """Write the configuration for the children."""
         write_whole(self.config, text.encode(), 0o644)
 
     def open_admin_socket(self) -> socket.socket:
-        """The listening socket that the other verbs connect to; one left by an earlier life is replaced."""
+        """Return the listening socket for the other verbs; replace an old one."""
         path = self.path / ADMIN_SOCKET
         path.unlink(missing_ok=True)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -134,7 +136,7 @@ class StateDirectory:
         return listener
 
     def close(self) -> None:
-        """Remove what only a running appliance has, and let the lock go."""
+        """Remove the files of a running appliance, and release the lock."""
         (self.path / ADMIN_SOCKET).unlink(missing_ok=True)
         self.config.unlink(missing_ok=True)
         os.ftruncate(self._lock, 0)
@@ -162,7 +164,7 @@ class StateDirectory:
             _hand_over(path, uid, gid, mode)
         except FileExistsError:
             found = path.lstat()
-            # Ours: an earlier start was killed before it gave the folder away.
+            # Owned by this user: an earlier start was killed before it changed the owner.
             if not stat.S_ISDIR(found.st_mode) or found.st_uid not in (uid, os.geteuid()):
                 raise StartError(
                     f"{path} is not a folder of user id {uid} (another user ran an appliance here): "
@@ -173,7 +175,7 @@ class StateDirectory:
 
 
 def _hand_over(path: Path, uid: int, gid: int, mode: int) -> None:
-    """Give a folder to a user and group. Ours first: in a group of others the kernel drops the set-group-id bit."""
+    """Change owner, group and mode of a folder; own it first, otherwise the kernel drops the set-group-id bit."""
     os.chown(path, os.geteuid(), os.getegid())
     path.chmod(mode)
     os.chown(path, uid, gid)

@@ -1,9 +1,7 @@
-"""Whom the children run as.
+"""Choose the users of the children.
 
-Started as root, each role has a user of its own: the one with the role's name in the user database,
-else a numeric id kept for it (so the appliance also runs where nobody made the users, in a container
-for example). Started otherwise, everything runs as the caller, and nothing is dropped because nothing
-is held.
+Started as root, each role has its own user: the one with the role's name in the user database, otherwise a reserved
+numeric id (so the appliance also runs in a container without these users). Otherwise everything runs as the caller.
 """
 
 import os
@@ -34,9 +32,9 @@ class Account:
 
 
 def account_of(user: str, group: str | None = None) -> Account:
-    """The account that a role's user stands for here, in the group of the user `group` if that is given.
+    """Return the account of a role's user, in the group of the user `group` if given.
 
-    Raises `KeyError` for a user that is no role's.
+    Raises `KeyError` for a user without a role.
     """
     if group is not None:
         return replace(account_of(user), gid=account_of(group).gid)

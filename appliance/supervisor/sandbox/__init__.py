@@ -1,1 +1,1 @@
-"""The walls around each process: what it may ask of the kernel (seccomp), its files and ports (Landlock)."""
+"""The sandbox of each process: limits on system calls (seccomp), and on files and ports (Landlock)."""

@@ -1,7 +1,7 @@
-"""The files and TCP ports of a process, by Landlock: it needs no privilege, and what a process starts inherits it.
+"""Limit files and TCP ports of a process with Landlock, which needs no privilege and is inherited by children.
 
-The kernel's version of Landlock (its ABI) says what can be limited: files from 1 (Linux 5.13), TCP ports from 4 (6.7),
-signals and abstract sockets outside of the walls from 6 (6.12). What it has not is left open, and told.
+The kernel's Landlock version (ABI) can limit files from 1 (Linux 5.13), TCP ports from 4 (6.7), and signals and
+abstract sockets from 6 (6.12). Limits that the kernel lacks are reported.
 """
 
 import contextlib
@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from appliance.supervisor.privileges import prctl
-from appliance.supervisor.sandbox.sandbox_plan import Walls
+from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
 
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # the same on all machines
 _ASK_VERSION = 1
@@ -26,28 +26,28 @@ _READ = _READ_FILE | _READ_DIR
 _PR_SET_NO_NEW_PRIVS = 38
 
 FILES, PORTS, SIGNALS = 1, 4, 6
-"""The first ABI that limits each."""
+"""The first ABI for each limit."""
 
 
 class LandlockError(Exception):
-    """The kernel has Landlock and refuses; the text says what."""
+    """Report that the kernel's Landlock rejects a rule."""
 
 
 def version() -> int:
-    """The ABI of the kernel's Landlock; 0 where there is none, or it is turned off."""
+    """Return the ABI of the kernel's Landlock; 0 without it, or if it is disabled."""
     return max(_call(_CREATE_RULESET, None, 0, _ASK_VERSION)[0], 0)
 
 
 def lacking(abi: int) -> list[str]:
-    """What this version leaves open, in words."""
+    """Return the limits that this version lacks, in words."""
     if abi < FILES:
-        return ["the kernel has no Landlock: files are for the users' rights alone"]
+        return ["the kernel has no Landlock: only users' rights protect files"]
     missing = [(PORTS, "TCP ports"), (SIGNALS, "signals to other processes of its user")]
     return [f"the kernel's Landlock ({abi}) does not limit {what}" for since, what in missing if abi < since]
 
 
-def raise_wall(walls: Walls) -> int:
-    """Limit this process and all it starts to the files and ports of `walls`; the ABI that did it, 0 for none.
+def restrict(sandbox: SandboxPlan) -> int:
+    """Limit this process and its children to the files and ports of `sandbox`; return the ABI, 0 for none.
 
     Raises `LandlockError`.
     """
@@ -57,11 +57,13 @@ def raise_wall(walls: Walls) -> int:
     every = _rights_of_files(abi)
     ports = 0
     if abi >= PORTS:
-        ports = (_BIND if walls.binds is not None else 0) | (_CONNECT if walls.reaches is not None else 0)
+        ports = (_BIND if sandbox.binds is not None else 0) | (
+            _CONNECT if sandbox.connects is not None else 0
+        )
     ruleset = _ruleset(abi, every, ports)
     try:
-        _grant_files(ruleset, walls, every)
-        for right, granted in ((_BIND, walls.binds), (_CONNECT, walls.reaches)):
+        _grant_files(ruleset, sandbox, every)
+        for right, granted in ((_BIND, sandbox.binds), (_CONNECT, sandbox.connects)):
             for port in granted or () if ports & right else ():
                 _require(_call(_ADD_RULE, ruleset, _PORT, struct.pack("=QQ", right, port), 0), f"port {port}")
         prctl(_PR_SET_NO_NEW_PRIVS, 1)
@@ -72,7 +74,7 @@ def raise_wall(walls: Walls) -> int:
 
 
 def _rights_of_files(abi: int) -> int:
-    """All rights that this version knows."""
+    """Return all rights of this version."""
     rights = (1 << 13) - 1
     for since, right in ((2, 1 << 13), (3, _TRUNCATE), (5, _IOCTL)):
         rights |= right if abi >= since else 0
@@ -85,11 +87,11 @@ def _ruleset(abi: int, files: int, ports: int) -> int:
     return _require(_call(_CREATE_RULESET, attributes[:size], size, 0), "a ruleset")
 
 
-def _grant_files(ruleset: int, walls: Walls, every: int) -> None:
+def _grant_files(ruleset: int, sandbox: SandboxPlan, every: int) -> None:
     grants = (
-        (walls.programs, _EXECUTE | _READ_FILE),
-        (walls.reads, _READ),
-        (walls.writes, every & ~_EXECUTE),
+        (sandbox.programs, _EXECUTE | _READ_FILE),
+        (sandbox.reads, _READ),
+        (sandbox.writes, every & ~_EXECUTE),
     )
     for paths, rights in grants:
         for path, descriptor in _opened(paths):
@@ -101,7 +103,7 @@ def _grant_files(ruleset: int, walls: Walls, every: int) -> None:
 
 
 def _opened(paths: Iterable[str]) -> Iterator[tuple[str, int]]:
-    """Those that are there and may be reached; nothing is to be granted of the others."""
+    """Open the paths that exist and can be reached."""
     for path in paths:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError):
             descriptor = os.open(Path(path), os.O_PATH | os.O_CLOEXEC)
@@ -112,7 +114,7 @@ def _opened(paths: Iterable[str]) -> Iterator[tuple[str, int]]:
 
 
 def _call(number: int, *arguments: int | bytes | None) -> tuple[int, int]:
-    """The result of a call of the kernel, and its error."""
+    """Return the result and the error number of a system call."""
     libc = ctypes.CDLL(None, use_errno=True)
     given = [ctypes.c_long(argument) if isinstance(argument, int) else argument for argument in arguments]
     result: int = libc.syscall(ctypes.c_long(number), *given)
@@ -122,5 +124,5 @@ def _call(number: int, *arguments: int | bytes | None) -> tuple[int, int]:
 def _require(outcome: tuple[int, int], what: str) -> int:
     result, error = outcome
     if result < 0:
-        raise LandlockError(f"Landlock takes no rule for {what}: {os.strerror(error)}")
+        raise LandlockError(f"Landlock rejects the rule for {what}: {os.strerror(error)}")
     return result

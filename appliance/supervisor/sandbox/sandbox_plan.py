@@ -1,28 +1,28 @@
-"""What a process may do, as its row in the table of roles says; how that is enforced is in `seccomp` and `landlock`."""
+"""The permissions of a process's sandbox. `seccomp` and `landlock` enforce them."""
 
 import socket
 from dataclasses import dataclass
 
 UNIX = (int(socket.AF_UNIX),)
 NETWORK = (*UNIX, int(socket.AF_INET), int(socket.AF_INET6))
-ROUTES = (*NETWORK, int(socket.AF_NETLINK))  # names are looked up by way of the kernel's routes
+ROUTES = (*NETWORK, int(socket.AF_NETLINK))  # name lookups read the kernel's routes
 
 
 @dataclass(frozen=True)
-class Walls:
-    """What a process may do.
+class SandboxPlan:
+    """The permissions of a process.
 
-    `listed`: only calls of the kernel that are on a list; else all but those that no process of ours makes. `families`
-    are those of sockets that it may make. `programs` are what it may execute, and what they load: none for most.
-    `reads` and `writes` are folders and files, `writes` readable, too; of those that are not there nothing is granted.
-    `binds` and `reaches` are the TCP ports it may listen on and connect to; None: any. A listed process that has none
-    of them may not even ask (`bind`, `connect`), of whatever family.
+    `allowlist`: only system calls on a list; otherwise all except those that no process of the appliance makes.
+    `families`: families of the sockets that it may make. `programs`: files that it may execute, and the libraries they
+    load. `reads`, `writes`: folders and files; what is in `writes` may also be read. A missing path grants nothing.
+    `binds`, `connects`: TCP ports to listen on and to connect to; None: any. With an allowlist and without ports the
+    calls `bind` and `connect` themselves fail, whatever the family.
     """
 
-    listed: bool = False
+    allowlist: bool = False
     families: tuple[int, ...] = UNIX
     programs: tuple[str, ...] = ()
     reads: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()
     binds: tuple[int, ...] | None = ()
-    reaches: tuple[int, ...] | None = ()
+    connects: tuple[int, ...] | None = ()

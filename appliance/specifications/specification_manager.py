@@ -1,21 +1,21 @@
-"""The specifications in force: loading, switching, going back, and what operators are answered.
+"""The specifications in force: load, switch, roll back, and answer operators.
 
-Larger than most files because each order is a few lines, and all of them change the same few things, one at a time.
+This file is long because each of its short methods changes the same state, one change at a time.
 
 Invariants:
 
-1. The folder is the baseline and only read; what is loaded, replaced or removed while the robot runs is a revision in
-   the store (`specification_revisions.py`) and survives a restart, as the switches (`switches.py`) do.
-2. New specifications are compiled before anything changes, by the process that `check` asks; bad ones change nothing
-   and say everything that is wrong with them. The relays are given what was compiled, and have the last word.
-3. What is loaded joins monitors in shadow mode that it shares variables with; no load and no switch takes a monitor
-   that is in force along.
-4. A reload takes what the folder has, and leaves what the folder does not have in force unless it is told to remove
-   that: nobody's protection ends because a file is not where it was.
-5. Every change can be made on trial (`store/revisions.py`), and every revision is kept with the switches that it had
-   last: a rollback to it brings its monitors back as they were.
-6. What operators have seen has a tag, which is another after every revision, switch and resumption, and never comes
-   back: a change that is meant for another tag than the present one is refused.
+1. The folder is the baseline and only read. Changes while the robot runs are revisions in the store
+   (`specification_revisions.py`) and, like switches (`switches.py`), survive a restart.
+2. New specifications are compiled before anything changes, by the compiler process; with errors nothing changes, and
+   all errors are returned. The relays get the compiled form, and may refuse it.
+3. A loaded monitor that shares variables with monitors in shadow mode is also in shadow mode; no load and no switch
+   takes a monitor out of force because of others.
+4. A reload takes the files of the folder, and leaves others in force unless it prunes: a missing file ends no
+   protection.
+5. Every change can have a time limit for confirmation (`store/revisions.py`). Each revision is stored with its last
+   switches, so a rollback restores its monitors as they were.
+6. A tag names the state that operators have seen. Each revision, switch and resumption changes it; tags never repeat. A
+   change for another tag is refused.
 """
 
 import asyncio
@@ -33,26 +33,29 @@ from appliance.audit.record import Severity
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import admin, messages
 from appliance.channel.answers import monitor_answers as answers
-from appliance.channel.answers.monitor_answers import Replaced, Switched
+from appliance.channel.answers.monitor_answers import Replacement, Switched
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
 from appliance.specifications.allocation import Allocation
-from appliance.specifications.folder import SpecificationFolder
 from appliance.specifications.live_topics import Published, judge_topics
 from appliance.specifications.records import MonitorRecords
-from appliance.specifications.relay_needs import Relays
-from appliance.specifications.returns import LONGEST, Returns
-from appliance.specifications.rollout import TRIAL, Parts, Revision, Rollout, Switch
-from appliance.specifications.specification_files import Checked, Sources, SpecificationsRefusedError
+from appliance.specifications.rollout import SHADOW, Parts, Relays, Revision, Rollout, Switch
+from appliance.specifications.specification_files import (
+    CheckedSpecifications,
+    Sources,
+    SpecificationFolder,
+    SpecificationsRefusedError,
+)
 from appliance.specifications.specification_revisions import (
     NOTHING,
     Check,
-    Kept,
+    StoredSpecifications,
     check_kept,
     kept_in,
     sources_of,
     text_of,
 )
 from appliance.specifications.switches import Switches, require_whole
+from appliance.specifications.timed_disables import LONGEST, TimedDisables
 from appliance.store.revisions import DISK, Revisions
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
@@ -70,21 +73,21 @@ _NO_FOLDER = (
 _EVENTS: dict[Switch, str] = {
     True: "monitor enabled",
     False: "monitor disabled",
-    TRIAL: "monitor on trial",
+    SHADOW: "monitor in shadow mode",
 }
-_WORDS: dict[Switch, str] = {True: "enabled", False: "disabled", TRIAL: "in shadow mode"}
+_WORDS: dict[Switch, str] = {True: "enabled", False: "disabled", SHADOW: "in shadow mode"}
 
 
 class UnknownMonitorError(Exception):
-    """There is no monitor or file of a name, or no such revision; the text says which there are."""
+    """A monitor, file or revision does not exist; the text lists the valid ones."""
 
 
 class DryRunUnderWayError(Exception):
-    """A client has a dry run under way, and may have no second one."""
+    """A client may have only one dry run at a time."""
 
 
 class MonitorsChangedError(Exception):
-    """The monitors are not as they were when a change to them was thought of; `tag` is the present one."""
+    """The monitors have changed since a change to them was prepared; `tag` is the present one."""
 
     def __init__(self, expected: str, tag: str) -> None:
         super().__init__(
@@ -94,12 +97,11 @@ class MonitorsChangedError(Exception):
         self.tag = tag
 
 
-class Monitors(Revisions[MonitorRevisionRow]):
-    """Keeps specifications and switches. What operators ask of them is answered by the method that takes the request.
+class SpecificationManager(Revisions[MonitorRevisionRow]):
+    """The keeper of specifications and switches, which answers operators' requests about them.
 
-    `published()` is called when monitors may publish other topics; each of `told` hears of every event that a relay
-    reports. Where there are `site_keys`, whatever comes into force is signed with one of them. Changes are made one at
-    a time.
+    `published()` is called when monitors may publish other topics; each of `told` is called for every event that a
+    relay reports. With `site_keys`, everything in force is signed with one of them. Changes are made one at a time.
     """
 
     refusal = SpecificationsRefusedError
@@ -124,7 +126,7 @@ class Monitors(Revisions[MonitorRevisionRow]):
         parts: Parts,
         live: Callable[[], Published],
     ) -> None:
-        """`check` compiles for an order, `try_out` for a dry run; `live()` is what nodes publish now."""
+        """`check` compiles for an order, `try_out` for a dry run; `live()` returns what nodes publish now."""
         super().__init__(
             store, store.monitor_revisions, store.save_monitor_revision, NOTHING, "confirm monitors"
         )
@@ -140,10 +142,10 @@ class Monitors(Revisions[MonitorRevisionRow]):
             allocation, trail, on_fault, self.switches.states_of, relays, slices=slices, parts=parts
         )
         self._acts = 0  # switches and resumptions, ever
-        self._attempting: set[str] = set()  # who has a dry run under way
-        self.returns = Returns(store, self._come_back)
+        self._attempting: set[str] = set()  # clients with a dry run under way
+        self.returns = TimedDisables(store, self._come_back)
         self.sources = Sources()
-        self.checked = Checked()
+        self.checked = CheckedSpecifications()
         self.records = MonitorRecords(trail, lambda topic, data: self.checked.fields(topic, data), told)  # noqa: PLW0108 - of whatever is in force then
         self._published = published
 
@@ -178,40 +180,42 @@ class Monitors(Revisions[MonitorRevisionRow]):
         unknown = sorted(self.switches.named - self.checked.monitors.keys())
         if unknown and self.in_force.who == DISK and not restarted:
             raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
-        if unknown:  # it was removed while the robot ran
+        if unknown:  # removed while the robot ran
             _log.warning("--enable names monitors that are not loaded", monitors=unknown)
 
-    # --- looking ---
+    # --- queries ---
 
     @property
     def tag(self) -> str:
-        """Names what a change is meant for: `expected` of the changes below."""
+        """Return the name of the present state, which changes expect (`expected`)."""
         return f"{self.revision}.{self._acts}"
 
     @property
     def differs_from_folder(self) -> bool:
-        """Whether what is in force is something else than the folder has now; not where there is no folder."""
+        """Whether the specifications in force differ from the folder's; False without a folder."""
         return self.folder is not None and self._folder.looked_at() != self.sources
 
     def names(self) -> list[str]:
-        """All monitors, in the order in which they see messages."""
+        """Return all monitors, in the order in which they get messages."""
         return list(self.checked.monitors)
 
     def file_of(self, name: str) -> str:
-        """The file of this name, or the file that this monitor stands in. Raises `UnknownMonitorError`."""
+        """Return the file of this name, or of this monitor. Raises `UnknownMonitorError`."""
         if name in self.sources.files:
             return name
         if name not in self.checked.monitors:
             raise UnknownMonitorError(self._unknown([name]))
         return self.checked.monitors[name]
 
+    @admin.answers(admin.MonitorRevisions)
     async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
-        """All kept revisions, the newest first."""
+        """Return all kept revisions, the newest first."""
         rows = [self._described(row) for row in await self._kept()]
         return answers.MonitorRevisionList(msgspec.convert(rows, list[answers.MonitorRevision]))
 
+    @admin.answers(admin.MonitorRevisionWanted)
     async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
-        """A revision with its texts. Raises `UnknownMonitorError`."""
+        """Return a revision with its texts. Raises `UnknownMonitorError`."""
         row = await self._find(request.revision)
         if row is None:
             raise UnknownMonitorError(f"there is no revision {request.revision} of the specifications")
@@ -219,25 +223,28 @@ class Monitors(Revisions[MonitorRevisionRow]):
         return msgspec.convert(self._described(row) | texts, answers.RevisionTexts)
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
-        """What a relay is told before anything else."""
+        """Return a relay's first message."""
         return self.rollout.statement(relay)
 
     # --- changing ---
 
-    async def load(self, request: admin.MonitorLoad, who: str) -> Replaced:
+    @admin.answers(admin.MonitorLoad, who=True)
+    async def load(self, request: admin.MonitorLoad, who: str) -> Replacement:
         """Add these files, or replace those of the same name. Raises `SpecificationsRefusedError`.
 
-        This and every change of the specifications goes back by itself after `confirm_within` seconds unless confirmed.
+        This and every change of the specifications is rolled back automatically after `confirm_within` seconds unless
+        confirmed.
         """
         async with self._changing(request.expected):
             new = Sources(request.files, request.definitions, request.signatures)
             sources = self.sources.with_files(new)
             shadow = frozenset(new.files) if request.shadow else frozenset()
             if self.in_force.who != DISK and sources == self.sources and not shadow:
-                return self._replaced(self.revision, ([], [], []))  # the same texts twice are one revision
+                return self._replaced(self.revision, ([], [], []))  # same texts: no new revision
             note, within = request.note or "loaded", request.confirm_within
             return await self._change(sources, who, who, note, within, shadow=shadow, forced=request.force)
 
+    @admin.answers(admin.MonitorTry, who=True)
     async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
         """Return what a load would do. Raises as `load`, and `DryRunUnderWayError`."""
         if who in self._attempting:
@@ -256,8 +263,9 @@ class Monitors(Revisions[MonitorRevisionRow]):
         files = following.difference(present)
         return answers.Tried(revision, tag, *files, [*checked.warnings, *warnings], [*checked.monitors])
 
-    async def replace(self, request: admin.MonitorReplace, who: str) -> Replaced:
-        """Put a text in the place of a monitor's file. Raises `UnknownMonitorError`, and as `load`."""
+    @admin.answers(admin.MonitorReplace, who=True)
+    async def replace(self, request: admin.MonitorReplace, who: str) -> Replacement:
+        """Replace the file of a monitor by a text. Raises `UnknownMonitorError`, and as `load`."""
         file = self.file_of(request.name)
         load = admin.MonitorLoad(
             {file: request.text},
@@ -271,10 +279,11 @@ class Monitors(Revisions[MonitorRevisionRow]):
         )
         return await self.load(load, who)
 
-    async def reload(self, request: admin.MonitorReload, who: str) -> Replaced:
-        """Take what the folder has now; what it does not have stays, unless `prune`.
+    @admin.answers(admin.MonitorReload, who=True)
+    async def reload(self, request: admin.MonitorReload, who: str) -> Replacement:
+        """Load the folder's files; files that it does not have stay in force, unless `prune`.
 
-        Raises `SpecificationsRefusedError`, also when there is no folder.
+        Raises `SpecificationsRefusedError`, also without a folder.
         """
         async with self._changing(request.expected):
             if self.folder is None:
@@ -283,7 +292,7 @@ class Monitors(Revisions[MonitorRevisionRow]):
             kept = [] if request.prune else sorted(self.sources.files.keys() - sources.files.keys())
             if kept:
                 sources = self.sources.with_files(sources)
-            keeper = who if kept else DISK  # else the next start would read the folder, and nothing else
+            keeper = who if kept else DISK  # otherwise the next start would read only the folder
             added, changed, _removed = sources.difference(self.sources)
             shadow = frozenset([*added, *changed]) if request.shadow else frozenset()
             within, note = request.confirm_within, "reloaded from disk"
@@ -291,11 +300,12 @@ class Monitors(Revisions[MonitorRevisionRow]):
                 sources, keeper, who, note, within, kept=kept, shadow=shadow, forced=request.force
             )
 
-    async def remove(self, request: admin.MonitorRemove, who: str) -> Replaced:
+    @admin.answers(admin.MonitorRemove, who=True)
+    async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
         """Remove files, by their names or those of their monitors.
 
-        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` where others use their variables, or a file has
-        other monitors as well.
+        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` if others use their variables, or a file has
+        other monitors.
         """
         async with self._changing(request.expected):
             names, owners = request.names, self.checked.monitors
@@ -315,16 +325,18 @@ class Monitors(Revisions[MonitorRevisionRow]):
             sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
             return await self._change(sources, who, who, note, request.confirm_within)
 
-    async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replaced:
+    @admin.answers(admin.MonitorRollback, who=True)
+    async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
         """Bring a kept revision into force again (None: the one before this; 0: nothing).
 
-        A monitor that comes back is switched as it was when it went. Raises `SpecificationsRefusedError`.
+        A monitor that comes back is switched as it was when it was removed. Raises `SpecificationsRefusedError`.
         """
         async with self._changing(request.expected):
             row = NOTHING if request.revision == 0 else await self._wanted(request.revision)
             note, switches = f"rolled back to revision {row.revision}", kept_in(row).switches
             return await self._change(sources_of(row), who, who, note, switches=switches, forced=True)
 
+    @admin.answers(admin.MonitorConfirm, who=True)
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
         """Keep an unconfirmed change, if there is one."""
         async with self._changing(request.expected):
@@ -341,8 +353,9 @@ class Monitors(Revisions[MonitorRevisionRow]):
                 await self.store.settled()
             return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
+    @admin.answers(admin.MonitorSwitch, who=True)
     async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
-        """Enable or disable monitors, for `for_seconds` or until further notice; return those that were not so already.
+        """Enable or disable monitors, for `for_seconds` or until further notice; return those that changed.
 
         Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for a monitor that is to be enabled but is in
         shadow mode, or shares variables with one that is.
@@ -353,16 +366,17 @@ class Monitors(Revisions[MonitorRevisionRow]):
             if seconds is not None and (request.enabled or not 0 < seconds <= LONGEST):
                 text = f"a monitor may be disabled for up to {LONGEST / 86_400:g} days; it is not enabled for a time"
                 raise SpecificationsRefusedError([text])
-            tried = [name for name in request.names if request.enabled and self.switches.on_trial(name)]
-            if tried:
-                text = f"{', '.join(tried)} is in shadow mode: rosrv monitor promote brings it into force"
+            shadowed = [name for name in request.names if request.enabled and self.switches.in_shadow(name)]
+            if shadowed:
+                text = f"{', '.join(shadowed)} is in shadow mode: rosrv monitor promote brings it into force"
                 raise SpecificationsRefusedError([text])
             return self._switched(await self._switch(request.names, request.enabled, who, seconds))
 
+    @admin.answers(admin.MonitorShadow, who=True)
     async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
-        """Put monitors into shadow mode, or from there into force; return those that were not so already.
+        """Put monitors into shadow mode, or from there into force; return those that changed.
 
-        Raises as `switch`, for a disabled monitor that is to be brought into force, and for one that would cut a topic.
+        Raises like `switch`, for a disabled monitor that shall be in force, and for one that would cut a topic.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
@@ -371,19 +385,20 @@ class Monitors(Revisions[MonitorRevisionRow]):
                 text = f"{', '.join(disabled)} is disabled, not in shadow mode: rosrv monitor enable"
                 raise SpecificationsRefusedError([text])
             if not request.shadow:
-                others = set(self.switches.tried()) - set(request.names)
+                others = set(self.switches.shadowed()) - set(request.names)
                 self._judged(self.checked, others, forced=request.force, promoted=request.names)
-            names = await self._switch(request.names, TRIAL if request.shadow else True, who)
+            names = await self._switch(request.names, SHADOW if request.shadow else True, who)
             return self._switched(names, self.rollout.began(names))
 
+    @admin.answers(admin.MonitorTrial, who=True)
     async def trial(self, request: admin.MonitorTrial, who: str) -> Switched:
-        """Do as `shadow`: the request under its name of earlier versions."""
+        """Do the same as `shadow`, under its name in earlier versions."""
         return await self.shadow(admin.MonitorShadow(request.names, request.trial, request.expected), who)
 
     async def _come_back(self, back: Mapping[str, Switch]) -> None:
-        """Switch monitors back whose time off is over. Raises `SpecificationsRefusedError`."""
+        """Switch monitors back when their time is over. Raises `SpecificationsRefusedError`."""
         async with self._one_change:
-            for to in (True, TRIAL):
+            for to in (True, SHADOW):
                 names = [name for name in self._disabled() if back.get(name) == to]
                 await self._switch(names, to, "its time off is over")
 
@@ -406,12 +421,12 @@ class Monitors(Revisions[MonitorRevisionRow]):
             return changed
         before, others = switches.said, dict.fromkeys(changed, to)
         require_whole(switches.states | others, self.checked)
-        retried = to == TRIAL or any(map(switches.on_trial, changed))
-        if not retried:
-            take_effect()  # else the rollout says when
+        switched_shadow = to == SHADOW or any(map(switches.in_shadow, changed))
+        if not switched_shadow:
+            take_effect()  # otherwise the rollout decides when
         await self._count()
         switches.said = before | others
-        if retried:
+        if switched_shadow:
             try:
                 await self.rollout.take(self._revision(self.revision, self.sources, self.checked))
             except (SpecificationsRefusedError, WithdrawnError):
@@ -423,7 +438,7 @@ class Monitors(Revisions[MonitorRevisionRow]):
             self.returns.begin({name: switches.states[name] or True for name in changed}, seconds)
         for name in changed:
             switches.states[name] = to
-            if not retried:
+            if not switched_shadow:
                 self.rollout.tell(name, messages.MonitorSwitched(name, to is True))
             self._say_switched(name, to, who)
         self.store.save_setting(_SWITCHES, json.dumps(switches.said))
@@ -444,11 +459,12 @@ class Monitors(Revisions[MonitorRevisionRow]):
             more=None if until is None else {"until": _moment(until)},
         )
 
+    @admin.answers(admin.MonitorResume, who=True)
     async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
-        """Let the topics of held monitors go on; which were held.
+        """Let the topics of these monitors go on; return the monitors that held theirs.
 
-        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for those whose relay process is away: the one
-        that comes will hold them.
+        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for monitors whose relay process is away: the
+        next one will hold them.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
@@ -477,26 +493,26 @@ class Monitors(Revisions[MonitorRevisionRow]):
             await self.rollout.carried_out()
             return self._switched(held)
 
-    # --- what the relay says ---
+    # --- the relay's messages ---
 
     def received(self, message: messages.Message, relay: int = 0) -> None:
-        """A message of a relay about monitors."""
+        """Process a message of a relay about monitors."""
         if isinstance(message, messages.MonitorsReported):
             self.records.reported(message.events, message.lost)
         else:
             self.rollout.received(message, relay)
 
     def relay_lost(self, relay: int) -> None:
-        """A relay is gone."""
+        """Note that a relay is gone."""
         self.rollout.lost(relay)
 
     # --- inside ---
 
-    def _revision(self, number: int, sources: Sources, checked: Checked) -> Revision:
-        """These, switched as they are now."""
+    def _revision(self, number: int, sources: Sources, checked: CheckedSpecifications) -> Revision:
+        """Return these specifications as a revision, with the present switches."""
         states = self.switches.states_of(checked)
-        trials = frozenset(name for name, state in states.items() if state == TRIAL)
-        return Revision(number, sources, checked, trials)
+        shadows = frozenset(name for name, state in states.items() if state == SHADOW)
+        return Revision(number, sources, checked, shadows)
 
     async def _kept(self) -> list[MonitorRevisionRow]:
         await self.store.settled()
@@ -515,7 +531,7 @@ class Monitors(Revisions[MonitorRevisionRow]):
             raise UnknownMonitorError(self._unknown(unknown))
 
     async def _count(self) -> None:
-        """The tag is another when this returns; kept before anybody sees it, so that no crash brings one back."""
+        """Change the tag; it is stored first, so that no crash restores an old tag."""
         self.store.save_setting(_ACTS, str(self._acts + 1))
         await self.store.settled()
         self._acts += 1
@@ -535,10 +551,10 @@ class Monitors(Revisions[MonitorRevisionRow]):
         switches: Mapping[str, Switch] = {},
         shadow: Collection[str] = (),
         forced: bool = False,
-    ) -> Replaced:
+    ) -> Replacement:
         """`switches` are for monitors that are not in force yet; those of the files `shadow` come in shadow mode.
 
-        `forced`: topics are cut whose publishers have another type.
+        `forced`: topics whose publishers have another type are cut.
         """
         before, previous, switched = self.revision, self.sources, self.switches.said
         self.switches.said = {
@@ -547,7 +563,7 @@ class Monitors(Revisions[MonitorRevisionRow]):
         }
         try:
             checked = await self._check(sources, self.site_keys)
-            put = {name: TRIAL for name, file in checked.monitors.items() if file in shadow}
+            put = {name: SHADOW for name, file in checked.monitors.items() if file in shadow}
             in_force = {name: True for name in checked.monitors if self.switches.enabled(name)} | put
             self.switches.said |= put
             warnings = self._judged(checked, self._in_shadow(checked), forced=forced)
@@ -579,23 +595,28 @@ class Monitors(Revisions[MonitorRevisionRow]):
             warnings=warnings,
         )
         for name in put:
-            self._say_switched(name, TRIAL, who, ", as it was loaded")
+            self._say_switched(name, SHADOW, who, ", as it was loaded")
         await self.store.settled()
         await self.rollout.all_taken()
         self._published()
-        began = self.rollout.began(checked.monitors)  # by those that have it only now, too
+        began = self.rollout.began(checked.monitors)  # also at relays that have only now taken it
         done = self._replaced(before, sources.difference(previous), moved, began, kept)
         return msgspec.structs.replace(done, warnings=[*done.warnings, *warnings])
 
-    def _in_shadow(self, checked: Checked, files: Collection[str] = ()) -> set[str]:
-        """Return which of these monitors are, or would be, in shadow mode: also those of the `files`."""
+    def _in_shadow(self, checked: CheckedSpecifications, files: Collection[str] = ()) -> set[str]:
+        """Return which of these monitors are, or would be, in shadow mode, including those of the `files`."""
         states = self.switches.states_of(checked)
-        return {name for name, file in checked.monitors.items() if states[name] == TRIAL or file in files}
+        return {name for name, file in checked.monitors.items() if states[name] == SHADOW or file in files}
 
     def _judged(
-        self, coming: Checked, shadow: Collection[str], *, forced: bool, promoted: Collection[str] = ()
+        self,
+        coming: CheckedSpecifications,
+        shadow: Collection[str],
+        *,
+        forced: bool,
+        promoted: Collection[str] = (),
     ) -> list[str]:
-        """Return warnings about topics. Raises `SpecificationsRefusedError` where one would be cut."""
+        """Return warnings about topics. Raises `SpecificationsRefusedError` if a topic would be cut."""
         found = judge_topics(
             coming, self.checked, self._live(), shadow=shadow, forced=forced, promoted=promoted
         )
@@ -610,17 +631,17 @@ class Monitors(Revisions[MonitorRevisionRow]):
         moved: Sequence[str] = (),
         began: Sequence[str] = (),
         kept: Sequence[str] = (),
-    ) -> Replaced:
+    ) -> Replacement:
         """Describe a change; `files` are those added, changed and removed."""
         warnings = list(self.checked.warnings)
-        return Replaced(
+        return Replacement(
             self.revision, self.tag, before, *files, warnings, [*moved], [*began], [*kept], self.confirm_by
         )
 
     def _keep(
         self,
         sources: Sources,
-        checked: Checked,
+        checked: CheckedSpecifications,
         *,
         who: str,
         note: str,
@@ -631,7 +652,9 @@ class Monitors(Revisions[MonitorRevisionRow]):
     ) -> None:
         last, before = self.in_force, sources_of(self.in_force)
         if last.revision:
-            ended = Kept(before.files, before.definitions, before.signatures, self.switches.said)
+            ended = StoredSpecifications(
+                before.files, before.definitions, before.signatures, self.switches.said
+            )
             self.store.save_monitor_revision(last._replace(sources=text_of(ended)))
         row = MonitorRevisionRow(last.revision + 1, text_of(sources), time.time(), who, note)
         self._put_in_force(row, within)
@@ -656,10 +679,10 @@ class Monitors(Revisions[MonitorRevisionRow]):
             warnings=[*checked.warnings, *warnings][:100],
         )
 
-    def _enforce(self, sources: Sources, checked: Checked) -> None:
+    def _enforce(self, sources: Sources, checked: CheckedSpecifications) -> None:
         self.sources, self.checked = sources, checked
         for name in self.switches.enforce(checked):
-            self._say_switched(name, TRIAL, self.in_force.who, ": it shares variables with one that is")
+            self._say_switched(name, SHADOW, self.in_force.who, ": it shares variables with one that is")
         self.returns.keep(self._disabled())
         self.store.save_setting(_SWITCHES, json.dumps(self.switches.said))
 

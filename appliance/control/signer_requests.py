@@ -1,6 +1,6 @@
-"""Control's link to the signer: checkpoints of the audit log and removals from it are signed there, certificates made.
+"""Send the signer's requests: sign checkpoints of the audit log and removals from it, and make certificates.
 
-Unsigned checkpoints are asked for again whenever a signer appears.
+Missing signatures are requested again whenever a signer starts.
 """
 
 import asyncio
@@ -12,8 +12,8 @@ from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 
 
-class Signing:
-    """The link to the signer; `want` and `want_removal` may be called on any thread."""
+class SignerRequests:
+    """The link to the signer; `want` and `want_removal` are thread-safe."""
 
     def __init__(self, audit: Callable[[], AuditLog]) -> None:
         self.link = Link(self._heard)
@@ -21,18 +21,18 @@ class Signing:
         self._loop = asyncio.get_running_loop()
 
     def want(self, number: int, text: bytes) -> None:
-        """Have a checkpoint signed. Called on the log's thread."""
+        """Request the signature of a checkpoint. Called on the log's thread."""
         self._ask(messages.SignatureWanted(number, text))
 
     def want_removal(self, number: int, checkpoint: bytes, newest: bytes) -> None:
-        """Have the removal of the records up to a checkpoint signed. Called on the log's thread."""
+        """Request the signature of a removal of the records up to a checkpoint. Called on the log's thread."""
         self._ask(messages.RemovalWanted(number, checkpoint, newest))
 
     def _ask(self, message: messages.Message) -> None:
         self._loop.call_soon_threadsafe(self.link.send, message)
 
     def attach(self, channel: Channel) -> None:
-        """A signer is there."""
+        """Attach the link of a started signer, and request missing signatures."""
         self.link.attach(channel)
         self._audit().request_signatures()
 

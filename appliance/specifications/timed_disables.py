@@ -1,12 +1,12 @@
-"""Monitors that are disabled for a while, and come back by themselves.
+"""Monitors that are disabled for a limited time.
 
 Invariants:
 
-1. A return is in the store before its monitor is disabled, and survives restarts of control and of the appliance.
-2. A monitor is never off for longer than it was disabled for, plus the time for which the appliance did not run: a
-   clock that was set back since does not count.
-3. A return that is refused (the monitor shares variables with others that are in shadow mode now) is tried again until
-   it succeeds, or an operator switches the monitor.
+1. The time is stored before its monitor is disabled, and survives restarts of control and of the appliance.
+2. A monitor is never off longer than ordered plus the time for which the appliance did not run, even if the clock was
+   set back.
+3. If enabling is refused (the monitor shares variables with others that are in shadow mode now), it is tried again
+   until it succeeds, or an operator switches the monitor.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 
 LONGEST = 30 * 86_400.0
-"""Seconds for which a monitor may be disabled with a return."""
+"""Most seconds for which a monitor may be disabled with a time limit."""
 
 _SETTING = "monitor returns"
 _AGAIN_SECONDS = 5.0
@@ -31,15 +31,15 @@ _log = structlog.get_logger()
 
 
 class _Return(msgspec.Struct, frozen=True):
-    """`until` is seconds since the epoch, `seconds` the whole length, `back` how the monitor is switched then."""
+    """A time limit: its end (`until`, seconds since the epoch), its length (`seconds`), and the switch `back`."""
 
     until: float
     seconds: float
     back: Switch
 
 
-class Returns:
-    """`come_back(names)` switches monitors back; it calls `end` for them, as every other switch does."""
+class TimedDisables:
+    """The time limits. At their end they call `come_back(names)`, which calls `end` as every switch does."""
 
     def __init__(
         self, store: StateStore, come_back: Callable[[Mapping[str, Switch]], Awaitable[None]]
@@ -54,7 +54,7 @@ class Returns:
         return name in self._kept
 
     def until(self, name: str) -> float | None:
-        """When a monitor comes back, in seconds since the epoch; None: not by itself."""
+        """Return when a monitor comes back, in seconds since the epoch; None if it does not."""
         found = self._kept.get(name)
         return found.until if found is not None else None
 
@@ -71,7 +71,7 @@ class Returns:
         self._save()
 
     def begin(self, back: Mapping[str, Switch], seconds: float) -> None:
-        """These monitors come back after so many seconds, switched as `back` says."""
+        """Have these monitors come back after `seconds`, switched as `back` says."""
         until = time.time() + seconds
         self._kept |= {
             name: _Return(until, seconds, self._kept[name].back if name in self._kept else to)
@@ -80,14 +80,14 @@ class Returns:
         self._save()
 
     def end(self, names: Iterable[str]) -> None:
-        """These monitors were switched, or are gone."""
+        """Forget monitors that were switched or removed."""
         ended = self._kept.keys() & set(names)
         if ended:
             self._kept = {name: one for name, one in self._kept.items() if name not in ended}
             self._save()
 
     def keep(self, disabled: Collection[str]) -> None:
-        """Only these monitors are disabled now."""
+        """Forget all but these disabled monitors."""
         self.end(self._kept.keys() - set(disabled))
 
     def _save(self) -> None:

@@ -1,0 +1,86 @@
+"""Make the core of RVMaster, which decides calls and changes the graph, but sends nothing."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from appliance.control.foundation import Current, Foundation
+from appliance.master.calls.gate import CallGate, HostLimits
+from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.endpoints.traffic import RelayTraffic
+from appliance.master.graph.grants import Grants
+from appliance.master.graph.graph import RosGraph
+from appliance.master.graph.mediation import Mediation
+from appliance.master.graph.registry import Registry
+from appliance.master.graph.revocation import Revocation
+from appliance.master.parameter_charges import ParameterCharges
+from appliance.master.parameter_mirror import ParameterMirror
+from appliance.policy.policy import Policy
+from appliance.quotas.pool import Pool
+from appliance.quotas.table import PARAMETER_BYTES
+from appliance.specifications.specification_manager import SpecificationManager
+
+
+@dataclass(frozen=True, slots=True)
+class Core:
+    """The core of RVMaster. `policy()` is the policy in force; `monitors` is set once the specifications are made."""
+
+    policy: Callable[[], Policy]
+    registry: Registry
+    carried: RelayTraffic
+    grants: Grants
+    mediation: Mediation
+    rights: ParameterRights
+    graph: RosGraph
+    gate: CallGate
+    parameters: ParameterMirror
+    revocation: Revocation
+    monitors: Current[SpecificationManager]
+
+
+def make_core(base: Foundation) -> Core:
+    """Make the core from the registry, the policy, and the parameters in the store."""
+    settings, registry, monitors = base.settings, base.registry, Current[SpecificationManager]()
+
+    def policy() -> Policy:
+        return base.policies.current
+
+    carried = RelayTraffic(base.trail, registry, settings.relays)
+    grants = Grants(carried.used)
+    mediation = Mediation(
+        policy,
+        lambda: monitors().checked,
+        relay_all=settings.relaying == "all",
+        stand_ins=settings.mediation == "full",
+    )
+    rights = ParameterRights(policy, base.trail)
+    graph = RosGraph(registry, grants, mediation, may_be_told=rights.may_be_told)
+    limits = HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host)
+    parameters = _make_mirror(base)
+    return Core(
+        policy=policy,
+        registry=registry,
+        carried=carried,
+        grants=grants,
+        mediation=mediation,
+        rights=rights,
+        graph=graph,
+        gate=CallGate(policy, registry, limits),
+        parameters=parameters,
+        revocation=Revocation(registry, grants, graph, policy, lambda: parameters.tree),
+        monitors=monitors,
+    )
+
+
+def _make_mirror(base: Foundation) -> ParameterMirror:
+    whole = int(base.settings.limits.parameter_bytes)
+    bounds = PARAMETER_BYTES.bounds.sized(whole, whole // 2)
+    pool = Pool("bytes of parameters", bounds, base.quota_class)
+    return ParameterMirror(
+        base.store.load_parameters(),
+        base.parameters_dirty.set,
+        ParameterCharges(pool, base.store, base.store.parameter_owners()),
+        depth_limit=base.settings.limits.nesting,
+        note=base.store.note_parameter,
+        together=base.store.database.together,
+        since=base.store.parameter_changes(),
+    )

@@ -1,0 +1,219 @@
+"""Make the first part of control: the store, the audit log, the policy, the tunnels and the listening sockets."""
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import structlog
+
+from appliance.audit.budget import Budget
+from appliance.audit.ids import IdSource
+from appliance.audit.log import AuditLog
+from appliance.audit.retention import Retention
+from appliance.channel import messages
+from appliance.configuration.settings import Settings
+from appliance.control.listener_limits import ListenerLimits
+from appliance.control.policies import Policies
+from appliance.control.quota_class import HostQuotaClass, charged_to
+from appliance.control.robot import robot_addresses
+from appliance.control.signer_requests import SignerRequests
+from appliance.control.supervisor_link import ControlLifeline
+from appliance.hosts.certificate_requests import Authority
+from appliance.hosts.host_table import HostTable
+from appliance.hosts.hosts_file import DeclaredHosts
+from appliance.hosts.tunnel_state import Tunnels
+from appliance.master.graph.registry import Registry
+from appliance.master.reconcile.enactor import Enforcement
+from appliance.quotas.pool import QuotaClass
+from appliance.quotas.table import AUDIT_RESERVE
+from appliance.recorder.recording_plan import RecordingPlan
+from appliance.rpc.server import listen
+from appliance.specifications.compiler_link import SpecificationCompiler
+from appliance.store.state_file import StateStore
+from appliance.telemetry.audit_trail import AuditTrail
+
+T = TypeVar("T")
+RVMASTER, INNER, OWN = "rvmaster", "inner", "own"
+"""The names of the listeners for nodes, for the ROS master, and for the appliance's own nodes."""
+
+_log = structlog.get_logger()
+_HOSTS_IN_RESERVE = AUDIT_RESERVE.bounds.whole // AUDIT_RESERVE.bounds.host
+
+
+class Current(Generic[T]):
+    """A value that is set after its readers are made; calling this object returns the current value."""
+
+    def __init__(self) -> None:
+        self._values: list[T] = []
+
+    def set(self, value: T) -> None:
+        """Set the value."""
+        self._values = [value]
+
+    def __bool__(self) -> bool:
+        return bool(self._values)
+
+    def __call__(self) -> T:
+        """Return the value. Raises `RuntimeError` before it is set."""
+        if not self._values:
+            raise RuntimeError("this part of control is used before it is made")
+        return self._values[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Foundation:
+    """The durable state, the policy and the listeners.
+
+    `enforcement` gets its value later; `parameters_dirty` is set when the mirror of the parameters has changed.
+    """
+
+    settings: Settings
+    lifeline: ControlLifeline
+    compiler: SpecificationCompiler
+    signing: SignerRequests
+    authority: Authority
+    audit: AuditLog
+    trail: AuditTrail
+    plan: RecordingPlan
+    store: StateStore
+    table: HostTable
+    tunnels: Tunnels
+    policies: Policies
+    registry: Registry
+    quota_class: HostQuotaClass
+    listener_limits: ListenerLimits
+    sockets: Mapping[str, socket.socket]
+    enforcement: Current[Enforcement]
+    parameters_dirty: asyncio.Event
+
+    def port(self, name: str) -> int:
+        """Return the port of a listener."""
+        return int(self.sockets[name].getsockname()[1])
+
+
+async def make_foundation(
+    settings: Settings,
+    lifeline: ControlLifeline,
+    compiler: SpecificationCompiler,
+    tunnels: Current[Tunnels],
+    *,
+    restarted: bool,
+) -> Foundation:
+    """Open the log and the store, read the policy and listen. Set `tunnels` before the supervisor reports about them.
+
+    Raises `PolicyRefusedError`, `StoreError`, and `OSError` if an address is in use.
+    """
+    audit, quota_class, enforcement = Current[AuditLog](), Current[HostQuotaClass](), Current[Enforcement]()
+    signing = SignerRequests(audit)
+    authority = Authority(signing.link)
+    audit.set(_open_audit(settings, signing, _log_held(lifeline), quota_class))
+    plan = RecordingPlan(settings.recorder, lambda host: charged_to(policies.current, host), IdSource().next)
+    trail = AuditTrail(
+        audit(),
+        strict=settings.audit.durability == "strict",
+        deny_when_failed=settings.audit.on_audit_failure == "deny",
+        recordings=plan.detail,
+    )
+    store = StateStore(
+        settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
+    )
+    # Start tunnels before the policy, which names hosts: their addresses are valid once clear text is blocked.
+    table = HostTable(store, settings.ipsec.pool, DeclaredHosts(settings.hosts))
+    tunnels.set(Tunnels(table, trail, authority, listen=settings.listen_address, say=lifeline.say))
+    await tunnels().start()
+    policies = Policies(
+        settings.policy,
+        store,
+        trail,
+        robot=robot_addresses(settings),
+        hosts=lambda: tunnels().addresses,
+        changed=lambda before, policy: enforcement().policy_changed(before, policy),
+        carried_out=lambda: enforcement().carried_out(),
+        site_keys=settings.site_keys,
+    )
+    policies.start(restarted=restarted)
+    registry = Registry()
+    quota_class.set(HostQuotaClass(lambda: policies.current, registry.registrations_of))
+    return Foundation(
+        settings=settings,
+        lifeline=lifeline,
+        compiler=compiler,
+        signing=signing,
+        authority=authority,
+        audit=audit(),
+        trail=trail,
+        plan=plan,
+        store=store,
+        table=table,
+        tunnels=tunnels(),
+        policies=policies,
+        registry=registry,
+        quota_class=quota_class(),
+        listener_limits=ListenerLimits(settings, trail, lambda: policies.current, quota_class()),
+        sockets=_open_listeners(settings, lifeline),
+        enforcement=enforcement,
+        parameters_dirty=asyncio.Event(),
+    )
+
+
+def _open_listeners(settings: Settings, lifeline: ControlLifeline) -> dict[str, socket.socket]:
+    """Return the listeners by name; those that the supervisor did not keep are opened."""
+    host, port = settings.listen_address
+    sockets = lifeline.sockets
+    for name, address in ((RVMASTER, (host, port)), (INNER, ("127.0.0.1", 0)), (OWN, ("127.0.0.1", 0))):
+        if name not in sockets:
+            try:
+                sockets[name] = listen(*address)
+            except OSError as error:
+                raise OSError(
+                    f"{address[0]}:{address[1]} cannot be listened on: {error.strerror}; "
+                    "is a ROS master running there? Stop it, or choose another --listen"
+                ) from error
+            lifeline.keep(name, sockets[name])
+    return sockets
+
+
+def _log_held(lifeline: ControlLifeline) -> Callable[[list[int]], None]:
+    """Return a thread-safe function that reports the processes that lock the log to the supervisor."""
+    loop = asyncio.get_running_loop()
+
+    def report(processes: list[int]) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(lifeline.say, messages.LogHeld(processes))
+
+    return report
+
+
+def _open_audit(
+    settings: Settings,
+    signing: SignerRequests,
+    held_by: Callable[[list[int]], None],
+    quota_class: Current[HostQuotaClass],
+) -> AuditLog:
+    audit = settings.audit
+    reserve = AUDIT_RESERVE.bounds.sized(
+        int(audit.reserve_bytes), int(audit.reserve_bytes) // _HOSTS_IN_RESERVE
+    )
+
+    def class_of_text(host: str) -> QuotaClass:
+        # Until the policy is read, all hosts count as named.
+        return quota_class().of_text(host) if quota_class else QuotaClass.NAMED
+
+    return AuditLog(
+        settings.state / "control" / "audit.db",
+        durability=audit.durability,
+        checkpoint_every=audit.checkpoint_records,
+        checkpoint_seconds=audit.checkpoint_seconds,
+        signer=signing.want,
+        removals=signing.want_removal,
+        held_by=held_by,
+        budget=Budget(class_of_text, reserve=reserve),
+        reserve=reserve.whole,
+        retention=Retention(
+            days=audit.retention_days,
+            size=None if audit.retention_bytes is None else int(audit.retention_bytes),
+        ),
+    )

@@ -1,0 +1,118 @@
+"""Make the parts for operators: hosts and tunnels, tokens, queries and orders, on the admin socket and over REST."""
+
+from dataclasses import dataclass
+from functools import partial
+
+from appliance.channel.answers.status import AuditState
+from appliance.control.administration import Administration
+from appliance.control.assembly import Parts
+from appliance.control.clock_check import ClockCheck
+from appliance.control.evidence_orders import EvidenceOrders
+from appliance.control.forwarder_link import ForwarderLink
+from appliance.control.foundation import Current, Foundation
+from appliance.control.queries import Queries
+from appliance.control.rest import RestLink
+from appliance.control.switched_off import SwitchedOffWatch
+from appliance.control.token_orders import TokenOrders
+from appliance.hosts.certification import Certification
+from appliance.hosts.enrolment import HostEnrolment, find_endpoint
+from appliance.hosts.rest_address import rest_address
+
+
+@dataclass(frozen=True, slots=True)
+class Operators:
+    """The parts that serve operators."""
+
+    certification: Certification
+    hosts: HostEnrolment
+    tokens: TokenOrders
+    clock: ClockCheck
+    forwarded: ForwarderLink
+    switched_off: SwitchedOffWatch
+    administration: Administration
+    rest: RestLink
+
+
+def make_operators(base: Foundation, parts: Parts) -> Operators:
+    """Make the parts that serve operators. The specifications must be loaded before."""
+    settings, trail, ends = base.settings, base.trail, parts.endpoints
+    certification = Certification(
+        base.store,
+        trail,
+        base.authority,
+        base.table,
+        base.tunnels,
+        master_port=settings.listen_address[1],
+        rest=rest_address(settings),
+        changed=base.policies.hosts_changed,
+    )
+    hosts = HostEnrolment(
+        certification,
+        partial(find_endpoint, settings, base.lifeline.endpoint),
+        expel=ends.enforcement.expel,
+        carried_out=ends.relay.carried_out,
+        machines=parts.core.registry.machines,
+    )
+    rest = Current[RestLink]()
+    tokens = TokenOrders(base.store, trail, lambda: rest().state_tokens())
+    clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
+    forwarded = ForwarderLink(settings.audit.syslog, trail)
+    switched_off = SwitchedOffWatch(
+        parts.monitors, base.policies, base.store, trail, settings.forgotten_after
+    )
+    looks = Queries(
+        parts,
+        trail,
+        base.policies,
+        hosts,
+        base.lifeline.surroundings,
+        audit=partial(_audit_state, base, forwarded),
+        clock=clock.state,
+        recorder=ends.recordings.state,
+        queued_deliveries=lambda: ends.enactor.delivery.waiting,
+        live=parts.core.revocation.live,
+        switched_off=switched_off.rows,
+    )
+    administration = Administration(
+        looks,
+        base.policies,
+        parts.monitors,
+        hosts,
+        hosts.itself,
+        hosts.ports,
+        certification,
+        tokens,
+        ends.recordings,
+        EvidenceOrders(base.audit, trail),
+        durable=trail.durable,
+        require_room=base.store.database.require_room,
+    )
+    rest.set(
+        RestLink(
+            administration,
+            tokens,
+            trail,
+            served=certification.served_by,
+            require_proof=settings.api_require_proof,
+        )
+    )
+    return Operators(
+        certification=certification,
+        hosts=hosts,
+        tokens=tokens,
+        clock=clock,
+        forwarded=forwarded,
+        switched_off=switched_off,
+        administration=administration,
+        rest=rest(),
+    )
+
+
+def _audit_state(base: Foundation, forwarded: ForwarderLink) -> AuditState:
+    return AuditState(
+        *base.audit.lag,
+        failed=base.audit.failed,
+        on_failure=base.settings.audit.on_audit_failure,
+        degraded=base.audit.degraded,
+        forwarding=forwarded.status(),
+    )

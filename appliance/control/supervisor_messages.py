@@ -1,0 +1,124 @@
+"""Handle the messages of the supervisor while control serves."""
+
+import asyncio
+import socket
+from typing import Any
+
+import structlog
+
+from appliance.channel import messages
+from appliance.channel.admin import HostsReload, PolicyReload
+from appliance.channel.answers.status import ProcessInfo
+from appliance.channel.channel import Channel
+from appliance.channel.messages.api import ApiLink
+from appliance.control.assembly import Parts
+from appliance.control.foundation import Foundation
+from appliance.control.operators import Operators
+from appliance.control.policies import PolicyRefusedError, RevisionChangedError
+from appliance.hosts.host_table import HostRefusedError
+from appliance.specifications.allocation import TOPIC
+from appliance.store.writer_thread import StoreError
+
+_log = structlog.get_logger()
+
+
+class SupervisorMessages:
+    """The dispatcher of the supervisor's links and reports to the parts of control."""
+
+    def __init__(self, base: Foundation, parts: Parts, operators: Operators) -> None:
+        self._base = base
+        self._parts = parts
+        self._operators = operators
+        self._reloading: set[asyncio.Task[None]] = set()
+        self._one_reload = asyncio.Lock()
+        self._failing: frozenset[str] = frozenset()  # the roles of processes that keep ending
+
+    def heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
+        """Handle a message and the descriptors that came with it."""
+        match message:
+            case messages.LinkOpened(role, index):
+                self._link(role, index, socket.socket(fileno=descriptors[0]))
+            case messages.ProcessesChanged(processes):
+                self._note_failing(processes)
+                self._parts.reconciler.wake()
+            case messages.PolicyReloadRequested():
+                task = asyncio.get_running_loop().create_task(self._reload())
+                self._reloading.add(task)  # referenced until it is done
+                task.add_done_callback(self._reloading.discard)
+            case messages.Announced():
+                self._operators.tokens.told()
+            case messages.ClockRead(synchronised):
+                self._operators.clock.told(synchronised)
+            case messages.ProbeFailed(reason):
+                self._base.listener_limits.probed(reason)
+            case messages.ProbePassed():
+                self._base.listener_limits.probed("")
+            case _:
+                _log.error(
+                    "the supervisor sent a message that is not for control", message=type(message).__name__
+                )
+
+    def _note_failing(self, processes: list[ProcessInfo]) -> None:
+        """Record each process that ends soon after every start."""
+        failing = {process.role: process for process in processes if process.failing}
+        for role in failing.keys() - self._failing:
+            process = failing[role]
+            self._base.trail.happened(
+                "process failing",
+                f"{role}: {process.failing}",
+                resource=role,
+                restarts=process.restarts,
+                output=process.output,
+            )
+        self._failing = frozenset(failing)
+
+    def _link(self, role: str, index: int, sock: socket.socket) -> None:
+        match role:
+            case "relay":
+                self._relay_link(index, Channel(sock, messages.RelayLink))
+            case "signer":
+                self._base.signing.attach(Channel(sock, messages.SignerLink))
+            case "api":
+                self._operators.rest.attach(Channel(sock, ApiLink, limit=16 << 20, longest=8 << 20))
+            case "charon":
+                self._base.tunnels.attach(Channel(sock, messages.TunnelLink))
+            case "syslog":
+                self._operators.forwarded.link.attach(Channel(sock, messages.ForwardingLink))
+            case "recorder":
+                self._parts.endpoints.recordings.link.attach(Channel(sock, messages.RecorderLink))
+            case _:
+                _log.error("a link leads to a process that control does not know", role=role)
+                sock.close()
+
+    def _relay_link(self, index: int, channel: Channel) -> None:
+        ends = self._parts.endpoints
+        ends.relay.attach(index, channel)
+        told = self._parts.core.graph.tell_everybody(lambda topic: ends.relay.carries(index, TOPIC, topic))
+        ends.enactor.carry_out(told)
+        self._parts.reminders.begin()
+
+    async def _reload(self) -> None:
+        """Read the policy and hosts.yaml again from the disk."""
+        async with self._one_reload:
+            try:
+                await self._reload_policy()
+            except PolicyRefusedError as error:
+                _log.error(
+                    "the policy was rejected, the last good one stays in force", findings=error.findings
+                )
+            except StoreError as error:
+                _log.error("the policy is in force and not kept", reason=str(error))
+            try:
+                await self._operators.hosts.reload(HostsReload(), "disk")
+            except HostRefusedError as error:
+                _log.error("hosts.yaml was rejected", reason=str(error))
+            except StoreError as error:
+                _log.error("hosts.yaml is in force and not kept", reason=str(error))
+
+    async def _reload_policy(self) -> None:
+        while True:
+            try:
+                await self._base.policies.reload(PolicyReload(), "disk")
+            except RevisionChangedError:  # another revision came into force meanwhile
+                continue
+            return
