@@ -1,4 +1,4 @@
-/** The console: the door, or the shell with the view that the address names. */
+/** The console: the sign-in page, or the shell with the view that the URL names. */
 
 import { Door, Lock } from "./door.js";
 import { html, useEffect } from "./html.js";

@@ -1,4 +1,4 @@
-/** What a host asks the policy for: the category of a decision, what whoever asks wants to do, the letter of the graph. */
+/** Categories of decisions: name, the host's action, the letter of the graph's keys. */
 
 export const CATEGORIES = /** @type {[string, string, string][]} */ ([
   ["publish", "publish a topic", "t"], ["subscribe", "subscribe to a topic", "t"], ["offer", "offer a service", "s"],

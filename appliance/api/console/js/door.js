@@ -1,4 +1,4 @@
-/** The door: a token is shown, recognised by the appliance, and kept no longer than its holder wants. */
+/** The sign-in page: the appliance checks an access token, which is kept only as long as its holder wants. */
 
 import { html, useEffect, useRef, useState } from "./html.js";
 import { lasting } from "./moments.js";
@@ -10,7 +10,7 @@ import { ask } from "./rest.js";
 import { open, session, stated, UNUSED } from "./session.js";
 import { useStore } from "./store.js";
 
-/** Ask who holds this token, and open the console to them. Throws `Problem`. @param {string} token @param {boolean} keep */
+/** Look up a token's holder and start the session. Throws `Problem`. @param {string} token @param {boolean} keep */
 export async function enter(token, keep) {
   const { body } = await ask("GET", "/v1/whoami", { token });
   open({ token, ...body }, keep);
@@ -35,23 +35,23 @@ export function Door() {
     }
   };
   const notice = stated("notice");
-  if (checking) return html`<main class="door" id="main"><p class="muted" role="status">Asking the appliance who holds this token.</p></main>`;
+  if (checking) return html`<main class="door" id="main"><p class="muted" role="status">Checking the token.</p></main>`;
   return html`<main class="door" id="main"><div class="door-box">
     <div class="brand"><${Mark} size=${40} /><div><h1 class="brand-name">ROSRV</h1><div class="brand-sub">Console of this appliance</div></div></div>
     <form class="panel" onSubmit=${submit}>
-      ${notice && html`<div class="site-notice" role="note" aria-label="Notice of the site">${notice}</div>`}
-      ${locked && !error && html`<${Notice} tone="warn" title="Locked" role="status">Nobody used this page for ${lasting(UNUSED / 1000)}. What <${Given} value=${locked.name} most=${40} /> was doing is still here for that token; another one begins anew.</${Notice}>`}
+      ${notice && html`<div class="site-notice" role="note" aria-label="Site notice">${notice}</div>`}
+      ${locked && !error && html`<${Notice} tone="warn" title="Locked" role="status">This page was not used for ${lasting(UNUSED / 1000)}. The work of <${Given} value=${locked.name} most=${40} /> is kept for that token; another token starts a new session.</${Notice}>`}
       ${ended && !error && html`<${Notice} tone="warn" title="Signed out" role="status">${ended}</${Notice}>`}
       <${Failure} error=${error} />
       <${Field} label="Access token" type="password" mono value=${token} set=${setToken} placeholder="rosrv_…" autofocus required
-        hint=${html`Made by <code>rosrv token add NAME --role viewer</code>. The first one is in <code>first-token</code> in the state directory.`} />
+        hint=${html`Create one with <code>rosrv token add NAME --role viewer</code>. The first token is in the file <code>first-token</code> of the state directory.`} />
       <${Check} label="Stay signed in until this tab is closed" on=${keep} set=${setKeep} />
-      <button class="button primary" type="submit" disabled=${busy || !token.trim()}>${busy ? "Asking the appliance" : "Sign in"}</button>
+      <button class="button primary" type="submit" disabled=${busy || !token.trim()}>${busy ? "Signing in" : "Sign in"}</button>
     </form>
   </div></main>`;
 }
 
-/** The door before a page that nobody used for a while: above all that is open there, also a dialog. */
+/** The sign-in page of a locked session, above everything else, including dialogs. */
 export function Lock() {
   const ref = useRef(/** @type {HTMLDialogElement | null} */ (null));
   useEffect(() => {

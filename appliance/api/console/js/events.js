@@ -1,6 +1,6 @@
 /**
- * Follows server-sent events with a token (EventSource cannot send one): reads, notices silence, comes back with a
- * growing pause and where it was.
+ * Follow server-sent events with a token (EventSource cannot send one). After an error or silence, reconnect with a
+ * growing pause, continuing after the last event.
  */
 
 import { Problem } from "./problem.js";

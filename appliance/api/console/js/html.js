@@ -1,4 +1,4 @@
-/** The one place where the views take their rendering from. */
+/** The rendering library, imported from one place. */
 
 export {
   Component, Fragment, h, html, render, useCallback, useEffect, useId, useLayoutEffect, useMemo, useRef, useState,

@@ -1,25 +1,25 @@
 /**
- * The two keys that are derived from a token (docs/rest.md, "Signed orders"): the token itself is sent nowhere.
+ * The two keys that are derived from a token (docs/reference/rest.md, "Signed orders"): the token itself is never sent.
  *
- * The reading key is a text that is shown with every request. The signing key (Ed25519) signs each order under a
- * challenge that the appliance takes once.
+ * The reading key is sent with every request. The signing key (Ed25519) signs each change together with a
+ * challenge that the appliance accepts once.
  */
 
 import { Problem } from "./problem.js";
 
 const bytes = (/** @type {string} */ text) => new TextEncoder().encode(text);
-// What stands before the 32 bytes of a private Ed25519 key in PKCS #8 (RFC 8410).
+// The prefix of the 32 bytes of a private Ed25519 key in PKCS #8 (RFC 8410).
 const PKCS8 = [0x30, 0x2e, 0x02, 0x01, 0x00, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x04, 0x22, 0x04, 0x20];
 
 /** @param {string} token @returns {Promise<string>} */
 export async function readingKey(token) {
   const id = /^rosrv_([0-9a-f]{12})_[\w-]{43}$/.exec(token)?.[1];
-  if (!id) throw new Problem(401, { detail: "The token is wrong, or was revoked: one has the form rosrv_… (rosrv token add)." });
+  if (!id) throw new Problem(401, { detail: "The token is wrong or revoked. A token starts with rosrv_; create one with rosrv token add." });
   return `rosrv-read_${id}_${text(await derived(token, "rosrv reading key 1"))}`;
 }
 
 /**
- * The header that proves an order, as it is sent: `target` is path and query.
+ * Return the header that proves a change; `target` is path and query.
  * @param {string} token @param {string} challenge
  * @param {{method: string, target: string, match: string, type: string, body: string}} order
  */
@@ -30,13 +30,13 @@ export async function proof(token, challenge, { method, target, match, type, bod
   try {
     key = await crypto.subtle.importKey("pkcs8", new Uint8Array([...PKCS8, ...seed]), "Ed25519", false, ["sign"]);
   } catch {
-    throw new Problem(0, { detail: "This browser cannot sign orders (Ed25519): take a newer one, or `rosrv` on the command line." });
+    throw new Problem(0, { detail: "This browser cannot sign changes (Ed25519). Use a newer browser, or `rosrv` on the command line." });
   }
   return `${challenge} ${text(await crypto.subtle.sign("Ed25519", key, bytes(lines.join("\n"))))}`;
 }
 
 async function derived(/** @type {string} */ token, /** @type {string} */ label) {
-  if (!globalThis.crypto?.subtle) throw new Problem(0, { detail: "This page has no cryptography here: open it over https, or on this machine." });
+  if (!globalThis.crypto?.subtle) throw new Problem(0, { detail: "Browsers disable cryptography on this page. Open it over https, or on the appliance's machine." });
   const key = await crypto.subtle.importKey("raw", bytes(token), { name: "HMAC", hash: "SHA-256" }, false, ["sign"]);
   return crypto.subtle.sign("HMAC", key, bytes(label));
 }

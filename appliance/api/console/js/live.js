@@ -1,4 +1,4 @@
-/** What the appliance says of itself while the page is open: status, open alarms, samples, the graph when it is wanted. */
+/** The appliance's live state: status, open alarms, samples and, on request, the graph. */
 
 import { follow } from "./events.js";
 import { get } from "./rest.js";
@@ -9,7 +9,7 @@ const HOUR = 3600;
 /**
  * @typedef {{time: number, allowed: number, denied: number, messages: number, bytes: number, dropped: number,
  *   nodes: number, monitors: Record<string, number[]>}} Sample
- * @typedef {{kind: string, severity: "alarm" | "warning" | "notice", text: string, about: string}} Alarm
+ * @typedef {{kind: string, severity: "alarm" | "warning" | "notice", text: string, about: string, to?: string}} Alarm
  */
 
 export const live = createStore({
@@ -25,7 +25,7 @@ export const live = createStore({
 let running = /** @type {ReturnType<typeof follow> | null} */ (null);
 let withGraph = false;
 
-/** Follow from now on; with the graph, or without. */
+/** Start following, with or without the graph. */
 export function start({ graph = false } = {}) {
   if (running && withGraph === graph) return;
   const first = !running;

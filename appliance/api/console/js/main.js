@@ -1,4 +1,4 @@
-/** The page begins: a token kept from before is tried, and what it may see is drawn. */
+/** The entry point: try a stored token and render the page. */
 
 import { App } from "./app.js";
 import { html, render } from "./html.js";

@@ -1,4 +1,4 @@
-/** Times in the reader's zone; UTC, to the nanosecond where it is known, on hover. */
+/** Times in the user's time zone; on hover in UTC, to the nanosecond where known. */
 
 import { html, useEffect, useState } from "./html.js";
 
@@ -12,7 +12,7 @@ export function dateOf(value) {
   return new Date(typeof value === "number" ? value * 1000 : value);
 }
 
-/** A moment: the clock today, with the day before. */
+/** A point in time: today only the time of day, else also the date. */
 export function Moment(/** @type {{at: string | number | null, always?: "day"}} */ { at, always }) {
   if (at === null || at === undefined) return html`<span class="muted">never</span>`;
   const date = dateOf(at);
@@ -31,13 +31,13 @@ export function minute(seconds) {
   return MINUTE.format(new Date(seconds * 1000));
 }
 
-/** The clock, with as much of a second as a line of so many seconds needs. @param {number} seconds since the epoch @param {number} span */
+/** The time of day, with the decimals that an axis of `span` seconds needs. @param {number} seconds since the epoch @param {number} span */
 export function clock(seconds, span) {
   const part = span < 1 ? 3 : span < 20 ? 1 : 0;
   return CLOCK.format(new Date(seconds * 1000)) + (part ? (seconds % 1).toFixed(3).slice(1, part + 2) : "");
 }
 
-/** A length of time in its two largest units. @param {number} seconds */
+/** A duration in its two largest units. @param {number} seconds */
 export function lasting(seconds) {
   const units = /** @type {[string, number][]} */ ([["d", 86_400], ["h", 3600], ["min", 60], ["s", 1]]);
   let left = Math.max(0, Math.round(seconds));
@@ -51,7 +51,7 @@ export function lasting(seconds) {
   return said.length ? said.join(" ") : "0 s";
 }
 
-/** The time now, in milliseconds, anew every so many of them. @param {number} every */
+/** The current time in milliseconds, updated at this interval. @param {number} every */
 export function useNow(every = 1000) {
   const [now, set] = useState(Date.now());
   useEffect(() => {

@@ -1,4 +1,4 @@
-/** The way to the views, and who reads. */
+/** Navigation between views, and the current user. */
 
 import { html } from "./html.js";
 import { live } from "./live.js";

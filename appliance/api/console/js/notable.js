@@ -1,6 +1,6 @@
 /**
- * The records that a person may want to see as they happen (notices and graver): refusals, what monitors did, changes.
- * One stream for all views; the last ones are kept, the newest first.
+ * Records to show as they happen (severity notice and above): denials, actions of monitors, changes.
+ * One stream serves all views; it keeps the last records, newest first.
  */
 
 import { follow } from "./events.js";
@@ -59,7 +59,7 @@ export function isDenial(record) {
 
 /** Whether a monitor did something, and not somebody something to it. @param {AuditRecord} record */
 function isDoing(record) {
-  return record.category === "monitor" && record.detail?.monitor !== undefined && !["monitor log", "trial observed"].includes(record.event);
+  return record.category === "monitor" && record.detail?.monitor !== undefined && !["monitor log", "shadow observed"].includes(record.event);
 }
 
 function added(/** @type {AuditRecord[] | null} */ list, /** @type {AuditRecord} */ record) {

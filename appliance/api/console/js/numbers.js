@@ -1,4 +1,4 @@
-/** Numbers as people read them. */
+/** Numbers for display. */
 
 const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 const SHORT = new Intl.NumberFormat("en", { notation: "compact", maximumFractionDigits: 1 });
@@ -9,12 +9,12 @@ export function count(value) {
   return Math.abs(value) < 100_000 ? WHOLE.format(value) : SHORT.format(value);
 }
 
-/** Every figure of it: the number of a record, which is looked up by it. @param {number} value */
+/** All digits, for a record's sequence number. @param {number} value */
 export function whole(value) {
   return WHOLE.format(value);
 }
 
-/** Per second; three figures. @param {number | null | undefined} value */
+/** A rate per second, to three digits. @param {number | null | undefined} value */
 export function rate(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";
@@ -41,10 +41,10 @@ export function counted(value, one, many = `${one}s`) {
   return `${count(value)} ${value === 1 ? one : many}`;
 }
 
-const LEAST = 1.5; // seconds a rate is measured over: the relay tells its counts once in a second
+const LEAST = 1.5; // shortest interval of a rate in seconds: the relay reports its counters once a second
 
 /**
- * How fast counters grew until each sample, since the newest one that is `LEAST` older; null where they began anew.
+ * The growth of counters up to each sample, since the newest sample that is `LEAST` older; null after a restart.
  * @template {{time: number}} S
  * @param {S[]} samples @param {(sample: S) => number} read
  * @returns {{time: number, value: number | null}[]}

@@ -1,4 +1,4 @@
-/** What went wrong with a request, as the appliance said it (problem details, RFC 9457). */
+/** The error of a request, as the appliance reported it (problem details, RFC 9457). */
 
 /** @typedef {{file: string, line: number, column: number, severity: string, text: string}} Finding */
 
@@ -16,26 +16,26 @@ export class Problem extends Error {
     this.retryAfter = retryAfter;
   }
 
-  /** Whether trying the same again later may help. */
+  /** Whether the same request may succeed later. */
   get passing() {
     return this.status === 0 || this.status === 429 || this.status >= 500;
   }
 }
 
-/** A short heading for what happened. @param {unknown} error */
+/** A short heading for an error. @param {unknown} error */
 export function headline(error) {
-  if (!(error instanceof Problem)) return "The page has a defect";
+  if (!(error instanceof Problem)) return "Defect in this page";
   const known = {
     0: "The appliance does not answer",
-    401: "The token is not accepted",
+    401: "Token rejected",
     403: "Not for this role",
-    404: "There is no such thing",
-    412: "Somebody else was quicker",
+    404: "Not found",
+    412: "Changed by someone else",
     413: "Too large",
-    422: "Refused",
+    422: "Rejected",
     428: "Load the page again first",
     429: "Too many requests",
-    503: "Not available now",
+    503: "Temporarily unavailable",
   };
   return known[/** @type {keyof typeof known} */ (error.status)] ?? `Failed (${error.status})`;
 }

@@ -1,4 +1,4 @@
-/** Requests to the appliance's REST interface, and only there: paths, never addresses. */
+/** Requests to the appliance's REST interface, by path only. */
 
 import { proof, readingKey } from "./keys.js";
 import { Problem } from "./problem.js";
@@ -10,7 +10,7 @@ import { end, session, unlocked } from "./session.js";
  */
 
 /**
- * The answer, once its headers are there. What has `match` is an order: it is signed. Throws `Problem`.
+ * Return the response once its headers arrive. A request with `match` is a change and is signed. Throws `Problem`.
  * @param {string} method @param {string} path @param {Options} [options]
  */
 export async function send(method, path, { query, json, text, match, token, headers = {}, signal } = {}) {
@@ -38,7 +38,7 @@ export async function send(method, path, { query, json, text, match, token, head
     });
   } catch (error) {
     if (signal?.aborted) throw error;
-    throw new Problem(0, { detail: "There was no answer: is the appliance running, and can this machine reach it?" });
+    throw new Problem(0, { detail: "No answer. Check that the appliance runs and that this machine can reach it." });
   }
   if (response.ok) return response;
   const problem = await problemOf(response);
@@ -58,7 +58,7 @@ export async function get(path, query, signal) {
   return (await ask("GET", path, { query, signal })).body;
 }
 
-/** @param {Record<string, any>} [query] What is null, undefined or empty is left out; an array is repeated. */
+/** @param {Record<string, any>} [query] Null, undefined and empty values are left out; an array repeats its name. */
 export function queryText(query) {
   const words = new URLSearchParams();
   for (const [name, value] of Object.entries(query ?? {})) {
@@ -75,6 +75,6 @@ async function problemOf(/** @type {Response} */ response) {
   try {
     return new Problem(response.status, await response.json(), after);
   } catch {
-    return new Problem(response.status, { detail: `The answer was ${response.status}, and no reason with it.` }, after);
+    return new Problem(response.status, { detail: `The appliance answered with status ${response.status}, without a reason.` }, after);
   }
 }

@@ -1,4 +1,4 @@
-/** Which view is shown, said by the page's address: every state worth coming back to has one. */
+/** The current view, from the page's URL; every state worth returning to has a URL. */
 
 import { html } from "./html.js";
 import { createStore } from "./store.js";

@@ -1,18 +1,18 @@
 /**
- * Who reads: the token, its role, its end; and the lock of a page that nobody uses.
+ * The session: the token, its role, its expiry; and the lock of an unused page.
  *
- * The token is in this page's memory, and in the tab's session storage if the reader wants it to outlive a reload. It
- * is never in a cookie (nothing is sent that a request of another page could carry) and never in an address.
+ * The token is in this page's memory, and in the tab's session storage if the user wants it to survive a reload. It
+ * is never in a cookie, which a request of another page could carry, and never in a URL.
  *
- * A page that was not used for a while is locked: it forgets the token and shows the door, and asks the appliance for
- * nothing. What was being edited stays behind the door for whoever was there before; for anybody else it is dropped.
+ * An unused page is locked: it forgets the token, shows the sign-in page, and requests
+ * nothing. Unsaved work is kept for the same token; another token discards it.
  */
 
 import { Problem } from "./problem.js";
 import { createStore } from "./store.js";
 
 const KEY = "rosrv.token";
-const LAST_USE = "rosrv.used"; // beside it: a browser may put a tab away and load it anew hours later
+const LAST_USE = "rosrv.used"; // beside it: a browser may unload a tab and reload it hours later
 const RANK = { viewer: 1, investigator: 1, operator: 2, admin: 3 };
 const USES = ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"];
 const LONGEST = 2 ** 31 - 1; // what a browser's timer can wait, in milliseconds
@@ -21,8 +21,8 @@ export const UNUSED = Number(stated("lock-seconds")) * 1000;
 
 /**
  * @typedef {{token: string, name: string, role: "viewer" | "investigator" | "operator" | "admin", expires: number}} Session
- * `current` is null while nobody is signed in; `ended` says why the last one ended. While the page is locked `locked` is
- * who was there. `number` counts those who came, and who only opened the lock again is not another.
+ * `current` is null while signed out; `ended` is why the last session ended. While the page is locked, `locked` is
+ * the former session. `number` counts sessions; unlocking does not start another.
  */
 export const session = createStore({
   current: /** @type {Session | null} */ (null),
@@ -51,7 +51,7 @@ export function open(opened, keep) {
   session.set({ current: opened, ended: null, checking: false, locked: null, number: same ? number : number + 1 });
   clearTimeout(ending);
   const left = opened.expires * 1000 - Date.now();
-  if (left < LONGEST) ending = setTimeout(() => end("The token has ended. Ask for another one: rosrv token add."), left);
+  if (left < LONGEST) ending = setTimeout(() => end("The token has expired. Create another: rosrv token add."), left);
   use();
   watch();
 }
@@ -73,7 +73,7 @@ export function lock() {
   session.update({ current: null, locked: { name: current.name, role: current.role } });
 }
 
-/** Requests of the page wait here while it is locked. Throws `Problem` when who was there does not come back. */
+/** Hold requests while the page is locked. Throws `Problem` when another user signs in. */
 export async function unlocked() {
   if (!session.get().locked) return;
   await new Promise((resolve, reject) => {
@@ -82,7 +82,7 @@ export async function unlocked() {
       if (locked) return;
       leave();
       if (current) resolve(undefined);
-      else reject(new Problem(401, { detail: "The page was locked, and who had asked for this did not come back." }));
+      else reject(new Problem(401, { detail: "The page was locked and another user signed in." }));
     });
   });
 }
@@ -104,7 +104,7 @@ export function may(role) {
   return held !== undefined && (role === "investigator" ? held === role : RANK[held] >= RANK[role]);
 }
 
-// A timer may be late (a computer that slept): what is done then is no use of a page that should be locked.
+// A timer may be late (a suspended computer): input after the deadline does not extend the session.
 for (const kind of USES) {
   addEventListener(kind, () => {
     if (session.get().current && Date.now() - used >= UNUSED) lock();
@@ -117,7 +117,7 @@ function use() {
   try {
     if (sessionStorage.getItem(KEY)) sessionStorage.setItem(LAST_USE, String(used));
   } catch {
-    // no page of this tab will have the token
+    // the token will not survive a reload
   }
 }
 

@@ -8,9 +8,9 @@ import { switchTheme } from "./theme.js";
 const LIST = [
   ["1 … 7", "Now, Graph, Audit, Policy, Monitors, Hosts, Recordings"],
   ["/", "Search in the view"],
-  ["j, k", "Next and previous record (Audit), or event (a recording)"],
-  ["← →, + −, 0", "Move and zoom on the time line of a recording; Shift: ten times as far"],
-  ["Esc", "Close what is open"],
+  ["j, k", "Next and previous record (Audit) or event (recordings)"],
+  ["← →, + −, 0", "Move and zoom on a recording's time line; Shift: ten times as far"],
+  ["Esc", "Close the open record or dialog"],
   ["Ctrl S", "Dry run of the text in the editor"],
   ["t", "Dark or light"],
   ["?", "This list"],
@@ -36,7 +36,7 @@ export function useShortcuts() {
     <dl class="facts">${LIST.map(([key, does]) => html`<dt key=${key}><code>${key}</code></dt><dd>${does}</dd>`)}</dl></${Dialog}>`;
 }
 
-/** Whether a key is meant for a field, the editor's inside included. @param {Event} event */
+/** Whether a key press belongs to a field or an editor. @param {Event} event */
 export function typing(event) {
   const target = /** @type {HTMLElement} */ (event.composedPath()[0]);
   return target instanceof HTMLElement && (target.isContentEditable || /^(INPUT|TEXTAREA|SELECT)$/.test(target.tagName));

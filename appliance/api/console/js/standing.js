@@ -1,4 +1,4 @@
-/** Whether what is shown is what is: a word beside the navigation, and a banner as soon as it is not. */
+/** Whether the page is live: a word beside the navigation, and a banner when it is not. */
 
 import { html } from "./html.js";
 import { live, retry } from "./live.js";

@@ -1,4 +1,4 @@
-/** A value that several parts of the page show: whoever uses it is drawn again when it changes. */
+/** A shared value; components that use it render again when it changes. */
 
 import { useEffect, useRef, useState } from "./html.js";
 

@@ -1,4 +1,4 @@
-/** Dark or light: as the reader's system has it until the switch is used, and then as that says. */
+/** The dark or light theme: the system's until the switch is used. */
 
 import { createStore } from "./store.js";
 
@@ -20,7 +20,7 @@ export function switchTheme() {
   try {
     localStorage.setItem(KEY, next);
   } catch {
-    // not kept: it holds until the page is closed
+    // not stored: it lasts until the page is closed
   }
   theme.set(next);
 }

@@ -1,6 +1,6 @@
 /**
- * Texts that strangers chose (names, headers, values), made harmless to read: what a reader cannot see, or what would
- * reorder the text around it, is shown as its code point; what is too long is cut and says how long it was.
+ * Text from the network (names, headers, values), made safe to display: invisible characters and characters that would
+ * reorder their surroundings become code points; text that is too long is cut, with its length.
  */
 
 // Controls, invisible and joining characters, directions (bidi), line separators, lone surrogates, tags, private use.
@@ -10,12 +10,12 @@ const UNSEEN = new RegExp(
   "\\u{1d173}-\\u{1d17a}\\u{e0000}-\\u{e0fff}\\u{f0000}-\\u{10ffff}\\ud800-\\udfff]", "gu",
 );
 
-const TOLD = 600; // from this length on it is said how long a text is that was cut
+const TOLD = 600; // from this length on, a cut text shows its full length
 
 /** @typedef {{text: string, unseen: boolean}} Piece */
 
 /**
- * A text in pieces; those that are `unseen` stand for a character that has no safe look of its own.
+ * Return a text in pieces; an `unseen` piece replaces a character that cannot be displayed safely.
  * @param {unknown} value @param {number} [most] characters that are shown
  * @returns {Piece[]}
  */

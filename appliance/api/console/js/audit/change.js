@@ -1,4 +1,4 @@
-/** What a monitor changed in a message: field by field where its type is known, else byte by byte. */
+/** A monitor's changes to a message: by field if the type is known, else by byte. */
 
 import { html } from "../html.js";
 import { Given } from "../parts/given.js";
@@ -18,7 +18,7 @@ export function Change({ detail }) {
   return html`<div class="stack-tight">${before && html`<h3>Bytes${after ? " before" : ""}</h3><pre class="bytes">${grouped(before)}</pre>`}${after && html`<h3>Bytes after</h3><pre class="bytes">${grouped(after)}</pre>`}</div>`;
 }
 
-/** Every field of either, those that differ first. @param {any} old @param {any} now */
+/** The fields of both messages, differing fields first. @param {any} old @param {any} now */
 export function compared(old, now) {
   const [before, after] = [flat(old), now === null ? null : flat(now)];
   const paths = [...new Set([...before.keys(), ...(after?.keys() ?? [])])];

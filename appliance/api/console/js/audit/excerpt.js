@@ -1,4 +1,4 @@
-/** The line of the policy that decided, with its neighbours, out of the revision that was in force then. */
+/** The deciding line of the policy and its neighbours, from the revision in force at that time. */
 
 import { html } from "../html.js";
 import { Loading, Notice } from "../parts/notice.js";
@@ -11,7 +11,7 @@ const AROUND = 3;
 /** @param {{rule: {line: number, file: string}, revision: number}} given */
 export function Excerpt({ rule, revision }) {
   const { value, error } = useResource((signal) => get(`/v1/policy/revisions/${revision}`, {}, signal), [revision]);
-  if (error) return html`<${Notice} tone="note">Revision ${revision} is not kept any more; the rule stood in line ${rule.line}.</${Notice}>`;
+  if (error) return html`<${Notice} tone="note">Revision ${revision} is no longer kept; the rule was in line ${rule.line}.</${Notice}>`;
   if (!value) return html`<${Loading} rows=${2} />`;
   const lines = value.text.split("\n");
   const first = Math.max(1, rule.line - AROUND);

@@ -1,4 +1,4 @@
-/** What is searched for: the filters of `/v1/audit`, kept in the address so that a search can be sent to a colleague. */
+/** The filters of `/v1/audit`, kept in the URL so that a search can be shared. */
 
 import { html, useState } from "../html.js";
 import { Field } from "../parts/field.js";

@@ -1,7 +1,8 @@
-/** "Grant this": the smallest change of the policy that grants what a record says was refused, and the way to its editor. */
+/** "Grant this": the smallest change of the policy that grants a denied request, with a link to the editor. */
 
 import { html, useState } from "../html.js";
 import { Button } from "../parts/button.js";
+import { UnifiedDiff } from "../parts/difference.js";
 import { Given } from "../parts/given.js";
 import { Failure } from "../parts/notice.js";
 import { discard, draft, look, write } from "../policy/draft.js";
@@ -32,8 +33,8 @@ export function Grant({ id }) {
   };
   if (error) return html`<${Failure} error=${error} retry=${ask} />`;
   if (!found) return html`<div class="row"><${Button} onClick=${ask}>Grant this</${Button}><span class="muted small">Shows what would change; nothing is changed yet.</span></div>`;
-  if (!found.added.length) return html`<p role="status">The policy in force grants it: it was refused for another reason, or before this revision.</p>`;
-  return html`<section class="stack-tight" aria-label="What would grant it"><pre class="bytes"><${Given} value=${found.diff.join("\n")} most=${4000} /></pre>
+  if (!found.added.length) return html`<p role="status">The policy in force grants it: it was denied for another reason, or before this revision.</p>`;
+  return html`<section class="stack-tight" aria-label="What would grant it"><${UnifiedDiff} lines=${found.diff} />
     ${found.findings.length > 0 && html`<p>The policy's tests refuse it:</p><ul class="plain-list">${found.findings.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${300} mono /></li>`)}</ul>`}
     <div class="row"><${Button} role="operator" tone="primary" onClick=${edit}>${unsaved ? "Replace that text" : "Open in the editor"}</${Button}><span class="muted small" role="status">${unsaved ? "The editor has a text that is not loaded; it would be lost." : "A dry run there says whom it touches; load it on trial."}</span></div></section>`;
 }

@@ -1,4 +1,4 @@
-/** What is looked for most: searches that are there from the start, and those that the reader kept in this browser. */
+/** Saved searches: built-in ones, and the user's own in this browser. */
 
 import { html, useState } from "../html.js";
 import { plain } from "../words.js";
@@ -9,7 +9,7 @@ import { auditPath, NAMES } from "./filters.js";
 const KEY = "rosrv.searches"; // filters only: no token, and nothing of the log
 const MOST = 12;
 const PRESETS = /** @type {[string, Record<string, string>][]} */ ([
-  ["What matters", {}], ["Refused", { decision: "deny" }], ["Monitors", { category: "monitor" }],
+  ["What matters", {}], ["Denied", { decision: "deny" }], ["Monitors", { category: "monitor" }],
   ["Changes by people", { who: "*", severity: "notice" }], ["All", { severity: "debug" }],
 ]);
 

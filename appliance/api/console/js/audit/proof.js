@@ -1,4 +1,4 @@
-/** The proof that the log is whole, and the log as a file. */
+/** Verification of the log, and its export. */
 
 import { html, useState } from "../html.js";
 import { count, whole } from "../numbers.js";
@@ -22,16 +22,17 @@ export function Verify() {
     }
   };
   return html`<${Button} role="operator" onClick=${run}><${Icon} name="check" size=${16} />Verify</${Button}>
-    ${shown && html`<${Dialog} title="Is the log complete and unchanged?" close=${() => setShown(null)}>${shown.error ? html`<${Failure} error=${shown.error} />` : html`<${Verdict} value=${shown.value} />`}</${Dialog}>`}`;
+    ${shown && html`<${Dialog} title="Verify the audit log" close=${() => setShown(null)}>${shown.error ? html`<${Failure} error=${shown.error} />` : html`<${Verdict} value=${shown.value} />`}</${Dialog}>`}`;
 }
 
 function Verdict(/** @type {{value: any}} */ { value }) {
-  return html`${value.ok ? html`<${Notice} tone="allow" title="The chain is whole">Each of the ${whole(value.records)} records is as it was written, and every signature holds.</${Notice}>`
-    : html`<${Notice} tone="deny" title="The log is not whole">Keep a copy of it now, and look at what was found below.</${Notice}>`}
+  const unsigned = html`<${Notice} tone="warn" title="The log is consistent, but nothing is signed yet">Its completeness is not proven. Verify again in a minute.</${Notice}>`;
+  return html`${value.ok && !value.signed_through ? unsigned : value.ok ? html`<${Notice} tone="allow" title="The log is complete and unchanged">Each of the ${whole(value.records)} records is unchanged, and every signature is valid.</${Notice}>`
+    : html`<${Notice} tone="deny" title="The log was changed or is damaged">Save a copy of it now, and check the findings below.</${Notice}>`}
     <dl class="facts"><dt>Log</dt><dd><${Given} value=${value.log} mono /></dd><dt>Records</dt><dd>${whole(value.first)} to ${whole(value.last)}${value.removed ? `, ${count(value.removed)} removed by retention` : ""}</dd>
       <dt>Checkpoints</dt><dd>${count(value.checkpoints)}, signed ${count(value.signed_checkpoints)}, the last one through record ${whole(value.signed_through)}</dd><dt>Not sealed yet</dt><dd>${whole(value.unsealed)}</dd><dt>Key</dt><dd><${Given} value=${value.key} mono /></dd></dl>
     ${value.findings.length > 0 && html`<ul class="stack-tight">${value.findings.map((/** @type {any} */ one, /** @type {number} */ index) => html`<li key=${index}><${Notice} tone="deny" title=${`${one.kind}: ${one.first}${one.last === one.first ? "" : ` to ${one.last}`}`}><${Given} value=${one.message} most=${500} /></${Notice}></li>`)}</ul>`}
-    <p class="muted small">The signer's own memory of checkpoints is looked at by <code>rosrv audit verify</code> on the machine.</p>`;
+    <p class="muted small">To compare with the signer's own checkpoints, run <code>rosrv audit verify</code> on the appliance.</p>`;
 }
 
 /** @param {{filter: Record<string, string>}} given */
@@ -40,18 +41,18 @@ export function Export({ filter }) {
     title="All records that match, one JSON object a line"><${Icon} name="down" size=${16} />Export</${Button}>`;
 }
 
-/** What happened in the time that the filters name, with what was in force. @param {{filter: Record<string, string>}} given */
+/** An evidence bundle of the filtered period. @param {{filter: Record<string, string>}} given */
 export function Evidence({ filter: { since, until } }) {
-  return html`<${Button} role=${may("investigator") ? "investigator" : "operator"} disabled=${!since} why="Choose first since when"
+  return html`<${Button} role=${may("investigator") ? "investigator" : "operator"} disabled=${!since} why="Choose a start time first"
     onClick=${() => take(`/v1/evidence${queryText({ since, until })}`, `rosrv-evidence-${now()}.zip`)}
-    title="All of this time, and what was in force, as a bundle that proves itself"><${Icon} name="down" size=${16} />Evidence</${Button}>`;
+    title="Everything in this period, with the policy and specifications in force, as a signed bundle"><${Icon} name="down" size=${16} />Evidence</${Button}>`;
 }
 
 function now() {
   return new Date().toISOString().slice(0, 19).replaceAll(":", "");
 }
 
-/** Give the reader what REST answers, as a file. */
+/** Download an answer of REST as a file. */
 export async function take(/** @type {string} */ path, /** @type {string} */ name) {
   try {
     const response = await send("GET", path);
@@ -61,7 +62,7 @@ export async function take(/** @type {string} */ path, /** @type {string} */ nam
   }
 }
 
-/** Give the reader a file. @param {Blob} blob @param {string} name */
+/** Download a file. @param {Blob} blob @param {string} name */
 export function save(blob, name) {
   const url = URL.createObjectURL(blob);
   const link = document.createElement("a");

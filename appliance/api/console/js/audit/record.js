@@ -1,4 +1,4 @@
-/** One record: what was decided and why, the rule where it stands, what a monitor changed, what happened around it. */
+/** One record: the decision and its reason, the rule in the policy, a monitor's changes, records around it. */
 
 import { isDecided } from "../categories.js";
 import { html, useEffect, useRef, useState } from "../html.js";
@@ -21,7 +21,7 @@ import { Why } from "./why.js";
 
 const GIVEN = new Set(["revoked", "connection refused"]);
 const SHOWN_APART = new Set(["before", "after", "before_fields", "after_fields", "at", "timer", "conditions", "values", "handler", "why"]);
-const MONITORS = new Set(["monitor verdict", "message dropped", "message changed", "monitor fault", "monitor published", "trial observed"]);
+const MONITORS = new Set(["monitor verdict", "message dropped", "message changed", "monitor fault", "monitor published", "shadow observed"]);
 
 /** @param {{id: string, filter: Record<string, string>}} given */
 export function RecordPanel({ id, filter }) {

@@ -1,4 +1,4 @@
-/** Pages of records, the newest first; further ones as they are made, when they are followed. */
+/** Pages of records, newest first; new records while following. */
 
 import { useCallback, useEffect, useRef, useState } from "../html.js";
 import { follow } from "../events.js";

@@ -1,4 +1,4 @@
-/** Records as rows: when, what came of it, who, what, why. */
+/** Records as rows: time, outcome, host, resource, reason. */
 
 import { html } from "../html.js";
 import { Moment } from "../moments.js";

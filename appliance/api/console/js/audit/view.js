@@ -1,4 +1,4 @@
-/** Audit: search the log, follow it, open one record, prove it whole, take it along. */
+/** Audit: search and follow the log, open a record, verify and export the log. */
 
 import { html, useEffect, useRef, useState } from "../html.js";
 import { counted } from "../numbers.js";
@@ -27,18 +27,18 @@ export function Audit() {
         <${Verify} /><${Export} filter=${filter} /><${Evidence} filter=${filter} /></div></div>
     <${Presets} filter=${filter} />
     <${Filters} filter=${filter} record=${chosen} />
-    ${following && standing && standing.state !== "live" && standing.reason && html`<div class="banner" role="status"><${Icon} name="warn" />Not following now: ${standing.reason} It is tried again by itself.</div>`}
+    ${following && standing && standing.state !== "live" && standing.reason && html`<div class="banner" role="status"><${Icon} name="warn" />Following is interrupted: ${standing.reason} Retrying automatically.</div>`}
     <div class=${`audit-grid${chosen ? " with-record" : ""}`}>
       <section class="panel" aria-label="Records" aria-busy=${String(loading)}>
         ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : null}
-        ${records === null ? (error ? null : html`<${Loading} rows=${10} />`) : !records.length ? html`<${Empty} icon="audit" title="No record matches">${notes.length ? notes.join(" · ") : Object.keys(filter).length ? "Take a filter away, or look further back." : "The log is empty; the appliance writes to it from its start on."}</${Empty}>`
+        ${records === null ? (error ? null : html`<${Loading} rows=${10} />`) : !records.length ? html`<${Empty} icon="audit" title="No record matches">${notes.length ? notes.join(" · ") : Object.keys(filter).length ? "Remove a filter, or search further back." : "The log is empty."}</${Empty}>`
           : html`<${Timeline} records=${records} chosen=${chosen} filter=${filter} /><${RecordTable} records=${records} chosen=${chosen} filter=${filter} />${cursor ? html`<div class="panel-body"><button class="button" onClick=${older}>Older records</button></div>` : null}`}
       </section>
       ${chosen && html`<${RecordPanel} key=${chosen} id=${chosen} filter=${filter} />`}
     </div>`;
 }
 
-/** j and k go through the records, Escape closes the one that is open. */
+/** j and k move through the records, Escape closes the open one. */
 function useSteps(/** @type {any[] | null} */ records, /** @type {string} */ chosen, /** @type {Record<string, string>} */ filter) {
   const newest = useRef({ records, chosen, filter });
   newest.current = { records, chosen, filter };

@@ -1,4 +1,4 @@
-/** Why a monitor's verdict, drop, change, fault or publication happened: the events that alone make it so, the values compared, the lines. Of a denial the line that would allow it, or why none would. */
+/** Why a verdict, drop, change, fault or publication of a monitor happened: the necessary events, the values compared, the lines. For a denial, the line that would allow it, or why none would. */
 
 import { html } from "../html.js";
 import { Given } from "../parts/given.js";

@@ -1,7 +1,7 @@
 /**
- * Where everything stands: from left to right in the direction the messages go; in a narrow frame from above downwards,
- * in two columns. What stands somewhere stays there while the graph changes a little; what is new is put beside what it
- * belongs to, in a narrow frame below the rest.
+ * The layout: from left to right in the direction of messages; in a narrow frame from top to bottom,
+ * in two columns. Existing items keep their places while the graph changes a little; new items are placed beside what
+ * they belong to, in a narrow frame below the rest.
  */
 
 import { Graph, layout } from "/console/static/vendor/dagre.js";
@@ -16,7 +16,7 @@ const COLUMN = 52;
 const GROUP = [206, 50];
 const BETWEEN = 44; // the two columns of a narrow frame: the lines are there
 const TALLEST = 12; // parts of an opened group in one column
-const LITTLE = 0.25; // of what is shown may be new before all is arranged afresh
+const LITTLE = 0.25; // fraction of new items above which the whole layout is computed again
 
 /**
  * @param {Map<string, any>} items @param {Map<string, any>} lines @param {Map<string, Spot>} before @param {boolean} narrow
@@ -31,8 +31,8 @@ export function arrange(items, lines, before, narrow) {
 }
 
 /**
- * Where a group was that is open now stand its parts, in columns: nodes, then topics. What stood right of it or below
- * makes room, and nothing else moves.
+ * An opened group is replaced by its parts, in columns: nodes, then topics. Items to the right of it or below
+ * make room, and nothing else moves.
  */
 function unfolded(/** @type {Map<string, any>} */ items, /** @type {Map<string, Spot>} */ before) {
   let spots = before;

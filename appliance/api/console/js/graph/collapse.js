@@ -1,8 +1,8 @@
 /**
- * Makes a large graph small enough to read: items of one namespace are drawn as one group until it is opened.
+ * Make a large graph readable: items of one namespace are drawn as one group until it is opened.
  *
  * The names of each kind form a tree, by host with the hosts as its first level; what is shown is a cut through it: the
- * groups of the first level, and the parts of those that the reader opened. A level with very many names is divided into
+ * groups of the first level, and the parts of those that the user opened. A level with very many names is divided into
  * ranges, so that no step shows too much at once. The result depends on the names alone: rates and the order of an
  * answer move nothing. The nodes and the topics of a namespace are one group while it is closed.
  */
@@ -53,12 +53,12 @@ function groupOf(/** @type {Branch} */ branch, /** @type {string} */ kind, /** @
   });
 }
 
-/** Nodes with the topics of the same namespace or host: what stays among them is not drawn. @param {Shown} nodes @param {Shown} more */
+/** Merge nodes with the topics of their namespace or host; lines inside a group are not drawn. @param {Shown} nodes @param {Shown} more */
 function together(nodes, more) {
   return { ...nodes, sub: `${nodes.sub}, ${more.sub}`, members: [...(nodes.members ?? []), ...(more.members ?? [])], rate: (nodes.rate ?? 0) + (more.rate ?? 0), mediated: more.mediated };
 }
 
-/** Lines between what is shown; those between the same two things are one. */
+/** Merge the lines between the same two items. */
 function joined(/** @type {import("./model.js").Model} */ model, /** @type {Map<string, string>} */ place) {
   const lines = new Map();
   for (const line of model.lines.values()) {
@@ -78,7 +78,7 @@ function joined(/** @type {import("./model.js").Model} */ model, /** @type {Map<
   return lines;
 }
 
-/** The branches that are shown: the largest that the reader did not open, with the opened ones around each, the outermost first. */
+/** The shown branches: the largest unopened ones, each with the opened ones around it, outermost first. */
 function cut(/** @type {Branch} */ branch, /** @type {Set<string>} */ opened, /** @type {string[]} */ within = []) {
   /** @type {{branch: Branch, within: string[]}[]} */
   const found = [];
@@ -96,7 +96,7 @@ function leaf(/** @type {import("./model.js").Item} */ item) {
 
 /** @typedef {{one: import("./model.js").Item, path: string}} Placed */
 
-/** The tree of paths below a prefix. @returns {Branch} */
+/** Return the tree of paths below a prefix. @returns {Branch} */
 function grow(/** @type {Placed[]} */ items, /** @type {string} */ kind, /** @type {string} */ prefix, /** @type {number} */ depth) {
   /** @type {Map<string, Placed[]>} */
   const families = new Map();
@@ -117,7 +117,7 @@ function grow(/** @type {Placed[]} */ items, /** @type {string} */ kind, /** @ty
   return { key, label: prefix.replace(/\/\*$/, ""), items: items.map(({ one }) => one), parts: parts.length > RANGE ? ranges(parts, key) : parts };
 }
 
-/** So many neighbours in the alphabet as one. @returns {Branch[]} */
+/** Merge neighbours in alphabetical order. @returns {Branch[]} */
 function ranges(/** @type {Branch[]} */ parts, /** @type {string} */ key) {
   const size = Math.max(RANGE, Math.ceil(parts.length / RANGE));
   const found = [];

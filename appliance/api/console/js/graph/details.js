@@ -1,4 +1,4 @@
-/** What is known of the chosen thing: who publishes, who listens, how much; for a refusal the rule and its line. */
+/** Details of the selected item: publishers, subscribers, rates; for a denial the rule and its line. */
 
 import { html } from "../html.js";
 import { Moment } from "../moments.js";
@@ -15,7 +15,7 @@ const MOST = 60;
 
 /** @param {{item: any, line: any, denials: any[], shown: {items: Map<string, any>, lines: Map<string, any>}, choose: (key: string | null) => void, open: (key: string) => void}} given `shown`: all that is drawn */
 export function Details({ item, line, denials, shown, choose, open }) {
-  const title = line ? "Refused" : item.members ? "Group" : { node: "Node", topic: "Topic", service: "Service", party: "Refused party", missing: "Refused, not in the graph", master: "RVMaster" }[/** @type {string} */ (item.kind)];
+  const title = line ? "Denied" : item.members ? "Group" : { node: "Node", topic: "Topic", service: "Service", party: "Denied host", missing: "Denied, not in the graph", master: "RVMaster" }[/** @type {string} */ (item.kind)];
   return html`<section class="panel details" aria-labelledby="details"><div class="panel-head"><h2 id="details">${title}</h2>
       <span class="end"><button class="button plain small" onClick=${() => choose(null)} aria-label="Close the details"><${Icon} name="close" size=${16} /></button></span></div>
     <div class="panel-body stack">${line ? html`<${Attempt} records=${line.denials} />` : item.members ? html`<${Group} item=${item} shown=${shown} choose=${choose} open=${open} />`
@@ -28,7 +28,7 @@ function part(/** @type {any} */ item, /** @type {(key: string) => void} */ choo
   if (item.kind === "node")
     return html`<dl class="facts"><dt>Host</dt><dd><${Given} value=${row.host} mono /></dd><dt>State</dt><dd><${Badge} word=${row.state} /></dd></dl>
       <${Names} title="Publishes" names=${row.publishes} letter="t" choose=${choose} /><${Names} title="Subscribes" names=${row.subscribes} letter="t" choose=${choose} /><${Names} title="Offers" names=${row.offers} letter="s" choose=${choose} />`;
-  const path = html`<dt>Path</dt><dd>${row.mediated ? html`<${Badge} word="mediated" tone="note" /> through the relay` : html`<${Badge} word="direct" /> past the appliance`}</dd>`;
+  const path = html`<dt>Path</dt><dd>${row.mediated ? html`<${Badge} word="mediated" tone="note" /> through the relay` : html`<${Badge} word="direct" /> bypasses the appliance`}</dd>`;
   if (item.kind === "service")
     return html`<dl class="facts"><dt>Offered by</dt><dd><${Given} value=${row.node} mono /></dd>${path}<dt>Messages</dt><dd>${count(row.messages)}</dd><dt>Clients now</dt><dd>${row.connections.length}</dd></dl>`;
   return html`<dl class="facts"><dt>Type</dt><dd><${Given} value=${row.type} mono /></dd>${path}</dl>
@@ -49,7 +49,7 @@ function Group(/** @type {{item: any, shown: {items: Map<string, any>, lines: Ma
   const ends = (/** @type {"from" | "to"} */ own, /** @type {"from" | "to"} */ other, /** @type {string} */ kind) => lines.filter((one) => one.kind === kind && one[own] === item.key && one[other] !== item.key).map((one) => ({ line: one, end: shown.items.get(one[other]) })).filter(({ end }) => end);
   return html`<h3><${Given} value=${item.name} mono /></h3><p class="muted">${item.sub}, drawn as one.</p><button class="button" onClick=${() => open(item.key)}>Open the group</button>
     <${Ends} title="Gets messages from" ends=${ends("to", "from", "flow")} choose=${choose} /><${Ends} title="Sends messages to" ends=${ends("from", "to", "flow")} choose=${choose} />
-    <${Ends} title="Others who were refused here" ends=${ends("to", "from", "denied")} choose=${choose} /><${Ends} title="Was refused at" ends=${ends("from", "to", "denied")} choose=${choose} />
+    <${Ends} title="Others denied here" ends=${ends("to", "from", "denied")} choose=${choose} /><${Ends} title="Denied at" ends=${ends("from", "to", "denied")} choose=${choose} />
     <h3>In it</h3>
     <ul class="plain-list">${item.members.slice(0, MOST).map((/** @type {any} */ one) => html`<li key=${one.key}><${Given} value=${one.name} mono /></li>`)}${item.members.length > MOST && html`<li class="muted">and ${item.members.length - MOST} more</li>`}</ul>`;
 }
@@ -75,7 +75,7 @@ function Refusals(/** @type {{item: any, denials: any[]}} */ { item, denials }) 
   const [caller, host] = item.kind === "party" ? [item.name, item.sub] : [item.name, null];
   const own = denials.filter((one) => (item.kind === "node" || item.kind === "party" ? one.caller_id === caller && (host === null || one.host === host) : one.resource === item.name)).slice(0, 8);
   if (!own.length) return null;
-  return html`<div><h3>Refused lately</h3><ul class="plain-list">${own.map((one) => html`<li key=${one.id}><${Link} to=${`/console/audit/${one.id}`}><${Moment} at=${one.time} /></${Link}> <span class="muted">${one.category}</span> <${Given} value=${item.kind === "topic" ? one.caller_id : one.resource} mono />
+  return html`<div><h3>Recently denied</h3><ul class="plain-list">${own.map((one) => html`<li key=${one.id}><${Link} to=${`/console/audit/${one.id}`}><${Moment} at=${one.time} /></${Link}> <span class="muted">${one.category}</span> <${Given} value=${item.kind === "topic" ? one.caller_id : one.resource} mono />
     <div class="small"><${Rule} rule=${one.rule} revision=${one.revision} /></div></li>`)}</ul></div>`;
 }
 

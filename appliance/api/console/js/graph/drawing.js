@@ -1,4 +1,4 @@
-/** The drawing: boxes for nodes, topics and services, lines for what flows, red ones for what was refused. */
+/** The drawing: boxes for nodes, topics and services, lines for messages, red lines for denials. */
 
 import { html, useEffect, useRef, useState } from "../html.js";
 import { Icon } from "../parts/icon.js";
@@ -21,7 +21,7 @@ export function Drawing({ items, lines, spots, chosen, choose, arranged, narrow 
   const box = useRef(/** @type {HTMLElement | null} */ (null));
   const [look, setLook] = useState(/** @type {Look} */ ({ x: 0, y: 0, zoom: 1 }));
   const all = withBows(extent(spots.values()), narrow ? NARROW_BOW : BOW);
-  const own = useRef(false); // whether the reader chose what is seen; until then all is
+  const own = useRef(false); // whether the user chose the view box; until then everything is shown
   const fit = () => {
     own.current = false;
     if (box.current) setLook(fitted(all, box.current));
@@ -30,7 +30,7 @@ export function Drawing({ items, lines, spots, chosen, choose, arranged, narrow 
   newest.current = fit;
   useEffect(() => fit(), [arranged, spots.size > 0]);
   useEffect(() => {
-    if (!own.current) fit(); // something new stands outside of what was seen
+    if (!own.current) fit(); // a new item is outside the view box
   }, [all.x, all.y, all.w, all.h]);
   useEffect(() => {
     if (!box.current) return undefined;
@@ -80,7 +80,7 @@ function Tip(/** @type {{id: string}} */ { id }) {
 function Box(/** @type {any} */ { item, spot, chosen, faint, zoom, choose }) {
   if (!spot) return null;
   const { x, y, w, h } = spot;
-  // From afar a name keeps its size on the screen and loses its middle; what stands below it goes first.
+  // Zoomed out, a name keeps its size on the screen and loses its middle; the line below it is hidden first.
   const size = NAME * Math.max(1, 1 / zoom);
   const left = item.mediated ? 25 : 14;
   const name = shortened(item.name, Math.floor((w - left - 8) / (size * GLYPH)));
@@ -114,7 +114,7 @@ function Line(/** @type {any} */ { line, spots, chosen, near, choose, narrow }) 
   const kind = line.kind === "denied" ? (line.would ? "would" : "denied") : line.mediated ? "mediated" : "flow";
   const shape = html`<path class=${`line ${kind}${line.kind === "flow" && line.rate > 0 ? " flowing" : ""}${touched ? "" : " faint"}${own ? " chosen" : ""}`} d=${path} marker-end=${`url(#tip-${kind})`} />`;
   if (line.kind !== "denied") return html`<g>${shape}${touched && near !== null && line.rate > 0 && (line.from !== chosen || !chosen.startsWith("t/")) && html`<text class="line-rate" x=${(from.x + to.x) / 2} y=${(from.y + to.y) / 2 - 5} text-anchor="middle">${rate(line.rate)}/s</text>`}</g>`;
-  const said = `refused: ${plain(line.from.slice(1), 60)} to ${plain(line.to.slice(1), 60)}, ${line.denials.length} times`;
+  const said = `denied: ${plain(line.from.slice(1), 60)} to ${plain(line.to.slice(1), 60)}, ${line.denials.length} times`;
   const pick = (/** @type {any} */ event) => {
     if (event.type === "keydown" && event.key !== "Enter" && event.key !== " ") return;
     event.preventDefault();
@@ -172,7 +172,7 @@ function withBows(/** @type {{x: number, y: number, w: number, h: number}} */ { 
 
 function fitted(/** @type {{x: number, y: number, w: number, h: number}} */ all, /** @type {HTMLElement} */ box) {
   const zoom = Math.min(1.15, (box.clientWidth - 2 * MARGIN) / all.w, (box.clientHeight - 2 * MARGIN) / all.h);
-  const readable = Math.max(zoom, FARTHEST); // what has no room is seen by moving
+  const readable = Math.max(zoom, FARTHEST); // panning shows the rest
   const [w, h] = [box.clientWidth / readable, box.clientHeight / readable];
   return { zoom: readable, x: all.w < w ? all.x - (w - all.w) / 2 : all.x - MARGIN / readable, y: all.h < h ? all.y - (h - all.h) / 2 : all.y - MARGIN / readable };
 }

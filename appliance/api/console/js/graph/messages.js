@@ -1,4 +1,4 @@
-/** Looking into a topic: its last message as subscribers get it, and one of its numbers over time. Each look is recorded. */
+/** A topic's last message as subscribers receive it, and one of its numbers over time. The audit log records it. */
 
 import { html, useEffect, useState } from "../html.js";
 import { Moment } from "../moments.js";
@@ -8,7 +8,7 @@ import { Failure } from "../parts/notice.js";
 import { Plot } from "../parts/plot.js";
 import { get } from "../rest.js";
 
-const SECONDS = 60; // that are shown, and after which the look ends by itself
+const SECONDS = 60; // to show; the query ends automatically after them
 const EACH = { messages: 20, seconds: 2 };
 
 /** @param {{topic: string}} given */
@@ -40,7 +40,7 @@ export function Messages({ topic }) {
   const chosen = names.includes(number) ? number : "";
   const points = chosen ? seen.map((one) => ({ time: one.time / 1e9, value: at(one.fields, chosen) })) : [];
   return html`<div><h3>Messages</h3><div class="row"><${Button} small role="operator" onClick=${() => setUntil(until ? 0 : Date.now() + SECONDS * 1000)}>${until ? "Stop" : "Look"}</${Button}>
-      <span class="muted small">${until ? "As subscribers get them, after the monitors." : "For a minute. It is recorded who looked."}</span></div>
+      <span class="muted small">${until ? "As subscribers receive them, after the monitors." : "For a minute. The audit log records it."}</span></div>
     ${error ? html`<${Failure} error=${error} />` : null}
     ${!last && until ? html`<p class="muted small" role="status">No message yet.</p>` : null}
     ${last && html`<p class="small"><${Moment} at=${new Date(last.time / 1e6).toISOString()} /> <${Given} value=${last.node} mono /> <span class="muted">${last.size} bytes</span></p>

@@ -1,8 +1,8 @@
 /**
- * What the graph has, out of `/v1/graph` and the refusals of the audit log: items and the lines between them.
+ * The graph's items and lines, from `/v1/graph` and the denials of the audit log.
  *
- * Keys are a letter and a name (`n/talker`, `t/chatter`, `s/set_mode`); a refused party that is not in the graph has
- * `x` and its name and host. Nothing here knows where things are drawn.
+ * Keys are a letter and a name (`n/talker`, `t/chatter`, `s/set_mode`); a denied host that is not in the graph has
+ * `x` and its name and host. The model has no layout.
  */
 
 /**
@@ -30,11 +30,11 @@ export function modelOf(graph, denials, wanted) {
   return model;
 }
 
-/** Refusals of the same party for the same thing as one, the newest first. @param {any[]} denials */
+/** Merge denials of the same host for the same resource, newest first. @param {any[]} denials */
 export function attempts(denials) {
   const found = new Map();
   for (const record of denials) {
-    if (!record.resource || record.category === "rest" || !(record.caller_id || record.host) || isLateWithdrawal(record)) continue;
+    if (!record.resource || record.category === "rest" || !(record.caller_id || record.host) || isLateWithdrawal(record) || isSelftest(record)) continue;
     const command = record.category === "command" || record.category === "parameters";
     const key = JSON.stringify([record.host, record.caller_id, record.category, command ? "" : record.resource]);
     const one = found.get(key);
@@ -44,7 +44,12 @@ export function attempts(denials) {
   return [...found.values()];
 }
 
-/** A node that was replaced withdraws what it had: refused, but nobody attempted anything. */
+/** Whether `rosrv selftest` was denied its own topic, which no other node uses. @param {any} record */
+export function isSelftest(record) {
+  return record.resource === "/rosrv_selftest" && /^\/rosrv_selftest_(publisher|subscriber)$/.test(record.caller_id ?? "");
+}
+
+/** A replaced node withdraws its registrations: denied, but not an attempt. */
 function isLateWithdrawal(/** @type {any} */ record) {
   return record.rule === null && String(record.detail?.call ?? "").startsWith("unregister");
 }
@@ -60,7 +65,7 @@ function topicOf(/** @type {Model} */ model, /** @type {any} */ topic) {
   for (const name of topic.subscribers) flow(model, key, `n${name}`, topic.mediated, item.rate);
 }
 
-/** The host of those who publish a topic, if they have one in common. */
+/** The common host of a topic's publishers, if any. */
 function hostOf(/** @type {Model} */ model, /** @type {string[]} */ names) {
   const hosts = [...new Set(names.map((name) => model.items.get(`n${name}`)?.host ?? ""))];
   return hosts.length === 1 ? hosts[0] : hosts.length ? "several hosts" : "no host";
@@ -78,15 +83,15 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
   const known = model.items.get(`n${caller}`);
   const from = known && known.sub === host ? known.key : `x${caller ?? ""}@${host}`;
   const to = attempt.command ? MASTER : `${letterOf(category)}${resource}`;
-  // What the party does have now was refused only for a moment (a call that came late): it is no attempt.
+  // A resource that the host has now was denied only briefly (a late call): not an attempt.
   if (model.lines.has(`${from}>${to}`) || model.lines.has(`${to}>${from}`)) return;
   if (!model.items.has(from)) put(model, { key: from, kind: "party", name: caller || "no name", sub: host ?? "" });
   if (!model.items.has(to)) {
     const kind = attempt.command ? "master" : "missing";
-    put(model, { key: to, kind, name: attempt.command ? "RVMaster" : resource, sub: attempt.command ? "calls" : `refused ${category ?? event}` });
+    put(model, { key: to, kind, name: attempt.command ? "RVMaster" : resource, sub: attempt.command ? "calls" : `denied ${category ?? event}` });
   }
   const key = `!${attempt.key}`;
-  const line = { key, from, to }; // to what was wanted, whichever way messages would have gone
+  const line = { key, from, to }; // towards the resource, whichever way messages would flow
   const would = attempt.records.every((one) => one.decision === "would deny");
   model.lines.set(key, { ...line, kind: "denied", mediated: false, rate: 0, denials: attempt.records, would });
 }

@@ -1,9 +1,9 @@
-/** How a topic flows while it is looked at: messages a second and the relay's delay, drawn from the graph as it comes. */
+/** A topic's rate and delay in the relay over time, from the graph's updates. */
 
 import { html, useEffect, useState } from "../html.js";
 import { Plot } from "../parts/plot.js";
 
-const SPAN = 120; // seconds that are shown; kept while the topic is open, and nowhere else
+const SPAN = 120; // seconds to show; kept only while the topic is open
 
 /** @typedef {{time: number, rate: number, delay: number}} Look */
 

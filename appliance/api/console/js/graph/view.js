@@ -1,4 +1,4 @@
-/** Graph: who talks to whom, through the appliance or past it, and who was not let. */
+/** Graph: nodes, topics and services, through the relay or past it, and denied hosts. */
 
 import { html, useMemo, useRef, useState } from "../html.js";
 import { live } from "../live.js";
@@ -15,7 +15,7 @@ import { TopicList } from "./list.js";
 import { modelOf } from "./model.js";
 
 const NARROW = matchMedia("(max-width: 620px)"); // as in graph.css
-const MOST = 42; // things of a kind that are drawn before they are grouped
+const MOST = 42; // items of a kind to draw without groups
 const RECENT_HOURS = 1;
 
 export function GraphView() {
@@ -32,7 +32,8 @@ export function GraphView() {
   const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted), search) : null), [graph, recent, wanted, search]);
   const shown = useMemo(() => (model ? collapse(model, opened, by, MOST) : null), [model, opened, by]);
   const { spots, arranged, narrow } = useSpots(shown, round, `${search}|${JSON.stringify(wanted)}|${by}`, NARROW.matches);
-  const head = html`<div class="head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(graph.nodes.length, "node")}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}
+  const present = (graph?.nodes ?? []).filter((/** @type {any} */ one) => one.state !== "lost");
+  const head = html`<div class="head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(present.length, "node")}${present.length < graph.nodes.length ? ` (${graph.nodes.length - present.length} lost)` : ""}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}
     <div class="head-actions"><div class="row" role="group" aria-label="Form">
       ${[["drawing", "Drawing"], ["list", "Table"]].map(([name, word]) => html`<button key=${name} class="button" aria-pressed=${String(form === name)} onClick=${() => setForm(name)}>${word}</button>`)}</div></div></div>`;
   if (!graph || !shown || !model) return html`${head}<section class="panel"><${Loading} rows=${8} /></section>`;
@@ -40,7 +41,7 @@ export function GraphView() {
   const item = chosen ? shown.items.get(chosen) ?? model.items.get(chosen) : null;
   const line = chosen ? shown.lines.get(chosen) : null;
   const open = (/** @type {string} */ key) => {
-    // With the nodes of a namespace its topics, too: each is read beside the other.
+    // Open the topics of a namespace together with its nodes.
     const kinds = ["gnode", "gtopic", "gservice"].map((kind) => key.replace(/^g[a-z]+/, kind));
     setOpened(new Set([...opened, key, ...kinds]));
     setChosen(null);
@@ -55,13 +56,13 @@ export function GraphView() {
     <div class=${`graph-grid${item || line ? " with-details" : ""}`}>
       <section class="panel graph-panel" aria-label="Graph">
         <div class="panel-head"><input class="input graph-search" type="search" data-search placeholder="Search nodes, topics, types, hosts" aria-label="Search the graph" value=${search} onInput=${(/** @type {any} */ event) => setSearch(event.target.value)} onKeyDown=${(/** @type {any} */ event) => event.key === "Enter" && choose(found(model, search))} />
-          <${Check} label="Refused" on=${wanted.denied} set=${(denied) => setWanted({ ...wanted, denied })} />
+          <${Check} label="Denied" on=${wanted.denied} set=${(denied) => setWanted({ ...wanted, denied })} />
           <${Check} label="Services" on=${wanted.services} set=${(services) => setWanted({ ...wanted, services })} />
           <${Check} label="Without logging" on=${wanted.quiet} set=${(quiet) => setWanted({ ...wanted, quiet })} />
           <select class="input graph-fold" aria-label="Groups" value=${by} onInput=${(/** @type {any} */ event) => fold(event.target.value)}>
             <option value="namespace" selected=${by === "namespace"}>Groups by namespace</option><option value="host" selected=${by === "host"}>Groups by host</option></select>
           <span class="end">${opened.size > 0 && html`<button class="button small" onClick=${() => setOpened(new Set())}>Close groups</button>`}
-            ${form === "drawing" && html`<button class="button small" onClick=${() => setRound(round + 1)} title="Place everything anew">Arrange</button>`}</span></div>
+            ${form === "drawing" && html`<button class="button small" onClick=${() => setRound(round + 1)} title="Compute the layout again">Arrange</button>`}</span></div>
         ${form === "list" ? html`<${TopicList} topics=${topics} denials=${recent} choose=${choose} chosen=${chosen} />`
           : shown.items.size === 0 ? html`<${Empty} icon="graph" title=${search ? "Nothing matches" : "No node has registered yet"}>${search ? "Search for a part of a name, a type or a host." : "Point nodes at the appliance: export ROS_MASTER_URI to its address, and start them."}</${Empty}>`
           : html`<${Drawing} items=${shown.items} lines=${shown.lines} spots=${spots} chosen=${chosen} choose=${choose} arranged=${arranged} narrow=${narrow} /><${Legend} />`}
@@ -76,10 +77,10 @@ function Legend() {
     <li><svg width="32" height="18" aria-hidden="true"><rect class="legend-node" x="3" y="3" width="28" height="14" rx="4" /><rect class="legend-node" x="1" y="1" width="28" height="14" rx="4" /></svg>several, drawn as one</li>
     <li><svg width="30" height="16" aria-hidden="true"><rect class="legend-node lost" x="1" y="1" width="28" height="14" rx="4" /></svg>node that does not answer</li>
     <li><svg width="30" height="16" aria-hidden="true"><rect class="legend-topic" x="1" y="1" width="28" height="14" rx="7" /></svg>topic or service</li>
-    <li><svg width="34" height="16" aria-hidden="true"><path class="line mediated" d="M1 8H33" /></svg>mediated by the relay</li>
+    <li><svg width="34" height="16" aria-hidden="true"><path class="line mediated" d="M1 8H33" /></svg>through the relay</li>
     <li><svg width="34" height="16" aria-hidden="true"><path class="line flow" d="M1 8H33" /></svg>direct</li>
-    <li><svg width="34" height="16" aria-hidden="true"><path class="line denied" d="M1 8H33" /></svg>refused in the last hour</li>
-    <li><svg width="34" height="16" aria-hidden="true"><path class="line would" d="M1 8H33" /></svg>would be refused</li></ul>`;
+    <li><svg width="34" height="16" aria-hidden="true"><path class="line denied" d="M1 8H33" /></svg>denied in the last hour</li>
+    <li><svg width="34" height="16" aria-hidden="true"><path class="line would" d="M1 8H33" /></svg>would be denied</li></ul>`;
 }
 
 /** Places that hold while the graph changes; a search, a filter or an opened group arranges afresh. */

@@ -1,4 +1,4 @@
-/** Letting a host in: by a one-time token that it brings with its own key, or by a kit that is carried there. */
+/** Enrol a host: with a one-time token and its own key, or with a kit. */
 
 import { html, useState } from "../html.js";
 import { save } from "../audit/proof.js";
@@ -12,7 +12,7 @@ import { Failure, Notice } from "../parts/notice.js";
 import { done } from "../parts/toast.js";
 import { send } from "../rest.js";
 
-const HOW = /** @type {[string, string][]} */ ([["token", "One-time token: the host makes its own key"], ["kit", "Kit: an archive with a private key, to be carried there"]]);
+const HOW = /** @type {[string, string][]} */ ([["token", "One-time token: the host creates its own key"], ["kit", "Kit: an archive with a private key, to copy to the host"]]);
 const LASTS = /** @type {[string, string][]} */ ([["900", "15 minutes"], ["3600", "1 hour"], ["86400", "1 day"], ["604800", "7 days"]]);
 
 /** @param {{host?: any, etag: string, close: () => void, after: () => Promise<void>}} given `host`: one that is there already */
@@ -29,7 +29,7 @@ export function Enrol({ host, etag, close, after }) {
       if (token) setMade(await response.json());
       else {
         save(await response.blob(), `rosrv-${form.name}.tar.gz`);
-        done(`The kit of ${form.name} is saved`, "There is a private key in it: carry it as one, and delete it afterwards.");
+        done(`The kit of ${form.name} is saved`, "It contains a private key: keep it secret, and delete it afterwards.");
         close();
       }
       await after();
@@ -39,17 +39,17 @@ export function Enrol({ host, etag, close, after }) {
   };
   if (made) return html`<${Made} made=${made} close=${close} />`;
   const title = host ? `A new ${host.enrolled === null ? "token" : "certificate"} for ${host.name}` : "Enrol a host";
-  const foot = html`<button class="button" onClick=${close}>Not yet</button><${Button} role="admin" tone="primary" disabled=${!form.name} why="A name is needed" onClick=${go}>${token ? "Make the token" : "Make the kit"}</${Button}>`;
+  const foot = html`<button class="button" onClick=${close}>Not yet</button><${Button} role="admin" tone="primary" disabled=${!form.name} why="Enter a name" onClick=${go}>${token ? "Create the token" : "Create the kit"}</${Button}>`;
   return html`<${Dialog} title=${title} close=${close} foot=${foot}><${Failure} error=${error} />
     ${!host && html`<${Field} label="Name" mono value=${form.name} set=${set("name")} placeholder="ocu-1" hint="host:NAME in the policy" />`}
     <${Field} label="How" value=${form.how} set=${set("how")} options=${HOW} />
-    ${host?.enrolled && !token && html`<${Notice} tone="warn">The certificate before is revoked and its tunnel closed at once.</${Notice}>`}
-    <div class="form-grid"><${Field} label="Address of the appliance, from there" mono value=${form.endpoint} set=${set("endpoint")} placeholder="what the appliance finds" hint="UDP 500 and 4500 must be reachable" /><${Field} label="Certificate lasts (days)" type="number" min="1" max="398" value=${form.days} set=${set("days")} /></div>
-    <div class="form-grid">${token && html`<${Field} label="The token can be used for" value=${form.token_seconds} set=${set("token_seconds")} options=${LASTS} />`}<${Field} label="Services that stay open there" mono value=${form.open} set=${set("open")} placeholder="tcp/22" hint="all others are closed to all but the appliance" />
+    ${host?.enrolled && !token && html`<${Notice} tone="warn">The old certificate is revoked and its tunnel closed at once.</${Notice}>`}
+    <div class="form-grid"><${Field} label="Address of the appliance, as the host sees it" mono value=${form.endpoint} set=${set("endpoint")} placeholder="what the appliance finds" hint="UDP 500 and 4500 must be reachable" /><${Field} label="Certificate valid for (days)" type="number" min="1" max="398" value=${form.days} set=${set("days")} /></div>
+    <div class="form-grid">${token && html`<${Field} label="Token valid for" value=${form.token_seconds} set=${set("token_seconds")} options=${LASTS} />`}<${Field} label="Services to keep open on the host" mono value=${form.open} set=${set("open")} placeholder="tcp/22" hint="all others are closed to all but the appliance" />
       ${!host && html`<${Field} label="Virtual address" mono value=${form.address} set=${set("address")} placeholder="the next free one" />`}</div></${Dialog}>`;
 }
 
-/** Where the browser reaches the appliance is where hosts do, too, unless it sits on the same machine. */
+/** Hosts reach the appliance where the browser does, unless the browser runs on the same machine. */
 function reachedAt(/** @type {string} */ hostname) {
   const name = hostname.replace(/^\[|\]$/g, "");
   return name === "localhost" || name === "::1" || name.startsWith("127.") ? "" : name;
@@ -63,13 +63,13 @@ function request(/** @type {Record<string, string>} */ form, /** @type {any} */ 
   return send("POST", "/v1/hosts", { json: { ...common, ...timed, name: form.name, how: form.how, address: form.address || null }, match: etag });
 }
 
-/** The token: the only time it is seen. */
+/** The token, which is shown once. */
 function Made(/** @type {{made: any, close: () => void}} */ { made, close }) {
   const script = () => save(new Blob([made.script], { type: "text/x-shellscript" }), `rosrv-${made.name}-join.sh`);
   return html`<${Dialog} title=${`${made.name} may enrol itself`} close=${close} foot=${html`<button class="button primary" onClick=${close}>Done</button>`}>
-    <${Notice} tone="warn" title="Shown this once">The token is kept nowhere. It can be used one time, until <${Moment} at=${made.expires} />.</${Notice}>
-    <dl class="facts"><dt>Host</dt><dd><${Given} value=${made.name} mono />, <${Given} value=${made.address} mono /></dd><dt>Token</dt><dd data-token><${Given} value=${made.token} mono most=${200} /></dd><dt>Brought to</dt><dd><${Given} value=${made.url} mono most=${200} />${made.endpoint_reason && html` <${Given} value=${`(${made.endpoint_reason})`} />`}</dd></dl>
-    <p>Bring the script there and run it as root: it makes the key on the host, enrols it, and starts and checks the tunnel.</p>
+    <${Notice} tone="warn" title="Shown this once">The token is not stored. It can be used once, until <${Moment} at=${made.expires} />.</${Notice}>
+    <dl class="facts"><dt>Host</dt><dd><${Given} value=${made.name} mono />, <${Given} value=${made.address} mono /></dd><dt>Token</dt><dd data-token><${Given} value=${made.token} mono most=${200} /></dd><dt>For</dt><dd><${Given} value=${made.url} mono most=${200} />${made.endpoint_reason && html` <${Given} value=${`(${made.endpoint_reason})`} />`}</dd></dl>
+    <p>Copy the script to the host and run it as root. It creates the key, enrols the host, starts the tunnel and checks it.</p>
     <pre class="bytes">sudo sh rosrv-${made.name}-join.sh</pre>
     <div class="row"><button class="button" onClick=${script}><${Icon} name="down" size=${16} />Download the script</button></div></${Dialog}>`;
 }

@@ -1,4 +1,4 @@
-/** Letting a host out for good: asked twice, done within a second. */
+/** Revoke a host, after confirmation. */
 
 import { html, useState } from "../html.js";
 import { Button } from "../parts/button.js";
@@ -17,7 +17,7 @@ export function Revoke({ host, etag, close, after }) {
     setError(null);
     try {
       const { body } = await ask("DELETE", `/v1/hosts/${encodeURIComponent(host.name)}`, { match: etag });
-      done(`${host.name} is revoked`, `${body.taken_back} registrations and grants were taken back.`);
+      done(`${host.name} is revoked`, `${body.taken_back} registrations and grants were removed.`);
       await after();
       close();
     } catch (failure) {
@@ -27,6 +27,6 @@ export function Revoke({ host, etag, close, after }) {
   };
   const foot = html`<button class="button" onClick=${close}>Keep it</button><${Button} role="admin" tone="danger" disabled=${typed !== host.name} why="Type the host's name first" onClick=${go}>Revoke ${host.name}</${Button}>`;
   return html`<${Dialog} title=${`Revoke ${host.name}?`} close=${close} foot=${foot}><${Failure} error=${error} />
-    <p>Its certificate ends, its tunnel is closed, and what it registered is taken back, now. Its address <${Given} value=${host.address} mono /> is given to no other. It cannot be undone; the host can be enrolled anew.</p>
+    <p>Its certificate is revoked, its tunnel closed, and its registrations removed, now. Its address <${Given} value=${host.address} mono /> is not reused. This cannot be undone, but the host can be enrolled again.</p>
     <${Field} label=${`Type ${host.name} to confirm`} mono value=${typed} set=${setTyped} /></${Dialog}>`;
 }

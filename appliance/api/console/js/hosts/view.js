@@ -1,4 +1,4 @@
-/** Hosts: who comes through a tunnel, until when, whether its ports are closed; letting in and out. */
+/** Hosts: tunnels, certificates, open ports; enrol and revoke. */
 
 import { html, useEffect, useState } from "../html.js";
 import { live } from "../live.js";
@@ -50,9 +50,9 @@ export function Hosts() {
   return html`<div class="head"><h1>Hosts</h1><span class="head-sub">${counted(body.hosts.length, "host")}, ${body.hosts.filter((/** @type {any} */ one) => one.state === "up").length} up</span>
       <div class="head-actions"><${Button} role="operator" onClick=${reload} title=${`Read ${body.hosts_file} again`}><${Icon} name="again" size=${16} />Reload hosts.yaml</${Button}><${Button} role="admin" tone="primary" onClick=${() => setOpen({ what: "enrol" })}><${Icon} name="plus" size=${16} />Enrol a host</${Button}></div></div>
     <div class="standing">${isolation === "none" && html`<${Notice} title="Tunnels need isolation netns or container">With isolation none the appliance shares the robot's network, and no host can be enrolled.</${Notice}>`}
-      ${body.troubles.map((/** @type {string} */ one) => html`<${Notice} key=${one} tone="warn" title="To be looked at"><${Given} value=${one} most=${400} /></${Notice}>`)}</div>
-    <div class="stack"><section class="panel" aria-label="Hosts in tunnels">${!body.hosts.length ? html`<${Empty} icon="hosts" title="No host is enrolled">Enrol an operator's laptop or a second robot: it gets a name (host:NAME in the policy) and an address of its own, which nobody else can use.</${Empty}>` : html`<${HostTable} hosts=${body.hosts} open=${setOpen} />`}</section>
-      <section class="panel" aria-labelledby="machines"><div class="panel-head"><h2 id="machines">Machines without a tunnel</h2></div>${!body.machines.length ? html`<${Empty} icon="hosts" title="No node in clear text">Machines whose nodes register without a tunnel appear here.</${Empty}>` : html`<${MachineTable} machines=${body.machines} />`}</section>
+      ${body.troubles.map((/** @type {string} */ one) => html`<${Notice} key=${one} tone="warn" title="Needs attention"><${Given} value=${one} most=${400} /></${Notice}>`)}</div>
+    <div class="stack"><section class="panel" aria-label="Hosts with tunnels">${!body.hosts.length ? html`<${Empty} icon="hosts" title="No host is enrolled">Enrol an operator's laptop or a second robot: it gets a name (host:NAME in the policy) and an address that no other host can use.</${Empty}>` : html`<${HostTable} hosts=${body.hosts} open=${setOpen} />`}</section>
+      <section class="panel" aria-labelledby="machines"><div class="panel-head"><h2 id="machines">Machines without a tunnel</h2></div>${!body.machines.length ? html`<${Empty} icon="hosts" title="No nodes without a tunnel">Machines whose nodes register without a tunnel appear here.</${Empty}>` : html`<${MachineTable} machines=${body.machines} />`}</section>
       <section class="panel"><div class="panel-body"><dl class="facts"><dt>ESP runs in</dt><dd>${body.esp ?? html`<span class="muted">no tunnels are open</span>`}</dd><dt>Key exchange</dt><dd>${body.key_exchange.length ? html`<${Given} value=${body.key_exchange.join(", ")} mono />` : html`<span class="muted">not known yet</span>`}${body.post_quantum === null ? "" : body.post_quantum ? html` <${Badge} word="post-quantum" tone="allow" />` : html` <${Badge} word="not post-quantum" />`}</dd>
         <dt>Addresses</dt><dd><${Given} value=${body.pool} mono />, the appliance is <${Given} value=${body.address} mono /></dd><dt>Declared in</dt><dd><${Given} value=${body.hosts_file} mono most=${200} /></dd></dl></div></section></div>
     ${open?.what === "revoke" && html`<${Revoke} host=${open.host} etag=${etag} close=${() => setOpen(null)} after=${again} />`}
@@ -64,7 +64,7 @@ function HostTable(/** @type {{hosts: any[], open: (what: any) => void}} */ { ho
     <tbody>${hosts.map((one) => html`<tr key=${one.name} data-host=${one.name}><td class="first"><strong><${Given} value=${one.name} /></strong>${one.groups.length > 0 && html`<div class="muted small"><${Given} value=${one.groups.join(", ")} most=${80} /></div>`}${one.divergence && html`<div class="small"><${Given} value=${one.divergence} most=${200} /></div>`}</td>
       <td data-label="Tunnel"><div><${Badge} word=${one.state} tone=${TONES[/** @type {keyof typeof TONES} */ (one.state)]} />${one.state === "up" && html`<div class="muted small nowrap">for ${lasting(one.seconds)}</div>`}${one.token_expires && html`<div class="muted small">token until <${Moment} at=${one.token_expires} /></div>`}</div></td>
       <td data-label="Address"><${Given} value=${one.address} mono /></td><td data-label="From"><div><${Given} value=${one.remote} mono />${one.remote && html`<div class="muted small nowrap">${bytes(one.bytes_in)} in, ${bytes(one.bytes_out)} out</div>`}</div></td>
-      <td class="nowrap" data-label="Certificate"><div>${one.expires === null ? html`<span class="muted">–</span>` : html`<${Moment} at=${one.expires} always="day" />`}${one.expires_soon && html`<div><${Badge} word="ends soon" tone="warn" /></div>`}${one.renewing && html`<div class="muted small">renewal waits to be taken</div>`}</div></td>
+      <td class="nowrap" data-label="Certificate"><div>${one.expires === null ? html`<span class="muted">–</span>` : html`<${Moment} at=${one.expires} always="day" />`}${one.expires_soon && html`<div><${Badge} word="expires soon" tone="warn" /></div>`}${one.renewing && html`<div class="muted small">a renewed certificate waits for the host</div>`}</div></td>
       <td class="nowrap" data-label="Last seen"><${Moment} at=${one.last_seen} /></td><td data-label="Ports"><${Ports} ports=${one.ports} /></td>
       <td><div class="row row-end">${one.state !== "revoked" && html`<${Button} small role="admin" onClick=${() => open({ what: "again", host: one })}>${one.enrolled === null ? "Token" : "New kit"}</${Button}>`}${one.enrolled !== null && one.revoked === null && html`<${Button} small role="admin" tone="danger" onClick=${() => open({ what: "revoke", host: one })}>Revoke</${Button}>`}</div></td></tr>`)}</tbody></table></div>`;
 }
@@ -73,7 +73,7 @@ function MachineTable(/** @type {{machines: any[]}} */ { machines }) {
   return html`<div class="table-wrap"><table class="table"><thead><tr><th>Machine</th><th class="number">Nodes</th><th>Ports of its nodes</th></tr></thead><tbody>${machines.map((one) => html`<tr key=${one.address}><td><${Given} value=${one.address} mono /></td><td class="number">${one.nodes}</td><td><${Ports} ports=${one.ports} /></td></tr>`)}</tbody></table></div>`;
 }
 
-/** Whether anybody but the appliance reaches the ports of its nodes, as somebody saw who tried. */
+/** Whether other machines can reach the ports of its nodes, from the last check. */
 function Ports(/** @type {{ports: any}} */ { ports }) {
   const tone = { closed: "allow", open: "deny", unknown: "" }[/** @type {string} */ (ports.state)];
   return html`<div><${Badge} word=${ports.state} tone=${tone} />${ports.state === "unknown" ? html`<div class="muted small">try: rosrv protect --check</div>` : html`<div class="muted small">seen <${Moment} at=${ports.checked} /></div>`}

@@ -1,4 +1,4 @@
-/** A specification that is being written: tried and loaded with the findings at their place. */
+/** A draft of a specification, with dry run, load and findings. */
 
 import { useState } from "../html.js";
 import { ask } from "../rest.js";

@@ -1,4 +1,4 @@
-/** Loading a specification that is new here, from a file or written in place, with the definitions it needs. */
+/** Load a new specification, from a file or the editor, with its message definitions. */
 
 import { html, useState } from "../html.js";
 import { Button } from "../parts/button.js";
@@ -11,7 +11,7 @@ import { done, failed } from "../parts/toast.js";
 import { useSpecification } from "./draft.js";
 import { Outcome } from "./report.js";
 
-const EXAMPLE = `// What it is for, in a sentence.
+const EXAMPLE = `// The purpose of the monitor, in a sentence.
 
 example() {
     int count = 0;
@@ -61,7 +61,7 @@ export function LoadSpecification({ etag, files, signed, close, loaded }) {
   const rename = (/** @type {string} */ old, /** @type {string} */ next) => setDefinitions(Object.fromEntries(Object.entries(definitions).map(([key, text]) => [key === old ? next : key, text])));
   const foot = html`<button class="button" onClick=${close}>Not yet</button><${Button} role="operator" onClick=${() => send(true)}>Dry run</${Button}><${Button} role="admin" tone="primary" onClick=${load}>${files.includes(name) ? "Replace the file" : "Load"}</${Button}>`;
   return html`<${Dialog} wide title="Load a specification" close=${close} foot=${foot}>
-    <div class="form-grid"><${Field} label="File name" mono value=${name} set=${setName} hint=${files.includes(name) ? "replaces the file of this name" : "a new file"} /><${Field} label="Comment" value=${note} set=${setNote} placeholder="Why, or a ticket" maxlength="200" hint="kept with the revision" />
+    <div class="form-grid"><${Field} label="File name" mono value=${name} set=${setName} hint=${files.includes(name) ? "replaces the file of this name" : "a new file"} /><${Field} label="Comment" value=${note} set=${setNote} placeholder="Reason or ticket number" maxlength="200" hint="kept with the revision" />
       <div class="field"><label for="spec-files">Take it from files</label><input id="spec-files" class="input" type="file" multiple accept=".rv,.msg,.srv,.sig" onChange=${choose} /><span class="hint">.rv, and the .msg or .srv that ROS does not ship${signed && ", each with its .sig"}</span></div></div>
     <${Signature} asked=${signed} value=${signatures[name] ?? ""} set=${(/** @type {string} */ next) => setSignatures({ ...signatures, [name]: next })} />
     ${Object.keys(definitions).length > 0 && html`<div class="form-grid">${Object.keys(definitions).map((one, index) => html`<${Field} key=${index} label="Definition, as package/Type.msg" mono value=${one} set=${(/** @type {string} */ next) => rename(one, next)} hint=${html`${definitions[one].length} characters; ends up as <${Given} value=${one} />`} />`)}</div>`}

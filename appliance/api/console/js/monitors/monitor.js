@@ -1,4 +1,4 @@
-/** One monitor: its state, what it did over time, its events and properties, the text it is made of. */
+/** One monitor: state, actions over time, events, properties and specification. */
 
 import { html, useState } from "../html.js";
 import { live } from "../live.js";
@@ -33,13 +33,13 @@ export function MonitorPage({ name, row, monitors }) {
   const [removing, setRemoving] = useState(false);
   const head = html`<div class="head"><${Link} to="/console/monitors" class="button plain" aria-label="All monitors"><${Icon} name="back" /></${Link}><h1><${Given} value=${name} most=${80} /></h1>
     ${row && html`<${Badge} word=${stateOf(row)} /><span class="head-sub"><${Given} value=${row.file} mono most=${80} /></span>
-      <div class="head-actions">${row.held && html`<${Resume} row=${row} monitors=${monitors} />`}${(row.trial || !row.enabled) && html`<${Promote} row=${row} monitors=${monitors} />`}<span class="row"><span class="small muted">Enabled</span><${MonitorSwitch} row=${row} monitors=${monitors} /></span>
+      <div class="head-actions">${row.held && html`<${Resume} row=${row} monitors=${monitors} />`}${(row.shadow || !row.enabled) && html`<${Promote} row=${row} monitors=${monitors} />`}<span class="row"><span class="small muted">Enabled</span><${MonitorSwitch} row=${row} monitors=${monitors} /></span>
         <${Button} role="admin" tone="danger" onClick=${() => setRemoving(true)}>Remove</${Button}></div>`}</div>`;
-  if (!row) return html`${head}<section class="panel"><${Empty} icon="monitors" title="This monitor is not loaded">It may have been removed. What it did is still in the <${Link} to=${`/console/audit?category=monitor&text=${encodeURIComponent(name)}`}>audit log</${Link}>.</${Empty}></section>`;
-  const held = row.why_held && html`<p role="status">It holds its topics: ${row.why_held}. When that is safe, resume it (<code>rosrv monitor resume ${name}</code>).</p>`;
+  if (!row) return html`${head}<section class="panel"><${Empty} icon="monitors" title="This monitor is not loaded">It may have been removed. Its actions are still in the <${Link} to=${`/console/audit?category=monitor&text=${encodeURIComponent(name)}`}>audit log</${Link}>.</${Empty}></section>`;
+  const held = row.why_held && html`<p role="status">It holds its topics: ${row.why_held}. When it is safe, resume it (<code>rosrv monitor resume ${name}</code>).</p>`;
   return html`${head}${held}
     <div class="policy-grid"><div class="stack"><${Verdicts} name=${name} row=${row} />${error ? html`<${Failure} error=${error} retry=${again} />` : !value ? html`<section class="panel"><${Loading} /></section>` : html`<${Specification} key=${value.revision} monitor=${value} monitors=${monitors} />`}</div>
-      <div class="stack">${value && html`<${About} monitor=${value} path=${path} />`}<${Margins} row=${row} /><${History} path=${path} row=${row} /></div></div>
+      <div class="stack">${value && html`<${About} monitor=${value} path=${path} />`}<${History} path=${path} row=${row} /></div></div>
     ${removing && html`<${Remove} name=${name} row=${row} path=${path} monitors=${monitors} close=${() => setRemoving(false)} />`}`;
 }
 
@@ -47,8 +47,8 @@ function Verdicts(/** @type {{name: string, row: any}} */ { name, row }) {
   const samples = useStore(live, (one) => one.samples);
   const [span, setSpan] = useState(900);
   const series = /** @type {any[]} */ ([["verdicts", "c1", 0], ["dropped", "c2", 1], ["changed", "c3", 2], ["faults", "c4", 3]]).map(([word, colour, place]) => ({ name: word, colour, points: counters(samples, name, place) }));
-  return html`<section class="panel" aria-labelledby="verdicts"><div class="panel-head"><h2 id="verdicts">What it does</h2><span class="end">${[[900, "15 min"], [3600, "1 h"]].map(([seconds, word]) => html`<button key=${word} class="button small" aria-pressed=${String(span === seconds)} onClick=${() => setSpan(Number(seconds))}>${word}</button>`)}</span></div>
-    <div class="panel-body stack"><dl class="figures">${[["Events", row.events], ["Verdicts", row.verdicts], ...(row.trial ? [["Would have dropped", row.would_drop], ["Would have changed", row.would_change], ["Missed", row.missed]] : [["Dropped", row.drops], ["Changed", row.changes]]), ["Faults", row.faults], ...(row.slice_limit ? [["Slices", row.slices], ["Slices at most", row.slice_limit]] : [])].map(([word, value]) => html`<div key=${word}><dt>${word}</dt><dd>${count(value)}</dd></div>`)}</dl>
+  return html`<section class="panel" aria-labelledby="verdicts"><div class="panel-head"><h2 id="verdicts">Activity</h2><span class="end">${[[900, "15 min"], [3600, "1 h"]].map(([seconds, word]) => html`<button key=${word} class="button small" aria-pressed=${String(span === seconds)} onClick=${() => setSpan(Number(seconds))}>${word}</button>`)}</span></div>
+    <div class="panel-body stack"><dl class="figures">${[["Events", row.events], ["Verdicts", row.verdicts], ...(row.shadow ? [["Would have dropped", row.would_drop], ["Would have changed", row.would_change], ["Missed", row.missed]] : [["Dropped", row.drops], ["Changed", row.changes]]), ["Faults", row.faults], ...(row.slice_limit ? [["Slices", row.slices], ["Slice limit", row.slice_limit]] : [])].map(([word, value]) => html`<div key=${word}><dt>${word}</dt><dd>${count(value)}</dd></div>`)}</dl>
       <${Plot} label=${`What ${name} does`} series=${series} span=${span} /></div></section>`;
 }
 
@@ -72,11 +72,11 @@ function Specification(/** @type {{monitor: any, monitors: any}} */ { monitor, m
   };
   const findings = draft.report || draft.findings.length || draft.error ? draft.findings : monitor.warnings;
   return html`<section class="panel" aria-labelledby="specification"><div class="panel-head"><h2 id="specification">Specification</h2>${changed && html`<${Badge} word="changed here, not loaded" tone="warn" />`}
-      <span class="end">${changed && html`<button class="button small plain" onClick=${() => draft.write(monitor.text)}>Discard</button>`}<${Button} small role="operator" onClick=${dry} title="Compile and check (Ctrl S)">Dry run</${Button}><${Button} small role="admin" tone="primary" disabled=${!changed} why="The text is that of the monitor in force" onClick=${() => setAsking(true)}>Replace</${Button}></span></div>
+      <span class="end">${changed && html`<button class="button small plain" onClick=${() => draft.write(monitor.text)}>Discard</button>`}<${Button} small role="operator" onClick=${dry} title="Compile and check (Ctrl S)">Dry run</${Button}><${Button} small role="admin" tone="primary" disabled=${!changed} why="The text is unchanged" onClick=${() => setAsking(true)}>Replace</${Button}></span></div>
     ${(draft.report || draft.error || findings.length > 0) && html`<div class="panel-body"><${Outcome} report=${draft.report} error=${draft.error} findings=${findings} pick=${(/** @type {any} */ one) => setLine({ number: one.line, column: one.column, count: (line?.count ?? 0) + 1 })} /></div>`}
     <${Editor} label=${`Specification ${monitor.file}`} language="rv" value=${draft.text} change=${draft.write} findings=${findings} line=${line} dry=${() => may("operator") && dry()} height="46vh" />
     ${asking && html`<${Dialog} title=${`Replace ${monitor.file}?`} close=${() => setAsking(false)} foot=${html`<button class="button" onClick=${() => setAsking(false)}>Not yet</button><${Button} role="admin" tone="primary" onClick=${load}>Replace</${Button}>`}>
-      <p>It is compiled and swapped between two messages; monitors of this file begin in their initial state, others keep theirs.</p><${Field} label="Comment" value=${note} set=${setNote} placeholder="Why, or a ticket" maxlength="200" />
+      <p>The specification is compiled and replaced between two messages. Monitors of this file start in their initial state; others keep theirs.</p><${Field} label="Comment" value=${note} set=${setNote} placeholder="Reason or ticket number" maxlength="200" />
       <${Signature} asked=${monitors.body.site_keys.length > 0} value=${signature} set=${setSignature} /></${Dialog}>`}</section>`;
 }
 
@@ -85,22 +85,12 @@ function About(/** @type {{monitor: any, path: string}} */ { monitor, path }) {
   return html`<section class="panel" aria-label="About the monitor"><${Tabs} label="About the monitor" tabs=${[["properties", `Properties ${monitor.properties.length}`], ["events", `Events ${monitor.alphabet.length}`]]} chosen=${tab} choose=${setTab}>
     ${tab === "events" ? html`<div class="table-wrap"><table class="table"><thead><tr><th>Event</th><th>On</th><th class="number">Line</th></tr></thead><tbody>${monitor.alphabet.map((/** @type {any} */ one) => html`<tr key=${`${one.name}${one.line}`}><td><code><${Given} value=${one.name} /></code></td>
         <td>${one.topic ? html`<${Given} value=${one.topic} mono /><div class="muted small"><${Given} value=${one.type} most=${80} />${one.part && ` (${one.part})`}</div>` : `every ${one.every} s`}</td><td class="number">${one.line}</td></tr>`)}</tbody></table></div>`
-      : !monitor.properties.length ? html`<${Empty} icon="monitors" title="No property">This monitor acts in its events alone.</${Empty}>`
+      : !monitor.properties.length ? html`<${Empty} icon="monitors" title="No properties">This monitor acts only in its events.</${Empty}>`
       : html`<div class="panel-body stack">${monitor.properties.map((/** @type {any} */ one, /** @type {number} */ index) => html`<div key=${index} class="stack-tight"><div class="row"><${Badge} word=${one.logic} tone="note" /><span class="muted small">handles ${one.handled.join(", ") || "nothing"}</span></div><pre class="bytes"><${Given} value=${one.formula} most=${1500} /></pre>${monitor.certificates[index] && html`<p class="muted small"><${Given} value=${monitor.certificates[index].replace(/^\w+: /, "")} most=${200} /></p>`}</div>`)}
         ${monitor.properties.some((/** @type {any} */ one) => one.drawn) && html`<${Picture} path=${path} name=${monitor.name} />`}</div>`}</${Tabs}></section>`;
 }
 
-/** How close its conditions on numbers came; `At` is where the constant would have to stand to be reached. */
-function Margins(/** @type {{row: any}} */ { row }) {
-  if (!row.margins.length) return null;
-  const number = (/** @type {number | null | undefined} */ value) => value === null || value === undefined ? "–" : Number(value.toPrecision(6)).toString();
-  return html`<section class="panel" aria-labelledby="margins"><div class="panel-head"><h2 id="margins">How close it came</h2></div>
-    <div class="table-wrap"><table class="table"><thead><tr><th>Condition</th><th class="number">Today</th><th class="number">Since load</th><th class="number">At</th></tr></thead>
-      <tbody>${row.margins.map((/** @type {any} */ one) => html`<tr key=${`${one.line}:${one.column}${one.holds}`}><td><code><${Given} value=${one.condition} most=${120} /></code><div class="muted small">line ${one.line}, was ${one.holds ? "true" : "false"}</div></td>
-        <td class="number">${number(one.today?.distance)}</td><td class="number">${number(one.since_load.distance)}<div class="muted small"><${Moment} at=${one.since_load.time} /></div></td><td class="number">${number(one.since_load.threshold_at)}</td></tr>`)}</tbody></table></div></section>`;
-}
-
-/** The automata, as an image: what is in it is never part of the page. */
+/** The automata as an image, never as part of the page. */
 function Picture(/** @type {{path: string, name: string}} */ { path, name }) {
   const { value } = useResource(async (signal) => (await send("GET", `${path}/picture`, { signal })).text(), [path]);
   if (!value) return null;
@@ -108,9 +98,9 @@ function Picture(/** @type {{path: string, name: string}} */ { path, name }) {
 }
 
 function History(/** @type {{path: string, row: any}} */ { path, row }) {
-  const mark = [row.verdicts, row.drops, row.changes, row.faults, row.enabled, row.trial, row.would_drop, row.would_change].join();
+  const mark = [row.verdicts, row.drops, row.changes, row.faults, row.enabled, row.shadow, row.would_drop, row.would_change].join();
   const { value, error, again } = useResource((signal) => get(`${path}/history`, { limit: 200 }, signal), [path, mark]);
-  return html`<section class="panel" aria-labelledby="history"><div class="panel-head"><h2 id="history">What it did last</h2><span class="end"><${Link} class="small" to=${`/console/audit?category=monitor&text=${encodeURIComponent(row.name)}`}>In the audit log</${Link}></span></div>
+  return html`<section class="panel" aria-labelledby="history"><div class="panel-head"><h2 id="history">Latest actions</h2><span class="end"><${Link} class="small" to=${`/console/audit?category=monitor&text=${encodeURIComponent(row.name)}`}>In the audit log</${Link}></span></div>
     ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} /> ` : !value.happened.length ? html`<${Empty} icon="monitors" title="Nothing yet">Verdicts, dropped and changed messages appear here.</${Empty}>`
       : html`<ul class="event-list tall">${value.happened.slice(0, 40).map((/** @type {any} */ one) => html`<li key=${one.sequence} class="event"><span class="event-time"><${Link} to=${`/console/audit/${one.sequence}`}><${Moment} at=${one.time} /></${Link}></span><span class="event-badge"><${Badge} word=${one.category ?? one.event.replace(/^(monitor|message|trial) /, "")} tone=${tone(one)} /></span>
         <div class="event-body"><${Given} value=${one.resource} mono most=${60} />${one.count ? html` <span class="muted">${counted(one.count, "more", "more")}</span>` : ""}<div class="event-reason"><${Given} value=${one.reason} most=${200} none="" /></div></div></li>`)}</ul>`}</section>`;
@@ -134,6 +124,6 @@ function Remove(/** @type {any} */ { name, row, path, monitors, close }) {
     close();
   };
   return html`<${Dialog} title=${`Remove ${name}?`} close=${close} foot=${html`<button class="button" onClick=${close}>Keep it</button><${Button} role="admin" tone="danger" onClick=${remove}>Remove</${Button}>`}>
-    <p>Messages on its topics pass unwatched from then on. The file <code><${Given} value=${row.file} /></code> on disk stays.</p>
-    ${others.length > 0 && html`<p>With it go the other monitors of this file: <${Given} value=${others.join(", ")} most=${200} />.</p>`}</${Dialog}>`;
+    <p>Its topics are no longer monitored. The file <code><${Given} value=${row.file} /></code> on disk is kept.</p>
+    ${others.length > 0 && html`<p>This also removes the other monitors of this file: <${Given} value=${others.join(", ")} most=${200} />.</p>`}</${Dialog}>`;
 }

@@ -1,4 +1,4 @@
-/** What came of trying or loading a specification. */
+/** The result of a dry run or load of a specification. */
 
 import { html } from "../html.js";
 import { counted } from "../numbers.js";
@@ -11,9 +11,9 @@ export function Outcome({ findings, report, error, pick }) {
   if (!findings.length && !report && !error) return null;
   return html`<div class="stack" data-outcome>
     ${error && !errors.length ? html`<${Failure} error=${error} />` : null}
-    ${errors.length > 0 && html`<${Notice} tone="deny" role="alert" title=${`Refused: ${counted(errors.length, "error")}`}>Nothing was changed. Choose an error to go to its place.</${Notice}>`}
+    ${errors.length > 0 && html`<${Notice} tone="deny" role="alert" title=${`Rejected: ${counted(errors.length, "error")}`}>Nothing was changed. Select an error to move to its place.</${Notice}>`}
     ${findings.length > 0 && html`<${Findings} findings=${findings} pick=${pick} />`}
     ${report && html`<${Notice} tone="allow" role="status" title=${report.loaded ? `Revision ${report.revision} is in force` : "It can be loaded"}>
       ${["added", "changed", "removed"].filter((word) => report[word]?.length).map((word) => html`<div key=${word}>${word}: <${Given} value=${report[word].join(", ")} most=${300} /></div>`)}
-      ${!report.added?.length && !report.changed?.length && !report.removed?.length && "It changes no monitor."}</${Notice}>`}</div>`;
+      ${!report.added?.length && !report.changed?.length && !report.removed?.length && "No monitor changes."}</${Notice}>`}</div>`;
 }

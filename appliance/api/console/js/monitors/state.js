@@ -1,4 +1,4 @@
-/** The monitors as `/v1/monitors` has them, fetched anew when the appliance says that something changed. */
+/** The monitors from `/v1/monitors`, fetched again after each change. */
 
 import { useEffect, useRef, useState } from "../html.js";
 import { live } from "../live.js";
@@ -6,22 +6,22 @@ import { ask } from "../rest.js";
 import { useStore } from "../store.js";
 
 /**
- * `change` sends what changes one of them as it is shown here. Such changes wait for one another: every one makes another
- * ETag, and a second click before the first is answered is meant for what the first one made.
+ * `change` sends a change of one monitor. Changes are queued: each one makes a new
+ * ETag, and a second click before the first answer applies to its result.
  * @returns {{body: any, etag: string, error: unknown, again: () => Promise<void>, change: (name: string, to: any) => Promise<void>}}
  */
 export function useMonitors() {
   const [state, setState] = useState({ body: /** @type {any} */ (null), etag: "", error: /** @type {unknown} */ (null) });
   const mark = useStore(live, (one) => JSON.stringify(one.status?.monitors ?? null));
-  // What one in shadow mode would have done is in no sample: it is fetched with each.
-  const trying = state.body?.monitors.some((/** @type {any} */ row) => row.trial);
+  // Samples lack the counts of shadow mode, which are fetched with each sample.
+  const trying = state.body?.monitors.some((/** @type {any} */ row) => row.shadow);
   const counted = useStore(live, (one) => JSON.stringify([one.samples.at(-1)?.monitors ?? null, trying && one.samples.at(-1)?.time]));
   const shown = useRef({ etag: "", changes: 0, last: /** @type {Promise<unknown>} */ (Promise.resolve()) });
   const again = async () => {
     const { changes } = shown.current;
     try {
       const { body, etag } = await ask("GET", "/v1/monitors");
-      if (changes !== shown.current.changes) return; // it may be from before a change, which has it fetched anew
+      if (changes !== shown.current.changes) return; // the answer may be older than a change, which fetches again
       shown.current.etag = etag ?? "";
       setState({ body, etag: etag ?? "", error: null });
     } catch (error) {
@@ -48,10 +48,10 @@ export function useMonitors() {
 
 /** In one word. @param {any} row */
 export function stateOf(row) {
-  return row.trial ? "shadow mode" : row.held ? "held" : row.failing ? "failing" : row.enabled ? "enabled" : "disabled";
+  return row.shadow ? "shadow mode" : row.held ? "held" : row.failing ? "failing" : row.enabled ? "enabled" : "disabled";
 }
 
-/** How a monitor's counter grew, out of the samples. @param {any[]} samples @param {string} name @param {number} place */
+/** The growth of a monitor's counter over the samples. @param {any[]} samples @param {string} name @param {number} place */
 export function counters(samples, name, place) {
   const found = [];
   for (let index = 1; index < samples.length; index += 1) {

@@ -1,4 +1,4 @@
-/** Monitors: what each watches, what it did, whether it may act; one of them with its specification. */
+/** Monitors: topics, actions and state; a single monitor with its specification. */
 
 import { html, useState } from "../html.js";
 import { live } from "../live.js";
@@ -29,7 +29,7 @@ export function Monitors() {
   const reload = async () => {
     try {
       const { body: now } = await ask("POST", "/v1/monitors/reload", { match: monitors.etag });
-      done(`Revision ${now.revision} of the specifications is in force`, "They are those of the folder.");
+      done(`Revision ${now.revision} of the specifications is in force`, "They are the folder's.");
       await again();
     } catch (failure) {
       failed(failure);
@@ -38,18 +38,18 @@ export function Monitors() {
   return html`<div class="head"><h1>Monitors</h1><span class="head-sub">revision ${body.revision}, loaded <${Moment} at=${body.loaded} /> <${By} who=${body.who} />${body.note && html`: <${Given} value=${body.note} most=${80} />`}</span>
       <div class="head-actions"><${Button} role="admin" tone="primary" onClick=${() => setLoading(true)}><${Icon} name="up" size=${16} />Load a specification</${Button}></div></div>
     <div class="standing">
-      ${body.refused.length > 0 && html`<${Notice} tone="deny" title="The relay does not take the specifications: everything is blocked">${body.refused.map((/** @type {string} */ one) => html`<div key=${one}><${Given} value=${one} most=${400} /></div>`)}</${Notice}>`}
-      ${body.differs_from_folder && html`<${Notice} title="The specifications in force are not what the folder has"><div class="row"><span><${Given} value=${body.folder} mono most=${120} /></span><${Button} small role="operator" onClick=${reload}><${Icon} name="again" size=${14} />Take the folder's</${Button}></div></${Notice}>`}
+      ${body.refused.length > 0 && html`<${Notice} tone="deny" title="The relay rejected the specifications: all topics are blocked">${body.refused.map((/** @type {string} */ one) => html`<div key=${one}><${Given} value=${one} most=${400} /></div>`)}</${Notice}>`}
+      ${body.differs_from_folder && html`<${Notice} title="The specifications in force differ from the folder"><div class="row"><span><${Given} value=${body.folder} mono most=${120} /></span><${Button} small role="operator" onClick=${reload}><${Icon} name="again" size=${14} />Load the folder's</${Button}></div></${Notice}>`}
       ${body.warnings.length > 0 && html`<details class="notice warn"><summary>${counted(body.warnings.length, "warning")} about the specifications</summary><ul class="plain-list">${body.warnings.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${400} /></li>`)}</ul></details>`}</div>
     <section class="panel" aria-label="Monitors">${body.monitors.length === 0
-      ? html`<${Empty} icon="monitors" title="No monitor is loaded">Load a specification (.rv), or start the appliance with <code>--monitors FOLDER</code>. docs/monitors-tutorial.md begins with an example.</${Empty}>`
+      ? html`<${Empty} icon="monitors" title="No monitor is loaded">Load a specification (.rv), or start the appliance with <code>--monitors FOLDER</code>. See docs/monitors-tutorial.md for an example.</${Empty}>`
       : html`<${MonitorTable} monitors=${monitors} />`}</section>
     ${loading && html`<${LoadSpecification} etag=${monitors.etag} files=${body.monitors.map((/** @type {any} */ one) => one.file)} signed=${body.site_keys.length > 0} close=${() => setLoading(false)} loaded=${again} />`}`;
 }
 
 function MonitorTable(/** @type {{monitors: any}} */ { monitors }) {
   const samples = useStore(live, (one) => one.samples);
-  return html`<div class="table-wrap"><table class="table stacked monitors"><thead><tr><th>On</th><th>Monitor</th><th>State</th><th>Watches</th><th class="number">Events</th><th class="number">Verdicts</th><th class="number">Dropped</th><th class="number">Changed</th><th class="number">Faults</th><th>Acts, last hour</th></tr></thead>
+  return html`<div class="table-wrap"><table class="table stacked monitors"><thead><tr><th>On</th><th>Monitor</th><th>State</th><th>Watches</th><th class="number">Events</th><th class="number">Verdicts</th><th class="number">Dropped</th><th class="number">Changed</th><th class="number">Faults</th><th>Actions, last hour</th></tr></thead>
     <tbody>${monitors.body.monitors.map((/** @type {any} */ one) => html`<tr key=${one.name} data-monitor=${one.name}>
       <td data-label="On"><${MonitorSwitch} row=${one} monitors=${monitors} /></td>
       <td class="first"><${Link} to=${`/console/monitors/${encodeURIComponent(one.name)}`}><strong><${Given} value=${one.name} most=${60} /></strong></${Link}><div class="muted small"><${Given} value=${one.file} most=${60} /></div></td>
@@ -57,10 +57,10 @@ function MonitorTable(/** @type {{monitors: any}} */ { monitors }) {
       <td data-label="Watches"><div>${[...one.topics, ...one.services].slice(0, 3).map((/** @type {string} */ name) => html`<div key=${name}><${Given} value=${name} mono most=${60} /></div>`)}${one.topics.length + one.services.length > 3 && html`<div class="muted small">and ${one.topics.length + one.services.length - 3} more</div>`}</div></td>
       <td class="number" data-label="Events">${count(one.events)}</td><td class="number" data-label="Verdicts">${count(one.verdicts)}</td><td class="number" data-label="Dropped">${one.trial ? html`<span class="muted" title="would have dropped">(${count(one.would_drop)})</span>` : count(one.drops)}</td><td class="number" data-label="Changed">${one.trial ? html`<span class="muted" title="would have changed">(${count(one.would_change)})</span>` : count(one.changes)}</td>
       <td class="number" data-label="Faults">${one.faults ? html`<${Badge} word=${count(one.faults)} tone="deny" />` : "0"}</td>
-      <td data-label="Acts"><${Sparkline} label=${`Acts of ${one.name} over the last hour`} colour="c3" points=${summed(samples, one.name)} /></td></tr>`)}</tbody></table></div>`;
+      <td data-label="Actions"><${Sparkline} label=${`Actions of ${one.name} in the last hour`} colour="c3" points=${summed(samples, one.name)} /></td></tr>`)}</tbody></table></div>`;
 }
 
-/** Verdicts, drops and changes together. */
+/** The sum of verdicts, drops and changes. */
 function summed(/** @type {any[]} */ samples, /** @type {string} */ name) {
   const [first, ...rest] = [0, 1, 2].map((place) => counters(samples, name, place));
   return first.map((point, index) => ({ time: point.time, value: point.value === null ? null : rest.reduce((sum, one) => sum + (one[index].value ?? 0), point.value) }));
@@ -68,11 +68,11 @@ function summed(/** @type {any[]} */ samples, /** @type {string} */ name) {
 
 /** @param {{row: any, monitors: any}} given */
 export function MonitorSwitch({ row, monitors }) {
-  const on = row.enabled || row.trial;
+  const on = row.enabled || row.shadow;
   const change = async () => {
     try {
       await monitors.change(row.name, { enabled: !on });
-      done(`${row.name} is ${on ? "disabled" : "enabled"}`, on ? "Messages pass it untouched." : "Its events happen from now on.");
+      done(`${row.name} is ${on ? "disabled" : "enabled"}`, on ? "Messages pass unchanged." : "It handles events from now on.");
     } catch (failure) {
       failed(failure);
     }
@@ -81,18 +81,18 @@ export function MonitorSwitch({ row, monitors }) {
   return html`<${Switch} role="operator" on=${on} label=${`${row.name} enabled`} change=${change} />`;
 }
 
-/** From shadow mode into force, or (disabled) into shadow mode. @param {{row: any, monitors: any}} given */
+/** Promote from shadow mode, or (disabled) move into shadow mode. @param {{row: any, monitors: any}} given */
 export function Promote({ row, monitors }) {
   const change = async () => {
     try {
-      await monitors.change(row.name, { shadow: !row.trial });
-      done(row.trial ? `${row.name} is promoted` : `${row.name} is in shadow mode`, row.trial ? "What it does is done from now on." : "It changes and drops nothing; what it would have done is recorded.");
+      await monitors.change(row.name, { shadow: !row.shadow });
+      done(row.shadow ? `${row.name} is promoted` : `${row.name} is in shadow mode`, row.shadow ? "It acts from now on." : "It only records what it would have done.");
     } catch (failure) {
       failed(failure);
     }
     await monitors.again();
   };
-  return html`<${Button} small role="operator" onClick=${change}><${Icon} name=${row.trial ? "up" : "play"} size=${14} />${row.trial ? "Promote" : "Try"}</${Button}>`;
+  return html`<${Button} small role="operator" onClick=${change}><${Icon} name=${row.shadow ? "up" : "play"} size=${14} />${row.shadow ? "Promote" : "Try"}</${Button}>`;
 }
 
 /** @param {{row: any, monitors: any}} given */
@@ -100,7 +100,7 @@ export function Resume({ row, monitors }) {
   const change = async () => {
     try {
       await monitors.change(row.name, { held: false });
-      done(`${row.name} is resumed`, "The topics that it held go on.");
+      done(`${row.name} is resumed`, "Its topics are released.");
     } catch (failure) {
       failed(failure);
     }

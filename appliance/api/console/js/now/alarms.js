@@ -1,4 +1,4 @@
-/** What stands open, and the alarms of the last day that nobody has looked at on this machine. */
+/** Open conditions, and the last day's alarms that were not reviewed in this browser. */
 
 import { html, useState } from "../html.js";
 import { Moment } from "../moments.js";
@@ -10,6 +10,11 @@ import { Link } from "../router.js";
 const PLACES = { policy: "/console/policy", monitors: "/console/monitors", hosts: "/console/hosts", audit: "/console/audit", system: "/console/audit?severity=warning" };
 const SEEN = "rosrv.reviewed";
 const MOST = 8;
+
+/** The page about an alarm. @param {import("../live.js").Alarm} alarm */
+export function placeOf(alarm) {
+  return alarm.to ?? PLACES[/** @type {keyof typeof PLACES} */ (alarm.about)];
+}
 
 export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ { alarms, incidents }) {
   const [seen, setSeen] = useState(reviewed());
@@ -24,10 +29,10 @@ export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ {
     setSeen(last);
   };
   return html`<section class="panel" aria-labelledby="alarms"><div class="panel-head"><h2 id="alarms">Open alarms</h2>
-      ${open.length > 0 && html`<span class="end"><button class="button small" onClick=${review} title="Hides the alarms below on this machine; conditions stay until they are over">Mark as reviewed</button></span>`}</div>
-    ${incidents === null ? html`<${Loading} rows=${2} />` : !alarms.length && !open.length ? html`<${Empty} icon="check" title="Nothing is open">Alarms of monitors, processes and the audit log appear here.</${Empty}>`
+      ${open.length > 0 && html`<span class="end"><button class="button small" onClick=${review} title="Hide the alarms below in this browser; conditions stay until they end">Mark as reviewed</button></span>`}</div>
+    ${incidents === null ? html`<${Loading} rows=${2} />` : !alarms.length && !open.length ? html`<${Empty} icon="check" title="No open alarms">Alarms of monitors, processes and the audit log appear here.</${Empty}>`
       : html`<ul class="alarm-list">${alarms.map((one, /** @type {number} */ at) => html`<li key=${`${one.kind} ${at}`} class=${`alarm ${one.severity}`}><${Badge} word=${one.severity} />
-          <${Link} to=${PLACES[/** @type {keyof typeof PLACES} */ (one.about)]} class="alarm-text"><${Given} value=${one.text} most=${300} /></${Link}></li>`)}
+          <${Link} to=${placeOf(one)} class="alarm-text"><${Given} value=${one.text} most=${300} /></${Link}></li>`)}
         ${open.slice(0, MOST).map((one) => html`<li key=${one.id} class="alarm"><${Badge} word=${one.severity} />
           <${Link} to=${`/console/audit/${one.id}`} class="alarm-text"><${Given} value=${one.event} />: <${Given} value=${one.reason || one.resource} most=${160} /></${Link}><span class="muted small nowrap"><${Moment} at=${one.time} /></span></li>`)}
         ${open.length > MOST && html`<li class="alarm"><${Link} to="/console/audit?severity=alarm&since=1d">${open.length - MOST} more in the last day</${Link}></li>`}</ul>`}</section>`;

@@ -1,6 +1,7 @@
-/** The last refusals, and the last things that monitors did, as they happen. */
+/** The latest denials and actions of monitors, live. */
 
 import { html } from "../html.js";
+import { isSelftest } from "../graph/model.js";
 import { Moment } from "../moments.js";
 import { notable } from "../notable.js";
 import { counted } from "../numbers.js";
@@ -15,17 +16,17 @@ const SHOWN = 8;
 
 export function Refusals() {
   const denials = useStore(notable, (one) => one.denials);
-  return html`<section class="panel" aria-labelledby="refusals"><div class="panel-head"><h2 id="refusals">Refused lately</h2>
+  return html`<section class="panel" aria-labelledby="refusals"><div class="panel-head"><h2 id="refusals">Recently denied</h2>
       <span class="end"><${Link} to="/console/audit?decision=deny&since=1d" class="small">All in the audit log</${Link}></span></div>
-    ${denials === null ? html`<${Loading} />` : !denials.length ? html`<${Empty} icon="check" title="Nothing was refused in the last day">Who tries what the policy does not allow appears here at once.</${Empty}>`
+    ${denials === null ? html`<${Loading} />` : !denials.length ? html`<${Empty} icon="check" title="Nothing was denied in the last day">Requests that the policy denies appear here at once.</${Empty}>`
       : html`<${List} records=${denials} what=${denied} />`}</section>`;
 }
 
 export function Doings() {
   const doings = useStore(notable, (one) => one.doings);
-  return html`<section class="panel" aria-labelledby="doings"><div class="panel-head"><h2 id="doings">Done by monitors lately</h2>
+  return html`<section class="panel" aria-labelledby="doings"><div class="panel-head"><h2 id="doings">Recent actions of monitors</h2>
       <span class="end"><${Link} to="/console/audit?category=monitor&since=1d" class="small">All in the audit log</${Link}></span></div>
-    ${doings === null ? html`<${Loading} />` : !doings.length ? html`<${Empty} icon="monitors" title="No monitor had to act in the last day">Verdicts, dropped and changed messages appear here.</${Empty}>`
+    ${doings === null ? html`<${Loading} />` : !doings.length ? html`<${Empty} icon="monitors" title="No monitor acted in the last day">Verdicts, dropped and changed messages appear here.</${Empty}>`
       : html`<${List} records=${doings} what=${done} />`}</section>`;
 }
 
@@ -34,7 +35,7 @@ function List(/** @type {{records: any[], what: (record: any, more: any[]) => an
     <span class="event-time"><${Moment} at=${first.time} /></span>${what(first, more)}</li>`)}</ul>`;
 }
 
-/** Neighbours that differ in what was wanted alone, as one. */
+/** Merge neighbours that differ only in the resource. */
 function alike(/** @type {any[]} */ records) {
   /** @type {{first: any, more: any[]}[]} */
   const found = [];
@@ -52,7 +53,7 @@ function near(/** @type {any} */ a, /** @type {any} */ b) {
 
 function denied(/** @type {any} */ one, /** @type {any[]} */ more) {
   return html`<span class="event-badge"><${Badge} word=${one.decision} /></span><div class="event-body">
-    <div><${Given} value=${one.caller_id} most=${60} mono none="no name" /> <span class="muted">of</span> <${Given} value=${one.host} mono none="no address" /> <span class="muted"><${Given} value=${one.resource ? one.category : one.event} none="" /></span> <${Given} value=${one.resource} most=${80} mono none="" /><${More} more=${more} /></div>
+    <div><${Given} value=${one.caller_id} most=${60} mono none="no name" /> <span class="muted">of</span> <${Given} value=${one.host} mono none="no address" /> <span class="muted"><${Given} value=${isSelftest(one) ? "rosrv selftest" : one.resource ? one.category : one.event} none="" /></span> <${Given} value=${one.resource} most=${80} mono none="" /><${More} more=${more} /></div>
     <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Given} value=${one.reason || one.event} most=${220} /></${Link}></div></div>`;
 }
 

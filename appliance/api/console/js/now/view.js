@@ -1,4 +1,4 @@
-/** Now: is all well, what flows, what was refused, what is open. */
+/** Now: state, rates, denials and alarms. */
 
 import { html } from "../html.js";
 import { live } from "../live.js";
@@ -11,17 +11,20 @@ import { Loading } from "../parts/notice.js";
 import { Plot } from "../parts/plot.js";
 import { Link } from "../router.js";
 import { useStore } from "../store.js";
-import { Alarms } from "./alarms.js";
+import { Alarms, placeOf } from "./alarms.js";
+import { activity, droppedByMonitors } from "./activity.js";
 import { Doings, Refusals } from "./lists.js";
 
 const SPAN = 900;
 
 export function Now() {
   const status = useStore(live, (one) => one.status);
-  const alarms = useStore(live, (one) => one.alarms);
+  const conditions = useStore(live, (one) => one.alarms);
+  const samples = useStore(live, (one) => one.samples);
   const incidents = useStore(notable, (one) => one.incidents);
   const now = useNow(5000);
   if (!status) return html`<div class="head"><h1>Now</h1></div><section class="panel"><${Loading} /></section>`;
+  const alarms = [...conditions, ...activity(samples)];
   return html`<div class="head"><h1>Now</h1><span class="head-sub">running for ${lasting(now / 1000 - status.since)}</span></div>
     <${Health} status=${status} alarms=${alarms} />
     <div class="now-grid">
@@ -35,10 +38,12 @@ function Health(/** @type {{status: any, alarms: any[]}} */ { status, alarms }) 
   const grave = alarms.filter((one) => one.severity === "alarm").length;
   const warnings = alarms.filter((one) => one.severity === "warning").length;
   const state = grave ? ["deny", "Needs attention"] : warnings ? ["warn", "In service, with warnings"] : ["allow", "In service"];
+  const first = alarms.find((one) => one.severity !== "notice");
+  const isolation = status.isolation === "none" ? "isolation none: ports of nodes stay open" : `isolation ${status.isolation}`;
   const { policy, monitors, ipsec, audit } = status;
   return html`<section class="cards" aria-label="Health">
-    <${Card} name="Appliance" to="/console/now" tone=${state[0]} figure=${state[1]} words>${status.isolation === "none" ? "isolation none: ports of nodes stay open" : `isolation ${status.isolation}`}</${Card}>
-    <${Card} name="Policy" to="/console/policy" figure=${`Revision ${policy.revision}`} words tone=${policy.confirm_by ? "warn" : ""}>${policy.confirm_by ? "goes back unless confirmed" : html`<${By} who=${policy.who} most=${30} />${policy.differs_from_file ? ", not what the file says" : ""}`}</${Card}>
+    <${Card} name="Appliance" to=${first ? placeOf(first) : "/console/now"} tone=${state[0]} figure=${state[1]} words>${first ? html`<${Given} value=${first.text} most=${120} />` : isolation}</${Card}>
+    <${Card} name="Policy" to="/console/policy" figure=${`Revision ${policy.revision}`} words tone=${policy.confirm_by ? "warn" : ""}>${policy.confirm_by ? "rolls back unless confirmed" : html`<${By} who=${policy.who} most=${30} />${policy.differs_from_file ? ", differs from the file" : ""}`}</${Card}>
     <${Card} name="Nodes" to="/console/graph" figure=${count(status.nodes)}>${counted(status.topics, "topic")}, ${counted(status.services, "service")}${status.shadows ? `, ${status.shadows} lost` : ""}</${Card}>
     <${Card} name="Monitors enabled" to="/console/monitors" figure=${`${monitors.enabled} of ${monitors.loaded}`} tone=${monitors.held.length || monitors.failing.length ? "deny" : ""}>${monitors.held.length ? `${monitors.held.length} hold their topics` : monitors.failing.length ? `${monitors.failing.length} failing` : "none held, none failing"}</${Card}>
     <${Card} name="Tunnels up" to="/console/hosts" figure=${`${ipsec.up} of ${ipsec.enrolled}`}>${ipsec.enrolled ? "enrolled hosts" : "no host is enrolled"}</${Card}>
@@ -55,8 +60,8 @@ function Curves() {
   const series = (/** @type {string} */ name, /** @type {any} */ colour, /** @type {(one: any) => number} */ read) => ({ name, colour, points: growth(samples, read) });
   return html`<section class="panel" aria-labelledby="curves"><div class="panel-head"><h2 id="curves">Rates, last 15 minutes</h2></div>
     <div class="panel-body plots">
-      <div><h3>Decisions</h3><${Plot} label="Decisions" span=${SPAN} series=${[series("allowed", "c1", (one) => one.allowed), series("refused", "c2", (one) => one.denied)]} /></div>
-      <div><h3>Messages through the relay</h3><${Plot} label="Messages" span=${SPAN} series=${[series("relayed", "c3", (one) => one.messages), series("dropped", "c4", (one) => one.dropped)]} /></div>
+      <div><h3>Decisions</h3><${Plot} label="Decisions" span=${SPAN} series=${[series("allowed", "c1", (one) => one.allowed), series("denied", "c2", (one) => one.denied)]} /></div>
+      <div><h3>Messages through the relay</h3><${Plot} label="Messages" span=${SPAN} series=${[series("relayed", "c3", (one) => one.messages), series("dropped by monitors", "c2", droppedByMonitors), series("missed by slow subscribers", "c4", (one) => one.dropped)]} /></div>
     </div></section>`;
 }
 

@@ -1,4 +1,4 @@
-/** Words with a colour: decisions, severities, states. The word says it; the colour only helps to find it. */
+/** Coloured words for decisions, severities and states. */
 
 import { html } from "../html.js";
 import { Given } from "./given.js";
@@ -15,7 +15,7 @@ export function Badge({ word, tone, title }) {
   return html`<span class=${`badge ${colour}`} title=${title}><${Given} value=${word} most=${40} /></span>`;
 }
 
-/** What a record's outcome is, in one word: its decision, or how grave it is. */
+/** A record's outcome in one word: its decision or severity. */
 export function Outcome(/** @type {{record: Record<string, any>}} */ { record }) {
   return html`<${Badge} word=${record.decision ?? record.severity} />`;
 }

@@ -1,4 +1,4 @@
-/** Buttons that say when they cannot be used, and why: a role that is missing is named, not hidden. */
+/** Buttons that show why they are disabled, such as a missing role. */
 
 import { html, useState } from "../html.js";
 import { may, session } from "../session.js";

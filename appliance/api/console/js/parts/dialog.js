@@ -1,4 +1,4 @@
-/** A question that has to be answered first. Escape and the cross close it; the focus goes back to where it was. */
+/** A modal dialog. Escape and the close button close it; the focus returns to the former element. */
 
 import { html, useEffect, useId, useRef } from "../html.js";
 import { Icon } from "./icon.js";

@@ -1,14 +1,14 @@
-/** Two texts line by line: what was taken away, what was added, and a few lines around. */
+/** The differences between two texts, line by line with context. */
 
 import { html } from "../html.js";
 import { plain } from "../words.js";
 
 const AROUND = 3;
-const MOST = 4000; // lines of a text that are compared
+const MOST = 4000; // lines of a text to compare
 
 /** @typedef {{kind: "same" | "added" | "removed", text: string, old: number | null, now: number | null}} DiffLine */
 
-/** @param {{old: string, now: string, same: string}} given `same`: what is said when they do not differ */
+/** @param {{old: string, now: string, same: string}} given `same`: the text for equal texts */
 export function Difference({ old, now, same }) {
   const lines = difference(old, now);
   if (lines.every((one) => one.kind === "same")) return html`<p class="muted">${same}</p>`;
@@ -23,6 +23,13 @@ export function Difference({ old, now, same }) {
     }
   }
   return html`<div class="diff" tabindex="0" role="region" aria-label="Differences">${shown}</div>`;
+}
+
+/** The lines of a unified diff. @param {{lines: string[]}} given */
+export function UnifiedDiff({ lines }) {
+  const kinds = /** @type {Record<string, DiffLine["kind"]>} */ ({ "+": "added", "-": "removed", " ": "same" });
+  const shown = lines.filter((one) => one[0] in kinds && !/^(\+\+\+|---) /.test(one));
+  return html`<div class="diff" tabindex="0" role="region" aria-label="Differences">${shown.map((one, index) => html`<${Line} key=${index} line=${{ kind: kinds[one[0]], text: one.slice(1), old: null, now: null }} />`)}</div>`;
 }
 
 function Line(/** @type {{line: DiffLine}} */ { line }) {
@@ -47,7 +54,7 @@ export function difference(old, now) {
   ];
 }
 
-/** The longest common subsequence of what is left. */
+/** The difference by longest common subsequence. */
 function walked(/** @type {string[]} */ a, /** @type {string[]} */ b, /** @type {number} */ head) {
   const width = b.length + 1;
   const best = new Uint16Array((a.length + 1) * width);

@@ -1,8 +1,8 @@
 /**
- * A text with line numbers, colours and errors at their place (CodeMirror).
+ * An editor with line numbers, colours and errors in place (CodeMirror).
  *
  * It lives in a shadow root: there its style sheets are constructed objects, which the page's content security policy
- * allows, and not style elements, which it forbids. It is fetched when it is first needed.
+ * allows, unlike style elements. It is loaded on first use.
  */
 
 import { html, useEffect, useRef, useState } from "../html.js";
@@ -44,7 +44,7 @@ export function Editor({ label, value, change, language, findings = [], line = n
     const { told } = newest.current;
     if (view.state.doc.toString() === value) told.clear();
     else if (!told.has(value)) {
-      // Not what was written here and comes back a moment late while more is written: the text is another now.
+      // Ignore the echo of an older edit that arrives while the user types.
       view.dispatch({ changes: { from: 0, to: view.state.doc.length, insert: value } });
       told.clear();
     }
@@ -95,8 +95,8 @@ function tell(/** @type {any} */ reader, /** @type {string} */ text) {
 }
 
 /**
- * Text typed over a selection is put there by us: left to the browser it would first merge the lines in the page and
- * give them style attributes, which the policy forbids.
+ * Insert text over a selection here: the browser would merge the lines in the page first and
+ * add style attributes, which the policy forbids.
  */
 function typedOver(/** @type {InputEvent} */ event, /** @type {any} */ view) {
   if (event.inputType !== "insertText" || event.data === null || view.state.selection.main.empty || view.state.readOnly) return false;

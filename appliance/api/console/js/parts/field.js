@@ -1,4 +1,4 @@
-/** One thing to fill in, with its name above it and what is wrong or expected below. */
+/** A form field with its label above, and the hint or error below. */
 
 import { html, useId } from "../html.js";
 

@@ -1,4 +1,4 @@
-/** Texts that strangers chose, as text: never markup, never invisible, never reordering their surroundings. */
+/** Text from the network: never markup, never invisible, never reordering its surroundings. */
 
 import { html } from "../html.js";
 import { pieces, plain } from "../words.js";
@@ -16,12 +16,12 @@ export function Given({ value, most = 160, mono = false, none = "–" }) {
     ${shown.map((one) => (one.unseen ? html`<span class="unseen">${one.text}</span>` : name ? words(one.text) : one.text))}</bdi>`;
 }
 
-/** Who brought a revision: "by" a person or a program, or "from disk". @param {{who: string, most?: number}} given */
+/** The origin of a revision: "by" a user or program, or "from disk". @param {{who: string, most?: number}} given */
 export function By({ who, most = 40 }) {
   return who === "disk" ? "from disk" : html`by <${Given} value=${who} most=${most} />`;
 }
 
-/** A short name does not break, a longer one after its slashes and underscores; a word too long for a line where it must. */
+/** A short name does not break; a longer one breaks after slashes and underscores, or anywhere if it must. */
 function words(/** @type {string} */ text) {
   if (text.length <= SHORT) return text;
   return (text.match(/[/_]*[^/_]+[/_]*/g) ?? [text]).map((one, at) => [at > 0 && html`<wbr />`, one.length > WORD ? html`<span class="long">${one}</span>` : one]);

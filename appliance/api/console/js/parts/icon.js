@@ -1,4 +1,4 @@
-/** Small pictures, drawn in the colour of the text. */
+/** Icons in the colour of the text. */
 
 import { html } from "../html.js";
 
@@ -40,7 +40,7 @@ export function Icon({ name, size = 18 }) {
     stroke-linecap="round" stroke-linejoin="round" aria-hidden="true"><path d=${DRAWN[name]} /></svg>`;
 }
 
-/** The product's mark. */
+/** The product's logo. */
 export function Mark({ size = 30 }) {
   return html`<svg width=${size} height=${size} viewBox="0 0 32 32" aria-hidden="true">
     <rect width="32" height="32" rx="7" fill="#1d4f91" />

@@ -1,4 +1,4 @@
-/** What the words of a policy and of a specification are, for their colours. */
+/** Syntax highlighting of policies and specifications. */
 
 const PLAIN_KEY = /^(default|read|write|range|topic|service|takeover|audit-only|tell)\b/;
 

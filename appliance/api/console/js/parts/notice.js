@@ -1,4 +1,4 @@
-/** Something to be read: what went wrong and what to do, what is missing, what was done. */
+/** Messages: errors, hints, empty states, results. */
 
 import { html } from "../html.js";
 import { headline, Problem } from "../problem.js";
@@ -15,7 +15,7 @@ export function Notice({ tone = "note", title, children, role }) {
   </div>`;
 }
 
-/** A failed request, as the appliance explained it. @param {{error: unknown, retry?: () => void}} given */
+/** The error of a failed request. @param {{error: unknown, retry?: () => void}} given */
 export function Failure({ error, retry }) {
   if (!error) return null;
   const text = error instanceof Error ? error.message : String(error);
@@ -27,18 +27,18 @@ export function Failure({ error, retry }) {
   </${Notice}>`;
 }
 
-/** What stands where nothing is yet: what it would be, and what to do. @param {{icon: any, title: string, children?: any}} given */
+/** An empty state: what would be here, and what to do. @param {{icon: any, title: string, children?: any}} given */
 export function Empty({ icon, title, children }) {
   return html`<div class="empty"><${Icon} name=${icon} size=${26} /><strong>${title}</strong>${children && html`<p>${children}</p>`}</div>`;
 }
 
-/** Stands for rows that are being fetched, in their size. @param {{rows?: number}} given */
+/** Placeholders of the size of the rows being loaded. @param {{rows?: number}} given */
 export function Loading({ rows = 5 }) {
   return html`<div class="panel-body stack" role="status"><span class="sr-only">Loading</span>
     ${Array.from({ length: rows }, (_, index) => html`<div key=${index} class="skeleton"></div>`)}</div>`;
 }
 
-/** Errors and warnings of a text, each at its place; `pick(finding)` goes there. */
+/** Errors and warnings of a text; `pick(finding)` moves to its place. */
 export function Findings(/** @type {{findings: import("../problem.js").Finding[], pick?: (one: any) => void}} */ { findings, pick }) {
   return html`<ul class="findings">${findings.map((one) => {
     const inside = html`<span class="place">${one.line}:${one.column}</span><span><${Given} value=${one.text} most=${600} /></span>`;

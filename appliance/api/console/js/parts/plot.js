@@ -1,4 +1,4 @@
-/** Curves over time, as a drawing with its axes; what is under the pointer is said in the legend. */
+/** A chart of curves over time; the legend shows the values under the pointer. */
 
 import { html, useEffect, useRef, useState } from "../html.js";
 import { minute } from "../moments.js";
@@ -45,7 +45,7 @@ export function Plot({ label, series, span = 900, height = 148, unit = "/s", say
     </div></div>`;
 }
 
-/** A curve of its own size, without axes. @param {{points: {time: number, value: number | null}[], colour: string, label: string}} given */
+/** A small curve without axes. @param {{points: {time: number, value: number | null}[], colour: string, label: string}} given */
 export function Sparkline({ points, colour, label }) {
   const width = 96;
   const height = 22;

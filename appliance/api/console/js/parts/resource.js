@@ -1,11 +1,11 @@
-/** Something fetched: what it is, whether it is being fetched, what went wrong, and how to fetch it again. */
+/** A fetched resource: its value, whether it is loading, its error, and a function to fetch it again. */
 
 import { useCallback, useEffect, useRef, useState } from "../html.js";
 
 /**
  * @template T
  * @param {(signal: AbortSignal) => Promise<T>} fetching
- * @param {any[]} inputs fetched anew when one of them changes
+ * @param {any[]} inputs fetched again when one of them changes
  * @returns {{value: T | null, error: unknown, loading: boolean, again: () => void, set: (value: T) => void}}
  */
 export function useResource(fetching, inputs) {

@@ -1,4 +1,4 @@
-/** A rule of the policy, by its section and key, with the way to its line. */
+/** A rule of the policy by section and key, with a link to its line. */
 
 import { html } from "../html.js";
 import { Link } from "../router.js";

@@ -1,4 +1,4 @@
-/** Tabs, with the arrow keys as everywhere. */
+/** Tabs, also moved through with the arrow keys. */
 
 import { html, useId, useRef } from "../html.js";
 

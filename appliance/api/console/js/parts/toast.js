@@ -1,4 +1,4 @@
-/** What was just done, said in a corner for a few seconds; failures stay until they are read. */
+/** Notifications in a corner for a few seconds; errors stay until dismissed. */
 
 import { html } from "../html.js";
 import { headline } from "../problem.js";

@@ -1,4 +1,4 @@
-/** What is wrong with the text, what its tests say, and what it would change. */
+/** Errors of the text, failed tests, and the changes it would make. */
 
 import { html } from "../html.js";
 import { counted } from "../numbers.js";
@@ -15,23 +15,23 @@ export function Check({ pick }) {
   const ours = findings.filter((one) => one.file === "policy" || !one.file.includes(".tests."));
   const ofTests = findings.filter((one) => !ours.includes(one));
   if (!error && !report && !findings.length) {
-    return html`<${Empty} icon="policy" title=${text === base ? "This is the policy in force" : "No error in this text"}>${text === base ? "Change the text; errors appear at their place while you write." : "A dry run shows what is live now and would end, or be decided differently."}</${Empty}>`;
+    return html`<${Empty} icon="policy" title=${text === base ? "This is the policy in force" : "No errors in this text"}>${text === base ? "Change the text; errors appear in place while you write." : "A dry run shows live connections that would end and requests that would be decided differently."}</${Empty}>`;
   }
   return html`<div class="panel-body stack">
     ${error && !errors.length ? html`<${Failure} error=${error} />` : null}
-    ${errors.length > 0 && html`<${Notice} tone="deny" role="alert" title=${`Refused: ${counted(errors.length, "error")}`}>Nothing was changed. Choose an error to go to its place.</${Notice}>`}
+    ${errors.length > 0 && html`<${Notice} tone="deny" role="alert" title=${`Rejected: ${counted(errors.length, "error")}`}>Nothing was changed. Select an error to move to its place.</${Notice}>`}
     ${ours.length > 0 && html`<${Findings} findings=${ours} pick=${pick} />`}
     ${ofTests.length > 0 && html`<div><h3>Tests that fail</h3><${Findings} findings=${ofTests} /></div>`}
     ${report && html`<${Report} report=${report} />`}</div>`;
 }
 
-/** What a text would do, or did. @param {{report: any}} given */
+/** The effect of a text. @param {{report: any}} given */
 export function Report({ report }) {
   const ends = report.ends.length;
   const what = counted(ends, "live connection");
   const title = report.loaded ? `Revision ${report.revision} is in force${ends ? `, and ended ${what}` : ""}` : ends ? `It can be loaded, and would end ${what}` : "It can be loaded";
-  const taken = report.revoked === null ? "" : ` ${counted(report.revoked, "registration or connection", "registrations and connections")} taken back.`;
-  return html`<${Notice} tone=${ends ? "warn" : "allow"} role="status" title=${title}>${report.changes.length ? `${counted(report.changes.length, "live request")} ${report.loaded ? "are" : "would be"} decided differently.` : "Nothing that is live now is decided differently."}${taken}
+  const taken = report.revoked === null ? "" : ` ${counted(report.revoked, "registration or connection", "registrations and connections")} revoked.`;
+  return html`<${Notice} tone=${ends ? "warn" : "allow"} role="status" title=${title}>${report.changes.length ? `${counted(report.changes.length, "live request")} ${report.loaded ? "are" : "would be"} decided differently.` : "No live request is decided differently."}${taken}
       ${ends > 0 && html`<ul class="plain-list">${report.ends.slice(0, 50).map((/** @type {any} */ one, /** @type {number} */ index) => html`<li key=${index}>${one.what} <${Given} value=${one.resource} mono /> of <${Given} value=${one.caller_id || "a client"} mono /> on <${Given} value=${one.host} mono /></li>`)}${ends > 50 && html`<li>and ${ends - 50} more</li>`}</ul>`}</${Notice}>
     ${report.changes.length > 0 && html`<div class="table-wrap"><table class="table"><thead><tr><th>Now</th><th>Then</th><th>Node</th><th>Wants</th></tr></thead><tbody>
       ${report.changes.slice(0, 200).map((/** @type {any} */ one, /** @type {number} */ index) => html`<tr key=${index}><td><${Badge} word=${one.now} /></td><td><${Badge} word=${one.then} /></td><td><${Given} value=${one.caller_id} mono /><div class="muted small"><${Given} value=${one.host} mono /></div></td>

@@ -1,4 +1,4 @@
-/** The policy in force and the text that is being written; it is not lost by looking at another view. */
+/** The policy in force and the edited text, which is kept while another view is shown. */
 
 import { ask, get } from "../rest.js";
 import { session } from "../session.js";

@@ -1,4 +1,4 @@
-/** Why a request is decided as it is: under the policy in force, or under the text in the editor. */
+/** Explain a decision, under the policy in force or the text in the editor. */
 
 import { CATEGORIES, isDecided } from "../categories.js";
 import { html, useEffect, useState } from "../html.js";
@@ -39,19 +39,19 @@ export function Explain({ query, pick }) {
         <${Field} label="Node" mono value=${question.node} set=${set("node")} placeholder="/joystick" hint="the name it gives" /></div>
       <div class="form-grid"><${Field} label="Wants to" value=${question.category} set=${set("category")} options=${CATEGORIES} />
         <${Field} label="What" mono value=${question.resource} set=${set("resource")} placeholder="/cmd_vel" required /></div>
-      <div class="row"><button class="button primary" type="submit">Explain</button><${Check} label="Under the text in the editor" on=${underDraft} set=${setUnderDraft} /></div></form>
+      <div class="row"><button class="button primary" type="submit">Explain</button><${Check} label="Use the text in the editor" on=${underDraft} set=${setUnderDraft} /></div></form>
     ${answer?.error ? html`<${Failure} error=${answer.error} />` : null}
     ${answer?.value && html`<${Explained} found=${answer.value} pick=${pick} />`}</div>`;
 }
 
 function Explained(/** @type {{found: any, pick: (place: any) => void}} */ { found, pick }) {
   return html`<div class="stack" role="status" data-explained>
-    <div class="stack-tight"><div class="row"><${Badge} word=${found.decision} /><strong>${found.allowed ? "The request is allowed" : "The request is refused"}</strong></div><p><${Given} value=${found.reason} most=${600} /></p></div>
-    <dl class="facts"><dt>Rule</dt><dd>${found.rule ? html`<${Place} rule=${found.rule} pick=${pick} />` : html`<span class="muted">no rule speaks of it</span>`}</dd>
-      ${found.through.length > 0 && html`<dt>By the words</dt><dd><${Given} value=${found.through.join(" → ")} mono /></dd>`}
+    <div class="stack-tight"><div class="row"><${Badge} word=${found.decision} /><strong>${found.allowed ? "The request is allowed" : "The request is denied"}</strong></div><p><${Given} value=${found.reason} most=${600} /></p></div>
+    <dl class="facts"><dt>Rule</dt><dd>${found.rule ? html`<${Place} rule=${found.rule} pick=${pick} />` : html`<span class="muted">no rule applies</span>`}</dd>
+      ${found.through.length > 0 && html`<dt>Matched text</dt><dd><${Given} value=${found.through.join(" → ")} mono /></dd>`}
       ${found.limit && html`<dt>Limit</dt><dd><${Given} value=${found.limit} most=${300} /></dd>`}</dl>
-    ${found.lost.length > 0 && html`<div><h3>Rules that lost</h3><ul class="stack-tight">${found.lost.map((/** @type {any} */ one, /** @type {number} */ index) => html`<li key=${index} class="row"><${Badge} word=${one.would} /><${Place} rule=${one.rule} pick=${pick} /><span class="muted"><${Given} value=${one.why} most=${300} /></span></li>`)}</ul></div>`}
-    ${found.command && html`<div class="nested"><h3>The call with which it is done</h3><${Explained} found=${found.command} pick=${pick} /></div>`}
+    ${found.lost.length > 0 && html`<div><h3>Overridden rules</h3><ul class="stack-tight">${found.lost.map((/** @type {any} */ one, /** @type {number} */ index) => html`<li key=${index} class="row"><${Badge} word=${one.would} /><${Place} rule=${one.rule} pick=${pick} /><span class="muted"><${Given} value=${one.why} most=${300} /></span></li>`)}</ul></div>`}
+    ${found.command && html`<div class="nested"><h3>The call that it uses</h3><${Explained} found=${found.command} pick=${pick} /></div>`}
     ${found.node && html`<div class="nested"><h3>The node's name</h3><${Explained} found=${found.node} pick=${pick} /></div>`}</div>`;
 }
 

@@ -1,4 +1,4 @@
-/** Bringing the text into force: why, and whether it goes back by itself. */
+/** Load the text, permanently or with commit-confirm. */
 
 import { html, useEffect, useState } from "../html.js";
 import { Button } from "../parts/button.js";
@@ -12,13 +12,20 @@ import { useStore } from "../store.js";
 import { Report } from "./check.js";
 import { draft, dryRun, load, look } from "./draft.js";
 
-const WITHIN = /** @type {[string, string][]} */ ([["", "Stays until it is changed"], ["60", "Goes back in 1 minute unless confirmed"], ["300", "Goes back in 5 minutes unless confirmed"], ["900", "Goes back in 15 minutes unless confirmed"]]);
+const MINUTES = "300"; // preselected where connections would end
+const WITHIN = /** @type {[string, string][]} */ ([["", "Permanent"], ["60", "Roll back in 1 minute unless confirmed"], ["300", "Roll back in 5 minutes unless confirmed"], ["900", "Roll back in 15 minutes unless confirmed"]]);
+
+/** A policy that would end live connections rolls back unless it is confirmed. @param {any} report of a dry run */
+function preselected(report) {
+  return report?.ends.length ? MINUTES : "";
+}
 
 /** @param {{close: () => void}} given */
 export function LoadDialog({ close }) {
   const { live, text, signature, etag, report } = useStore(draft);
   const [note, setNote] = useState("");
-  const [within, setWithin] = useState("");
+  const [chosen, setWithin] = useState(/** @type {string | null} */ (null));
+  const within = chosen ?? preselected(report);
   const [error, setError] = useState(/** @type {any} */ (null));
   useEffect(() => {
     if (!report) dryRun().then(() => setError(null), setError);
@@ -26,8 +33,10 @@ export function LoadDialog({ close }) {
   const go = async () => {
     setError(null);
     try {
-      const body = await load(note, within ? Number(within) : null);
-      done(`Revision ${body.revision} is in force`, body.confirm_by ? "Confirm it before it goes back." : `${body.revoked} registrations and connections were taken back.`);
+      if (!report) await dryRun();
+      const seconds = chosen ?? preselected(draft.get().report);
+      const body = await load(note, seconds ? Number(seconds) : null);
+      done(`Revision ${body.revision} is in force`, body.confirm_by ? "Confirm it before it rolls back." : `${body.revoked} registrations and connections were revoked.`);
       close();
     } catch (failure) {
       setError(failure);
@@ -38,10 +47,10 @@ export function LoadDialog({ close }) {
   const foot = html`<button class="button" onClick=${close}>Not yet</button><${Button} tone="primary" role="admin" onClick=${go}>Load the policy</${Button}>`;
   return html`<${Dialog} wide title="Load this policy?" close=${close} foot=${foot}>
     <${Failure} error=${error} />
-    ${error?.status === 412 && html`<p>Close this, and look at what is different from revision ${live.revision} under Diff; then load again.</p>`}
-    <div class="form-grid"><${Field} label="Comment" value=${note} set=${setNote} placeholder="Why, or a ticket" maxlength="200" hint="kept with the revision" /><${Field} label="If you lock yourself out" value=${within} set=${setWithin} options=${WITHIN} /></div>
+    ${error?.status === 412 && html`<p>Close this dialog and compare with revision ${live.revision} under Diff, then load again.</p>`}
+    <div class="form-grid"><${Field} label="Comment" value=${note} set=${setNote} placeholder="Reason or ticket number" maxlength="200" hint="kept with the revision" /><${Field} label="Commit-confirm" value=${within} set=${setWithin} options=${WITHIN} /></div>
     <${Signature} asked=${live.site_keys.length > 0} value=${signature} set=${(/** @type {string} */ next) => draft.update({ signature: next, report: null })} />
     ${report && !report.loaded && html`<${Report} report=${report} />`}
-    <div><h3>Changes to revision ${live.revision}${etag === `"${live.revision}"` ? "" : `, which is newer than what this text was begun from (${etag})`}</h3>
-      <${Difference} old=${live.text} now=${text} same="The text is that of the policy in force." /></div></${Dialog}>`;
+    <div><h3>Changes to revision ${live.revision}${etag === `"${live.revision}"` ? "" : `, which is newer than the base of this text (${etag})`}</h3>
+      <${Difference} old=${live.text} now=${text} same="The text is the policy in force." /></div></${Dialog}>`;
 }

@@ -1,4 +1,4 @@
-/** The policies that were in force: who, when, why; compared with the present one; the way back. */
+/** Earlier revisions of the policy, their differences, and rollback. */
 
 import { html, useState } from "../html.js";
 import { Moment } from "../moments.js";
@@ -34,7 +34,7 @@ function RevisionDialog(/** @type {{revision: number, back: boolean, close: () =
   const go = async () => {
     try {
       const body = await change("rollback", { revision });
-      done(`Revision ${body.revision} is in force`, `It has the text of revision ${revision}; ${body.revoked} registrations and connections were taken back.`);
+      done(`Revision ${body.revision} is in force`, `It has the text of revision ${revision}; ${body.revoked} registrations and connections were revoked.`);
       close();
     } catch (failure) {
       failed(failure);
@@ -42,7 +42,7 @@ function RevisionDialog(/** @type {{revision: number, back: boolean, close: () =
   };
   const foot = back ? html`<button class="button" onClick=${close}>Leave it</button><${Button} tone="primary" role="operator" disabled=${!value} onClick=${go}>Roll back to revision ${revision}</${Button}>` : undefined;
   return html`<${Dialog} wide title=${back ? `Roll back to revision ${revision}?` : `Revision ${revision} beside revision ${live.revision}`} close=${close} foot=${foot}>
-    ${error ? html`<${Failure} error=${error} />` : !value ? html`<${Loading} rows=${4} />` : html`<p class="muted">${back ? "What changes in the text of the policy in force:" : "Removed lines are those of the older revision."}</p>
+    ${error ? html`<${Failure} error=${error} />` : !value ? html`<${Loading} rows=${4} />` : html`<p class="muted">${back ? "Changes to the policy in force:" : "Removed lines are from the older revision."}</p>
       <${Difference} old=${back ? live.text : value.text} now=${back ? value.text : live.text} same="The texts are the same." />`}</${Dialog}>`;
 }
 

@@ -1,4 +1,4 @@
-/** Policy: write it, see errors where they are, ask it, test it, compare it, load it, go back. */
+/** Policy: edit, check, explain, test, compare, load and roll back. */
 
 import { html, useEffect, useState } from "../html.js";
 import { live as appliance } from "../live.js";
@@ -69,7 +69,7 @@ export function PolicyView() {
       </section>
       <section class="panel" aria-label="About the policy"><${Tabs} label="About the policy" tabs=${TABS} chosen=${tab} choose=${setTab}>
         ${tab === "check" && html`<${Check} pick=${pick} />`}
-        ${tab === "diff" && html`<div class="panel-body"><${Difference} old=${live.text} now=${text} same="The text is that of the policy in force." /></div>`}
+        ${tab === "diff" && html`<div class="panel-body"><${Difference} old=${live.text} now=${text} same="The text is the policy in force." /></div>`}
         ${tab === "explain" && html`<${Explain} key=${query.toString()} query=${query} pick=${pick} />`}
         ${tab === "tests" && html`<${Tests} />`}${tab === "revisions" && html`<${Revisions} />`}</${Tabs}></section></div>
     ${loading && html`<${LoadDialog} close=${() => setLoading(false)} />`}
@@ -92,8 +92,8 @@ function Standing(/** @type {{live: any, stale: boolean, showDiff: () => void}} 
     }
   };
   return html`<div class="standing">
-    ${live.confirm_by && html`<${Notice} tone="warn" title=${`Revision ${live.revision} goes back in ${lasting(live.confirm_by - now / 1000)} unless it is confirmed`}>
-      <div class="row"><${Button} small role="operator" tone="primary" onClick=${act("confirm", undefined, "The policy stays")}>Keep it</${Button}><${Button} small role="operator" onClick=${act("rollback", {}, "The policy before is back")}>Go back now</${Button}></div></${Notice}>`}
+    ${live.confirm_by && html`<${Notice} tone="warn" title=${`Revision ${live.revision} rolls back in ${lasting(live.confirm_by - now / 1000)} unless confirmed`}>
+      <div class="row"><${Button} small role="operator" tone="primary" onClick=${act("confirm", undefined, "The policy is kept")}>Keep it</${Button}><${Button} small role="operator" onClick=${act("rollback", {}, "The policy before is back")}>Roll back now</${Button}></div></${Notice}>`}
     ${live.differs_from_file && html`<${Notice} title="The policy in force is not what the file says"><div class="row"><span><${Given} value=${live.policy_file} mono most=${120} /> stays as it is until it is read again.</span><${Button} small role="operator" onClick=${act("reload", undefined, "The file was read again")}><${Icon} name="again" size=${14} />Reload from the file</${Button}></div></${Notice}>`}
     ${live.warnings.length > 0 && html`<details class="notice warn"><summary>${live.warnings.length} ${live.warnings.length === 1 ? "warning" : "warnings"} about the policy in force</summary><ul class="plain-list">${live.warnings.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${400} /></li>`)}</ul></details>`}
     ${stale && html`<${Notice} tone="warn" title=${`Revision ${live.revision} came into force while you wrote`}><div class="row"><span>Look at the difference; then keep your text and load it over that revision, or discard it.</span><button class="button small" onClick=${() => (rebase(), showDiff())}>Keep my text, show the difference</button></div></${Notice}>`}</div>`;

@@ -1,4 +1,4 @@
-/** The time line: what happened above, a lane for each topic below, one axis for all, and the moment that is chosen. */
+/** The time line: events above, a lane for each topic below, on one axis, with the selected time. */
 
 import { html, useState } from "../html.js";
 import { clock } from "../moments.js";

@@ -1,4 +1,4 @@
-/** What was said around a moment, decoded: for investigators, and each reading is recorded. */
+/** Decoded messages around a point in time, for investigators. The audit log records each request. */
 
 import { html, useEffect, useState } from "../html.js";
 import { clock } from "../moments.js";

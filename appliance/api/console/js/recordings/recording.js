@@ -1,4 +1,4 @@
-/** One recording: why it was made, its time line, and what was said and happened at the moment that is chosen on it. */
+/** One recording: its triggers, its time line, and the messages and events at the selected time. */
 
 import { html, useEffect, useRef, useState } from "../html.js";
 import { clock, lasting, Moment } from "../moments.js";

@@ -1,4 +1,4 @@
-/** What can be had of a recording, each by the role that may: its messages, a bundle that proves itself, its end. */
+/** Actions on a recording: download its messages, export evidence, remove it. */
 
 import { html, useEffect, useState } from "../html.js";
 import { take } from "../audit/proof.js";
@@ -18,9 +18,9 @@ export function Taking({ row, small = false }) {
   const icon = !small && html`<${Icon} name="down" size=${16} />`;
   const reads = may("investigator");
   const evidence = reads ? `${path}/evidence` : `/v1/evidence${queryText({ since: iso(row.began), until: iso(row.ended) })}`;
-  return html`<${Button} small=${small} role="investigator" title="For rosbag, rqt_bag, PlotJuggler; it is recorded who takes it" onClick=${() => take(`${path}/bag`, `rosrv-${row.id}.bag`)}>${icon}Bag</${Button}>
-    <${Button} small=${small} role="investigator" title="For Foxglove; it is recorded who takes it" onClick=${() => take(`${path}/bag?format=mcap`, `rosrv-${row.id}.mcap`)}>${icon}MCAP</${Button}>
-    <${Button} small=${small} role=${reads ? "investigator" : "operator"} title=${`All of its time, and what was in force, as a bundle that proves itself${reads ? "" : "; without the messages, which are for investigators"}`} onClick=${() => take(evidence, `rosrv-evidence-${row.id}.zip`)}>${icon}Evidence</${Button}>`;
+  return html`<${Button} small=${small} role="investigator" title="For rosbag, rqt_bag, PlotJuggler; the audit log records the download" onClick=${() => take(`${path}/bag`, `rosrv-${row.id}.bag`)}>${icon}Bag</${Button}>
+    <${Button} small=${small} role="investigator" title="For Foxglove; the audit log records the download" onClick=${() => take(`${path}/bag?format=mcap`, `rosrv-${row.id}.mcap`)}>${icon}MCAP</${Button}>
+    <${Button} small=${small} role=${reads ? "investigator" : "operator"} title=${`Everything in its period, with the policy and specifications in force, as a signed bundle${reads ? "" : "; without the messages, which are for investigators"}`} onClick=${() => take(evidence, `rosrv-evidence-${row.id}.zip`)}>${icon}Evidence</${Button}>`;
 }
 
 /** @param {{row: any, small?: boolean, gone: () => void}} given `gone`: what follows when it is removed */
@@ -29,7 +29,7 @@ export function Remove({ row, small = false, gone }) {
   const remove = async () => {
     try {
       await ask("DELETE", `/v1/recordings/${encodeURIComponent(row.id)}`, { match: "*" });
-      done("The recording is removed", "It is recorded who removed it.");
+      done("The recording is removed", "The audit log records it.");
       setAsking(false);
       gone();
     } catch (failure) {
@@ -39,10 +39,10 @@ export function Remove({ row, small = false, gone }) {
   };
   return html`<${Button} small=${small} role="admin" tone="danger" onClick=${() => setAsking(true)}>Remove</${Button}>
     ${asking && html`<${Dialog} title="Remove this recording?" close=${() => setAsking(false)} foot=${html`<button class="button" onClick=${() => setAsking(false)}>Keep it</button><${Button} role="admin" tone="danger" onClick=${remove}>Remove</${Button}>`}>
-      <p>Its messages are gone then. The audit log keeps its hash, and what happened.</p></${Dialog}>`}`;
+      <p>Its messages are deleted. The audit log keeps its hash and the events.</p></${Dialog}>`}`;
 }
 
-/** Where a record of the audit log stands on the time line of a recording, if there is one of its time. @param {{record: any}} given */
+/** A link from an audit record to its place on a recording's time line, if there is one. @param {{record: any}} given */
 export function OnTimeline({ record }) {
   const [found, setFound] = useState(/** @type {any} */ (null));
   const closed = record.event === "recording closed" ? String(record.detail.recording) : "";

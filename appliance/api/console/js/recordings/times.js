@@ -6,10 +6,10 @@ export function iso(time) {
   return new Date(Math.floor(time / 1e6)).toISOString().replace("Z", `${micro}Z`);
 }
 
-/** What a trigger or event is called, and its colour. */
+/** The name and colour of a trigger or event. */
 export const KINDS = {
   alarm: { name: "Alarms", tone: "deny" },
-  denial: { name: "Refused", tone: "deny" },
+  denial: { name: "Denied", tone: "deny" },
   drop: { name: "Dropped", tone: "warn" },
   change: { name: "Changed", tone: "note" },
   verdict: { name: "Verdicts", tone: "note" },
