@@ -1,12 +1,12 @@
-"""Who is asking: recognises bearer tokens.
+"""Authenticate bearer tokens.
 
 Invariants:
 
-1. Without a token that control stated, is not expired and not revoked, nobody is anybody.
-2. The costly check (scrypt) runs for one request at a time and in a thread, and a peer that keeps bringing wrong
-   tokens is made to wait before it runs again: guessing cannot keep the process busy.
-3. A token that was recognised is remembered under a key that is made anew with each process, never in the clear; a
-   change of the tokens forgets all.
+1. Only a token from control's list that has not expired identifies its owner.
+2. The costly check (scrypt) runs in a thread, for one request at a time. A peer that keeps sending wrong tokens must
+   wait between checks, so guessing cannot keep the process busy.
+3. A token that passed is remembered as a hash under a random key of this process, never in clear text. A change of the
+   tokens clears this memory.
 """
 
 import asyncio
@@ -22,9 +22,9 @@ from typing import cast
 from appliance.api.problems import ProblemError, too_many
 from appliance.api.rates import Buckets, peer_key
 from appliance.channel.answers.token_answers import TokenRole
-from appliance.channel.messages.api import Asked, TokenKept
+from appliance.channel.messages.api import ClientRequest, TokenKept
 from appliance.configuration.settings import is_loopback
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from appliance.signing.request_signing import reading_hash, reading_id
 from appliance.store.access_tokens import is_secret, parse_token
 
@@ -36,8 +36,8 @@ _MOST_KNOWN = 1024
 class Bearer:
     """The holder of a token; `expires` is seconds since the epoch.
 
-    `shown` is what came with the request, the token or its reading key; `asked` the request itself, if it is no look,
-    and `gone` ends when its client disconnects.
+    `shown` is the token, or its reading key, as sent with the request. `asked` is the request, unless it is a GET.
+    `gone` is set when the client disconnects.
     """
 
     id: str
@@ -45,40 +45,40 @@ class Bearer:
     role: TokenRole
     expires: float
     shown: str
-    asked: Asked | None = None
+    asked: ClientRequest | None = None
     gone: "asyncio.Future[None] | None" = field(default=None, compare=False)
 
 
-class Doorkeeper:
-    """Recognises tokens; `failures_per_minute` wrong ones of one peer are looked at."""
+class TokenAuthenticator:
+    """The check of tokens; at most `failures_per_minute` wrong ones of a peer are checked."""
 
     def __init__(self, failures_per_minute: int) -> None:
         self._tokens: dict[str, TokenKept] = {}
         self._recognised: dict[bytes, str] = {}
         self._key = secrets.token_bytes(32)
-        # Apart, so that somebody who tries ids at random does not lock out a neighbour with a good token.
+        # Separate, so that a peer that tries random ids does not lock out a neighbour with a valid token.
         self._unknown = Buckets(failures_per_minute / 60, failures_per_minute)
         self._wrong = Buckets(failures_per_minute / 60, failures_per_minute)
         self._checking = asyncio.Lock()
-        self._shown: OrderedDict[str, float] = OrderedDict()  # which peers showed a good token, and when
+        self._shown: OrderedDict[str, float] = OrderedDict()  # peers that showed a valid token, and when
 
-    def standing(self, peer: str) -> Standing:
-        """A peer that showed a good token lately is known, and so is this machine; every other is a stranger."""
+    def quota_class(self, peer: str) -> QuotaClass:
+        """Return a peer's quota class: registered if it is this machine or lately sent a valid token, else unknown."""
         shown = self._shown.get(peer)
         lately = shown is not None and time.monotonic() - shown < _KNOWN_SECONDS
-        return Standing.REGISTERED if lately or is_loopback(peer) else Standing.STRANGER
+        return QuotaClass.REGISTERED if lately or is_loopback(peer) else QuotaClass.UNKNOWN
 
     def state(self, tokens: Iterable[TokenKept]) -> None:
-        """Only these may be used from now on."""
+        """Accept only these tokens from now on."""
         self._tokens = {token.id: token for token in tokens}
         self._recognised.clear()
 
     def still_good(self, bearer: Bearer) -> bool:
-        """Whether a token that was recognised before may still be used."""
+        """Whether a token that passed before may still be used."""
         return bearer.id in self._tokens and time.time() < bearer.expires
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
-        """The holder of the token, or reading key, in an `Authorization` header. Raises `ProblemError` (401, 429)."""
+        """Return the holder of an `Authorization` header. Raises `ProblemError` (401, 429)."""
         if authorization is None:
             raise self._refusal("no token: send it as `Authorization: Bearer TOKEN`")
         scheme, _space, text = authorization.partition(" ")
@@ -97,7 +97,7 @@ class Doorkeeper:
         failures = self._unknown if kept is None else self._wrong
         _require_patience(failures, host)
         failures.take(host, time.monotonic())
-        raise self._refusal("the token is wrong, or was revoked")
+        raise self._refusal("the token is wrong or revoked")
 
     async def _matches(self, text: str, secret: str, kept: TokenKept, host: str) -> bool:
         digest = hmac.digest(self._key, text.encode("ascii"), hashlib.sha256)

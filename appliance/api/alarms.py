@@ -1,114 +1,118 @@
-"""What stands open now and should be looked at, read from the status: pure, and the same for every page."""
+"""Derive the open conditions that need attention from the status, for the console, REST and `rosrv status`."""
 
 import datetime
+import time
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import msgspec
 
 from appliance.channel.answers.field_docs import told
-from appliance.channel.answers.status import Status
+from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.channel.status_summary import no_relay, probe_failed
+
+Severity = Literal["alarm", "warning", "notice"]
+About = Literal["system", "policy", "monitors", "hosts", "audit"]
+_Condition = tuple[Severity, str, About, str]
+_ORDER = ("alarm", "warning", "notice")
 
 
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):
-    """A condition that holds now. `kind` is a stable name; it goes by itself when the condition does."""
+    """A condition that holds now. `kind` is a stable name; the alarm ends together with the condition."""
 
     kind: str
-    severity: Literal["alarm", "warning", "notice"]
+    severity: Severity
     text: Annotated[str, told("what is the matter and what to do, for a person")]
-    about: Literal["system", "policy", "monitors", "hosts", "audit"]
+    about: About
 
 
 def open_alarms(status: Status) -> list[Alarm]:
-    """The open conditions, the gravest first."""
-    order = ("alarm", "warning", "notice")
-    found = [*_system(status), *_audit(status), *_policy(status), *_monitors(status), *_hosts(status)]
-    found += _forgotten(status)
-    return sorted(found, key=lambda alarm: order.index(alarm.severity))
+    """Return the open conditions, the most severe first."""
+    found = [*_system(status), *_policy(status), *_monitors(status)]
+    found += [("warning", "ipsec", "hosts", line) for line in status.ipsec.troubles]
+    alarms = (
+        Alarm(kind=kind, severity=severity, text=text, about=about) for severity, kind, about, text in found
+    )
+    return sorted(alarms, key=lambda alarm: _ORDER.index(alarm.severity))
 
 
-def _system(status: Status) -> Iterator[Alarm]:
+def _system(status: Status) -> Iterator[_Condition]:
+    audit, forwarding = status.audit, status.audit.forwarding
+    if audit.failed is not None:
+        yield "alarm", "audit-failed", "audit", f"the audit log cannot be written: {audit.failed}"
     if probe_failed(status):
-        text = (
-            f"the hidden ROS Master can be reached past the appliance; nodes are not served: {status.probe}"
-        )
-        yield Alarm(kind="probe", severity="alarm", text=text, about="system")
+        text = f"the ROS master is not hidden: {status.probe}; nodes are not served"
+        yield "alarm", "probe", "system", text
     relay = no_relay(status.relay)
     if relay is not None:
-        text = f"{relay}, until it is back"
-        yield Alarm(kind="relay", severity="alarm", text=text, about="system")
+        yield "alarm", "relay", "system", f"{relay}, until it is back"
+    for process in status.processes:
+        if process.failing:
+            yield "alarm", "process-failing", "system", _failing(process)
     if status.rosmaster != "reachable":
-        text = "the ROS Master behind the appliance is being rebuilt; calls of nodes wait"
-        yield Alarm(kind="rosmaster", severity="warning", text=text, about="system")
-
-
-def _audit(status: Status) -> Iterator[Alarm]:
-    audit = status.audit
-    if audit.failed is not None:
-        text = f"the audit log cannot be written: {audit.failed}"
-        yield Alarm(kind="audit-failed", severity="alarm", text=text, about="audit")
+        yield "warning", "rosmaster", "system", "the ROS master is being rebuilt: calls wait"
+    if status.recorder is not None and not status.recorder.running:
+        yield "warning", "recorder", "system", "the flight recorder is not running: nothing is recorded"
     if audit.degraded is not None:
-        yield Alarm(kind="audit-degraded", severity="warning", text=audit.degraded, about="audit")
-    forwarding = audit.forwarding
+        yield "warning", "audit-degraded", "audit", f"the audit log is behind: {audit.degraded}"
     if forwarding is not None and forwarding.trouble:
-        text = (
-            f"the audit log is not forwarded to {forwarding.to}, {forwarding.behind} records wait:"
-            f" {forwarding.trouble}"
-        )
-        yield Alarm(kind="audit-not-forwarded", severity="warning", text=text, about="audit")
+        where = f"the audit log is not forwarded to {forwarding.to}, {forwarding.behind} records wait"
+        yield "warning", "audit-not-forwarded", "audit", f"{where}: {forwarding.trouble}"
 
 
-def _policy(status: Status) -> Iterator[Alarm]:
+def _policy(status: Status) -> Iterator[_Condition]:
     policy = status.policy
-    if policy.confirm_by is not None:
-        text = f"revision {policy.revision} goes back by itself unless it is confirmed"
-        yield Alarm(kind="policy-unconfirmed", severity="warning", text=text, about="policy")
-    if policy.audit_only:
-        text = (
-            f"the policy refuses nothing by [{'], ['.join(policy.audit_only)}], it only records (audit-only)"
-        )
-        yield Alarm(kind="policy-audit-only", severity="warning", text=text, about="policy")
-    if policy.differs_from_file:
-        text = f"revision {policy.revision} is not what {policy.file} says"
-        yield Alarm(kind="policy-differs", severity="notice", text=text, about="policy")
-
-
-def _forgotten(status: Status) -> Iterator[Alarm]:
     for off in status.switched_off:
         if off.forgotten:
             text = f"{off.what} since {_moment(off.since)}: {off.again}"
-            yield Alarm(kind=f"forgotten:{off.name}", severity="alarm", text=text, about=off.about)
+            yield "alarm", f"forgotten:{off.name}", off.about, text
         elif off.about == "monitors":
             end = "without an end" if off.until is None else f"until {_moment(off.until)}"
-            text = f"{off.what}, {end}: {off.again}"
-            yield Alarm(kind=f"monitor-off:{off.name}", severity="notice", text=text, about="monitors")
+            yield "notice", f"monitor-off:{off.name}", "monitors", f"{off.what}, {end}: {off.again}"
+    if policy.confirm_by is not None:
+        yield (
+            "warning",
+            "policy-unconfirmed",
+            "policy",
+            _rolls_back("the policy rolls", policy.confirm_by, "policy"),
+        )
+    if policy.audit_only:
+        sections = "], [".join(policy.audit_only)
+        text = f"the policy refuses nothing by [{sections}], it only records (audit-only)"
+        yield "warning", "policy-audit-only", "policy", text
+    if policy.differs_from_file:
+        text = f"revision {policy.revision} is not what {policy.file} says"
+        yield "notice", "policy-differs", "policy", text
 
 
-def _monitors(status: Status) -> Iterator[Alarm]:
+def _monitors(status: Status) -> Iterator[_Condition]:
     monitors = status.monitors
     for name in monitors.held:
         why = monitors.why_held.get(name, "a relay was restarted")
-        text = f"{name} holds its topics: {why}; resume it when that is safe (rosrv monitor resume {name})"
-        yield Alarm(kind=f"monitor-held:{name}", severity="alarm", text=text, about="monitors")
+        text = f"topics are held ({name}: {why}): rosrv monitor resume {name}"
+        yield "alarm", f"monitor-held:{name}", "monitors", text
     for name in monitors.failing:
-        text = f"{name} is failing: its actions faulted again and again"
-        yield Alarm(kind=f"monitor-failing:{name}", severity="alarm", text=text, about="monitors")
+        text = f"monitors fail: {name}; its messages are dropped"
+        yield "alarm", f"monitor-failing:{name}", "monitors", text
     for line in monitors.refused:
-        yield Alarm(kind="monitors-refused", severity="warning", text=line, about="monitors")
+        yield "warning", "monitors-refused", "monitors", f"the relay rejected the specifications: {line}"
     if monitors.confirm_by is not None:
-        text = (
-            f"revision {monitors.revision} of the specifications goes back by itself unless it is confirmed"
-        )
-        yield Alarm(kind="monitors-unconfirmed", severity="warning", text=text, about="monitors")
+        text = _rolls_back("the specifications roll", monitors.confirm_by, "monitor")
+        yield "warning", "monitors-unconfirmed", "monitors", text
     if monitors.differs_from_folder:
         text = f"revision {monitors.revision} of the specifications is not what their folder has"
-        yield Alarm(kind="monitors-differ", severity="notice", text=text, about="monitors")
+        yield "notice", "monitors-differ", "monitors", text
 
 
-def _hosts(status: Status) -> Iterator[Alarm]:
-    for line in status.ipsec.troubles:
-        yield Alarm(kind="ipsec", severity="warning", text=line, about="hosts")
+def _failing(process: ProcessInfo) -> str:
+    """Return why a process keeps restarting, with its last output."""
+    lines = "".join(f"\n    {line}" for line in process.output)
+    printed = f"; it printed last:{lines}" if lines else ""
+    return f"{process.role} is failing, after {process.restarts} restarts: {process.failing}{printed}"
+
+
+def _rolls_back(what: str, deadline: float, noun: str) -> str:
+    return f"{what} back in {max(0, round(deadline - time.time()))} s unless confirmed: rosrv {noun} confirm"
 
 
 def _moment(seconds: float) -> str:

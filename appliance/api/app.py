@@ -1,4 +1,4 @@
-"""The REST application: routes, how their errors are answered, and the contract (OpenAPI) made from them."""
+"""Build the REST application: its routes, the answers to errors, and the contract (OpenAPI)."""
 
 from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -12,26 +12,22 @@ from appliance.api import (
     console,
     enrol,
     evidence_routes,
-    graph_routes,
     health,
     host_routes,
     live,
     metrics_route,
-    monitor_changes,
     monitor_routes,
-    policy_changes,
+    operation_routes,
     policy_routes,
     recording_routes,
-    token_routes,
-    whoami,
 )
 from appliance.api.contract import contract_of
 from appliance.api.control import ControlAwayError
-from appliance.api.parameters import only_known
 from appliance.api.problems import REASON, BadInput, ProblemError, bad_input, defect
 from appliance.api.services import Services
-from appliance.base.validation_messages import refusal
+from appliance.base.validation_messages import meant, refusal
 
+_MOST_SHOWN = 5
 _DESCRIPTION = """\
 The appliance's own interface for scripts and other programs. Every call but the health probes needs a bearer token
 (`rosrv token add`). Errors are problem details (RFC 9457). A change needs `If-Match` with the ETag of what it changes.
@@ -39,7 +35,7 @@ The appliance's own interface for scripts and other programs. Every call but the
 
 
 def build_app(services: Services) -> FastAPI:
-    """The application; `Gate` goes around it."""
+    """Return the application, without `RequestGate`."""
     app = FastAPI(
         title="ROSRV appliance",
         version=appliance.__version__,
@@ -48,7 +44,7 @@ def build_app(services: Services) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
-        dependencies=[Depends(only_known)],
+        dependencies=[Depends(_only_known)],
         exception_handlers={
             RequestValidationError: _invalid,
             HTTPException: _of_http,
@@ -57,33 +53,50 @@ def build_app(services: Services) -> FastAPI:
             Exception: _defect,
         },
     )
+    answers = host_routes.ANSWERS | monitor_routes.ANSWERS | policy_routes.ANSWERS
+    app.include_router(operation_routes.routes(services, answers))
     for part in (
         health,
         policy_routes,
-        policy_changes,
         host_routes,
         enrol,
         monitor_routes,
-        monitor_changes,
         recording_routes,
-        token_routes,
         audit,
         evidence_routes,
-        graph_routes,
         metrics_route,
         live,
-        whoami,
     ):
         app.include_router(part.routes(services))
     app.include_router(console.routes(services.settings))
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 
     async def contract() -> JSONResponse:
-        """The contract of this interface (OpenAPI 3.1)."""
+        """Return the contract of this interface (OpenAPI 3.1)."""
         return JSONResponse(app.openapi())
 
     app.add_api_route("/v1/openapi.json", contract, include_in_schema=False)
     return app
+
+
+async def _only_known(request: Request) -> None:
+    """Raise `ProblemError` (422) for query parameters that the contract lacks; other pages (the console) take any."""
+    given = request.query_params.keys()
+    if not given:
+        return
+    operations = request.app.openapi()["paths"].get(request.scope["route"].path, {})
+    operation = operations.get(request.method.lower())
+    if operation is None:
+        return
+    known = [parameter["name"] for parameter in operation.get("parameters", []) if parameter["in"] == "query"]
+    unknown = [name for name in dict.fromkeys(given) if name not in known][:_MOST_SHOWN]
+    if unknown:
+        there_are = f"there are: {', '.join(known)}" if known else "this path takes none"
+        bad = [
+            BadInput(where=f"query.{name}", text=f"there is no such parameter{meant(name, known)}")
+            for name in unknown
+        ]
+        raise bad_input(bad, besides=f"; {there_are}")
 
 
 def _answer(request: Request, problem: ProblemError) -> Response:
@@ -118,7 +131,7 @@ async def _of_http(request: Request, error: Exception) -> Response:
 
 
 def _methods(request: Request) -> set[str]:
-    """What can be done at a path; pages outside the contract are only read."""
+    """Return the methods of a path; GET if no route matches."""
     matching = [
         route
         for route in iter_route_contexts(request.app.routes)
@@ -128,7 +141,7 @@ def _methods(request: Request) -> set[str]:
     ]
     if not matching:
         return {"GET"}
-    # A path that is written out goes before a name.
+    # A literal path takes precedence over a path with a parameter.
     here = min((str(route.path) for route in matching), key=lambda path: path.count("{"))
     return {method for route in matching if route.path == here for method in route.methods or ()}
 

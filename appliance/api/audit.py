@@ -1,7 +1,7 @@
 """`/v1/audit`: search, one record, follow live, verify, export. Reads the log's file, which it cannot write.
 
-What is costly is bounded: so many searches, exports and followers at once, one verification. Whoever comes on top
-waits a moment and is then told to come back.
+Costly work is limited: the numbers of searches, exports and followers, and one verification at a time. A request above
+a limit waits briefly; then the answer is 503.
 """
 
 import asyncio
@@ -25,7 +25,7 @@ from appliance.api.problems import ProblemError
 from appliance.api.route_roles import OPERATOR, VIEWER, Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
-from appliance.api.streams import Held, Streams, in_thread, peer_of, turn
+from appliance.api.streams import StreamResponse, Streams, in_thread, peer_of, turn
 from appliance.api.unrecorded import unrecorded
 from appliance.audit.chain_findings import Verification
 from appliance.audit.chain_proofs import evidence, evidence_line
@@ -33,9 +33,9 @@ from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
-from appliance.audit.record_format import Entry, as_json, as_object, without_contents
+from appliance.audit.record_format import LogEntry, as_json, as_object, without_contents
 from appliance.audit.schema import json_schema
-from appliance.audit.search import Follower, Shown, export, search, show
+from appliance.audit.search import Follower, RecordInContext, export, search, show
 from appliance.audit.signatures import KeyUnreadableError
 from appliance.audit.verification import verify
 from appliance.channel.admin import PolicyWanted
@@ -49,7 +49,7 @@ _POLL_SECONDS = 0.2
 _PING_SECONDS = 15
 _STREAM_PAGE = 500
 _LARGEST_PAGE = 1000
-_MOST_NEIGHBOURS = 1000  # as the command line takes
+_MOST_NEIGHBOURS = 1000  # the same as on the command line
 
 RECORD = {key: value for key, value in json_schema().items() if key != "$schema"}
 _RECORD_REF = {"$ref": "#/components/schemas/AuditRecord"}
@@ -112,7 +112,7 @@ def _wanted(
     ] = True,
 ) -> Filter:
     if resource is not None and topic is not None:
-        raise ProblemError(422, "bad-input", "resource and topic are two words for one thing: give one")
+        raise ProblemError(422, "bad-input", "resource and topic mean the same: give one")
     return Filter(
         decision=tuple(dict.fromkeys([*(decision or ()), *(["deny"] if deny else [])])),
         since=None if since is None else given(since),
@@ -144,8 +144,8 @@ OneRecord = Annotated[
 ]
 
 
-class Desk:
-    """Reads the log in threads, so many at once."""
+class LogReader:
+    """A reader of the log in threads, limited in number."""
 
     def __init__(self, services: Services) -> None:
         self.path = services.audit_log
@@ -154,19 +154,19 @@ class Desk:
         self.verification = asyncio.Semaphore(1)
 
     async def read(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
-        """What a function of `appliance.audit` says. Raises `ProblemError`."""
+        """Wait for a turn and call a function of `appliance.audit` in a thread. Raises `ProblemError`."""
         async with turn(self.searches, "searches of the audit log"):
             return await self.in_thread(function, *arguments, **named)
 
-    async def record(self, record_id: str, neighbours: int) -> Shown:
-        """A record with what was around it. Raises `ProblemError`."""
+    async def record(self, record_id: str, neighbours: int) -> RecordInContext:
+        """Return a record with its neighbours. Raises `ProblemError`."""
         shown = await self.read(show, self.path, record_id, neighbours)
         if shown is None:
             raise ProblemError(404, "unknown", f"there is no record {record_id}")
         return shown
 
     async def in_thread(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
-        """The same without waiting for a turn."""
+        """Call a function as `read` does, without waiting for a turn."""
         try:
             return await asyncio.to_thread(function, *arguments, **named)
         except FilterError as error:
@@ -184,16 +184,16 @@ def _json(schema: dict[str, Any]) -> Responses:
 
 
 def routes(services: Services) -> Routes:
-    """The routes."""
+    """Return the routes."""
     router = Routes(prefix="/v1/audit", tags=["audit"])
-    desk = Desk(services)
+    desk = LogReader(services)
     _add_searches(router, services, desk)
     _add_proofs(router, services, desk)
     _add_one(router, services, desk)
     return router
 
 
-def _add_searches(router: Routes, services: Services, desk: Desk) -> None:
+def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
     @router.get("", responses=_json(_PAGE))
     async def search_audit(
         bearer: Viewer,
@@ -223,15 +223,15 @@ def _add_searches(router: Routes, services: Services, desk: Desk) -> None:
         follower = await desk.read(Follower, desk.path, wanted, start)
         give_back = desk.streams.take(bearer, peer_of(request), "clients follow the audit log")
         following = _follow(services, desk, follower, bearer, wanted.text)
-        return Held(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
+        return StreamResponse(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
 
-def _add_proofs(router: Routes, services: Services, desk: Desk) -> None:
+def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
     @router.get("/verify", dependencies=[OPERATOR])
     async def verify_audit() -> Verification:
         """Prove that the log is complete and unchanged; for operators, one at a time.
 
-        What the signer remembers is not looked at: `rosrv audit verify` on the machine does that too.
+        The checkpoints of the signer are not compared; `rosrv audit verify` on the machine also does that.
         """
         async with turn(desk.verification, "verifications"):
             return await desk.in_thread(verify, desk.path)
@@ -248,21 +248,20 @@ def _add_proofs(router: Routes, services: Services, desk: Desk) -> None:
         "/export", responses=file("application/x-ndjson", "A record a line."), response_class=Response
     )
     async def export_audit(request: Request, bearer: Viewer, wanted: Wanted) -> Response:
-        """All records that match, oldest first, one JSON object a line.
+        """Return all records that match, oldest first, one JSON object a line.
 
-        Each has in `chain` its place in the hash chain, as far as a signed checkpoint: `rosrv audit verify --export`
-        proves it on any machine, with the appliance's public key. Viewers get records as a search shows them to
-        viewers, without what messages said and without `chain`: only what is whole can be proven.
+        Each has in `chain` its place in the hash chain, as far as a signed checkpoint. Viewers get records as a search
+        shows them to viewers, without what messages said and without `chain`: only what is whole can be proven.
         """
         found = await desk.read(_exported, desk.path, wanted, bearer)
         give_back = services.exports.take(bearer, peer_of(request), "exports")
-        return Held(
+        return StreamResponse(
             StreamingResponse(in_thread(_joined(found)), media_type="application/x-ndjson"), give_back
         )
 
 
-def _add_one(router: Routes, services: Services, desk: Desk) -> None:
-    """A record, and what can be said of it."""
+def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
+    """Add the routes of one record."""
 
     @router.get("/{record_id}", responses=_json(_ONE) | _UNKNOWN)
     async def audit_record(
@@ -275,10 +274,9 @@ def _add_one(router: Routes, services: Services, desk: Desk) -> None:
 
     @router.get("/{record_id}/why", responses=_UNKNOWN)
     async def why_of_record(record_id: OneRecord, bearer: Viewer) -> Why:
-        """Why what a record tells happened: who did it, which events and values (not for viewers) made it so, where.
-
-        Of a monitor's verdict the events are such that they alone give it; of a refusal there is the smallest change of
-        the policy in force that would allow it.
+        """Explain a record: its cause, the deciding events and values (not for viewers), and the places in the text.
+        For a monitor's verdict, these events alone lead to it. For a denial, the answer has the smallest change of the
+        policy in force that would allow it.
         """
         shown = await desk.record(record_id, 0)
         record = _readable(shown.entry, bearer).record
@@ -290,7 +288,7 @@ def _add_one(router: Routes, services: Services, desk: Desk) -> None:
 
     @router.get("/{record_id}/grant", responses=_UNKNOWN | _NO_GRANT)
     async def grant_of_record(record_id: OneRecord, bearer: Viewer) -> Granted:
-        """The smallest change of the policy in force that grants what this record says was refused."""
+        """Return the smallest change of the policy in force that grants what this record says was refused."""
         shown = await desk.record(record_id, 0)
         known = await ask(services.control, PolicyWanted(), bearer)
         async with services.judging:
@@ -301,7 +299,7 @@ def _add_one(router: Routes, services: Services, desk: Desk) -> None:
 
 
 async def _follow(
-    services: Services, desk: Desk, follower: Follower, bearer: Bearer, text: str | None
+    services: Services, desk: LogReader, follower: Follower, bearer: Bearer, text: str | None
 ) -> AsyncIterator[ServerSentEvent]:
     while not services.stopping.is_set():
         if not services.doorkeeper.still_good(bearer):
@@ -319,7 +317,7 @@ async def _follow(
 def page_of(
     path: pathlib.Path, wanted: Filter, cursor: str | None, limit: int, bearer: Bearer, *, newest_first: bool
 ) -> dict[str, Any]:
-    """A page as who asks may read it: its cursor, too, tells nothing of records that he is not shown."""
+    """Return a page that the bearer may read; its cursor discloses nothing about hidden records."""
     shown: list[dict[str, Any]] = []
     more: str | None = cursor
     count = limit + 1
@@ -328,14 +326,14 @@ def page_of(
         shown += _shown(entries, bearer, wanted.text)
         if more is None:
             break
-        count = _STREAM_PAGE  # what is not shown may be much: it is not looked through in small steps
+        count = _STREAM_PAGE  # many records may be hidden: skip them in large steps
     last = str(shown[limit - 1]["sequence"]) if len(shown) > limit else None
     page: dict[str, Any] = {"records": shown[:limit], "cursor": last}
     return page | {"notes": notes} if (notes := unrecorded(wanted)) else page
 
 
-def _shown(entries: Iterable[Entry], bearer: Bearer, text: str | None = None) -> list[dict[str, Any]]:
-    """The records as who asks may read them, without those that only what he may not read made match the text."""
+def _shown(entries: Iterable[LogEntry], bearer: Bearer, text: str | None = None) -> list[dict[str, Any]]:
+    """Return the records that the bearer may read, without those whose hidden parts alone matched the text."""
     shown = []
     for entry in entries:
         readable = _readable(entry, bearer)
@@ -344,8 +342,8 @@ def _shown(entries: Iterable[Entry], bearer: Bearer, text: str | None = None) ->
     return shown
 
 
-def _readable(entry: Entry, bearer: Bearer) -> Entry:
-    """The record as who asks may read it."""
+def _readable(entry: LogEntry, bearer: Bearer) -> LogEntry:
+    """Return the record as the bearer may read it."""
     return entry if reads_contents(bearer) else without_contents(entry)
 
 
@@ -357,13 +355,13 @@ def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer) -> Iterator[st
 
 
 def _begun(entries: Iterator[_T]) -> Iterator[_T]:
-    """The same entries, the first of them read: what is wrong with a search is known before the answer begins."""
+    """Return the entries with the first already read, so that an invalid search fails before the answer begins."""
     first = next(entries, None)
     return iter(()) if first is None else itertools.chain((first,), entries)
 
 
 def _joined(lines: Iterator[str]) -> Iterator[str]:
-    """So many lines at once."""
+    """Join lines into larger pieces."""
     while piece := "".join(f"{line}\n" for line in itertools.islice(lines, _STREAM_PAGE)):
         yield piece
 

@@ -1,7 +1,7 @@
-"""The certificate REST is served with: self-signed, made at first start, kept in the api's part of the state.
+"""Make and keep the certificate of REST: self-signed, made at the first start, in the api's part of the state.
 
-The authority of the tunnels' hosts does not sign it: REST is there before, and without, any tunnel. A client is given
-`certificate.pem` by hand, or pins its fingerprint, as the kits of hosts do.
+The authority of the tunnels' hosts does not sign it, because REST also runs without tunnels. Give `certificate.pem` to
+clients by hand, or let them pin the key's fingerprint, as the kits of hosts do.
 """
 
 import base64
@@ -24,14 +24,15 @@ CERTIFICATE = "certificate.pem"
 KEY = "key.pem"
 _DAYS = 825
 _RENEW_DAYS = 30
-_TOO_EARLY = datetime.datetime(2025, 1, 1, tzinfo=datetime.UTC)  # before this is no clock right
+_TOO_EARLY = datetime.datetime(2025, 1, 1, tzinfo=datetime.UTC)  # a clock before this is wrong
 _HOST_NAME_LIMIT = 64
 
 
 def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl.SSLContext:
-    """A server's context with the kept certificate; a new one when there is none, it ends soon or lacks a name.
+    """Return a server's context with the kept certificate.
 
-    Raises `OSError`, `ValueError` and `ssl.SSLError` when what is kept cannot be used.
+    Make a new certificate when there is none, or when it ends soon or lacks a name. Raises `OSError`, `ValueError` and
+    `ssl.SSLError` when the kept one cannot be used.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -42,9 +43,9 @@ def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl
 
 
 def renew(context: ssl.SSLContext, home: Path, names: Iterable[str], now: datetime.datetime) -> bool:
-    """Whether new connections have a new certificate: it ends soon, or the clock was wrong when it was made.
+    """Replace a certificate that ends soon, or was made with a wrong clock; return whether it was replaced.
 
-    Raises what `tls_context` does.
+    Raises the same errors as `tls_context`.
     """
     made = _make_if_needed(home, names, now)
     if made:
@@ -62,7 +63,7 @@ def _make_if_needed(home: Path, names: Iterable[str], now: datetime.datetime) ->
     except ValueError as error:
         raise ValueError(
             f"{home}: {CERTIFICATE} or {KEY} is damaged: restore both from a backup, or remove them: then hosts and"
-            f" clients do not know this appliance until they are told the new ones ({error})"
+            f" clients do not know this appliance until they get the new ones ({error})"
         ) from error
     return True
 
@@ -99,7 +100,7 @@ def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: dat
 
 
 def pin_of(home: Path) -> str:
-    """By what the server is recognised whatever its certificate says: curl's `--pinnedpubkey`."""
+    """Return the pin of a server's key, in the form of curl's `--pinnedpubkey`."""
     certificate = x509.load_pem_x509_certificate((home / CERTIFICATE).read_bytes())
     public = certificate.public_key().public_bytes(
         serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
@@ -108,7 +109,7 @@ def pin_of(home: Path) -> str:
 
 
 def _kept_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    """The key that is there already, which enrolled hosts have pinned; a new one when there is none."""
+    """Return the stored key, which enrolled hosts have pinned; make one if there is none."""
     if path.exists():
         key = serialization.load_pem_private_key(path.read_bytes(), password=None)
         if isinstance(key, ec.EllipticCurvePrivateKey):

@@ -1,14 +1,13 @@
-"""The console: one page for operators, served with all it needs by the appliance itself.
+"""Serve the console: one page for operators, with all its files.
 
 Invariants:
 
-1. What is served here is part of the program, but for the notice of the site and the time after which the page locks,
-   and the same for everybody: it needs no token and knows no secret. What the page shows it asks of `/v1`, with the
-   token its reader brings.
-2. Only files that were there when the routes were made are served, by an exact name: a path never reaches the file
+1. The files are part of the program. Only the site's notice, and the time after which the page locks, are settings.
+   They need no token and contain no secret. The page requests its content from `/v1` with its reader's token.
+2. Only files that existed when the routes were made are served, by exact name: no path of a request reaches the file
    system.
-3. Its headers let the page load and connect to nothing but this origin, run no script but these files, and let no
-   string become markup (Trusted Types).
+3. The headers let the page load from, and connect to, this origin alone, and run only these scripts. A string never
+   becomes markup (Trusted Types).
 """
 
 import hashlib
@@ -37,7 +36,7 @@ _HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(), geolocation=(), microphone=(), payment=(), usb=()",
     "X-Frame-Options": "DENY",
-    "Cache-Control": "no-cache",  # kept, and asked for again with its ETag: an update is seen at once
+    "Cache-Control": "no-cache",  # cached and checked by its ETag, so that an update takes effect at once
 }
 
 
@@ -48,7 +47,7 @@ class _File(NamedTuple):
 
 
 def routes(settings: Settings) -> APIRouter:
-    """The routes; none is of the contract."""
+    """Return the routes, which are not part of the contract."""
     router = APIRouter(include_in_schema=False)
     served = _collect(files("appliance.api") / "console", "")
     page = served["index.html"] = _stating(
@@ -57,11 +56,11 @@ def routes(settings: Settings) -> APIRouter:
     )
 
     async def index(request: Request) -> Response:
-        """The page; which view it shows is said by its address."""
+        """Answer with the page; its address selects the view."""
         return _answer(request, page)
 
     async def file(request: Request, name: str) -> Response:
-        """One of the page's files."""
+        """Answer with one of the page's files."""
         found = served.get(name)
         if found is None:
             raise ProblemError(404, "unknown-path", "the console has no such file")
@@ -85,7 +84,7 @@ def _answer(request: Request, found: _File) -> Response:
 
 
 def _collect(folder: Traversable, prefix: str) -> dict[str, _File]:
-    """All files under a folder, by their path in it."""
+    """Return all files under a folder, by their path in it."""
     found: dict[str, _File] = {}
     for entry in folder.iterdir():
         if entry.is_dir():
@@ -96,7 +95,7 @@ def _collect(folder: Traversable, prefix: str) -> dict[str, _File]:
 
 
 def _stating(page: _File, said: dict[str, str]) -> _File:
-    """The page with what the site has it say and do, in its `meta` elements."""
+    """Return the page with the site's settings in its `meta` elements."""
     body = page.body.decode()
     for name, text in said.items():
         empty = f'<meta name="rosrv:{name}" content="'

@@ -1,4 +1,4 @@
-"""The contract: FastAPI's OpenAPI document, made true where FastAPI says what this application does not do."""
+"""Build the contract: FastAPI's OpenAPI document, corrected where this application differs."""
 
 import json
 from importlib.resources import files
@@ -12,7 +12,7 @@ from appliance.api.audit import RECORD
 from appliance.api.problems import MEDIA_TYPE, Problem
 from appliance.api.routing import CONTRACT
 
-# What the gate may answer to any call.
+# Answers of the gate to any call.
 _ALWAYS = {
     "403": "From a page of another site, or not for this role.",
     "408": "The body did not come in time.",
@@ -29,16 +29,16 @@ _NOT_HTTP = (
 )
 _HASH = {"description": "of this body; If-None-Match takes it", "schema": {"type": "string"}}
 _REFERENCE = CONTRACT.reference(Problem)
-# What an appliance was asked and what it answered, long texts and lists cut: by the kind of a body, or by the operation
-# where that has none. tests/integration/api/test_examples.py holds them against what comes.
+# Requests and answers of an appliance, with long texts and lists cut, by the kind of the body, or by the operation for
+# a body without a kind. tests/integration/api/test_examples.py compares them with real answers.
 EXAMPLES: dict[str, Any] = json.loads(files(__package__).joinpath("examples.json").read_text("utf-8"))
-# What the contract says of fields whose structs leave it to the name: the same words wherever the name is the same. A
-# name that means something else in one kind has words of its own there (`Kind.name`). What a struct says itself stands.
+# Descriptions of fields by name, for fields that their structs do not describe. A name with another meaning in one kind
+# is described there as `Kind.name`.
 WORDS: dict[str, str] = json.loads(files(__package__).joinpath("field_words.json").read_text("utf-8"))
 
 
 def contract_of(app: FastAPI) -> dict[str, Any]:
-    """The document; made once."""
+    """Return the OpenAPI document; it is made once."""
     if app.openapi_schema is None:
         app.openapi_schema = _made(app)
     return app.openapi_schema
@@ -72,7 +72,7 @@ def _made(app: FastAPI) -> dict[str, Any]:
 
 
 def _plain(schema: Any) -> Any:
-    """A schema in words that generators of clients know: a tuple's length is said by `maxItems` alone."""
+    """Return a schema that client generators understand: `maxItems` alone gives a tuple's length."""
     if isinstance(schema, list):
         return [_plain(part) for part in schema]
     if not isinstance(schema, dict):
@@ -81,7 +81,7 @@ def _plain(schema: Any) -> Any:
 
 
 def _described(kind: str, schema: dict[str, Any]) -> None:
-    """Words for the fields that have none; a field that is of a kind has the words of that."""
+    """Describe the fields without a description; a field that refers to a kind has the kind's description."""
     for name, field in schema.get("properties", {}).items():
         words = WORDS.get(f"{kind}.{name}", WORDS.get(name))
         if words is not None and "$ref" not in field and not is_described(field):
@@ -89,12 +89,12 @@ def _described(kind: str, schema: dict[str, Any]) -> None:
 
 
 def is_described(field: dict[str, Any]) -> bool:
-    """Whether something is said of a field: of itself, or of one of the things that it can be."""
+    """Whether a field is described: itself, or one of its possible types."""
     return "description" in field or any(map(is_described, field.get("anyOf", ())))
 
 
 def _tagged(responses: dict[str, Any]) -> None:
-    """What `Unchanged` does."""
+    """Describe the ETags of `ConditionalGet`."""
     good = responses["200"]
     if "application/json" in good.get("content", {}) and "ETag" not in good.get("headers", {}):
         good.setdefault("headers", {})["ETag"] = _HASH
@@ -105,7 +105,7 @@ def _tagged(responses: dict[str, Any]) -> None:
 
 
 def _exemplified(operation: dict[str, Any]) -> None:
-    """What an answer that is of no kind is like, and a body that is sent as text."""
+    """Add the examples of an answer without a kind, and of a body that is sent as text."""
     name = operation["operationId"]
     if name in EXAMPLES:
         (answer,) = operation["responses"]["200"]["content"].values()

@@ -1,11 +1,11 @@
-"""The api's end of its link to control: questions with answers, and what is told without being asked.
+"""Send the api's requests to control and await the answers; send notices of REST calls without an answer.
 
 Invariants:
 
-1. At most `_MOST_OPEN` questions are open; one more is refused here and costs control nothing.
-2. A question ends: with its answer, with the link, or after `seconds`.
-3. What is told (`tell`) never waits. While there is no control it is kept, the last `_MOST_KEPT` of it, and told to the
-   next one; what is lost is counted and logged.
+1. At most `_MOST_OPEN` requests are open; one more is rejected here and costs control nothing.
+2. A request ends with its answer, with the link, or after a time limit.
+3. A notice (`tell`) never waits. Without control the last `_MOST_KEPT` notices are kept for the next control; lost ones
+   are counted and logged.
 """
 
 import asyncio
@@ -19,7 +19,7 @@ from typing import Any
 import structlog
 
 from appliance.api.access import Bearer
-from appliance.channel.admin import CHANGES, ORDERS, A, AdminAnswer, AdminRequest, decode
+from appliance.channel.admin import CHANGES, ORDERS, A, AdminAnswer, AdminRequest, decode, operation_of
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
 from appliance.channel.messages.api import (
@@ -31,12 +31,12 @@ from appliance.channel.messages.api import (
     TokenKept,
     TokensStated,
 )
+from appliance.channel.rest_operation import ANSWER_SECONDS
 
 _log = structlog.get_logger()
 _MOST_OPEN = 48
 _MOST_KEPT = 1000
-ANSWER_SECONDS = 15.0
-_GRACE_SECONDS = 10.0  # in which control answers what became of an order whose time is over
+_GRACE_SECONDS = 10.0  # for control's report on an order whose time is over
 _UNKNOWN = (
     ": the order may have taken effect; if it has not by now, it never will. What took effect is in the audit log:"
     " rosrv audit search --since 5m (GET /v1/audit)"
@@ -44,7 +44,7 @@ _UNKNOWN = (
 
 
 class ControlAwayError(Exception):
-    """Control cannot be asked now; the text says why, for whoever called."""
+    """Report that control does not answer now; the text has the reason, for the client."""
 
 
 def _made(
@@ -56,9 +56,9 @@ def _made(
 
 
 class ControlLink:
-    """Asks whichever control is there.
+    """The link to the control process that is connected.
 
-    `tokens_stated(tokens)` hears what tokens may be used from now on, `lost()` that control is gone.
+    `tokens_stated(tokens)` is called with the tokens that are valid from now on, `lost()` when control disconnects.
     """
 
     def __init__(self, tokens_stated: Callable[[list[TokenKept]], None], lost: Callable[[], None]) -> None:
@@ -68,36 +68,40 @@ class ControlLink:
         self._kept: deque[RestCalled] = deque()
         self._dropped = 0
         self._pin = ""
-        self.known = False  # whether the tokens were told on this link
+        self.known = False  # whether this link has stated the tokens
 
     @property
     def connected(self) -> bool:
-        """Whether control is there and has said what the tokens are."""
+        """Whether control is connected and has sent its list of tokens."""
         return self._link.channel is not None and self.known
 
     def attach(self, channel: Channel) -> None:
-        """A control is there."""
+        """Use the channel to a new control."""
         self.known = False
         self._link.attach(channel)
         self._tell_pin()
 
     def state_pin(self, pin: str) -> None:
-        """Say by what hosts recognise this server, now and to every control that comes."""
+        """Send the pin of this server's key to control, now and whenever a new control connects."""
         self._pin = pin
         self._tell_pin()
 
     def _tell_pin(self) -> None:
         if self._pin:
-            with contextlib.suppress(ChannelFullError):  # the link ends, and the next is told
+            with contextlib.suppress(ChannelFullError):  # the link ends, and the next one gets it
                 self._link.send(RestServed(self._pin))
 
     async def ask(
-        self, request: AdminRequest[A], bearer: Bearer | None, seconds: float = ANSWER_SECONDS
+        self, request: AdminRequest[A], bearer: Bearer | None, seconds: float | None = None
     ) -> AdminAnswer[A]:
-        """Control's answer to a request of whoever showed a token, if any. Raises `ControlAwayError`.
+        """Return control's answer to a request of the bearer. Raises `ControlAwayError`.
 
-        What has not taken effect after so many seconds, or when the client is gone, is withdrawn; control says so.
+        A request is withdrawn if it has not taken effect after `seconds` (None: the operation's own limit), or when the
+        client disconnects.
         """
+        if seconds is None:
+            operation = operation_of(request)
+            seconds = operation.seconds if operation is not None else ANSWER_SECONDS
         if self._link.channel is None:
             raise ControlAwayError("the appliance is being restarted: try again in a second")
         if self._link.unanswered >= _MOST_OPEN:
@@ -121,7 +125,7 @@ class ControlLink:
     async def _asked(
         self, request: AdminRequest[Any], bearer: Bearer | None, until: float, longest: float
     ) -> bytes:
-        """Ask, and have the request withdrawn when its client is gone. Raises as `Link.ask`."""
+        """Send a request, and withdraw it when its client disconnects. Raises as `Link.ask`."""
         number = 0
 
         def question(given: int) -> RequestMade:
@@ -145,7 +149,7 @@ class ControlLink:
         return answer
 
     def tell(self, call: RestCalled) -> None:
-        """Have a call recorded."""
+        """Send a call to control to be recorded."""
         self._kept.append(call)
         if len(self._kept) > _MOST_KEPT:
             self._dropped += self._kept.popleft().count
@@ -157,13 +161,13 @@ class ControlLink:
                 self._link.send(self._kept[0])
             except ChannelFullError:
                 return
-            except UnicodeEncodeError as error:  # one that can never be told keeps the others from nothing
+            except UnicodeEncodeError as error:  # a call that cannot be encoded must not block the others
                 _log.error("a REST call cannot be recorded", reason=str(error))
                 self._dropped += self._kept[0].count
             self._kept.popleft()
         if self._dropped and self._link.channel is not None:
             _log.warning(
-                "REST calls were not recorded: control was away, or could not be told", calls=self._dropped
+                "REST calls were not recorded: control was away, or did not take them", calls=self._dropped
             )
             self._dropped = 0
 
@@ -180,7 +184,7 @@ class ControlLink:
                 self._tokens_stated(tokens)
                 self._tell_kept()
             case _:
-                _log.error("control said something that is not for the api", message=type(message).__name__)
+                _log.error("control sent a message that is not for the api", message=type(message).__name__)
 
     def _ended(self, reason: str) -> None:
         self.known = False

@@ -1,6 +1,6 @@
-"""Which records tell of a denial, and what would have allowed it: which question to the policy, or why no policy does.
+"""Derive from a record of a denial its request to the policy, or the reason why no policy would allow it.
 
-Who is denied something asks "what must change?". Every event that can be a denial has its row in `DENIALS`.
+Every event that can be a denial has its row in `DENIALS`.
 """
 
 from collections.abc import Callable
@@ -8,50 +8,50 @@ from dataclasses import replace
 
 import msgspec
 
-from appliance.audit.record import Record
+from appliance.audit.record import AuditRecord
 from appliance.audit.record_format import rule_text
 from appliance.audit.repetition import KIND
 from appliance.channel.messages.relay_link import NO_GRANT
-from appliance.policy.grant import Asked, UngrantableError, asked
+from appliance.policy.commands import policy_call
+from appliance.policy.grant import DecidedRequest, UngrantableError, asked
 from appliance.policy.model import Category
 from appliance.policy.policy_settings import AT_ONCE
-from appliance.policy.rights import category_of
 
 _ASKS = {"topic": "requestTopic", "service": "lookupService"}
-"""The call that gives the right to connect, by what a connection is for."""
+"""The call that grants a connection, by the connection's category."""
 
 
-def is_denial(record: Record) -> bool:
-    """Whether something was refused."""
+def is_denial(record: AuditRecord) -> bool:
+    """Whether a record is a denial."""
     return record.event in DENIALS and record.decision != "allow"
 
 
-def asks_policy(record: Record) -> bool:
-    """Whether a change of the policy might allow it: the policy in force is needed to say which."""
+def asks_policy(record: AuditRecord) -> bool:
+    """Whether a change of the policy might allow a denied request; the policy in force shows which."""
     try:
         return is_denial(record) and asked_of(record) is not None
     except UngrantableError:
         return False
 
 
-def asked_of(record: Record) -> Asked:
-    """What the policy is to be asked about a denial. Raises `UngrantableError`: why no change of it would allow it."""
+def asked_of(record: AuditRecord) -> DecidedRequest:
+    """Return the request that the policy denied. Raises `UngrantableError` if no change would allow it."""
     what = DENIALS.get(record.event)
     if what is None:
-        raise UngrantableError("it is no record of a decision about a host's call")
+        raise UngrantableError("it is not a record of a decision about a host's call")
     if isinstance(what, str):
         raise UngrantableError(f"no change of the policy would allow it: {what}")
     return what(record)
 
 
-def _of_decision(record: Record) -> Asked:
+def _of_decision(record: AuditRecord) -> DecidedRequest:
     found = asked(
         record.host or "", record.caller_id or "", record.category or "", record.resource or "", record.detail
     )
     return replace(found, takeover=AT_ONCE in record.reason)
 
 
-def _of_revoked(record: Record) -> Asked:
+def _of_revoked(record: AuditRecord) -> DecidedRequest:
     call = str(record.detail.get("call", ""))
     if not call:
         raise UngrantableError(
@@ -61,7 +61,7 @@ def _of_revoked(record: Record) -> Asked:
     return _of_call(record, call)
 
 
-def _of_connection(record: Record) -> Asked:
+def _of_connection(record: AuditRecord) -> DecidedRequest:
     call = _ASKS.get(record.category or "")
     if call is None or not record.reason.startswith(NO_GRANT) or record.decision is None:
         raise UngrantableError(
@@ -70,9 +70,9 @@ def _of_connection(record: Record) -> Asked:
     return _of_call(record, call)
 
 
-def _of_call(record: Record, call: str) -> Asked:
-    """As if the call had been decided that gives, or would have given, what the record is about."""
-    category, detail = category_of(call), {**record.detail, "call": call}
+def _of_call(record: AuditRecord, call: str) -> DecidedRequest:
+    """Return the request to the policy for the call that a record is about."""
+    category, detail = policy_call(call).category, {**record.detail, "call": call}
     resource = record.resource
     if category is Category.COMMAND:
         resource, detail["key"] = call, record.resource
@@ -81,27 +81,27 @@ def _of_call(record: Record, call: str) -> Asked:
     )
 
 
-def _of_folded(record: Record) -> Asked:
+def _of_folded(record: AuditRecord) -> DecidedRequest:
     detail = record.detail
     if detail.get("scope") != KIND:
         raise UngrantableError(
-            f"it stands for denials of many kinds; the first of them is record {detail.get('recorded_id')}"
+            f"it counts denials of many kinds; the first of them is record {detail.get('recorded_id')}"
         )
     return asked_of(msgspec.structs.replace(record, event=str(detail.get("of")), decision="deny"))
 
 
-def _of_limited(record: Record) -> Asked:
+def _of_limited(record: AuditRecord) -> DecidedRequest:
     line = "a line of [Limits] that is gone" if record.rule is None else rule_text(record.rule)
     raise UngrantableError(f"no right is missing; more would pass with a higher limit at {line}")
 
 
-DENIALS: dict[str, str | Callable[[Record], Asked]] = {
+DENIALS: dict[str, str | Callable[[AuditRecord], DecidedRequest]] = {
     "decision": _of_decision,
     "revoked": _of_revoked,
     "connection refused": _of_connection,
     "denials folded": _of_folded,
     "rate limited": _of_limited,
-    "limit exceeded": "the bounds on what one peer may send, hold and open are settings (docs/shares.md)",
+    "limit exceeded": "the bounds on what one peer may send, hold and open are settings (docs/reference/quotas.md)",
     "malformed": "what was sent is not what the protocol says, as its reason has it",
     "message dropped": "the monitor dropped it; change its specification, or switch it off (rosrv monitor disable)",
     "publication refused": "the specifications in force are for another definition of it; load specifications for this"
@@ -110,9 +110,9 @@ DENIALS: dict[str, str | Callable[[Record], Asked]] = {
     "specifications refused": "the specifications were refused, for what their findings say",
     "order refused": "REST goes by tokens and their roles (rosrv token list), and by signatures, not by the policy",
     "rest call": "REST goes by tokens and their roles (rosrv token list), not by the policy",
-    "enrolment refused": "who enrols brings a one-time token that is in force (rosrv host add)",
+    "enrolment refused": "enrolment needs a one-time token that is in force (rosrv host add)",
     "renewal refused": "a host renews its certificate in its own tunnel",
     "tunnel refused": "a tunnel takes a certificate of this appliance that is in force (rosrv host list)",
     "packets refused": "packets that were sent again, or under another's address, are never taken",
 }
-"""By event: how to make of its record the question to the policy, or why there is none."""
+"""For each event, the function that derives the request from its record, or why no policy would allow it."""

@@ -1,7 +1,7 @@
-"""What a policy would do, found out here without asking RVMaster: errors, tests, what is live, explanations.
+"""Compute the effects of a policy without RVMaster: errors, tests, live connections, explanations.
 
-Everything is a pure function of texts; it runs in a thread, and a stranger's long text costs RVMaster nothing.
-`current` is control's answer to `PolicyWanted`, and a text of None the policy in force.
+Everything is a pure function of texts and runs in a thread, so a client's long text costs RVMaster nothing.
+`current` is control's answer to `PolicyWanted`; a text of None means the policy in force.
 """
 
 from collections.abc import Iterable
@@ -13,17 +13,17 @@ import msgspec
 from appliance.api.denials import asked_of, is_denial
 from appliance.api.policy_models import Change, Ended, Report
 from appliance.api.problems import Finding, ProblemError
-from appliance.audit.record import Record
+from appliance.audit.record import AuditRecord
 from appliance.audit.why import lines_of
 from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.graph_answers import Registration
 from appliance.channel.answers.policy_answers import Granted, PolicyKnown, Why
 from appliance.policy.actions import BadWordError, check_resource, find_hosts
-from appliance.policy.decision_reasons import Explanation, explain
+from appliance.policy.decision_reasons import DecisionExplanation, explain
 from appliance.policy.diff import diff
 from appliance.policy.grant import UngrantableError, grant
-from appliance.policy.judgement import Judged, Known, judge
-from appliance.policy.live_rights import Live, endings
+from appliance.policy.judgement import PolicyContext, PolicyJudgement, judge
+from appliance.policy.live_rights import LiveRight, endings
 from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
@@ -36,17 +36,14 @@ _GRANTED = (
 
 
 def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterable[Registration]) -> Report:
-    """What a new text would do that is loaded in the place of the policy in force.
-
-    Raises `ProblemError` with every finding when it is refused.
-    """
-    known = Known.of(msgspec.structs.asdict(current))
+    """Return what loading a new text would change. Raises `ProblemError` with every finding when it is rejected."""
+    known = PolicyContext.of(msgspec.structs.asdict(current))
     before = compile_policy(current.text, file=current.file, hosts=known.hosts, robot=known.robot)
     try:
         policy = judge(order.text, "policy", known, order.signature).accepted()
     except PolicyError as error:
         raise _refused(error) from error
-    live = [Live.of(msgspec.structs.asdict(row)) for row in registrations]
+    live = [LiveRight.of(msgspec.structs.asdict(row)) for row in registrations]
     changes = diff(before, policy, (request for thing in live for request in thing.requests()))
     return Report(
         loaded=False,
@@ -62,9 +59,9 @@ def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterabl
     )
 
 
-def granted(record: Record, current: PolicyKnown) -> Granted:
-    """What would grant what a record says was refused. Raises `UngrantableError` where no line of a policy does."""
-    known = Known.of(msgspec.structs.asdict(current))
+def granted(record: AuditRecord, current: PolicyKnown) -> Granted:
+    """Return the change that grants a recorded denial. Raises `UngrantableError` if no line can."""
+    known = PolicyContext.of(msgspec.structs.asdict(current))
     found = grant(current.text, current.file, known, asked_of(record))
     return Granted(
         revision=current.revision,
@@ -76,8 +73,8 @@ def granted(record: Record, current: PolicyKnown) -> Granted:
     )
 
 
-def explained(record: Record, current: PolicyKnown | None) -> Why:
-    """Why what a record tells happened; of a denial that a policy might allow, the one in force is needed."""
+def explained(record: AuditRecord, current: PolicyKnown | None) -> Why:
+    """Explain a record; for a denial that a policy might allow, `current` must be given."""
     found, refusal = None, ""
     try:
         if current is not None:
@@ -91,15 +88,15 @@ def explained(record: Record, current: PolicyKnown | None) -> Why:
     return Why(lines=[*lines_of(record), *added], grant=found, refusal=refusal)
 
 
-def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Judged:
-    """A text, signed or not, with the cases beside the policy file if they matter, whether it passes them or not.
+def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> PolicyJudgement:
+    """Judge a text, signed or not; `cases`: also run the test cases beside the policy file.
 
-    Raises `ProblemError` with every finding when the text or the cases cannot be understood.
+    Raises `ProblemError` with every finding if the text or the cases are invalid.
     """
     text, file = (current.text, current.file) if text is None else (text, "policy")
-    known = Known.of(msgspec.structs.asdict(current))
+    known = PolicyContext.of(msgspec.structs.asdict(current))
     try:
-        known = replace(known, site_keys=()) if cases else Known(known.hosts, known.robot)
+        known = replace(known, site_keys=()) if cases else PolicyContext(known.hosts, known.robot)
         return judge(text, file, known)
     except PolicyError as error:
         raise _refused(error) from error
@@ -107,15 +104,15 @@ def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Judged
 
 def explanation(
     text: str | None, current: PolicyKnown, *, host: str, node: str, category: Category, resource: str
-) -> Explanation:
-    """Why a request is decided as it is. Raises `ProblemError` when the request makes no sense."""
+) -> DecisionExplanation:
+    """Return why a request is decided as it is. Raises `ProblemError` when the request makes no sense."""
     policy = judge_text(text, current, cases=False).policy
     try:
         request = Request(find_hosts(host, policy)[0], node, category, check_resource(category, resource))
     except BadWordError as error:
         raise ProblemError(422, "bad-input", str(error)) from error
     if needs_node(request) and not node:
-        raise ProblemError(422, "bad-input", "this makes a node part of the graph: say its name (node)")
+        raise ProblemError(422, "bad-input", "this needs the name of the node: give it (node)")
     return explain(policy, request)
 
 

@@ -1,12 +1,12 @@
-"""What a host asks for itself, without a bearer token: to be enrolled, to have its certificate renewed, the lists.
+"""Answer the requests that a host makes for itself, without a bearer token: enrolment, renewal, authority, revocations.
 
 Invariants:
 
-1. Enrolment takes a one-time token and nothing else for who asks; a host that brings wrong ones has to wait, and
-   all hosts together may bring only so many a minute. Whoever brought no wrong one is not made to wait for those who
-   did: a stranger with many addresses cannot keep a host with a good token out.
-2. Renewal is only for a host in its tunnel: control holds the peer's address against the virtual address of the
-   name, which the firewall lets come through IPsec alone, and the signer checks the signature of its present key.
+1. Enrolment needs only a one-time token. A host that sends wrong tokens must wait, and all such hosts share another
+   limit. A host that sent no wrong token never waits, so an unknown host with many addresses cannot keep out a valid
+   token.
+2. Only a host in its tunnel can renew: control compares the peer's address with the virtual address of the name, which
+   the firewall accepts through IPsec alone, and the signer checks the signature of its present key.
 3. Signing requests are not parsed here.
 """
 
@@ -15,22 +15,58 @@ import binascii
 import time
 from typing import Annotated
 
+import msgspec
 from fastapi import Header, Request, Response
 from msgspec import convert
 from msgspec.structs import asdict
 
-from appliance.api.host_routes import SLOW_SECONDS, OneName
-from appliance.api.hosts_models import Enrolled, Enrolment, Renewal
-from appliance.api.kits import Wishes, kit_of
+from appliance.api.host_routes import OneName
+from appliance.api.kits import KitOptions, kit_of
 from appliance.api.problems import ProblemError, too_many
 from appliance.api.rates import Buckets
 from appliance.api.route_roles import answered
 from appliance.api.routing import Responses, Routes, answer, body, content, file
 from appliance.api.services import Services
+from appliance.api.streams import peer_of
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
+from appliance.channel.answers.field_docs import Moment, told
 from appliance.channel.answers.host_answers import NewCertificate
+from appliance.channel.rest_bodies import WHOLE, SigningRequest
 from appliance.ipsec.enrolment_kit import archive, members
+
+TOKEN = r"^rosrv-enrol_[0-9a-f]{12}_[A-Za-z0-9_-]{43}$"  # noqa: S105  the form of one
+PROOF = r"^[A-Za-z0-9+/]+={0,2}$"
+
+
+class Enrolment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The request of a host that enrols."""
+
+    token: Annotated[str, msgspec.Meta(pattern=TOKEN + WHOLE)]
+    request: SigningRequest
+
+
+class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
+    """A host is enrolled; `files` are those of its kit, by path, all but the private key."""
+
+    name: str
+    address: str
+    appliance: Annotated[str, told("the appliance's address in the tunnel")]
+    master: Annotated[str, told("ROS_MASTER_URI through the tunnel")]
+    serial: str
+    expires: Moment
+    certificate: str
+    authority: str
+    warning: str | None
+    files: dict[str, str]
+
+
+class Renewal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A signing request for a new key, and the present key's signature over its bytes (base64)."""
+
+    request: SigningRequest
+    proof: Annotated[str, msgspec.Meta(min_length=1, max_length=1024, pattern=PROOF + WHOLE)]
+
 
 _ALL = "all"
 _ALL_PER_MINUTE = 60
@@ -53,7 +89,7 @@ _PEM: Responses = file("application/x-pem-file", "PEM") | {
 
 
 def routes(services: Services) -> Routes:
-    """The routes."""
+    """Return the routes."""
     router = Routes(tags=["hosts"])
     _add_enrolment(router, services)
     _add_renewal(router, services)
@@ -70,7 +106,7 @@ def _add_enrolment(router: Routes, services: Services) -> None:
         accept: Annotated[str, Header(max_length=200)] = "application/json",
     ) -> Response:
         """Enrol a host by its one-time token and a signing request for the key it made; no bearer token."""
-        peer = _peer(request)
+        peer = peer_of(request)
         patience.require(peer)
         try:
             parts = await _ask(services, admin.HostEnrol(brought.token, brought.request, peer))
@@ -78,7 +114,7 @@ def _add_enrolment(router: Routes, services: Services) -> None:
             if problem.status == 403:
                 patience.failed(peer)
             raise
-        kit = kit_of(parts, Wishes.of(parts.kept), None)
+        kit = kit_of(parts, KitOptions.of(parts.kept), None)
         if "application/gzip" in accept:
             return Response(archive(kit), media_type="application/gzip")
         files = {path: text for path, text, _mode in members(kit)}
@@ -95,7 +131,7 @@ def _add_renewal(router: Routes, services: Services) -> None:
             proof = base64.b64decode(renewal.proof, validate=True)
         except binascii.Error as error:
             raise ProblemError(422, "bad-input", f"body.proof: not base64: {error}") from None
-        return await _ask(services, admin.HostRenewItself(name, renewal.request, proof, _peer(request)))
+        return await _ask(services, admin.HostRenewItself(name, renewal.request, proof, peer_of(request)))
 
     @router.post(
         "/v1/hosts/{name}/renewed",
@@ -105,53 +141,50 @@ def _add_renewal(router: Routes, services: Services) -> None:
         status_code=204,
     )
     async def renewed(name: OneName, request: Request) -> None:
-        """For a host in its tunnel: the new certificate is in place; the one before ends, the tunnel comes anew."""
-        await _ask(services, admin.HostRenewed(name, _peer(request)))
+        """For a host in its tunnel: the new certificate is installed. The one before ends, and the tunnel is built
+        again.
+        """
+        await _ask(services, admin.HostRenewed(name, peer_of(request)))
 
     @router.get("/v1/revocations", responses=_PEM, response_class=Response)
     async def revocations() -> Response:
-        """The signed list of revoked certificates (CRL)."""
+        """Return the signed list of revoked certificates (CRL)."""
         listed = await _ask(services, admin.RevocationsWanted())
         return Response(listed.revocations, media_type="application/x-pem-file")
 
     @router.get("/v1/authority", responses=_PEM, response_class=Response)
     async def authority() -> Response:
-        """The certificate of the appliance's authority."""
+        """Return the certificate of the appliance's authority."""
         own = await _ask(services, admin.AuthorityWanted())
         return Response(own.authority, media_type="application/x-pem-file")
 
 
 class _Patience:
-    """How many wrong tokens are looked at: of one host, and of all."""
+    """The limits on wrong tokens, for one host and for all."""
 
     def __init__(self, per_minute: int) -> None:
         self._one = Buckets(per_minute / 60, per_minute)
-        # Hosts are as many as an attacker has addresses.
+        # An attacker may have many addresses.
         self._all = Buckets(max(per_minute, _ALL_PER_MINUTE) / 60, max(per_minute, _ALL_PER_MINUTE), peers=1)
 
     def require(self, peer: str) -> None:
-        """Raises `ProblemError` (429)."""
+        """Raise `ProblemError` (429) if this peer must wait."""
         now = time.monotonic()
         seconds = self._one.wait(peer, now)
         if self._one.touched(peer, now):
             seconds = max(seconds, self._all.wait(_ALL, now))
         if seconds:
-            raise too_many("too-many-failures", "too many wrong enrolment tokens were brought", seconds)
+            raise too_many("too-many-failures", "too many wrong enrolment tokens were sent", seconds)
 
     def failed(self, peer: str) -> None:
-        """A wrong token was brought."""
+        """Count a wrong token."""
         now = time.monotonic()
         self._one.take(peer, now)
         self._all.take(_ALL, now)
 
 
 async def _ask(services: Services, order: AdminRequest[A]) -> A:
-    answer = await services.control.ask(order, None, SLOW_SECONDS)
+    answer = await services.control.ask(order, None)
     if not answer.ok and answer.trouble == "forbidden":
         raise ProblemError(403, "not-recognised", answer.error)
     return answered(answer)
-
-
-def _peer(request: Request) -> str:
-    assert request.client is not None  # noqa: S101  every peer of a TCP listener has an address
-    return request.client.host

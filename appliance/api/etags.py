@@ -1,4 +1,4 @@
-"""What a client has already is not sent to it again: ETag and If-None-Match (RFC 9110, 13.1.2)."""
+"""Answer with ETags, so that a client does not get an answer twice (If-None-Match, RFC 9110, 13.1)."""
 
 import hashlib
 
@@ -8,11 +8,16 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 _JSON = "application/json"
 
 
-class Unchanged:
-    """ASGI middleware: a whole answer to GET, in JSON and without an ETag of its own, gets the hash of its body.
+def etag(tag: int | str) -> str:
+    """Return the ETag of a revision, or of an answer with its own tag."""
+    return f'"{tag}"'
 
-    A client that names it in `If-None-Match` is answered 304, without the body. An answer with an ETag of its own has
-    that of a revision, which is for `If-Match` of a change and says nothing of the rest of the body: it is sent.
+
+class ConditionalGet:
+    """ASGI middleware that gives each JSON answer to GET without an ETag the hash of its body.
+
+    A client that sends the hash in `If-None-Match` gets 304, without the body. An answer with its own ETag is sent
+    completely: that ETag is of a revision, for `If-Match` of a change, and does not cover the rest of the body.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -26,7 +31,7 @@ class Unchanged:
 
 
 class _Answer:
-    """One answer; its beginning waits for the body."""
+    """One answer; its start is sent together with the first part of the body."""
 
     def __init__(self, known: str, send: Send) -> None:
         self._known = {tag.strip().removeprefix("W/") for tag in known.split(",")}

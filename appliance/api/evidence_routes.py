@@ -1,4 +1,4 @@
-"""`/v1/evidence` and `/v1/recordings/{id}/evidence`: what happened, in one file that proves itself elsewhere."""
+"""`/v1/evidence` and `/v1/recordings/{id}/evidence`: one file that proves what happened on any machine."""
 
 import asyncio
 from typing import Annotated, Any
@@ -13,10 +13,10 @@ from appliance.api.recording_routes import OneId
 from appliance.api.route_roles import Investigator, Reader, problem_of
 from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
-from appliance.api.streams import Held, in_thread, peer_of
+from appliance.api.streams import StreamResponse, in_thread, peer_of
 from appliance.audit.log_database import LogUnreadableError
 from appliance.channel.admin import AdminAnswer, AdminRequest
-from appliance.evidence.bundle import BundleError, Kept, Span, export
+from appliance.evidence.bundle import BundleError, RecordingSelection, TimeSpan, export
 
 _ZIP: Responses = file("application/zip", "A ZIP file.", binary=True) | {
     404: {"description": "There is no such recording, or the log has no record of that time."}
@@ -25,7 +25,7 @@ _Moment = Annotated[str, Query(max_length=64, description="1h (ago), a date, or 
 
 
 def routes(services: Services) -> Routes:
-    """The routes."""
+    """Return the routes."""
     router = Routes(prefix="/v1", tags=["evidence"])
 
     @router.get("/evidence", responses=_ZIP, response_class=Response)
@@ -36,18 +36,20 @@ def routes(services: Services) -> Routes:
 
         For investigators, operators and admins. It is on record who exported what.
         """
-        return await _bundle(services, request, bearer, Span(given(since), given(until)))
+        return await _bundle(services, request, bearer, TimeSpan(given(since), given(until)))
 
     @router.get("/recordings/{recording_id:recording}/evidence", responses=_ZIP, response_class=Response)
     async def recording_evidence(recording_id: OneId, request: Request, bearer: Investigator) -> Response:
-        """The same of the time of a recording, with its messages. For investigators."""
-        kept = Kept(recording_id, services.settings.state / "recordings")
+        """Return the same of the time of a recording, with its messages. For investigators."""
+        kept = RecordingSelection(recording_id, services.settings.state / "recordings")
         return await _bundle(services, request, bearer, kept)
 
     return router
 
 
-async def _bundle(services: Services, request: Request, bearer: Bearer, wanted: Span | Kept) -> Response:
+async def _bundle(
+    services: Services, request: Request, bearer: Bearer, wanted: TimeSpan | RecordingSelection
+) -> Response:
     loop = asyncio.get_running_loop()
 
     def ask(asked: AdminRequest[Any]) -> AdminAnswer[Any]:
@@ -64,4 +66,6 @@ async def _bundle(services: Services, request: Request, bearer: Bearer, wanted: 
             raise ProblemError(503, "log-unreadable", str(error)) from error
         raise
     name = {"Content-Disposition": 'attachment; filename="rosrv-evidence.zip"'}
-    return Held(StreamingResponse(in_thread(pieces), headers=name, media_type="application/zip"), give_back)
+    return StreamResponse(
+        StreamingResponse(in_thread(pieces), headers=name, media_type="application/zip"), give_back
+    )

@@ -1,7 +1,7 @@
-"""`/healthz`, `/readyz`, `/v1/status`, `/v1/inventory`: is it alive, are nodes served, how does it stand, what is it.
+"""Answer `/healthz` (whether REST answers) and `/readyz` (whether nodes are served).
 
-The probes ask control nothing: whether nodes are served was seen at most `history.IDLE_SECONDS` ago, and is looked at
-anew when they were not, at most so often however many ask.
+The probes do not query control. They use the state sampled at most `history.IDLE_SECONDS` ago; a bad state is sampled
+again, at a limited rate.
 """
 
 from typing import Literal
@@ -9,10 +9,8 @@ from typing import Literal
 import msgspec
 
 from appliance.api.problems import ProblemError
-from appliance.api.route_roles import add_look
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
-from appliance.channel.admin import InventoryWanted, StatusWanted
 from appliance.channel.status_summary import unserved
 
 _PATIENCE_SECONDS = 1.0
@@ -25,7 +23,7 @@ class Health(msgspec.Struct, frozen=True):
 
 
 def routes(services: Services) -> Routes:
-    """The routes."""
+    """Return the routes."""
     router = Routes(tags=["status"])
 
     async def live() -> Health:
@@ -48,6 +46,4 @@ def routes(services: Services) -> Routes:
         router.add_api_route(f"{prefix}/healthz", live, operation_id=f"live{name}")
         router.add_api_route(f"{prefix}/readyz", ready, operation_id=f"ready{name}", responses=unready)
 
-    add_look(router, services.control, StatusWanted)
-    add_look(router, services.control, InventoryWanted)
     return router

@@ -1,7 +1,7 @@
-"""What the appliance did over the last hour, in samples: counters that only grow, for whoever draws their rates.
+"""Keep samples of the last hour: counters that only grow, from which clients compute rates.
 
-Control is asked for its measures every `BUSY_SECONDS` while somebody follows and every `IDLE_SECONDS` otherwise, once
-for everybody: how many look at it costs RVMaster nothing. What is kept is bounded by time and number.
+Control is queried every `BUSY_SECONDS` while a client follows, else every `IDLE_SECONDS`, once for all clients, so
+their number costs RVMaster nothing. The age and the number of samples are limited.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ _AWAY = "RVMaster does not answer"
 
 
 class Sample(msgspec.Struct, frozen=True, kw_only=True):
-    """Counters at one moment, since RVMaster started; after its restart they begin anew."""
+    """Counters at one time, since RVMaster started; after its restart they begin at zero."""
 
     time: Moment
     allowed: Annotated[int, told("decisions of the policy")]
@@ -41,8 +41,8 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     monitors: Annotated[dict[str, list[int]], told("of each monitor: verdicts, drops, changes, faults")]
 
 
-class Seen(NamedTuple):
-    """What control said last: its status, or why there is none."""
+class LastSample(NamedTuple):
+    """Control's last status, or the reason why it is unknown."""
 
     number: int
     status: Status | None
@@ -50,8 +50,8 @@ class Seen(NamedTuple):
     away: str | None
 
 
-class History:
-    """Takes the samples. `measures()` is control's answer to `MetricsWanted`."""
+class SampleHistory:
+    """The samples of the last hour; `measures()` returns control's answer to `MetricsWanted`."""
 
     def __init__(self, measures: Callable[[], Awaitable[Measures]]) -> None:
         self._measures = measures
@@ -59,17 +59,17 @@ class History:
         self._followers = 0
         self._sooner = asyncio.Event()
         self._news = asyncio.Condition()
-        self.seen = Seen(0, None, None, _AWAY)
+        self.seen = LastSample(0, None, None, _AWAY)
 
     def samples(self, most: int) -> list[Sample]:
-        """The samples of the last hour, at most so many, evenly taken, the newest last."""
+        """Return at most `most` samples of the last hour at even distances, the newest last."""
         kept = list(self._samples)
         step = -(-len(kept) // most)
         return kept[::-1][::step][::-1] if step > 1 else kept
 
     @contextlib.contextmanager
     def following(self) -> Iterator[None]:
-        """Samples come more often while this lasts."""
+        """Sample more often during the block."""
         self._followers += 1
         self._sooner.set()
         try:
@@ -77,16 +77,16 @@ class History:
         finally:
             self._followers -= 1
 
-    async def after(self, number: int) -> Seen:
-        """What was seen, as soon as it is something newer than this number."""
+    async def after(self, number: int) -> LastSample:
+        """Wait for a sample newer than this number, and return it."""
         async with self._news:
             await self._news.wait_for(lambda: self.seen.number > number)
             return self.seen
 
-    async def again(self, seconds: float) -> Seen:
-        """What is seen by a look sooner than is due; what was seen last when that takes longer than `seconds`.
+    async def again(self, seconds: float) -> LastSample:
+        """Sample early and return the result, or the last sample if that takes longer than `seconds`.
 
-        However many ask, there is one look in `LEAST_SECONDS`.
+        Control is queried at most once in `LEAST_SECONDS`.
         """
         self._sooner.set()
         with contextlib.suppress(TimeoutError):
@@ -114,11 +114,11 @@ class History:
         if sample is not None:
             self._keep(sample)
         async with self._news:
-            self.seen = Seen(self.seen.number + 1, status, sample, away)
+            self.seen = LastSample(self.seen.number + 1, status, sample, away)
             self._news.notify_all()
 
     def _keep(self, sample: Sample) -> None:
-        while self._samples and self._samples[-1].time > sample.time:  # the clock was set back since
+        while self._samples and self._samples[-1].time > sample.time:  # the clock was set back
             self._samples.pop()
         while self._samples and self._samples[0].time < sample.time - _KEPT_SECONDS:
             self._samples.popleft()
@@ -126,7 +126,7 @@ class History:
 
 
 async def measures_of(control: ControlLink) -> Measures:
-    """Control's answer to `MetricsWanted`. Raises `ControlAwayError`."""
+    """Return control's answer to `MetricsWanted`. Raises `ControlAwayError`."""
     answer = await control.ask(MetricsWanted(), None)
     if not answer.ok:
         raise ControlAwayError(answer.error)
@@ -134,7 +134,7 @@ async def measures_of(control: ControlLink) -> Measures:
 
 
 def sample_of(body: Measures, now: float) -> Sample:
-    """A sample out of control's answer to `MetricsWanted`."""
+    """Return a sample of control's answer to `MetricsWanted`."""
     decided = {"allow": 0, "deny": 0, "would deny": 0}
     for _category, outcome, count in body.decisions:
         decided[outcome] = decided.get(outcome, 0) + count

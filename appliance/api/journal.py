@@ -1,8 +1,8 @@
-"""What REST tells control to record: every call, equal reads and refusals folded.
+"""Report all REST calls to control, which records them; equal reads and rejections are folded.
 
-The first of its kind is told at once; repetitions within `FOLD_SECONDS` are counted and told as one. Kinds are
-bounded: past `kinds` the rest of the time is one kind per status. Changes (anything but GET and HEAD by a recognised
-token) are never folded.
+The first call of a kind is reported at once; repetitions within `FOLD_SECONDS` are counted and reported as one. Beyond
+`kinds` kinds, calls are counted by status only. Changes (anything but GET and HEAD with a valid token) are never
+folded.
 """
 
 from collections import Counter
@@ -17,7 +17,7 @@ _Kind = tuple[str, str, str, str, int, str]
 
 
 class Journal:
-    """Tells what was answered; `flush` is to be called every `FOLD_SECONDS`."""
+    """The report of answers; call `flush` every `FOLD_SECONDS`."""
 
     def __init__(self, tell: Callable[[RestCalled], None], *, kinds: int = 512) -> None:
         self._tell = tell
@@ -37,8 +37,8 @@ class Journal:
         duration_us: int,
         dry: bool = False,
     ) -> None:
-        """One answer was given."""
-        # What a client wrote may hold what is no text (JSON's \ud800); control could not be told it.
+        """Report one answer."""
+        # A client may send invalid text (JSON's \ud800), which cannot be encoded for control.
         path, reason = _text(path), _text(reason)
         self.calls[method if method in _METHODS else "other", str(status)] += 1
         if who and method not in _READS:
@@ -51,11 +51,11 @@ class Journal:
             self._repeated[kind] = 0
             self._tell(RestCalled(*kind, duration_us))
         else:
-            rest = ("", "", "", "", status, "further calls, not told one by one")
+            rest = ("", "", "", "", status, "further calls, not reported one by one")
             self._repeated[rest] = self._repeated.get(rest, 0) + 1
 
     def flush(self) -> None:
-        """Tell what was repeated."""
+        """Report repetitions."""
         repeated, self._repeated = self._repeated, {}
         for kind, count in repeated.items():
             if count:

@@ -1,4 +1,4 @@
-"""A host's kit out of control's answer and the wishes of whoever asked: the same over REST and on the command line."""
+"""Make a host's kit from control's answer and the given options, for REST and the command line."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,25 +9,25 @@ from appliance.network.close_ports import parse_ports, parse_services, protectio
 
 
 @dataclass(frozen=True)
-class Wishes:
-    """What goes into a kit besides certificates: where the host reaches the appliance, its ports, what stays open."""
+class KitOptions:
+    """Contents of a kit besides certificates: the appliance's address, the host's ports, services that stay open."""
 
     endpoint: str
     ports: str = "32768-60999"
     opened: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        """Raises `ValueError`, naming what is wrong."""
+        """Raise `ValueError` for an invalid option, with its name."""
         parse_ports(self.ports)
         parse_services(self.opened)
 
     @classmethod
-    def of(cls, kept: Mapping[str, str]) -> "Wishes":
-        """What was kept."""
+    def of(cls, kept: Mapping[str, str]) -> "KitOptions":
+        """Return the options that were stored with a token."""
         return cls(kept["endpoint"], kept["ports"], tuple(filter(None, kept["open"].split(","))))
 
 
-def kit_of(body: KitParts, wishes: Wishes, key: str | None) -> Kit:
-    """The kit of a host that control has enrolled; `key` None: the host has it."""
+def kit_of(body: KitParts, wishes: KitOptions, key: str | None) -> Kit:
+    """Return the kit of a host that control has enrolled; `key` None: the host has it."""
     ports, opened = parse_ports(wishes.ports), parse_services(wishes.opened)
     return Kit(body, wishes.endpoint, protection([body.appliance], ports, opened, tunnelled=True), key)

@@ -1,16 +1,17 @@
-"""Connections of REST: bounded by the front that RVMaster has too, served by uvicorn.
+"""Accept connections of REST behind the same front as RVMaster's; uvicorn serves them.
 
-uvicorn speaks HTTP and ASGI behind the front and is used through what it offers only: its configuration makes the
-protocol of a connection, which is handed what the front lets pass. Invariants beside those of `rpc/front`:
+uvicorn's configuration, a public interface, makes the protocol of a connection for HTTP and ASGI. The protocol gets the
+bytes that the front accepts. Invariants besides those of `rpc/front`:
 
-1. A connection has a place before anything is made for it, TLS included; else it is closed at once.
-2. A peer is known here that has shown a good token lately, or is on this machine; every other is a stranger. A stranger
-   makes room for whoever has none, whatever it is doing; a known peer only for another of them, and only with what has
-   waited for a second.
-3. Connections are opened (with TLS: the handshake begins) by the processor time that their peers have used. All
-   strangers are one peer there.
-4. Whoever sends anything after an answer has as long to begin, and to end the head of, the next request: neither an
-   empty line nor the rest of a body keeps a connection open.
+1. A connection is entered in the table before anything (such as TLS) is set up for it; if the table has no room, the
+   connection is closed at once.
+2. A peer is known if it lately sent a valid token or is on this machine. For a peer that has no connection yet, a
+   connection of an unknown peer may be closed at any time, one of a known peer only for another known peer, and only if
+   it has waited for a second.
+3. Connections are opened (with TLS: the handshake begins) in the order of the processor time that their peers have
+   used. All unknown peers count as one.
+4. The deadline for the head of the next request starts with the first byte after an answer, so neither an empty line
+   nor the rest of a body keeps a connection open.
 """
 
 import asyncio
@@ -29,30 +30,30 @@ from appliance.api.rates import peer_key
 from appliance.configuration.settings import ApiLimits
 from appliance.policy.model import Address
 from appliance.quotas.descriptors import connections_within
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import REST_CONNECTIONS
 from appliance.rpc.acceptor import Acceptor
-from appliance.rpc.connection_table import Stage, Visitors
+from appliance.rpc.connection_table import ConnectionTable, Stage
 from appliance.rpc.front import Front, HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
 
-_HANDSHAKE_SECONDS = 0.002  # of processor time, that a TLS handshake takes on a slow machine
+_HANDSHAKE_SECONDS = 0.002  # processor time of a TLS handshake on a slow machine
 _KEEP_ALIVE_SECONDS = 30
 _END_SECONDS = 1.0
 _CONNECTION = "rosrv.connection"  # the key of a request's state that has its connection
 
 
 class _Connection(Front, asyncio.Protocol):
-    """One connection: what the front lets pass goes to uvicorn's protocol."""
+    """One connection; it passes the bytes that the front accepts on to uvicorn's protocol."""
 
     most_waiting = 16
-    _uvicorn = asyncio.Protocol()  # until there is one
+    _uvicorn = asyncio.Protocol()  # does nothing until uvicorn's protocol replaces it
 
     def __init__(self, listener: "Listener", sock: socket.socket) -> None:
-        super().__init__(listener.limits, listener.visitors, sock)
+        super().__init__(listener.limits, listener.connection_table, sock)
         self._listener = listener
-        self._unanswered = 0  # requests whose head is there
-        self._rests = False  # since the last answer nothing has come
+        self._unanswered = 0  # requests whose head has arrived
+        self._rests = False  # nothing has arrived since the last answer
 
     @property
     def is_quiet(self) -> bool:
@@ -64,7 +65,7 @@ class _Connection(Front, asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         if self.open(cast(asyncio.Transport, transport)):
-            # As uvicorn's own parser has it: what comes after the last request of a connection is passed over.
+            # Like uvicorn's own parser, ignore data after the last request of a connection.
             self.parser.set_dangerous_leniencies(lenient_data_after_close=True)
             self._uvicorn = self._listener.protocol_of(self)
             self._uvicorn.connection_made(transport)
@@ -91,20 +92,20 @@ class _Connection(Front, asyncio.Protocol):
         super().on_headers_complete()
         self._unanswered += 1
         self.deadline = math.inf  # body and answer have deadlines of their own (`api/gate`)
-        self.visitors.file(self, Stage.SERVED)
+        self.connection_table.file(self, Stage.SERVED)
 
     def answered(self) -> None:
-        """An answer is sent."""
+        """Note that an answer is sent."""
         self._unanswered -= 1
         if self._unanswered:
             return
         begun = self.in_request and not self.head_done
         self._rests = not begun
         self.allow(self.limits.head_seconds if begun else self.limits.idle_seconds)
-        self.visitors.file(self, Stage.UNFINISHED if begun else Stage.IDLE)
+        self.connection_table.file(self, Stage.UNFINISHED if begun else Stage.IDLE)
 
     def reject(self, _status: bytes, what: str) -> None:
-        """Say what was wrong, and read nothing more. Closed at once, the answer would be lost with what is unread."""
+        """Answer with the error and stop reading. To close at once would lose the answer together with unread bytes."""
         self.closing = True
         self.transport.pause_reading()
         said = f"The peer {what}.\n".encode()
@@ -117,22 +118,22 @@ class _Connection(Front, asyncio.Protocol):
         self.allow(self.limits.linger_seconds)
 
 
-def _class_of(standing: Callable[[str], Standing], host: Address) -> str:
-    """As whom a peer has its turn to be opened: all that have shown no good token are one."""
+def _class_of(quota_class: Callable[[str], QuotaClass], host: Address) -> str:
+    """Return the key under which a peer's processor time counts; all unknown peers share one."""
     peer = peer_key(str(host))
-    return "" if standing(peer) is Standing.STRANGER else peer
+    return "" if quota_class(peer) is QuotaClass.UNKNOWN else peer
 
 
-def _patience(standing: Standing, stage: Stage, _own: bool) -> float:
-    if standing is Standing.STRANGER:
+def _patience(quota_class: QuotaClass, stage: Stage, _own: bool) -> float:
+    if quota_class is QuotaClass.UNKNOWN:
         return 0.0
     return math.inf if stage is Stage.SERVED else 1.0
 
 
 class Listener:
-    """Serves `app` on a listening socket. `standing(peer)` says whether a peer has shown a good token lately."""
+    """The server of `app` on a listening socket; `quota_class(peer)` tells known peers from unknown ones."""
 
-    def __init__(self, app: ASGIApp, limits: ApiLimits, standing: Callable[[str], Standing]) -> None:
+    def __init__(self, app: ASGIApp, limits: ApiLimits, quota_class: Callable[[str], QuotaClass]) -> None:
         self._app = app
         self._config = Config(
             self._serve,
@@ -152,18 +153,20 @@ class Listener:
         bounds = REST_CONNECTIONS.bounds.sized(
             connections_within(limits.connections), limits.connections_per_host
         )
-        self.visitors: Visitors[str] = Visitors(standing, connections=bounds, patience=_patience)
+        self.connection_table: ConnectionTable[str] = ConnectionTable(
+            quota_class, connections=bounds, patience=_patience
+        )
         self._tasks: set[asyncio.Task[None]] = set()
         self._acceptor: Acceptor | None = None
-        self._time = ProcessorTime(partial(_class_of, standing))
+        self._time = ProcessorTime(partial(_class_of, quota_class))
 
     def protocol_of(self, connection: _Connection) -> asyncio.Protocol:
-        """What speaks HTTP and ASGI for this connection, made as uvicorn's own server makes it."""
+        """Make the protocol for HTTP and ASGI of this connection as uvicorn's server does."""
         make = cast(Callable[..., asyncio.Protocol], self._config.http_protocol_class)
         return make(config=self._config, server_state=self._state, app_state={_CONNECTION: connection})
 
     async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Tell the request's connection when its answer is sent."""
+        """Serve a request, and notify its connection when the answer is sent."""
         connection: _Connection = scope["state"].pop(_CONNECTION)
 
         async def sending(message: Message) -> None:
@@ -181,10 +184,10 @@ class Listener:
     async def start(self, sock: socket.socket, context: ssl.SSLContext | None) -> None:
         """Begin to accept."""
         self._acceptor = Acceptor(sock, self._time, partial(self._accepted, context))
-        self._begin(self.visitors.sweep())
+        self._begin(self.connection_table.sweep())
 
     async def stop(self) -> None:
-        """Stop accepting, let what is being answered finish for a second, close the rest."""
+        """Stop accepting, let open requests finish for a second, and close all connections."""
         if self._acceptor is not None:
             self._acceptor.close()
         tasks = list(self._tasks)
@@ -195,12 +198,12 @@ class Listener:
             protocol.shutdown()
         if self._state.tasks:
             await asyncio.wait(list(self._state.tasks), timeout=_END_SECONDS)
-        for connection in self.visitors.connections:
+        for connection in self.connection_table.connections:
             connection.abort()
 
     def _accepted(self, context: ssl.SSLContext | None, sock: socket.socket, host: Address) -> bool:
         connection = _Connection(self, sock)
-        if self.visitors.enter(connection, peer_key(str(host))):
+        if self.connection_table.enter(connection, peer_key(str(host))):
             sock.close()
             return False
         sock.setblocking(False)
@@ -222,7 +225,7 @@ class Listener:
             await asyncio.get_running_loop().connect_accepted_socket(
                 lambda: connection, sock, ssl=context, **timeouts
             )
-        except OSError:  # it is gone, or what it says is no TLS
+        except OSError:  # the peer disconnected, or does not speak TLS
             connection.leave()
             sock.close()
         except BaseException:

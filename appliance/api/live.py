@@ -1,6 +1,6 @@
-"""`/v1/history` and `/v1/live`: the last hour, and what the appliance does now, as it happens.
+"""Answer `/v1/history` (the last hour), `/v1/live` (the present state) and `/v1/whoami` (the token's holder).
 
-A page that follows asks once and is told; the audit log has one record of it, not one for every look.
+A page that follows sends one request and gets every change; the audit log has one record of it.
 """
 
 import asyncio
@@ -16,19 +16,21 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from appliance.api.access import Bearer
 from appliance.api.alarms import Alarm, open_alarms
 from appliance.api.control import ControlAwayError
-from appliance.api.history import BUSY_SECONDS, Sample, Seen
+from appliance.api.history import BUSY_SECONDS, LastSample, Sample
 from appliance.api.moments import in_full
 from appliance.api.problems import ProblemError
 from appliance.api.route_roles import VIEWER, Viewer, ask
 from appliance.api.routing import Routes, file
 from appliance.api.services import Services
-from appliance.api.streams import Held, Streams, peer_of
+from appliance.api.streams import StreamResponse, Streams, peer_of
 from appliance.channel.admin import GraphWanted
+from appliance.channel.answers.field_docs import Moment, told
 from appliance.channel.answers.status import Status
+from appliance.channel.answers.token_answers import TokenRole
 from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
 _PING_SECONDS = 15
-_SHARE = 20  # of the time it takes to make the graph, that is how long one waits before the next
+_SHARE = 20  # the wait before the next graph, as a multiple of the time to make one
 _TEXT = file("text/event-stream", "Events `now`, `graph`, `away`, `end`.")
 
 
@@ -38,6 +40,14 @@ class Hour(msgspec.Struct, frozen=True):
     samples: list[Sample]
 
 
+class Holder(msgspec.Struct, frozen=True):
+    """The token's name and role; `expires` is seconds since the epoch."""
+
+    name: str
+    role: Annotated[TokenRole, told("each may do all that those before it may")]
+    expires: Moment
+
+
 class _Now(msgspec.Struct, frozen=True):
     status: Status
     alarms: list[Alarm]
@@ -45,9 +55,14 @@ class _Now(msgspec.Struct, frozen=True):
 
 
 def routes(services: Services) -> Routes:
-    """The routes."""
+    """Return the routes."""
     router = Routes(prefix="/v1", tags=["status"])
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
+
+    @router.get("/whoami")
+    async def whoami(bearer: Viewer) -> Holder:
+        """Return the name and role of the token that asks, and when it ends."""
+        return Holder(bearer.name, bearer.role, bearer.expires)
 
     @router.get("/history", operation_id="history", dependencies=[VIEWER])
     async def last_hour(
@@ -69,14 +84,14 @@ def routes(services: Services) -> Routes:
         """
         give_back = streams.take(bearer, peer_of(request), "clients follow")
         following = _follow(services, bearer, graph)
-        return Held(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
+        return StreamResponse(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
     return router
 
 
 async def _follow(services: Services, bearer: Bearer, graph: bool) -> AsyncIterator[ServerSentEvent]:
     history = services.history
-    number = max(0, history.seen.number - 1)  # what was seen last is told at once
+    number = max(0, history.seen.number - 1)  # the last sample is sent at once
     graph_due = 0.0
     with history.following():
         while not services.stopping.is_set():
@@ -87,7 +102,7 @@ async def _follow(services: Services, bearer: Bearer, graph: bool) -> AsyncItera
                 async with asyncio.timeout(BUSY_SECONDS * 2):
                     seen = await history.after(number)
             except TimeoutError:
-                continue  # control takes its time; look whether the token is still good
+                continue  # control is slow; check whether the token is still valid
             number = seen.number
             yield _told(seen)
             if graph and seen.away is None and time.monotonic() >= graph_due:
@@ -98,7 +113,7 @@ async def _follow(services: Services, bearer: Bearer, graph: bool) -> AsyncItera
                     yield drawn
 
 
-def _told(seen: Seen) -> ServerSentEvent:
+def _told(seen: LastSample) -> ServerSentEvent:
     if seen.status is None or seen.sample is None:
         return ServerSentEvent(event="away", data=json.dumps({"reason": seen.away}))
     now = _Now(seen.status, open_alarms(seen.status), seen.sample)
@@ -110,4 +125,4 @@ async def _graph(services: Services, bearer: Bearer) -> ServerSentEvent | None:
         graph = await ask(services.control, GraphWanted(), bearer)
         return ServerSentEvent(event="graph", data=msgspec.json.encode(in_full(graph)).decode())
     except (ProblemError, ControlAwayError):
-        return None  # said by the next `away`
+        return None  # the next `away` reports it

@@ -1,4 +1,4 @@
-"""`/metrics`: what is measured, in Prometheus's format."""
+"""Answer `/metrics` in Prometheus's format."""
 
 import os
 import time
@@ -30,11 +30,11 @@ _TEXT = file("text/plain", "Prometheus's text format")
 
 
 def routes(services: Services) -> Routes:
-    """The route, at the two places where it is looked for."""
+    """Return the route, at both of its paths."""
     router = Routes(tags=["metrics"])
 
     async def metrics(bearer: Viewer) -> Response:
-        """What is measured, in Prometheus's text format; docs/metrics.md lists it."""
+        """Return the metrics in Prometheus's text format; docs/reference/metrics.md lists them."""
         body = await ask(services.control, MetricsWanted(), bearer)
         return Response(rendered(body, services.journal.calls), media_type=CONTENT_TYPE_LATEST)
 
@@ -50,14 +50,14 @@ def routes(services: Services) -> Routes:
 
 
 def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
-    """Control's measures, and the calls of REST by method and status, as Prometheus reads them."""
+    """Return control's measures, and the REST calls by method and status, in Prometheus's format."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Once(body, calls))
     return generate_latest(registry)
 
 
 class _Once(Collector):
-    """Gives the families of one answer."""
+    """A collector of the metrics of one answer."""
 
     def __init__(self, body: Measures, calls: Mapping[tuple[str, str], int]) -> None:
         self._samples = {**_samples(body), "rosrv_rest_calls_total": calls.items()}
@@ -113,10 +113,6 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         "rosrv_monitor_dropped_total": [((name,), count) for name, count in body.drop_at.items()],
         "rosrv_monitor_changed_total": [((name,), count) for name, count in body.change_at.items()],
         "rosrv_monitor_events_total": [((kind, name), count) for kind, name, count in body.monitors],
-        "rosrv_monitor_margin": [
-            ((name, place, "true" if holds else "false"), distance)
-            for name, place, holds, distance in body.margins
-        ],
         "rosrv_monitor_slices": [((name,), count) for name, (count, _) in body.slices.items()],
         "rosrv_monitor_slice_limit": [((name,), most) for name, (_, most) in body.slices.items()],
         "rosrv_switched_off": [
@@ -129,8 +125,8 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         ],
         "rosrv_monitors": [
             (("enabled",), monitors.enabled),
-            (("trial",), len(monitors.trials)),
-            (("disabled",), monitors.loaded - monitors.enabled - len(monitors.trials)),
+            (("shadow",), len(monitors.shadow)),
+            (("disabled",), monitors.loaded - monitors.enabled - len(monitors.shadow)),
             (("holding",), len(monitors.held)),
             (("failing",), len(monitors.failing)),
         ],
@@ -176,7 +172,7 @@ _PORTS = {"open": 1, "closed": 0, "unknown": -1}
 
 
 def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
-    """Of the hosts that may come; a revoked one is only counted."""
+    """Return the samples of hosts; revoked hosts are only counted."""
     enrolled = [host for host in hosts if host.serial is not None and host.revoked is None]
     now = time.time()
     return {
@@ -196,7 +192,7 @@ def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
 
 
 def _named(processes: Sequence[ProcessInfo]) -> Iterator[tuple[str, ProcessInfo]]:
-    """A series of each: two of one role would be one series twice."""
+    """Yield the processes with unique names: two processes of one role are two series."""
     return zip(process_names(processes), processes, strict=True)
 
 

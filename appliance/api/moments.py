@@ -1,7 +1,7 @@
-"""Moments as JSON has them: the number that a struct has, and beside it RFC 3339 (`since`, `since_utc`).
+"""Write times in JSON twice: as the number in a struct's field, and as RFC 3339 beside it (`since`, `since_utc`).
 
-Which fields are moments says their type (`Moment`, `NanoMoment`): nobody who makes an answer thinks of it. The contract
-is completed from the same words.
+The type of a field (`Moment`, `NanoMoment`) marks it as a time, so answers need no code for it. The contract gets the
+additional fields from the same types.
 """
 
 import functools
@@ -13,15 +13,15 @@ import msgspec
 
 from appliance.api.problems import ProblemError
 from appliance.audit.record_format import rfc3339
-from appliance.audit.timestamps import parse_moment
+from appliance.base.timestamps import parse_timestamp
 from appliance.channel.answers.field_docs import UNIT
 
 _UTC = "_utc"
-_OF_A_SECOND = 1_000_000  # more digits of a float would be invented
+_OF_A_SECOND = 1_000_000  # a float has no more digits
 
 
 def in_full(value: Any) -> Any:
-    """What msgspec encodes, each moment in it with its text."""
+    """Return a value for msgspec to encode, with the text of each time added."""
     if isinstance(value, msgspec.Struct):
         units = _units(type(value))
         if units is None:
@@ -40,7 +40,7 @@ def in_full(value: Any) -> Any:
 
 
 def describe(schema: dict[str, Any]) -> None:
-    """Put the texts into the schema of a struct, each after its moment."""
+    """Add the texts to the schema of a struct, each after its time."""
     fields: dict[str, Any] = {}
     for name, field in schema.get("properties", {}).items():
         fields[name] = field
@@ -54,9 +54,9 @@ def describe(schema: dict[str, Any]) -> None:
 
 
 def given(text: str) -> int:
-    """A moment that somebody gave, in nanoseconds since the epoch. Raises `ProblemError` (422)."""
+    """Parse a time; return nanoseconds since the epoch. Raises `ProblemError` (422)."""
     try:
-        return parse_moment(text, time.time_ns())
+        return parse_timestamp(text, time.time_ns())
     except (OverflowError, ValueError) as error:
         raise ProblemError(422, "bad-input", str(error)) from error
 
@@ -67,7 +67,7 @@ def _text(moment: float, unit: str) -> str:
 
 @functools.cache
 def _units(kind: type[msgspec.Struct]) -> dict[str, str] | None:
-    """The units of its moments; None where there is none in anything that is in it either."""
+    """Return the units of the times of a struct; None if neither it nor a struct in it has a time."""
     _, kinds = msgspec.json.schema_components([kind])
     found = {
         name: {field: unit for field, of in schema.get("properties", {}).items() if (unit := _unit(of))}

@@ -1,7 +1,7 @@
-"""What the specifications in force are, found out here of their texts, and findings as structures.
+"""Compile the specifications in force from their texts, and convert findings to structures.
 
-Everything is a pure function of texts; it runs in a thread. The compiler is imported when it is first needed: an
-api that nobody asks about monitors starts without it.
+Everything is a pure function of texts and runs in a thread. The compiler is imported when it is first needed, so that
+an unused api starts without it.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from appliance.channel.answers.monitor_answers import Monitors
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
-    from rosmop.run.monitor import Monitor
+    from rosmop.run.monitor import MonitorInstance
 
 _PLACE = re.compile(r"(?s)(.*?):([0-9]+):([0-9]+): (error|warning): (.*)")
 
 
 def findings_of(texts: list[str]) -> list[Finding]:
-    """Findings as structures; one without a place (`file:line:column: error: text`) is left out."""
+    """Return findings as structures; skip those that are not of the form `file:line:column: error: text`."""
     return [
         Finding(file=file, line=int(line), column=int(column), severity=severity, text=text)
         for file, line, column, severity, text in (
@@ -31,7 +31,7 @@ def findings_of(texts: list[str]) -> list[Finding]:
 
 
 def refusal(error: str, findings: list[str]) -> ProblemError:
-    """A refusal of specifications as a problem; its detail has every finding on a line of its own."""
+    """Return a rejection of specifications as a problem; its detail has every finding on a line of its own."""
     return ProblemError(
         422,
         "specifications-refused",
@@ -41,20 +41,20 @@ def refusal(error: str, findings: list[str]) -> ProblemError:
 
 
 class Compiler:
-    """Compiles what is in force, and remembers the last: a page that looks at one monitor after the other costs one."""
+    """The compiler of the specifications in force; it keeps the last result, so that many queries compile once."""
 
     def __init__(self) -> None:
         self._last: tuple[int, MonitorSet] | None = None
 
-    def monitor(self, loaded: Monitors, name: str) -> Monitor:
-        """A monitor of what is loaded, with texts. Raises KeyError."""
+    def monitor(self, loaded: Monitors, name: str) -> MonitorInstance:
+        """Return a monitor of the loaded texts. Raises KeyError."""
         if self._last is None or self._last[0] != loaded.revision:
             self._last = (loaded.revision, _compiled(loaded.files or {}, loaded.definitions or {}))
         return self._last[1].monitor(name)
 
     def warnings(self, file: str) -> list[Finding]:
-        """The lint of a file of what was compiled last."""
-        assert self._last is not None  # noqa: S101  asked after `monitor`
+        """Return the warnings about a file of the last compilation."""
+        assert self._last is not None  # noqa: S101  callers compile by `monitor` first
         return findings_of(
             [str(warning) for warning in self._last[1].warnings if warning.position.file == file]
         )
@@ -70,8 +70,8 @@ def _compiled(files: dict[str, str], definitions: dict[str, str]) -> MonitorSet:
     return MonitorSet.of(compiled_from(files, known))
 
 
-def events_of(monitor: Monitor) -> list[EventShown]:
-    """The events of a monitor."""
+def events_of(monitor: MonitorInstance) -> list[EventShown]:
+    """Return the events of a monitor."""
     return [
         EventShown(
             name=event.name,
@@ -85,8 +85,8 @@ def events_of(monitor: Monitor) -> list[EventShown]:
     ]
 
 
-def properties_of(monitor: Monitor) -> list[PropertyShown]:
-    """The properties of a monitor."""
+def properties_of(monitor: MonitorInstance) -> list[PropertyShown]:
+    """Return the properties of a monitor."""
     from rosmop.logics.picture import dot_of  # noqa: PLC0415  the compiler: see the head
 
     return [
@@ -101,8 +101,8 @@ def properties_of(monitor: Monitor) -> list[PropertyShown]:
     ]
 
 
-def picture_of(monitor: Monitor) -> str | None:
-    """The automata of a monitor's properties (SVG); None when none is finite."""
+def picture_of(monitor: MonitorInstance) -> str | None:
+    """Return the automata of a monitor's properties (SVG); None if no automaton is finite."""
     from rosmop.logics.picture import svg_of  # noqa: PLC0415  the compiler: see the head
 
     return svg_of([code.property for code in monitor.code.properties])

@@ -1,38 +1,16 @@
-"""What `/v1/monitors` takes and gives besides what RVMaster answers."""
+"""Structs of `/v1/monitors` besides control's answers."""
 
 from typing import Annotated
 
 import msgspec
 
-from appliance.api.policy_models import Signature
 from appliance.api.problems import Finding
 from appliance.channel.answers.field_docs import Moment, told
 from appliance.channel.answers.monitor_answers import MonitorState, Tag
 
-_WHOLE = r"(?!\n)"  # after `$`, which Python finds before a last newline, too
-Name = Annotated[str, msgspec.Meta(min_length=1, max_length=256)]
-FileName = Annotated[
-    str, msgspec.Meta(max_length=200, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,190}\.rv$" + _WHOLE)
-]
-Definition = Annotated[
-    str,
-    msgspec.Meta(
-        max_length=200, pattern=r"^[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*\.(msg|srv)$" + _WHOLE
-    ),
-]
-Text = Annotated[str, msgspec.Meta(max_length=1 << 20)]
-Definitions = Annotated[
-    dict[Definition, Text],
-    told(
-        "definitions of messages and services that ROS does not ship, by `package/Type.msg`", max_length=1000
-    ),
-]
-Note = Annotated[str, told("kept with the revision: why", max_length=200)]
-Signatures = Annotated[dict[Name, Signature], told("by the names of files and definitions", max_length=2000)]
-
 
 class EventShown(msgspec.Struct, frozen=True, kw_only=True):
-    """An event of a specification: on a topic, in a service's request or response, or `every` so many seconds."""
+    """An event of a specification: on a topic, in a service's request or response, or a timer (`every`, in seconds)."""
 
     name: str
     line: int
@@ -65,7 +43,7 @@ class Happened(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Monitor(MonitorState, frozen=True, kw_only=True):
-    """A monitor with the text it was made of."""
+    """A monitor with its source text."""
 
     revision: int
     tag: Tag
@@ -78,36 +56,15 @@ class Monitor(MonitorState, frozen=True, kw_only=True):
 
 
 class History(msgspec.Struct, frozen=True):
-    """What a monitor did last, the newest first."""
+    """The latest actions of a monitor, the newest first."""
 
     name: str
     happened: list[Happened]
     cursor: Annotated[str | None, told("of the next page; null: there is none")]
 
 
-class NewSpecifications(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Specifications to add, or to put in the place of those in files of the same name."""
-
-    files: Annotated[
-        dict[FileName, Text], told("texts by the name of the file", min_length=1, max_length=1000)
-    ]
-    definitions: Definitions = {}
-    note: Note = ""
-    signatures: Signatures = {}
-
-
-class NewText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The new text of the file that a monitor stands in."""
-
-    text: Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
-    definitions: Definitions = {}
-    note: Note = ""
-    signature: Signature = ""
-    signatures: Annotated[Signatures, told("of the definitions")] = {}
-
-
 class Replaced(msgspec.Struct, frozen=True, kw_only=True):
-    """What a change did, or after a dry run (`loaded` false) would do; `replaced` is the revision before."""
+    """The effect of a change, or of the dry run of one (`loaded` false); `replaced` is the revision before."""
 
     loaded: bool
     revision: Annotated[int, told("in force now")]
@@ -127,33 +84,4 @@ class Replaced(msgspec.Struct, frozen=True, kw_only=True):
     kept: Annotated[
         list[str], told("files that a reload left in force although the folder does not have them")
     ] = []
-    confirm_by: Annotated[Moment | None, told("when it goes back by itself unless confirmed")] = None
-
-
-class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is to become of a monitor: exactly one of `enabled`, `shadow` and `held` (or `trial`)."""
-
-    enabled: bool | None = None
-    for_seconds: Annotated[
-        Annotated[float, msgspec.Meta(gt=0, le=2_592_000)] | None,
-        told("with `enabled` false: enable it again by itself after this time"),
-    ] = None
-    held: Annotated[bool | None, told("false: let its topics go on")] = None
-    shadow: Annotated[
-        bool | None,
-        told("true: shadow mode, it only records what it would have done; false: from there into force"),
-    ] = None
-    trial: Annotated[bool | None, told("the same as `shadow`; deprecated")] = None
-
-    def __post_init__(self) -> None:
-        """Raises `ValueError`."""
-        if [self.enabled, self.held, self.shadow, self.trial].count(None) != 3 or self.held is True:
-            raise ValueError("one of `enabled` (true or false), `shadow` (true or false) and `held` (false)")
-        if self.for_seconds is not None and self.enabled is not False:
-            raise ValueError("`for_seconds` goes with `enabled`: false")
-
-
-class SwitchMany(Switch, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The same for several monitors at once: all of them, or none when there is an unknown name."""
-
-    names: Annotated[list[Name], msgspec.Meta(min_length=1, max_length=1000)]
+    confirm_by: Annotated[Moment | None, told("when it goes back automatically unless confirmed")] = None

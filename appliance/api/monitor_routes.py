@@ -1,4 +1,4 @@
-"""`/v1/monitors`: look at the monitors, the specifications they are made of, and what they did."""
+"""Routes of `/v1/monitors`: the monitors, their specifications and history, and changes with answers of their own."""
 
 import asyncio
 from pathlib import Path as FilePath
@@ -8,23 +8,21 @@ from fastapi import Path, Query, Response
 from msgspec.structs import asdict
 
 from appliance.api.access import Bearer
-from appliance.api.audit import Desk
-from appliance.api.monitor_judgement import Compiler, events_of, picture_of, properties_of
-from appliance.api.monitor_models import Happened, History, Monitor
-from appliance.api.policy_models import OneRevision
+from appliance.api.audit import LogReader
+from appliance.api.monitor_judgement import Compiler, events_of, findings_of, picture_of, properties_of
+from appliance.api.monitor_models import Happened, History, Monitor, Replaced
+from appliance.api.operation_routes import Answer, OperationCall
 from appliance.api.problems import ProblemError
 from appliance.api.route_roles import Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes, Tagged, file, tagged
 from appliance.api.services import Services
 from appliance.audit.query import Filter
-from appliance.audit.record_format import Entry, rfc3339, without_contents
+from appliance.audit.record_format import LogEntry, rfc3339, without_contents
 from appliance.audit.search import search
-from appliance.channel.admin import MonitorRevisions, MonitorRevisionWanted, MonitorsWanted
+from appliance.channel import admin
 from appliance.channel.answers.monitor_answers import (
-    MonitorRevisionList,
     Monitors,
     MonitorState,
-    RevisionTexts,
 )
 
 UNKNOWN: Responses = {404: {"description": "There is no such monitor, or revision."}}
@@ -33,55 +31,37 @@ OneName = Annotated[str, Path(min_length=1, max_length=256, description="of a mo
 
 
 class _Looking:
-    """Reads what is in force and compiles it, so many texts at once."""
+    """The queries for monitors: they read and compile the specifications in force, a limited number at once."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
         self.compiler = Compiler()
-        self.desk = Desk(services)
+        self.desk = LogReader(services)
 
     async def state(self, bearer: Bearer, name: str) -> tuple[Monitors, MonitorState]:
-        """What is in force, with texts, and the row of a monitor. Raises `ProblemError` (404)."""
-        loaded = await ask(self._services.control, MonitorsWanted(texts=True), bearer)
+        """Return the specifications in force, with texts, and the row of a monitor. Raises `ProblemError` (404)."""
+        loaded = await ask(self._services.control, admin.MonitorsWanted(texts=True), bearer)
         row = next((monitor for monitor in loaded.monitors if monitor.name == name), None)
         if row is None:
             raise unknown_monitor(name, loaded)
         return loaded, row
 
     async def compiled(self, loaded: Monitors, name: str) -> Any:
-        """A monitor, compiled here."""
+        """Compile a monitor."""
         async with self._services.judging:
             return await asyncio.to_thread(self.compiler.monitor, loaded, name)
 
 
 def unknown_monitor(name: str, loaded: Monitors) -> ProblemError:
-    """Why a monitor is not found, and which there are."""
+    """Return the problem of an unknown monitor, which lists the known ones."""
     known = ", ".join(monitor.name for monitor in loaded.monitors) or "none is loaded"
     return ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
 
 
 def routes(services: Services) -> Routes:
-    """The routes."""
+    """Return the routes."""
     router = Routes(prefix="/v1/monitors", tags=["monitors"])
     looking = _Looking(services)
-
-    @router.get("")
-    async def monitors(
-        bearer: Viewer,
-        texts: Annotated[bool, Query(description="with the texts of the specifications")] = False,
-    ) -> Tagged[Monitors]:
-        """All monitors with state and counters, and whether they are what the folder has."""
-        return tagged(await ask(services.control, MonitorsWanted(texts=texts), bearer))
-
-    @router.get("/revisions", operation_id="monitor_revisions")
-    async def revisions(bearer: Viewer) -> MonitorRevisionList:
-        """The kept revisions of the specifications, the newest first."""
-        return await ask(services.control, MonitorRevisions(), bearer)
-
-    @router.get("/revisions/{revision}", operation_id="monitor_revision", responses=UNKNOWN)
-    async def revision_texts(revision: OneRevision, bearer: Viewer) -> RevisionTexts:
-        """A kept revision with its texts."""
-        return await ask(services.control, MonitorRevisionWanted(revision), bearer)
 
     @router.get("/{name}", responses=UNKNOWN)
     async def monitor(name: OneName, bearer: Viewer) -> Tagged[Monitor]:
@@ -103,7 +83,7 @@ def routes(services: Services) -> Routes:
 
     @router.get("/{name}/picture", responses=_PICTURE | UNKNOWN, response_class=Response)
     async def monitor_picture(name: OneName, bearer: Viewer) -> Response:
-        """The automata of its properties (SVG); 404 when it has none that is finite."""
+        """Return the automata of its properties (SVG); 404 when it has none that is finite."""
         loaded, _state = await looking.state(bearer, name)
         drawn = await asyncio.to_thread(picture_of, await looking.compiled(loaded, name))
         if drawn is None:
@@ -117,11 +97,13 @@ def routes(services: Services) -> Routes:
         cursor: Annotated[str | None, Query(max_length=18, description="of the page before")] = None,
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
     ) -> History:
-        """What it did last: verdicts, drops, changes, faults, output, switches; from the audit log.
+        """Return the monitor's latest actions: verdicts, drops, changes, faults, output, switches; from the audit log.
 
-        A monitor that is no longer there has its history, too.
+        A monitor that no longer exists also has its history.
         """
-        found: list[Entry] = await looking.desk.read(records_of, looking.desk.path, name, cursor, limit + 1)
+        found: list[LogEntry] = await looking.desk.read(
+            records_of, looking.desk.path, name, cursor, limit + 1
+        )
         happened = [
             _happened(entry if reads_contents(bearer) else without_contents(entry)) for entry in found[:limit]
         ]
@@ -130,9 +112,9 @@ def routes(services: Services) -> Routes:
     return router
 
 
-def records_of(path: FilePath, name: str, cursor: str | None, count: int) -> list[Entry]:
-    """The last records about a monitor. That others have the word in them does not show in how many there are."""
-    found: list[Entry] = []
+def records_of(path: FilePath, name: str, cursor: str | None, count: int) -> list[LogEntry]:
+    """Return the last `count` records about a monitor, without other records that contain its name."""
+    found: list[LogEntry] = []
     more: str | None = cursor
     while len(found) < count:
         page = search(path, Filter(category="monitor", text=name), more, count)
@@ -143,15 +125,15 @@ def records_of(path: FilePath, name: str, cursor: str | None, count: int) -> lis
     return found[:count]
 
 
-def _of(entry: Entry, name: str) -> bool:
-    """Whether a record is about this monitor, and not about one whose name or topic has that word in it."""
+def _of(entry: LogEntry, name: str) -> bool:
+    """Whether a record is about this monitor, not about one whose name or topic contains that word."""
     record = entry.record
     return record.detail.get("monitor") == name or (
         record.event.startswith("monitor ") and record.resource == name
     )
 
 
-def _happened(entry: Entry) -> Happened:
+def _happened(entry: LogEntry) -> Happened:
     record, detail = entry.record, entry.record.detail
     category, count = detail.get("category"), detail.get("count")
     return Happened(
@@ -163,3 +145,58 @@ def _happened(entry: Entry) -> Happened:
         category=category if isinstance(category, str) else None,
         count=count if isinstance(count, int) else None,
     )
+
+
+async def _load(call: OperationCall[admin.MonitorLoad]) -> Tagged[Replaced]:
+    if not call.dry_run:
+        return await _change(call)
+    new = call.order
+    return await _try(
+        call,
+        admin.MonitorTry(new.files, new.definitions, new.signatures, new.expected, new.force, new.shadow),
+    )
+
+
+async def _replace(call: OperationCall[admin.MonitorReplace]) -> Tagged[Replaced]:
+    if not call.dry_run:
+        return await _change(call)
+    new, file = call.order, await _file_of(call)
+    signatures = {**new.signatures, file: new.signature}
+    return await _try(
+        call,
+        admin.MonitorTry({file: new.text}, new.definitions, signatures, new.expected, new.force, new.shadow),
+    )
+
+
+async def _change(call: OperationCall[Any]) -> Tagged[Replaced]:
+    done = await call.ask(call.order)
+    monitors = (await call.ask(admin.MonitorsWanted())).monitors
+    fields = asdict(done) | {"warnings": findings_of(done.warnings)}
+    return tagged(Replaced(**fields, loaded=True, monitors=[monitor.name for monitor in monitors]))
+
+
+async def _try(call: OperationCall[Any], order: admin.MonitorTry) -> Tagged[Replaced]:
+    """Answer a dry run; control and the compiler limit the number of dry runs."""
+    done = await call.ask(order)
+    return tagged(Replaced(**asdict(done) | {"warnings": findings_of(done.warnings)}, loaded=False))
+
+
+async def _file_of(call: OperationCall[admin.MonitorReplace]) -> str:
+    """Return the file of a monitor. Raises `ProblemError` (404)."""
+    name, loaded = call.order.name, await call.ask(admin.MonitorsWanted(texts=True))
+    files = {monitor.name: monitor.file for monitor in loaded.monitors}
+    if name in (loaded.files or {}):
+        return name
+    if name not in files:
+        raise unknown_monitor(name, loaded)
+    return files[name]
+
+
+ANSWERS = {
+    "load_monitors": Answer(_load),
+    "replace_monitor": Answer(_replace),
+    "reload_monitors": Answer(_change),
+    "remove_monitor": Answer(_change),
+    "remove_monitors": Answer(_change),
+    "roll_back_monitors": Answer(_change),
+}

@@ -1,4 +1,4 @@
-"""What `/v1/policy` takes and gives besides what RVMaster answers."""
+"""Structs of `/v1/policy` besides control's answers."""
 
 from typing import Annotated, Literal
 
@@ -7,24 +7,11 @@ from fastapi import Path
 
 from appliance.api.problems import Finding
 from appliance.channel.answers.field_docs import Moment, told
+from appliance.channel.rest_bodies import LONGEST_REVISION
 from appliance.policy.model import Category
 
-LONGEST_REVISION = 10**15
 OneRevision = Annotated[int, Path(ge=1, le=LONGEST_REVISION, description="its number", examples=[1])]
 Decided = Literal["allow", "deny", "would deny"]
-Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
-Signature = Annotated[
-    str,
-    told("of the site, where it asks for one: what `rosrv sign FILE` writes to FILE.sig", max_length=8192),
-]
-
-
-class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A new policy."""
-
-    text: Text
-    note: Annotated[str, told("kept with the revision: why", max_length=200)] = ""
-    signature: Signature = ""
 
 
 class Change(msgspec.Struct, frozen=True):
@@ -50,7 +37,9 @@ class Ended(msgspec.Struct, frozen=True):
 
 
 class Report(msgspec.Struct, frozen=True, kw_only=True):
-    """What a new policy does; `loaded` is false after a dry run, and what only a load can tell is then null."""
+    """The effect of a new policy; `loaded` is false after a dry run, and the values that only a load can find are then
+    null.
+    """
 
     loaded: bool
     revision: Annotated[int, told("in force now")]
@@ -60,12 +49,6 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     warnings: list[Finding]
     changes: list[Change]
     ends: Annotated[list[Ended], told("what is live and ends by it")]
-
-
-class Rollback(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where to go back to; null: the revision before the present one."""
-
-    revision: Annotated[int, msgspec.Meta(ge=1, le=LONGEST_REVISION)] | None = None
 
 
 class RuleText(msgspec.Struct, frozen=True):

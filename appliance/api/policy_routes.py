@@ -1,4 +1,4 @@
-"""`/v1/policy`: look at the policy in force and at those before it; why a request is decided as it is; the tests."""
+"""`/v1/policy`: the policy in force, revisions, explanations, its tests, and the report of a load."""
 
 import asyncio
 from dataclasses import asdict
@@ -6,18 +6,22 @@ from typing import Annotated, Literal
 
 import msgspec
 from fastapi import Query
+from msgspec.structs import replace
 
 from appliance.api.access import Bearer
-from appliance.api.dry_run_policy import explanation, judge_text
-from appliance.api.policy_models import Decided, Explained, LostRule, OneRevision, Question, RuleText, Text
-from appliance.api.route_roles import Viewer, add_look, ask
+from appliance.api.dry_run_policy import explanation, judge_change, judge_text
+from appliance.api.operation_routes import Answer, OperationCall
+from appliance.api.policy_models import Decided, Explained, LostRule, Question, Report, RuleText
+from appliance.api.problems import ProblemError
+from appliance.api.route_roles import Viewer, ask
 from appliance.api.routing import Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services
-from appliance.channel.admin import PolicyRevisions, PolicyWanted
+from appliance.channel import admin
 from appliance.channel.answers.field_docs import told
-from appliance.channel.answers.policy_answers import PolicyInForce, RevisionText
+from appliance.channel.answers.policy_answers import PolicyInForce
+from appliance.channel.rest_bodies import Text
 from appliance.policy.cases import CaseResult
-from appliance.policy.decision_reasons import Explanation
+from appliance.policy.decision_reasons import DecisionExplanation
 from appliance.policy.model import Category
 
 _UNKNOWN: Responses = {404: {"description": "There is no such revision."}}
@@ -57,26 +61,18 @@ class Tested(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def routes(services: Services) -> Routes:
-    """The routes."""
+    """Return the routes."""
     router = Routes(prefix="/v1/policy", tags=["policy"])
     control = services.control
 
     @router.get("")
     async def policy(bearer: Viewer) -> Tagged[PolicyInForce]:
-        """The policy in force, with its ETag."""
-        known = await ask(control, PolicyWanted(), bearer)
+        """Return the policy in force, with its ETag."""
+        known = await ask(control, admin.PolicyWanted(), bearer)
         return tagged(msgspec.convert(known, PolicyInForce, from_attributes=True))
 
-    add_look(router, control, PolicyRevisions)
-
-    @router.get("/revisions/{revision}", operation_id="policy_revision", responses=_UNKNOWN)
-    async def revision_text(revision: OneRevision, bearer: Viewer) -> RevisionText:
-        """A kept revision with its text."""
-        known = await ask(control, PolicyWanted(revision), bearer)
-        return msgspec.convert(known, RevisionText, from_attributes=True)
-
     async def explained(question: Question, bearer: Bearer) -> Explained:
-        current = await ask(control, PolicyWanted(), bearer)
+        current = await ask(control, admin.PolicyWanted(), bearer)
         async with services.judging:
             asked = msgspec.structs.asdict(question)
             return _explained(await asyncio.to_thread(explanation, current=current, **asked))
@@ -96,13 +92,13 @@ def routes(services: Services) -> Routes:
 
     @router.post("/explain")
     async def explain_under(question: Annotated[Question, body(Question)], bearer: Viewer) -> Explained:
-        """The same under another text, which is not loaded."""
+        """Return the same under another text, which is not loaded."""
         return await explained(question, bearer)
 
     @router.post("/test")
     async def test_policy(draft: Annotated[Draft, body(Draft)], bearer: Viewer) -> Tested:
         """Run the policy's tests on a text; nothing is loaded. A text with errors is refused with every finding."""
-        current = await ask(control, PolicyWanted(), bearer)
+        current = await ask(control, admin.PolicyWanted(), bearer)
         async with services.judging:
             ran = (await asyncio.to_thread(judge_text, draft.text, current, cases=True)).results
         cases = sorted(map(_case, ran), key=lambda case: case.passed)
@@ -131,7 +127,7 @@ def _case(case: CaseResult) -> Case:
     )
 
 
-def _explained(found: Explanation) -> Explained:
+def _explained(found: DecisionExplanation) -> Explained:
     decision = found.decision
     return Explained(
         **found.request.fields(),
@@ -151,3 +147,33 @@ def _explained(found: Explanation) -> Explained:
         command=_explained(found.command) if found.command is not None else None,
         allowed=found.allowed,
     )
+
+
+async def _load(call: OperationCall[admin.PolicyLoad]) -> Tagged[Report]:
+    order, services = call.order, call.services
+    current = await call.ask(admin.PolicyWanted())
+    if order.expected not in (None, current.revision):
+        text = f"revision {current.revision} is in force, not {order.expected}"
+        raise ProblemError(412, "changed-meanwhile", text)
+    live = (await call.ask(admin.RegistrationsWanted())).registrations
+    try:
+        async with services.judging if call.dry_run else services.ordering:
+            report = await asyncio.to_thread(judge_change, order, current, live)
+    except ProblemError as refusal:
+        if call.dry_run:
+            raise
+        # Control decides, and records the rejection; the places of the findings are from here.
+        try:
+            loaded = await call.ask(order)
+        except ProblemError as said:
+            raise refusal if said.kind == "refused" else said from None
+        report = Report(loaded=False, revision=0, warnings=[], changes=[], ends=[])
+    else:
+        if call.dry_run:
+            return tagged(report)
+        loaded = await call.ask(order)
+    told = {name: getattr(loaded, name) for name in ("revision", "replaced", "revoked", "confirm_by")}
+    return tagged(replace(report, loaded=True, **told))
+
+
+ANSWERS = {"load_policy": Answer(_load)}

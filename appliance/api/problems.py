@@ -1,4 +1,4 @@
-"""What goes wrong, as clients see it: problem details (RFC 9457), one form for every error."""
+"""Errors as clients get them: problem details (RFC 9457)."""
 
 import http
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from starlette.responses import Response
 from appliance.channel.answers.field_docs import told
 
 MEDIA_TYPE = "application/problem+json"
-REASON = "rosrv.reason"  # the key of a request's scope that has why it was answered as it was
+REASON = "rosrv.reason"  # the key of a request's scope for the reason of its answer
 _MOST_FINDINGS = 200
 
 
@@ -73,7 +73,7 @@ class ProblemError(Exception):
         self.column = findings[0].column if findings else column
 
     def response(self) -> Response:
-        """The problem as an answer."""
+        """Return the problem as an answer."""
         problem = Problem(
             f"urn:rosrv:problem:{self.kind}",
             http.HTTPStatus(self.status).phrase,
@@ -88,16 +88,16 @@ class ProblemError(Exception):
 
 
 def too_many(kind: str, detail: str, seconds: float) -> ProblemError:
-    """Who asks too often is told (429) after how many seconds to try again."""
+    """Return the problem of too many requests (429), with the seconds to wait."""
     return ProblemError(429, kind, detail, retry_after=int(seconds) + 1)
 
 
 def bad_input(wrong: list[BadInput], *, besides: str = "") -> ProblemError:
-    """Each part of a request that makes no sense (422); `besides` ends the sentence for a person."""
+    """Return the problem of a request with these wrong parts (422); `besides` ends its detail."""
     detail = "; ".join(f"{problem.where}: {problem.text}" for problem in wrong[:5])
     return ProblemError(422, "bad-input", detail + besides, errors=wrong)
 
 
 def defect(error: Exception) -> ProblemError:
-    """What a client is told of a defect of ours: its kind, nothing of what it was about."""
+    """Return the problem of a defect of the appliance: its kind, and nothing about its cause."""
     return ProblemError(500, "defect", f"a defect of rosrv, please report it: {type(error).__name__}")

@@ -1,9 +1,9 @@
-"""The api as a process of the appliance: lifeline, link to control, certificate, and the listener.
+"""Run the api process: its lifeline, its link to control, its certificate, and the listener.
 
-It ends when the supervisor says `Stop` or is gone. It outlives control: while there is none, calls that need it are
-answered 503. A control that does not come back, or that closed the link because of what it was sent, is answered by
-ending: the supervisor starts a fresh api with a fresh link. Routes and contract are made for the first request that
-passes the gate: where nobody asks REST, they would be most of what this process takes.
+It ends when the supervisor sends `Stop` or has ended. It outlives control: meanwhile, calls that need control are
+answered 503. If control does not come back, or closed the link because of an invalid message, the api ends and the
+supervisor starts another. Routes and contract are made for the first request that passes the gate, so an unused api
+needs little memory.
 """
 
 import asyncio
@@ -20,14 +20,14 @@ import structlog
 import uvloop
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from appliance.api.access import Doorkeeper
+from appliance.api.access import TokenAuthenticator
 from appliance.api.certificate import pin_of, renew, tls_context
 from appliance.api.control import ControlLink
-from appliance.api.etags import Unchanged
-from appliance.api.history import History, measures_of
+from appliance.api.etags import ConditionalGet
+from appliance.api.history import SampleHistory, measures_of
 from appliance.api.journal import FOLD_SECONDS, Journal
 from appliance.api.listener import Listener
-from appliance.api.request_gate import Gate
+from appliance.api.request_gate import RequestGate
 from appliance.api.services import Services
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
@@ -46,7 +46,7 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class _Application:
-    """The application, made when it is first called; ASGI."""
+    """The ASGI application, made at its first call."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
@@ -66,12 +66,12 @@ class _Application:
 
 
 class _Api:
-    """The parts of the api and the wires between them."""
+    """The parts of the api and their connections."""
 
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
         self._settings = settings
         self._lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
-        self._doorkeeper = Doorkeeper(settings.api_limits.failures_per_minute)
+        self._doorkeeper = TokenAuthenticator(settings.api_limits.failures_per_minute)
         self._control = ControlLink(self._doorkeeper.state, self._await_control)
         self._journal = Journal(self._control.tell)
         self._stopping = asyncio.Event()
@@ -82,27 +82,27 @@ class _Api:
     async def run(self) -> None:
         """Serve from start to end."""
         loop = asyncio.get_running_loop()
-        # More than all that is done in threads at once: no verification of the log keeps a token from being checked.
+        # More threads than concurrent work, so that a verification of the log never delays the check of a token.
         loop.set_default_executor(ThreadPoolExecutor(_THREADS, "api"))
         self._lifeline.attach(loop, self._received, self._end)
-        history = History(lambda: measures_of(self._control))
+        history = SampleHistory(lambda: measures_of(self._control))
         services = Services(
             self._settings, self._control, self._doorkeeper, self._journal, self._stopping, history
         )
-        gate = Gate(
-            Unchanged(_Application(services)),
+        gate = RequestGate(
+            ConditionalGet(_Application(services)),
             limits=self._settings.api_limits,
             doorkeeper=self._doorkeeper,
             journal=self._journal,
             names=[
                 *self._settings.api_names,
-                *filter(None, [self._settings.ipsec.endpoint]),  # where hosts that enrol themselves come to
+                *filter(None, [self._settings.ipsec.endpoint]),  # the address for hosts that enrol themselves
                 socket.gethostname(),
             ],
             tunnels=self._settings.ipsec.pool,
             networks=map(ip_network, self._settings.api_networks),
         )
-        listener = Listener(gate, self._settings.api_limits, self._doorkeeper.standing)
+        listener = Listener(gate, self._settings.api_limits, self._doorkeeper.quota_class)
         await self._given.wait()
         if self._socket is None:
             return
@@ -144,7 +144,7 @@ class _Api:
                 _log.error("the certificate of REST cannot be renewed", reason=str(error))
 
     def _certified(self) -> tuple[Path, list[str], datetime.datetime]:
-        """Where the certificate is kept, the names it is for, and the time."""
+        """Return the certificate's folder, its names, and the time."""
         address = self._settings.api_address
         names = [*self._settings.api_names]
         if address is not None and address[0] not in ("0.0.0.0", "::"):  # noqa: S104  compared only
@@ -190,5 +190,5 @@ class _Api:
                 for descriptor in descriptors:
                     os.close(descriptor)
                 _log.error(
-                    "the supervisor said something that is not for the api", message=type(message).__name__
+                    "the supervisor sent a message that is not for the api", message=type(message).__name__
                 )

@@ -1,10 +1,10 @@
-"""How much one peer may do: token buckets, bounded in number. No I/O; time is given.
+"""Limit the rate of each peer with token buckets. No I/O; the time is a parameter.
 
 Invariants:
 
-1. Memory is bounded: at most `peers` buckets. One more pushes out the one that was used longest ago, which by then
-   is full or belongs to a peer that is still waiting its turn: a flood from many addresses gains one burst each.
-2. An IPv6 peer is its /64: whoever has one address there has all of them.
+1. There are at most `peers` buckets. One more replaces the least recently used one, so a flood from many addresses
+   gains at most one burst for each.
+2. An IPv6 peer is its /64, since one host can use all addresses of it.
 """
 
 import ipaddress
@@ -14,7 +14,7 @@ _V6_PREFIX = 64
 
 
 def peer_key(host: str) -> str:
-    """What counts as one peer."""
+    """Return the key of the peer that an address belongs to."""
     try:
         address = ipaddress.ip_address(host)
     except ValueError:
@@ -36,7 +36,7 @@ class Buckets:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, host: str, now: float) -> float:
-        """Take one: 0 when there was one, else the seconds until there will be."""
+        """Take one token; return 0, or the seconds until there will be one."""
         left = self._left(host, now)
         if left < 1:
             self._keep(host, left, now)
@@ -45,12 +45,12 @@ class Buckets:
         return 0.0
 
     def wait(self, host: str, now: float) -> float:
-        """What `take` would say, without taking."""
+        """Return the seconds that `take` would return, without taking."""
         left = self._left(host, now)
         return 0.0 if left >= 1 else (1 - left) / self._per_second
 
     def touched(self, host: str, now: float) -> bool:
-        """Whether the peer has taken some that have not come back yet."""
+        """Whether the peer's bucket is not full again."""
         return self._left(host, now) < self._burst
 
     def _left(self, host: str, now: float) -> float:

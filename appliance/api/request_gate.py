@@ -1,16 +1,14 @@
-"""What every request passes before it reaches a route: limits, where it came from, who asks; and what is recorded.
+"""Check every request before it reaches a route (limits, origin, token), and report its answer.
 
 Order: rate → Host → Origin → size of the body → token. Invariants:
 
-1. A request that does not pass costs no more than its headers, and no route, no parser of bodies and no question to
-   control sees it.
-2. Only `PUBLIC` and the console's own files answer without a token; any other path that does not exist is no
-   different from one that does.
-3. A page of another site cannot use the browser of somebody who can reach the appliance: a Host that is a foreign
-   name (DNS rebinding) and an Origin that is not the appliance's own are refused, and no CORS header is ever sent.
-4. Every answer but those of the health probes and the console's own files is recorded (equal reads folded, see
+1. A request that fails a check costs no more than its headers: neither a route, a parser of bodies nor control sees it.
+2. Only `PUBLIC` and the console's own files answer without a token; an unknown path is answered like a known one.
+3. A page of another site cannot use the browser of a person who can reach the appliance: a foreign name as Host (DNS
+   rebinding) and a foreign Origin are rejected, and no CORS header is ever sent.
+4. Every answer except those of the health probes and the console's own files is reported (equal reads folded, see
    `Journal`).
-5. A client that does not take its answer is cut off.
+5. A client that does not read its answer is cut off.
 """
 
 import asyncio
@@ -24,12 +22,12 @@ import structlog
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from appliance.api.access import Bearer, Doorkeeper
-from appliance.api.dry_runs import is_dry
+from appliance.api.access import Bearer, TokenAuthenticator
 from appliance.api.journal import Journal
 from appliance.api.problems import REASON, ProblemError, defect, too_many
 from appliance.api.rates import Buckets
-from appliance.channel.messages.api import Asked
+from appliance.channel.messages.api import ClientRequest
+from appliance.channel.rest_meaning import is_dry_run
 from appliance.configuration.settings import ApiLimits
 from appliance.signing.request_signing import HEADER
 
@@ -39,16 +37,17 @@ PUBLIC = frozenset({
     "/healthz", "/readyz", "/v1/healthz", "/v1/readyz", "/v1/openapi.json",
     "/v1/enrol", "/v1/revocations", "/v1/authority",
 })  # fmt: skip
-BEARER = "rosrv.bearer"  # the key of a request's scope that has who asks
+BEARER = "rosrv.bearer"  # the key of a request's scope for its bearer
 _NOT_RECORDED = frozenset({"/healthz", "/readyz", "/v1/healthz", "/v1/readyz"})
+_QUESTIONS = frozenset({"/v1/policy/explain", "/v1/policy/test"})  # queries with a body
 _LOOKS = frozenset({"GET", "HEAD"})
 _BODY_SECONDS = 30.0
-_NOBODYS_BODY = 1024  # bytes of a body that somebody without a token may send
+_LONGEST_ANONYMOUS_BODY = 1024  # bytes of a body without a token
 _REQUEST_BODY = 24 << 10  # of a host that brings a signing request
-_RENEWAL = re.compile(r"/v1/hosts/[^/]{1,63}/renew(ed)?")  # for a host in its tunnel, which is who it is
+_RENEWAL = re.compile(r"/v1/hosts/[^/]{1,63}/renew(ed)?")  # for a host in its tunnel, which identifies it
 _IN_TUNNELS = frozenset({"/v1/revocations", "/v1/authority"})
 _SEND_SECONDS = 30.0
-_PAGE_SHARE = 10  # so many times the requests of REST may be for the console's files
+_PAGE_SHARE = 10  # the rate of the console's files, as a multiple of REST's
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
@@ -58,25 +57,25 @@ _HEADERS = {
 
 
 def is_console(path: str) -> bool:
-    """Whether a path is one of the console's, which is served without a token."""
+    """Whether a path is one of the console's files, which are served without a token."""
     return path in ("/", "/console") or path.startswith("/console/")
 
 
-class Gate:
-    """ASGI middleware around the application; `names` are those REST is called by, besides addresses."""
+class RequestGate:
+    """ASGI middleware around the application; `names` are REST's host names, besides addresses."""
 
     def __init__(
         self,
         app: ASGIApp,
         *,
         limits: ApiLimits,
-        doorkeeper: Doorkeeper,
+        doorkeeper: TokenAuthenticator,
         journal: Journal,
         names: Iterable[str],
         tunnels: ipaddress.IPv4Network | None = None,
         networks: Iterable[Network] = (),
     ) -> None:
-        """Hosts in `tunnels` that are in none of `networks` may do no more than renew their certificates."""
+        """Let hosts in `tunnels` that are in none of `networks` only renew their certificates."""
         self._app = app
         self._tunnels = tunnels
         self._networks = tuple(networks)
@@ -85,7 +84,7 @@ class Gate:
         self._journal = journal
         self._names = {"localhost", *(name.lower() for name in names)}
         self._rate = Buckets(limits.requests_per_second, limits.burst)
-        # A page is many small files at once; they cost nobody but this process anything.
+        # A page is many small files at once, which cost only this process anything.
         self._page_rate = Buckets(limits.requests_per_second * _PAGE_SHARE, limits.burst * _PAGE_SHARE)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -127,12 +126,12 @@ class Gate:
         self._check_tunnel(host, path, renewal=renewal)
         if path not in PUBLIC and not renewal and not is_console(path):
             bearer = await self._doorkeeper.recognise(headers.get("authorization"), host)
-        limit = int(self._limits.body_bytes) if bearer is not None else _NOBODYS_BODY
+        limit = int(self._limits.body_bytes) if bearer is not None else _LONGEST_ANONYMOUS_BODY
         if renewal or path == "/v1/enrol":
             limit = _REQUEST_BODY
         body = await _read(headers, receive, limit)
         if bearer is not None and scope["method"] not in _LOOKS:
-            bearer = replace(bearer, asked=_asked(scope, headers, body))
+            bearer = replace(bearer, asked=asked_of(scope, headers, body))
         return bearer, body
 
     def _check_tunnel(self, host: str, path: str, *, renewal: bool) -> None:
@@ -159,10 +158,10 @@ class Gate:
             )
 
 
-def _asked(scope: Scope, headers: Headers, body: bytes) -> Asked:
-    """The request as control holds it against its proof."""
+def asked_of(scope: Scope, headers: Headers, body: bytes) -> ClientRequest:
+    """Return the request in the form that control compares with its signature."""
     query = scope["query_string"].decode("latin-1")
-    return Asked(
+    return ClientRequest(
         host=scope["client"][0],
         method=scope["method"],
         target=scope["raw_path"].decode("latin-1") + (f"?{query}" if query else ""),
@@ -174,7 +173,7 @@ def _asked(scope: Scope, headers: Headers, body: bytes) -> Asked:
 
 
 class _Answer:
-    """One answer on its way out: hardened, bounded in time, reported when its status is known."""
+    """One outgoing answer: with hardening headers, limited in time, reported when its status is known."""
 
     def __init__(self, scope: Scope, send: Send, journal: Journal) -> None:
         self._scope = scope
@@ -196,7 +195,7 @@ class _Answer:
         self._ended = message["type"] == "http.response.body" and not message.get("more_body", False)
 
     async def fail(self, problem: ProblemError, receive: Receive) -> None:
-        """Answer with a problem; an answer that was begun and cannot be finished is broken off."""
+        """Answer with a problem; abort an answer that has already begun."""
         if self._ended:
             return
         if self._begun:
@@ -215,13 +214,13 @@ class _Answer:
             path=path,
             status=status,
             reason=self._scope.get(REASON, ""),
-            dry=is_dry(path, self._scope["query_string"]),
+            dry=path in _QUESTIONS or is_dry_run(self._scope["query_string"].decode("latin-1")),
             duration_us=(time.monotonic_ns() - self._started) // 1000,
         )
 
 
 async def _disconnected(receive: Receive) -> None:
-    """Return when the client is gone."""
+    """Wait until the client disconnects."""
     while (await receive())["type"] != "http.disconnect":
         pass
 

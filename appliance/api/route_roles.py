@@ -1,4 +1,4 @@
-"""What a route asks of who calls it: a role, and what every other route asks the same way."""
+"""Require roles for routes, and convert control's rejections to problems."""
 
 from typing import Annotated, Any
 
@@ -9,15 +9,14 @@ from appliance.api.access import Bearer
 from appliance.api.control import ControlLink
 from appliance.api.problems import ProblemError
 from appliance.api.request_gate import BEARER
-from appliance.api.routing import Routes
-from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble, answer_to, operation_of
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble
 from appliance.channel.answers.token_answers import TokenRole, may
 
 _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token add`")
 
 
 class _Requires:
-    """A dependency: the bearer, whose role must be at least this one."""
+    """A dependency that returns the bearer, whose role must be at least `least`."""
 
     def __init__(self, least: TokenRole) -> None:
         self.least = least
@@ -31,7 +30,7 @@ class _Requires:
 
 
 VIEWER = Depends(_Requires("viewer"))
-"""For `dependencies=` of a route that asks for the role and nothing more of who calls."""
+"""For `dependencies=` of a route that requires the role and does not use the bearer."""
 
 OPERATOR = Depends(_Requires("operator"))
 Viewer = Annotated[Bearer, VIEWER]
@@ -41,7 +40,7 @@ Admin = Annotated[Bearer, Depends(_Requires("admin"))]
 
 
 def reads_contents(bearer: Bearer) -> bool:
-    """Whether who calls may read what single messages said in the records of monitors: all but viewers."""
+    """Whether a bearer may read message contents in the records of monitors: all but viewers."""
     return bearer.role != "viewer"
 
 
@@ -53,7 +52,7 @@ def _no_viewer(bearer: Viewer) -> Bearer:
 
 
 Reader = Annotated[Bearer, Depends(_no_viewer)]
-"""Whoever may read what messages said in records: investigators, operators and admins."""
+"""The roles that may read messages in records: investigators, operators and admins."""
 
 _PROBLEMS = {
     "request": (422, "bad-input"),
@@ -67,11 +66,11 @@ _PROBLEMS = {
 
 
 async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
-    """Control's answer. Raises `ProblemError` for a refusal, `ControlAwayError` when there is no control."""
+    """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
     return answered(await control.ask(request, bearer))
 
 
-_LEAST: dict[str, Any] = {
+LEAST: dict[str, Any] = {
     "viewer": Viewer,
     "investigator": Investigator,
     "operator": Operator,
@@ -79,29 +78,14 @@ _LEAST: dict[str, Any] = {
 }
 
 
-def add_look(routes: Routes, control: ControlLink, question: type[AdminRequest[Any]]) -> None:
-    """Add the route of a question that has no fields: its path, role, answer and words are those of the request."""
-    operation = operation_of(question())
-    assert operation is not None  # noqa: S101  it has `@rest`
-    path = operation.path.removeprefix(routes.prefix)
-
-    async def look(bearer: Bearer) -> Any:
-        return await ask(control, question(), bearer)
-
-    look.__doc__ = question.__doc__
-    look.__name__ = operation.path.rpartition("/")[2]
-    look.__annotations__ = {"bearer": _LEAST[operation.role or ""], "return": answer_to(question)}
-    routes.add_api_route(path, look, operation_id=operation.path.removeprefix("/v1/").replace("/", "_"))
-
-
 def answered(answer: AdminAnswer[A]) -> A:
-    """The body of an answer. Raises `ProblemError` for a refusal."""
+    """Return the body of an answer. Raises `ProblemError` for a rejection."""
     if answer.ok:
         return answer.given()
     raise problem_of(answer.trouble, "\n".join([answer.error, *answer.findings]))
 
 
 def problem_of(trouble: Trouble, detail: str) -> ProblemError:
-    """How a refusal is answered."""
+    """Return the problem for a rejection by control."""
     status, kind = _PROBLEMS.get(trouble, (503, "not-available"))
     return ProblemError(status, kind, detail)

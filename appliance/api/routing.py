@@ -1,7 +1,7 @@
-"""Routes whose handlers take and give structs (msgspec): how those are read and written, and what the contract says.
+"""Make routes whose handlers take and return structs (msgspec): parse, encode, and add schemas to the contract.
 
-A handler gives a struct, or `Tagged` with its ETag; the contract has the schema that is made of it. A body is taken by
-`Annotated[Kind, body(Kind)]`. Where an answer is something else, the handler gives a `Response`.
+A handler returns a struct, or `Tagged` with a struct and its ETag; the struct's schema is in the contract. It takes a
+body by `Annotated[Kind, body(Kind)]`. For anything else it returns a `Response`.
 """
 
 import enum
@@ -15,8 +15,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import msgspec
 from fastapi import APIRouter, Depends, Request, Response
 
+from appliance.api.etags import etag
 from appliance.api.moments import in_full
-from appliance.api.preconditions import etag
 from appliance.api.problems import BadInput, ProblemError, bad_input
 from appliance.base.validation_messages import body_refusal, meant
 
@@ -29,36 +29,36 @@ _PLACE = re.compile(r"(?s)(.*) - at `(?:key` in `)?\$(.*)`")
 
 
 class Tagged(NamedTuple, Generic[A]):
-    """An answer with the revision, or the tag, that its ETag has."""
+    """An answer with the revision, or the tag, of its ETag."""
 
     body: A
     tag: int | str
 
 
 def tagged(body: A) -> Tagged[A]:
-    """With the tag that it has itself, or its revision."""
-    return Tagged(body, getattr(body, "tag", None) or body.revision)  # type: ignore[attr-defined]  # it has one
+    """Return an answer with its own tag, or its revision."""
+    return Tagged(body, getattr(body, "tag", None) or body.revision)  # type: ignore[attr-defined]  # each versioned answer has a revision
 
 
 def answer(body: Any, status: int = 200, tag: int | str | None = None) -> Response:
-    """A struct as JSON."""
+    """Return a struct as JSON."""
     headers = None if tag is None else {"ETag": etag(tag)}
     return Response(msgspec.json.encode(in_full(body)), status, headers, _JSON)
 
 
 class Contract:
-    """The structs that the contract speaks of."""
+    """The structs in the contract."""
 
     def __init__(self) -> None:
         self.kinds: set[Any] = set()
 
     def reference(self, kind: Any) -> dict[str, Any]:
-        """The schema of a struct, by its name."""
+        """Return the schema of a struct, by its name."""
         self.kinds.add(kind)
         return {"$ref": f"#/components/schemas/{kind.__name__}"}
 
     def components(self) -> dict[str, Any]:
-        """Their schemas, and those of what is in them."""
+        """Return the schemas of all structs, and of the structs in them."""
         kinds = sorted(self.kinds, key=lambda kind: str(kind.__name__))
         return msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")[1]
 
@@ -67,25 +67,25 @@ CONTRACT = Contract()
 
 
 def content(kind: Any) -> dict[str, Any]:
-    """An answer of this kind, as `responses=` of a route takes it."""
+    """Describe an answer of this kind, for `responses=` of a route."""
     return {_JSON: {"schema": CONTRACT.reference(kind)}}
 
 
 def file(media_type: str, description: str, *, binary: bool = False) -> Responses:
-    """An answer that is no JSON, as `responses=` of a route takes it."""
+    """Describe an answer that is not JSON, for `responses=` of a route."""
     schema = {"type": "string"} | ({"format": "binary"} if binary else {})
     return {200: {"description": description, "content": {media_type: {"schema": schema}}}}
 
 
 class _Body:
-    """Reads a body of one kind; `text` names what may also be sent as text/plain, the field `text` of the kind."""
+    """A dependency that reads a body of one kind; `text` describes its field `text` if text/plain is also accepted."""
 
     def __init__(self, kind: Any, text: str | None) -> None:
         self.kind = kind
         self.text = text
 
     async def __call__(self, request: Request) -> Any:
-        """The body. Raises `ProblemError` (415, 422)."""
+        """Return the body. Raises `ProblemError` (415, 422)."""
         content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if content_type == "text/plain" and self.text is not None:
             return self._of_text(_text(await request.body()))
@@ -107,21 +107,21 @@ class _Body:
             try:
                 return msgspec.json.decode(text, type=self.kind)
             except msgspec.ValidationError as error:
-                # That was the first field that is wrong: behind it may be what is no JSON.
+                # The error is about the first wrong field; invalid JSON may follow it.
                 wrong = _all_wrong(msgspec.json.decode(text), self.kind) or [_bad(error)]
         except (msgspec.DecodeError, RecursionError) as error:
             raise _not_json(text, error) from None
         raise bad_input(wrong)
 
     def schema(self) -> dict[str, Any]:
-        """How the contract describes it."""
+        """Return the body's description for the contract."""
         kinds = content(self.kind)
         if self.text is not None:
             kinds["text/plain"] = {"schema": {"type": "string", "minLength": 1}}
         return {"requestBody": {"required": True, "content": kinds}}
 
     def responses(self) -> Responses:
-        """What the contract says of those that are not taken."""
+        """Return the contract's responses for bodies that are rejected."""
         wrong: Responses = {422: {"description": "A parameter or the body makes no sense."}}
         if self.text is not None:
             wrong[415] = {"description": "The body is neither text/plain nor JSON."}
@@ -136,7 +136,7 @@ def _text(data: bytes) -> str:
 
 
 def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
-    """What is wrong with each field of a body, where msgspec ends with the first."""
+    """Return the errors of all fields of a body; msgspec stops at the first."""
     if not isinstance(given, dict):
         return []
     known = {field.encode_name: field for field in msgspec.structs.fields(kind)}
@@ -157,14 +157,14 @@ def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
 
 
 def _bad(error: msgspec.ValidationError, where: str = "body", kind: Any = None) -> BadInput:
-    """What is wrong with a part of a body of this kind, and where."""
+    """Return the error of a part of a body of this kind, with its place."""
     found = _PLACE.fullmatch(str(error))
     text, place = (str(error), "") if found is None else found.groups()
     return BadInput(where + place, body_refusal(text, _choices(kind)))
 
 
 def _choices(kind: Any) -> tuple[str, ...]:
-    """The texts that a value of this kind may be, where it is one of a few."""
+    """Return the permitted strings of a kind with a fixed set of values, otherwise nothing."""
     parts = typing.get_args(kind)
     if isinstance(kind, type) and issubclass(kind, enum.StrEnum):
         return tuple(kind)
@@ -174,7 +174,7 @@ def _choices(kind: Any) -> tuple[str, ...]:
 
 
 def _not_json(text: str, error: Exception) -> ProblemError:
-    """What is wrong with it, and where, in the words of Python's reader."""
+    """Return the problem of invalid JSON, with the place and the message of Python's parser."""
     try:
         json.loads(text)
     except json.JSONDecodeError as found:
@@ -186,12 +186,12 @@ def _not_json(text: str, error: Exception) -> ProblemError:
 
 
 def body(kind: type, *, text: str | None = None) -> Any:
-    """For the annotation of a handler's parameter: the body is of this kind, or the text that is called `text`."""
+    """Return the annotation of a handler's parameter for a body of this kind, or for the text that `text` describes."""
     return Depends(_Body(kind, text))
 
 
 class Routes(APIRouter):
-    """FastAPI's router, for handlers that take and give structs."""
+    """FastAPI's router, for handlers that take and return structs."""
 
     def add_api_route(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
         """Add a handler; its name, answer, ETag and body are put into the contract."""

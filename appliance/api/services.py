@@ -1,12 +1,12 @@
-"""What the routes work with, named once."""
+"""Define the parts that the routes share."""
 
 import asyncio
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from appliance.api.access import Doorkeeper
+from appliance.api.access import TokenAuthenticator
 from appliance.api.control import ControlLink
-from appliance.api.history import History
+from appliance.api.history import SampleHistory
 from appliance.api.journal import Journal
 from appliance.api.streams import Streams
 from appliance.configuration.settings import Settings
@@ -17,16 +17,16 @@ from appliance.quotas.table import REST_EXPORTS
 class Services:
     """The parts that the routes share; `stopping` is set when the process is to end.
 
-    `judging` bounds the texts that are compiled at once to answer questions and dry runs, `ordering` those of orders,
-    which never wait for the others; `exports` bounds the exports of the audit log.
+    `judging` limits the texts that are compiled at once for queries and dry runs, `ordering` those for orders, which
+    never wait for the former; `exports` limits the exports of the audit log.
     """
 
     settings: Settings
     control: ControlLink
-    doorkeeper: Doorkeeper
+    doorkeeper: TokenAuthenticator
     journal: Journal
     stopping: asyncio.Event
-    history: History
+    history: SampleHistory
     judging: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
     ordering: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
     exports: Streams = field(
@@ -35,5 +35,5 @@ class Services:
 
     @property
     def audit_log(self) -> Path:
-        """The audit log, which may be read here and not written."""
+        """Return the path of the audit log, which is read-only here."""
         return self.settings.state / "control" / "audit.db"

@@ -1,8 +1,8 @@
-"""Who follows: streams and exports that last, each a place of which there are so many, with a share for everybody.
+"""Limit long answers, which are streams and exports, by quotas.
 
-A place is held by a token and by a peer, and each of both has a share: whoever holds a viewer's token takes neither the
-places of the others nor those that are kept for operators and admins, from however many connections; and one machine
-with many tokens does not, either. Places are given back when the response is over, whatever ended it.
+A long answer counts for its token and for its peer, and each has a quota. So neither viewers' tokens with many
+connections nor one machine with many tokens can use up the places of others, or those for operators and admins.
+A place is free again when the response ends, for whatever reason.
 """
 
 import asyncio
@@ -17,35 +17,35 @@ from starlette.types import Receive, Scope, Send
 from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
 from appliance.channel.answers.token_answers import TokenRole
-from appliance.quotas.pool import Pool, Standing
-from appliance.quotas.table import Share
+from appliance.quotas.pool import Pool, QuotaClass
+from appliance.quotas.table import QuotaRow
 
 _PATIENCE_SECONDS = 5.0
 A = TypeVar("A", str, bytes)
 
 
 def peer_of(request: Request) -> str:
-    """The machine that a request comes from."""
+    """Return the address that a request comes from."""
     return request.client.host if request.client is not None else ""
 
 
 class Streams:
-    """The places of one kind: `tokens` and `peers` are their shares, `whole` is how many there are."""
+    """The places for long answers of one kind: `whole` in number, with quotas for `tokens` and `peers`."""
 
-    def __init__(self, tokens: Share, peers: Share, whole: int) -> None:
+    def __init__(self, tokens: QuotaRow, peers: QuotaRow, whole: int) -> None:
         self.roles: dict[str, TokenRole] = {}
         part = whole / tokens.bounds.whole
         self._tokens: Pool[str] = Pool(
-            "of these", tokens.bounds.sized(whole, max(1, int(tokens.bounds.host * part))), self._standing
+            "of these", tokens.bounds.sized(whole, max(1, int(tokens.bounds.host * part))), self._quota_class
         )
         self._peers: Pool[str] = Pool(
             "of these",
             peers.bounds.sized(whole, max(1, int(peers.bounds.host * part))),
-            lambda _peer: Standing.REGISTERED,
+            lambda _peer: QuotaClass.REGISTERED,
         )
 
     def take(self, bearer: Bearer, peer: str, what: str) -> Callable[[], None]:
-        """Take a place; what is returned gives it back. Raises `ProblemError` (503)."""
+        """Take a place; return the function that gives it back. Raises `ProblemError` (503)."""
         self.roles[bearer.id] = bearer.role
         busy = self._tokens.refusal(bearer.id) or self._peers.refusal(peer)
         if busy:
@@ -63,8 +63,8 @@ class Streams:
 
         return give_back
 
-    def _standing(self, token: str) -> Standing:
-        return Standing.NAMED if self.roles[token] == "viewer" else Standing.REGISTERED
+    def _quota_class(self, token: str) -> QuotaClass:
+        return QuotaClass.NAMED if self.roles[token] == "viewer" else QuotaClass.REGISTERED
 
     def _forget(self, token: str) -> None:
         if not self._tokens.held(token):
@@ -73,7 +73,7 @@ class Streams:
 
 @contextlib.asynccontextmanager
 async def turn(turns: asyncio.Semaphore, what: str) -> AsyncIterator[None]:
-    """Wait a moment for one of so many at once. Raises `ProblemError` (503)."""
+    """Wait a moment for one of the `turns`. Raises `ProblemError` (503)."""
     try:
         async with asyncio.timeout(_PATIENCE_SECONDS):
             await turns.acquire()
@@ -86,14 +86,14 @@ async def turn(turns: asyncio.Semaphore, what: str) -> AsyncIterator[None]:
 
 
 async def in_thread(pieces: Iterator[A]) -> AsyncIterator[A]:
-    """What an iterator gives that takes its time, without the empty pieces."""
+    """Yield the pieces of a slow iterator, without empty ones."""
     while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
         if piece:
             yield piece
 
 
-class Held(Response):
-    """A response that lasts: its place is given back when it is over."""
+class StreamResponse(Response):
+    """A long response that gives its place back when it ends."""
 
     def __init__(self, response: Response, give_back: Callable[[], None]) -> None:
         self._response = response
@@ -102,7 +102,7 @@ class Held(Response):
         self.background = response.background
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send it."""
+        """Send the response, then give its place back."""
         try:
             await self._response(scope, receive, send)
         finally:

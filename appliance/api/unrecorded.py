@@ -1,4 +1,4 @@
-"""What an audit search asks for that this version never records: a slip of the pen, or a log of another version."""
+"""Find names in an audit search that this version never records: misspelt, or of another version."""
 
 from appliance.audit.events import EVENTS
 from appliance.audit.query import Filter
@@ -6,11 +6,11 @@ from appliance.base.validation_messages import meant
 from appliance.policy.model import Category
 
 CATEGORIES = (*Category, "monitor", "parameter", "publication", "rest", "service", "subscription", "topic")
-"""What a record may be about: what the policy decides, and what else there is."""
+"""The categories of records: those that the policy decides, and the others."""
 
 
 def unrecorded(wanted: Filter) -> list[str]:
-    """A sentence for each name that no record has, with the nearest known one; a glob has none."""
+    """Return a sentence for each name that no record can have, with the nearest known name; globs are not checked."""
     return [
         f"this version records no {what} {name!r}{meant(name, known)}"
         for what, name, known in (("event", wanted.event, EVENTS), ("category", wanted.category, CATEGORIES))
