@@ -1,4 +1,4 @@
-"""`rosrv backup`, `restore` and `purge`: the state directory in one file, and back; and its end."""
+"""`rosrv backup`, `restore` and `purge`: save, restore and erase the state directory."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,26 +9,27 @@ from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up
 from appliance.backup.purge import purge as remove
 from appliance.backup.restore import restore as put_back
+from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
-from appliance.cli.target import DEFAULT_STATE, State
 from rosmop.tool.terminal import printable, refused, say
 
 _NewState = Annotated[
     Path,
-    typer.Option(
-        "--state", envvar="ROSRV_STATE", help="State directory to make; must not exist, or be empty"
-    ),
+    typer.Option("--state", envvar="ROSRV_STATE", help="State directory to create; must be absent or empty"),
 ]
 
 
 def backup(
-    file: Annotated[Path, typer.Argument(help="Where to; must not exist. It has keys in it: keep it as one")],
+    file: Annotated[
+        Path,
+        typer.Argument(help="File to write; must not exist. It contains private keys"),
+    ],
     state: State = DEFAULT_STATE,
     as_json: Json = False,
 ) -> None:
-    """Write the state directory to one file: audit log, registrations, policies, keys. The appliance may run.
+    """Write the state directory to one file: audit log, registrations, policies, keys. The appliance may be running.
 
-    Configuration, policy and specifications are your own files and not in it.
+    Your own files are not included: configuration, policy and specifications.
 
     Example: rosrv backup /media/safe/rosrv-2026-03-01.tar.gz --state /var/lib/rosrv
     """
@@ -44,11 +45,11 @@ def backup(
 
 
 def restore(
-    file: Annotated[Path, typer.Argument(help="What `rosrv backup` wrote")],
+    file: Annotated[Path, typer.Argument(help="File written by `rosrv backup`")],
     state: _NewState = DEFAULT_STATE,
     as_json: Json = False,
 ) -> None:
-    """Make a state directory of a backup; `rosrv up --state` there goes on from it. Nothing is written over.
+    """Create a state directory from a backup, for `rosrv up --state`. Existing files are never overwritten.
 
     Example: rosrv restore /media/safe/rosrv-2026-03-01.tar.gz --state /var/lib/rosrv
     """
@@ -59,26 +60,26 @@ def restore(
     if as_json:
         say_json({"state": str(state), "files": len(names)})
     else:
-        say(f"{state}: {len(names)} files; prove the log: rosrv audit verify --state {state}")
+        say(f"{state}: {len(names)} files; verify the log: rosrv audit verify --state {state}")
 
 
 def purge(
     state: State = DEFAULT_STATE,
     confirm: Annotated[
         str | None,
-        typer.Option(metavar="DIR", help="The state directory once more, for scripts; else it is asked for"),
+        typer.Option(metavar="DIR", help="The state directory again, for scripts (default: ask for it)"),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Remove a state directory for good: audit log, policies, keys of the appliance and of its hosts. It must not run.
+    """Erase a state directory: audit log, policies, keys of the appliance and its hosts. Stop the appliance first.
 
-    Keys and other small files are written over first; what the disk itself keeps of them is not reached.
+    Keys and other small files are overwritten first; copies that the disk itself keeps cannot be reached.
 
     Example: rosrv purge --state /var/lib/rosrv
     """
     if confirm is None:
         text = (
-            f"Everything in {printable(str(state))} is lost for good. Write the path once more to remove it"
+            f"This erases everything in {printable(str(state))} permanently. Type the path again to erase it"
         )
         confirm = str(typer.prompt(text, err=True))
     if Path(confirm).absolute() != state.absolute():
@@ -90,7 +91,7 @@ def purge(
     if as_json:
         say_json({"state": str(state), "files": files, "written_over": written})
     else:
-        say(f"{state} is gone: {files} files, {written} of them written over first")
+        say(f"{state} is erased: {files} files, {written} of them overwritten first")
 
 
 def _failed(text: str) -> typer.Exit:

@@ -1,4 +1,4 @@
-"""What `rosrv policy` and `rosrv monitor` say of revisions, and of changes that go back unless they are confirmed."""
+"""Define the verbs for revisions and commit-confirm, for `rosrv policy` and `rosrv monitor`."""
 
 import datetime
 from collections.abc import Callable
@@ -8,9 +8,9 @@ import typer
 
 from appliance.channel.admin import AdminRequest
 from appliance.channel.answers import monitor_answers, policy_answers
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import say_json
-from appliance.cli.target import Appliance, speaks
 from rosmop.tool.terminal import say
 
 _Listed = TypeVar("_Listed", policy_answers.PolicyRevisionList, monitor_answers.MonitorRevisionList)
@@ -20,20 +20,20 @@ _Done = TypeVar("_Done")
 ConfirmWithin = Annotated[
     str | None,
     typer.Option(
-        help="Go back by itself after this time (30s, 5m, 1h) unless it is confirmed (the verb confirm)"
+        help="Commit-confirm: roll back after this time (30s, 5m, 1h) unless the verb confirm is run"
     ),
 ]
 
 
 def seconds_within(text: str | None, noun: str) -> float | None:
-    """What --confirm-within of a verb of `rosrv noun` says. Ends the program with 2 when it is no time."""
+    """Return the seconds given with --confirm-within of `rosrv noun`. Exits with status 2 if it is not a duration."""
     return None if text is None else span_given("--confirm-within", text, "30s, 5m or 1h", f"rosrv {noun}")
 
 
 def say_deadline(confirm_by: float | None, noun: str) -> None:
-    """Until when `rosrv noun confirm` is awaited; nothing when it is not."""
+    """Print when a change rolls back without `rosrv noun confirm`; print nothing for a permanent change."""
     if confirm_by is not None:
-        say(f"it goes back by itself at {_time(confirm_by)} unless you say: rosrv {noun} confirm", "yellow")
+        say(f"rolls back at {_time(confirm_by)} unless you run: rosrv {noun} confirm", "yellow")
 
 
 def verbs_of(
@@ -44,9 +44,9 @@ def verbs_of(
     back: Callable[[int | None], AdminRequest[_Done]],
     say_done: Callable[[_Done], None],
 ) -> tuple[Callable[..., None], Callable[..., None], Callable[..., None]]:
-    """The verbs `revisions`, `rollback` and `confirm` of `rosrv noun`; what they do says the table of verbs.
+    """Return the verbs `revisions`, `rollback` and `confirm` of `rosrv noun`.
 
-    `listed`, `confirmation` and `back(revision)` are what each asks; `say_done` says what a rollback did.
+    `listed`, `confirmation` and `back(revision)` are their requests; `say_done` prints the result of a rollback.
     """
 
     def revisions(appliance: Appliance) -> None:
@@ -56,7 +56,7 @@ def verbs_of(
     def rollback(
         appliance: Appliance,
         revision: Annotated[
-            int | None, typer.Argument(help="A kept revision; without it, the one before")
+            int | None, typer.Argument(help="A kept revision (default: the previous one)")
         ] = None,
     ) -> None:
         say_done(appliance.answer_or_exit(back(revision)))
@@ -67,7 +67,7 @@ def verbs_of(
             say_json(body)
         else:
             kept = f"revision {body.revision} stays in force"
-            say(kept if body.confirmed else f"nothing waits to be confirmed: {kept}")
+            say(kept if body.confirmed else f"nothing to confirm: {kept}")
         raise typer.Exit(0 if body.confirmed else 1)
 
     for verb, example in ((revisions, "revisions"), (rollback, "rollback 7"), (confirm, "confirm")):

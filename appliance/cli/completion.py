@@ -1,6 +1,6 @@
-"""What the shell completes: names that the running appliance knows, where its admin socket can be asked; else nothing.
+"""Complete names in the shell, by queries of the running appliance's admin socket.
 
-Whoever presses Tab is told no errors: an appliance that does not run, or is not his, has no names to offer.
+Completion never prints errors: without access to a running appliance it offers no names.
 """
 
 from collections.abc import Callable, Iterable
@@ -10,13 +10,13 @@ import typer
 
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
-from appliance.cli.admin_client import AdminSocket, NotRunningError
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 
 Complete = Callable[[typer.Context, str], list[str]]
 
 
 def _names(request: AdminRequest[A], of: Callable[[A], Iterable[str]]) -> Complete:
-    """Completes names in the answer to a question."""
+    """Return a function that completes the names in the answer to a request."""
 
     def complete(context: typer.Context, incomplete: str) -> list[str]:
         state = context.params.get("state") or "/var/lib/rosrv"

@@ -1,4 +1,4 @@
-"""`rosrv config check|show`: what configuration is in force, and whether it is right."""
+"""`rosrv config check|show`: validate and print the configuration."""
 
 import json
 import os
@@ -19,7 +19,7 @@ _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
 
 
 def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = False) -> None:
-    """Report every mistake in the file and the environment; exit status 1 when there is one.
+    """Report every error in the file and the environment. Exit status: 0 valid, 1 errors.
 
     Example: rosrv config check appliance.yaml
     """
@@ -32,7 +32,7 @@ def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = Fals
             _print(json.dumps({"place": mistake.place, "text": mistake.text}))
         raise typer.Exit(1) from error
     if not as_json:
-        _print("The configuration is right.")
+        _print("The configuration is valid.")
 
 
 def show(
@@ -42,7 +42,7 @@ def show(
         bool, typer.Option("--schema", help="Print the JSON schema of the file instead")
     ] = False,
 ) -> None:
-    """Print every key with the value that is in force, defaults included.
+    """Print every key with its effective value, defaults included.
 
     Example: rosrv config show --schema
     """

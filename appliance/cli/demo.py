@@ -1,4 +1,4 @@
-"""`rosrv demo`: the product at work. What it shows is `examples/landshark`, which comes with the program."""
+"""`rosrv demo`: run `examples/landshark`, which is installed with the program."""
 
 import importlib
 import sys
@@ -17,7 +17,7 @@ def demo(
     ] = False,
     picture: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.svg", help="Draw the robot's ways, without and with monitors, from above"),
+        typer.Option(metavar="FILE.svg", help="Draw the robot's paths from above, without and with monitors"),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="One JSON object for each result; the story goes to standard error")
@@ -25,12 +25,12 @@ def demo(
 ) -> None:
     """Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.
 
-    Exit status: 0 the robot obeyed its operator and nobody else, 1 it did not.
+    Exit status: 0 the robot obeyed only its operator, 1 it did not.
 
     Example: rosrv demo --hold --picture drive.svg
     """
     if not (SHIPPED / "examples").is_dir():
-        raise refused([f"rosrv demo: the simulated robot is not in {SHIPPED}: install rosrv anew"])
+        raise refused([f"rosrv demo: the simulated robot is missing from {SHIPPED}: install rosrv again"])
     sys.path.insert(0, str(SHIPPED))
     demonstration = importlib.import_module("examples.landshark.demonstration")
     raise typer.Exit(demonstration.demonstrate(hold=hold, picture=picture, as_json=as_json))

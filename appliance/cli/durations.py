@@ -1,4 +1,4 @@
-"""Times as they are given on the command line: moments, and spans as `30s`, `5m`, `1.5h`, `90d`, `52w`."""
+"""Parse times on the command line: points in time, and durations such as `30s`, `5m`, `1.5h`, `90d`, `52w`."""
 
 import re
 from typing import Annotated
@@ -7,14 +7,14 @@ import typer
 
 from appliance.cli.output import usage_error
 
-Since = Annotated[str | None, typer.Option("--since", help="From this moment: 1h (ago), a date, or RFC 3339")]
-Until = Annotated[str | None, typer.Option("--until", help="Before this moment")]
+Since = Annotated[str | None, typer.Option("--since", help="From this time: 1h (ago), a date, or RFC 3339")]
+Until = Annotated[str | None, typer.Option("--until", help="Before this time")]
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 _SPAN = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)([smhdw])")
 
 
 def seconds_of(text: str, units: str) -> float | None:
-    """The seconds of a span that has one of these units; None when the text is none, or no time at all."""
+    """Return a duration in seconds; None unless it is longer than zero and its unit is in `units`."""
     found = _SPAN.fullmatch(text)
     if found is None or found[2] not in units or float(found[1]) <= 0:
         return None
@@ -22,9 +22,9 @@ def seconds_of(text: str, units: str) -> float | None:
 
 
 def span_given(option: str, text: str, spans: str, verb: str = "rosrv") -> float:
-    """The seconds of what was given for an option; `spans` are examples, one of each unit that it takes.
+    """Return the seconds of an option's duration; `spans` lists one example of each unit it accepts.
 
-    Ends the program with 2 when the text is none of them.
+    Exits with status 2 for any other text.
     """
     seconds = seconds_of(text, "".join(filter(str.isalpha, spans.replace(" or ", ""))))
     if seconds is None:

@@ -1,4 +1,4 @@
-"""`rosrv evidence export|verify|verifier`: what happened in one file that proves itself elsewhere."""
+"""`rosrv evidence export|verify|verifier`: signed evidence of an incident in one file."""
 
 import errno
 import os
@@ -12,22 +12,22 @@ from urllib.parse import quote
 import typer
 
 from appliance.audit.record_format import rfc3339
-from appliance.audit.timestamps import parse_moment
 from appliance.base.atomic_files import name_to_make
+from appliance.base.timestamps import parse_timestamp
 from appliance.cli import completion
-from appliance.cli.admin_client import AdminSocket
 from appliance.cli.audit.audit_errors import Errors, fail
+from appliance.cli.connection.admin_client import AdminSocket
+from appliance.cli.connection.rest_orders import RestWay
+from appliance.cli.connection.rest_session import RestProblemError
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import Since, Until
 from appliance.cli.output import Json, say_json, usage_error
-from appliance.cli.rest.orders import RestWay
-from appliance.cli.rest.session import ProblemError
-from appliance.cli.target import Appliance, speaks
 from appliance.evidence import bundle_verifier as verifier_module
-from appliance.evidence.bundle import VERIFIER, BundleError, Kept, Span, export
+from appliance.evidence.bundle import VERIFIER, BundleError, RecordingSelection, TimeSpan, export
 from appliance.signing.fingerprints import fingerprint
 from rosmop.tool.terminal import say
 
-_SILENCE_SECONDS = 3600.0  # it is made twice before the first byte comes
+_SILENCE_SECONDS = 3600.0  # the appliance builds a bundle twice before it sends the first byte
 
 
 @speaks
@@ -37,7 +37,7 @@ def export_evidence(
         str | None,
         typer.Argument(
             metavar="[RECORDING]",
-            help="The messages of this recording, and its time",
+            help="Export the messages and the time of this recording",
             autocompletion=completion.recordings,
         ),
     ] = None,
@@ -46,10 +46,10 @@ def export_evidence(
     since: Since = None,
     until: Until = None,
 ) -> None:
-    """Write what the log has of a time, and what was in force, as a bundle that proves itself anywhere.
+    """Export the audit log of a period as a bundle that can be verified anywhere.
 
-    It is on record who did. In the bundle are the recording, if it is of one, the audit records, the policies and
-    specifications in force, signed checkpoints, a page for people and the verifier.
+    The bundle holds the recording (if one is given), the audit records, the policies and specifications in force,
+    signed checkpoints, a readable page and the verifier. The audit log records the export.
 
     Example: rosrv evidence export --since 2026-03-01T10:00Z --until 2026-03-01T11:00Z -o incident.zip
     """
@@ -57,7 +57,7 @@ def export_evidence(
         if (recording is None) is (since is None) or (recording is not None and until is not None):
             raise usage_error("give a recording, or --since (and --until)")
         now = time.time_ns()
-        span = Span(parse_moment(since or "0s", now), parse_moment(until or "0s", now))
+        span = TimeSpan(parse_timestamp(since or "0s", now), parse_timestamp(until or "0s", now))
         size, part = 0, name_to_make(output)
         if os.path.lexists(output):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(output))
@@ -69,19 +69,19 @@ def export_evidence(
             part.rename(output)
         except BaseException as error:
             part.unlink()
-            if isinstance(error, BundleError | ProblemError):
+            if isinstance(error, BundleError | RestProblemError):
                 fail(str(error), 1)
             raise
     if appliance.as_json:
         say_json({"file": str(output), "bytes": size})
     else:
-        say(f"{output}: {size} bytes; prove it: python3 verify.py {output.name} --key audit.pub")
+        say(f"{output}: {size} bytes; verify it: python3 verify.py {output.name} --key audit.pub")
 
 
-def _bundle(appliance: Appliance, wanted: str | Span) -> Iterator[bytes]:
+def _bundle(appliance: Appliance, wanted: str | TimeSpan) -> Iterator[bytes]:
     match appliance.way:
         case AdminSocket(state=state):
-            asked = Kept(wanted, state / "recordings") if isinstance(wanted, str) else wanted
+            asked = RecordingSelection(wanted, state / "recordings") if isinstance(wanted, str) else wanted
             yield from export(state / "control" / "audit.db", asked, appliance.ask)
         case RestWay(client=client):
             path, params = "/v1/evidence", {}
@@ -94,18 +94,21 @@ def _bundle(appliance: Appliance, wanted: str | Span) -> Iterator[bytes]:
 
 
 def verify(
-    bundle: Annotated[Path, typer.Argument(help="What `rosrv evidence export` wrote, or the folder of it")],
+    bundle: Annotated[
+        Path, typer.Argument(help="Bundle written by `rosrv evidence export`, or its unpacked folder")
+    ],
     key: Annotated[
-        Path | None, typer.Option("--key", help="Public key (PEM) of the appliance, kept elsewhere")
+        Path | None, typer.Option("--key", help="Public key (PEM) of the appliance, kept on another machine")
     ] = None,
     checkpoints: Annotated[
-        Path | None, typer.Option("--checkpoints", help="What `rosrv audit checkpoints` gave, kept elsewhere")
+        Path | None,
+        typer.Option("--checkpoints", help="Output of `rosrv audit checkpoints`, kept on another machine"),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Hold a bundle against what the appliance signed: exit status 0 right, 1 not, 2 when it is no bundle.
+    """Verify a bundle. Exit status: 0 valid, 1 invalid, 2 not a bundle.
 
-    The same as `python3 verify.py`, which is in each bundle and needs no appliance.
+    Does the same as `python3 verify.py`, which is in each bundle and does not need an appliance.
 
     Example: rosrv evidence verify incident.zip --key /media/safe/audit.pub
     """
@@ -115,7 +118,7 @@ def verify(
 
 
 def verifier(as_json: Json = False) -> None:
-    """Write the verifier that comes with this version, for who does not trust the one in a bundle.
+    """Print the verifier of this version, so that you need not trust the copy in a bundle.
 
     Example: rosrv evidence verifier > verify.py
     """

@@ -1,8 +1,7 @@
 """The health check of a container, `python -m appliance.cli.healthy`: exit status 0 while nodes are served.
 
-What a person should look at, but nodes do not notice (a certificate that ends soon), is for `rosrv status`: an engine
-that restarts what is unhealthy would only make it worse. Run every few seconds, so it loads next to nothing: a tenth
-of what the command `rosrv` takes.
+Problems that do not affect nodes (a certificate that expires soon) appear in `rosrv status` only, because a container
+engine would restart the appliance for them in vain. The check runs every few seconds, so it imports very little.
 """
 
 import os
@@ -11,14 +10,14 @@ from pathlib import Path
 
 from appliance.channel.admin import StatusWanted
 from appliance.channel.status_summary import unserved
-from appliance.cli.admin_client import AdminSocket, NotRunningError
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 
 _STATE = "/var/lib/rosrv"  # the default of the configuration's key `state`
 _SECONDS = 4.0
 
 
 def main() -> None:
-    """Say what is wrong, if anything, and end with 1 then."""
+    """Print why nodes are not served and exit with 1; otherwise print nothing."""
     state = Path(os.environ.get("ROSRV_STATE", _STATE))
     try:
         answer = AdminSocket(state, _SECONDS).ask(StatusWanted())

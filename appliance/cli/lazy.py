@@ -1,14 +1,12 @@
-"""Verbs whose modules are imported when they are run, not when the command starts.
+"""Make typer commands that import their module when they run.
 
-`rosrv status` must not wait for the compiler of specifications, nor for a network library that one other verb needs.
-What `--help` and completion list is known without importing anything: names stand in a table, the first sentences in
-the files of the verbs.
+Importing all modules takes a second of processor time, so `rosrv status` must not import the compiler. `--help` and
+completion take the names from the table, and the first sentences of help from the source files.
 """
 
 import functools
 import importlib
 import inspect
-import os.path
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -24,7 +22,7 @@ from appliance.base.validation_messages import refusal
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """Where a verb is in this folder (`module:function`); the first sentence of its help, if its docstring lacks it."""
+    """A verb's function in this folder (`module:function`); `first` is put before its docstring in the help."""
 
     place: str
     first: str = ""
@@ -32,7 +30,7 @@ class Verb:
 
     @property
     def help(self) -> str:
-        """The first sentence; a docstring is read without importing its module."""
+        """Return the first sentence, read without importing the module."""
         module, _colon, function = self.place.partition(":")
         file = _FOLDER.joinpath(*module.split(".")).with_suffix(".py")
         return self.first or _first_sentence(file, function)
@@ -55,14 +53,14 @@ def _first_sentence(file: Path, function: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Verbs of several modules with a first word in common."""
+    """A command with verbs of its own, such as `rosrv audit`."""
 
     help: str
     verbs: Mapping[str, Verb]
 
 
 def application(verbs: Verbs, *, callback: Callable[..., None] | None = None, **settings: Any) -> typer.Typer:
-    """An application of typer's with these verbs; `callback` has the options that stand before a verb."""
+    """Return a typer application with these verbs; `callback` takes the options before the verb."""
     app = typer.Typer(
         cls=_group_of(verbs),
         no_args_is_help=True,
@@ -78,58 +76,8 @@ def _nothing() -> None:
     pass
 
 
-class _Reader:
-    """Reads one flag or argument as typer does, which has pydantic say that a text is a text and a path is a path.
-
-    Those, and what is not given, are read without: loading pydantic would be half of the time of a short command.
-    """
-
-    def __init__(self, parameter: Any) -> None:
-        self._parameter = parameter
-        self._typers = parameter.get_runtime_param
-
-    def itself(self) -> "_Reader":
-        """As typer asks for it."""
-        return self
-
-    def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
-        """The value that the verb is given. Raises `typer.BadParameter`."""
-        kind = self._parameter.type_descriptor.annotation
-        if value is None:
-            return () if param.multiple or param.nargs == -1 else None
-        plain = isinstance(value, str | Path) and str(value).isascii()
-        if kind is Path and plain and not self._looks_at(Path(value)):
-            return Path(value)
-        if (kind is str and plain) or (kind in (int, float, str) and value is param.default):
-            return value
-        return self._typers().coerce(value, param=param, ctx=ctx)
-
-    def _looks_at(self, path: Path) -> bool:
-        """Whether typer might refuse this path, or change it."""
-        info = self._parameter.type_descriptor.parameter_info
-        if info.exists or info.writable or info.resolve_path or not (info.file_okay and info.dir_okay):
-            return True
-        return info.readable and os.path.exists(path) and not os.access(path, os.R_OK)  # noqa: PTH110  no error
-
-
-class _Sparing:
-    """A command whose flags and arguments are read by `_Reader`."""
-
-    def get_params(self, ctx: Any) -> Any:
-        """All of them, `--help` included."""
-        found = super().get_params(ctx)  # type: ignore[misc]  # the class beside it has them
-        for parameter in found:
-            if parameter.get_runtime_param.__name__ != "itself":
-                parameter.get_runtime_param = _Reader(parameter).itself
-        return found
-
-
-class _Command(_Sparing, TyperCommand):
-    pass
-
-
 def _group_of(verbs: Verbs) -> type[TyperGroup]:
-    class _Lazy(_Sparing, TyperGroup):
+    class _Lazy(TyperGroup):
         """A group whose commands are imported when they are run."""
 
         def __init__(self, **settings: Any) -> None:
@@ -137,11 +85,11 @@ def _group_of(verbs: Verbs) -> type[TyperGroup]:
             self.commands = {name: _command_of(verb, name) for name, verb in verbs.items()}
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-            """The verb; one that is none and near to none is told which there are."""
+            """Return the verb. For an unknown name without a close match, list all verbs."""
             name = args[0]
             if name not in self.commands and name[:1] != "-" and not get_close_matches(name, self.commands):
                 shown = [verb for verb, command in self.commands.items() if not command.hidden]
-                ctx.fail(f"No such command {name!r}; there are: {', '.join(shown)}.")
+                ctx.fail(f"No such command {name!r}; use one of: {', '.join(shown)}.")
             return super().resolve_command(ctx, args)
 
     return _Lazy
@@ -161,7 +109,7 @@ def _named(command: Any, name: str) -> Any:
 
 
 class _Deferred(TyperCommand):
-    """A verb that is not imported yet; its help is looked up when somebody wants to see it."""
+    """A verb that is not imported yet."""
 
     help = property(lambda self: self._verb.help, lambda _self, _given: None)  # click sets it
 
@@ -170,12 +118,12 @@ class _Deferred(TyperCommand):
         self._verb = verb
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """It is run, or completed: from here on it is the real one."""
+        """Import the verb and delegate to it."""
         command = loaded(self._verb, str(self.name))
         try:
             return command.make_context(info_name, args, parent, **extra)
         except typer.BadParameter as error:
-            # Of pydantic, which is not imported for this.
+            # typer chains pydantic's error.
             wrong: list[dict[str, Any]] = getattr(error.__cause__, "errors", list)()
             if wrong:
                 error.message = refusal(wrong[0])
@@ -183,11 +131,9 @@ class _Deferred(TyperCommand):
 
 
 def loaded(verb: Verb, name: str) -> Any:
-    """The real command of a verb."""
+    """Import a verb and return its command."""
     module, _colon, attribute = verb.place.partition(":")
     found = getattr(importlib.import_module(f"appliance.cli.{module}"), attribute)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command(name, cls=_Command, help="\n\n".join(filter(None, (verb.first, inspect.getdoc(found)))))(
-        found
-    )
+    app.command(name, help="\n\n".join(filter(None, (verb.first, inspect.getdoc(found)))))(found)
     return typer.main.get_command(app)

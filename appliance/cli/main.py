@@ -1,4 +1,4 @@
-"""The `rosrv` command: one app, one module for each verb, imported when it is run (`lazy.py`)."""
+"""Define the `rosrv` command: the table of its verbs, and the handling of errors that they do not catch."""
 
 import errno
 import os
@@ -10,8 +10,9 @@ import typer
 
 from appliance import __version__
 from appliance.cli.lazy import Group, Verb, application
+from rosmop.tool.options import SUMMARIES
 
-_CONFIRM = "Keep what was loaded with --confirm-within; exit status 1 when there is nothing to confirm."
+_CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there is nothing to confirm."
 
 VERBS: dict[str, Verb | Group] = {
     "up": Verb("up:up"),
@@ -20,7 +21,7 @@ VERBS: dict[str, Verb | Group] = {
     "demo": Verb("demo:demo"),
     "protect": Verb("protect_verb:protect", "Close the ROS ports of this machine to all but the appliance."),
     "audit": Group(
-        "Review the audit log and prove that it is complete.",
+        "Review the audit log and verify that it is complete.",
         {
             "why": Verb("policy.grant_verb:why"),
             "search": Verb("audit.audit_verbs:search"),
@@ -32,7 +33,7 @@ VERBS: dict[str, Verb | Group] = {
         },
     ),
     "evidence": Group(
-        "Evidence: what happened, in one file that proves itself elsewhere.",
+        "Export and verify signed evidence of an incident.",
         {
             "export": Verb("evidence_verbs:export_evidence"),
             "verify": Verb("evidence_verbs:verify"),
@@ -43,13 +44,12 @@ VERBS: dict[str, Verb | Group] = {
         "Check, explain, test, compare, learn and change access policies.",
         {
             "learn": Verb("policy.learn_verb:learn_policy"),
+            "show": Verb("policy.live_verbs:show"),
             "reload": Verb("policy.live_verbs:reload"),
-            "rollback": Verb(
-                "policy.live_verbs:rollback", "Bring a kept revision of the policy into force again."
-            ),
+            "rollback": Verb("policy.live_verbs:rollback", "Return to an earlier revision of the policy."),
             "confirm": Verb("policy.live_verbs:confirm", _CONFIRM),
             "revisions": Verb(
-                "policy.live_verbs:revisions", "List the kept revisions of the policy, the newest first."
+                "policy.live_verbs:revisions", "List the kept revisions of the policy, newest first."
             ),
             "grant": Verb("policy.grant_verb:grant"),
             "check": Verb("policy.policy_verbs:check"),
@@ -59,15 +59,14 @@ VERBS: dict[str, Verb | Group] = {
         },
     ),
     "monitor": Group(
-        "Monitors: check specifications, try them on a recording, run them on the robot.",
+        "Check specifications, test them on recordings, and run them as monitors on the robot.",
         {
-            "check": Verb("monitor.verbs:check"),
-            "run": Verb("monitor.verbs:run"),
-            "learn": Verb("monitor.verbs:learn_monitors"),
+            "check": Verb("monitor.verbs:check", SUMMARIES["check"]),
+            "run": Verb("monitor.verbs:run", SUMMARIES["run"]),
+            "learn": Verb("monitor.verbs:learn", SUMMARIES["learn"]),
             "replay": Verb("monitor.replay:replay_monitor"),
-            "coverage": Verb("monitor.verbs:coverage"),
+            "coverage": Verb("monitor.verbs:coverage", SUMMARIES["coverage"]),
             "list": Verb("monitor.in_force:list_monitors"),
-            "margins": Verb("monitor.in_force:margins"),
             "enable": Verb("monitor.in_force:enable"),
             "promote": Verb("monitor.in_force:promote"),
             "disable": Verb("monitor.in_force:disable"),
@@ -76,13 +75,13 @@ VERBS: dict[str, Verb | Group] = {
             "reload": Verb("monitor.in_force:reload"),
             "revisions": Verb(
                 "monitor.revision_verbs:revisions",
-                "List the kept revisions of the specifications, the newest first.",
+                "List the kept revisions of the specifications, newest first.",
             ),
             "show": Verb("monitor.revision_verbs:show"),
             "diff": Verb("monitor.revision_verbs:diff"),
             "rollback": Verb(
                 "monitor.revision_verbs:rollback",
-                "Bring a kept revision of the specifications into force again; what comes back is switched as it was.",
+                "Return to an earlier revision of the specifications, with its monitors enabled or disabled as then.",
             ),
             "confirm": Verb("monitor.revision_verbs:confirm", _CONFIRM),
             "resume": Verb("monitor.in_force:resume"),
@@ -91,11 +90,16 @@ VERBS: dict[str, Verb | Group] = {
         },
     ),
     "topic": Group(
-        "What is said on the topics of the running robot.",
-        {"echo": Verb("topic_verbs:echo"), "info": Verb("topic_verbs:info")},
+        "Show topics of the running robot.",
+        {
+            "list": Verb("graph_verbs:list_topics"),
+            "echo": Verb("topic_verbs:echo"),
+            "info": Verb("topic_verbs:info"),
+        },
     ),
+    "node": Group("Show nodes of the running robot.", {"list": Verb("graph_verbs:list_nodes")}),
     "record": Group(
-        "The flight recorder: what was said before and after something happened.",
+        "Use the flight recorder: messages before and after an event.",
         {
             "now": Verb("record_verbs:now"),
             "list": Verb("record_verbs:list_recordings"),
@@ -113,7 +117,7 @@ VERBS: dict[str, Verb | Group] = {
         {"check": Verb("config_verbs:check"), "show": Verb("config_verbs:show")},
     ),
     "host": Group(
-        "Enrol, list and revoke hosts that come through IPsec tunnels.",
+        "Enrol, list and revoke hosts that connect through IPsec tunnels.",
         {
             "add": Verb("host.host_verbs:add"),
             "kit": Verb("host.host_verbs:kit"),
@@ -126,7 +130,7 @@ VERBS: dict[str, Verb | Group] = {
     "restore": Verb("backup:restore"),
     "purge": Verb("backup:purge"),
     "token": Group(
-        "Make, list and revoke access tokens for REST.",
+        "Create, list and revoke access tokens for REST.",
         {"add": Verb("token:add"), "list": Verb("token:list_tokens"), "revoke": Verb("token:revoke")},
     ),
 }
@@ -138,7 +142,7 @@ def _show_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-def _before_the_verb(
+def _global_options(
     version: Annotated[
         bool,
         typer.Option("--version", help="Show the version and exit.", callback=_show_version, is_eager=True),
@@ -148,22 +152,23 @@ def _before_the_verb(
 
 
 app = application(
-    VERBS, callback=_before_the_verb, name="rosrv", help="A network-security appliance for ROS 1 robots."
+    VERBS, callback=_global_options, name="rosrv", help="A network-security appliance for ROS 1 robots."
 )
 
-_TOLD = frozenset({"ConfigError", "StartError", "NetworkError"})
-"""Errors whose text is for a person. By name: their modules are imported only where they can occur."""
+_USER_ERRORS = frozenset({"ConfigError", "StartError", "NetworkError"})
+"""Errors whose text is shown to users. Compared by name, so that their modules need not be imported."""
 
 
 def main() -> None:
-    """Entry point of the command: errors are words, never a traceback."""
+    """Run the command; print errors as text, never as a traceback."""
     _open_closed_streams()
     sys.argv[1:] = _asking_for_help(_without_old_flags(sys.argv[1:]))
     try:
         app()
-    except Exception as error:  # noqa: BLE001  the last resort; what it was and where is still told
+    except Exception as error:  # noqa: BLE001  the last resort; the error and its place are printed
         if any(
-            cls.__name__ in _TOLD and cls.__module__.startswith("appliance.") for cls in type(error).__mro__
+            cls.__name__ in _USER_ERRORS and cls.__module__.startswith("appliance.")
+            for cls in type(error).__mro__
         ):
             sys.stderr.write(f"rosrv: {error}\n")
             sys.exit(1)
@@ -173,13 +178,13 @@ def main() -> None:
         last = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{last.filename}:{last.lineno}"
         sys.stderr.write(
-            f"rosrv: a defect of rosrv, please report it: {type(error).__name__}: {error} ({where})\n"
+            f"rosrv: a defect in rosrv, please report it: {type(error).__name__}: {error} ({where})\n"
         )
         sys.exit(70)
 
 
 def _open_closed_streams() -> None:
-    """Standard streams that are closed (`>&-`) go to /dev/null; no file that is opened later gets their number."""
+    """Open closed standard streams (`>&-`) on /dev/null, so that no other file gets their descriptor."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(descriptor, True)
     os.close(descriptor)
@@ -189,17 +194,17 @@ def _open_closed_streams() -> None:
 
 
 _OLD_FLAGS = {"-list": "list", "-rvstate": "rvstate", "-enable": "enable", "-disable": "disable"}
-"""ROSRV's own flags, and the verbs of `rosrv monitor` that took their place."""
+"""Flags of the original ROSRV, and the verbs of `rosrv monitor` that replace them."""
 
 
 def _without_old_flags(arguments: list[str]) -> list[str]:
-    """`rosrv -enable M…` is `rosrv monitor enable M…`."""
+    """Translate `rosrv -enable M…` to `rosrv monitor enable M…`."""
     verb = _OLD_FLAGS.get(arguments[0]) if arguments else None
     return arguments if verb is None else ["monitor", verb, *arguments[1:]]
 
 
 def _asking_for_help(arguments: list[str]) -> list[str]:
-    """`rosrv help policy check` is `rosrv policy check --help`, and so is `rosrv policy help check`."""
+    """Translate `rosrv help policy check` and `rosrv policy help check` to `rosrv policy check --help`."""
     if "help" not in arguments[:2]:
         return arguments
     return [*(word for word in arguments[:2] if word != "help"), *arguments[2:], "--help"]

@@ -1,7 +1,6 @@
-"""How all verbs show things: coloured on a terminal, plain otherwise, JSON when asked for.
+"""Print the output of all verbs: coloured on a terminal, plain in a pipe, JSON on request.
 
-A stranger's strings (names, file names, whatever stands in a log) never reach a terminal with control
-characters in them, and are never read as markup.
+Text from the network (names, log entries) is printed without control characters and never as markup.
 """
 
 import datetime
@@ -21,18 +20,18 @@ Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one
 
 
 def moment(seconds: float) -> str:
-    """A time (seconds since the epoch) as lists show it: to the minute, in UTC."""
+    """Format a time (seconds since the epoch) for lists: to the minute, in UTC."""
     return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
 
 
 def usage_error(text: str, verb: str = "rosrv") -> typer.Exit:
-    """Write what was wrong with the command line; raise the result (exit status 2)."""
+    """Print an error of the command line; the caller raises the result (exit status 2)."""
     typer.echo(f"{verb}: {printable(text)}", err=True)
     return typer.Exit(2)
 
 
 def write_told(path: Path, data: bytes) -> None:
-    """Write what somebody wants at a place of his choice. Raises `OSError`; what is not surely kept is told."""
+    """Write to a path that the user chose; warn if the data may not survive a power cut. Raises `OSError`."""
     try:
         write_where_told(path, data)
     except NotLastingError as error:
@@ -40,5 +39,5 @@ def write_told(path: Path, data: bytes) -> None:
 
 
 def say_json(fields: msgspec.Struct | Mapping[str, Any] | tuple[Any, ...]) -> None:
-    """Write one object on one line to standard output."""
+    """Write an object to standard output as one line of JSON."""
     terminal.say_json(in_full(fields))

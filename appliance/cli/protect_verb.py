@@ -1,8 +1,7 @@
-"""`rosrv protect`: close the ROS ports of the machine the nodes run on, and check from outside that they are.
+"""`rosrv protect`: close the ROS ports of a machine with nodes, and check from outside that they are closed.
 
-It needs no state directory, so it runs on any machine that has this program; where an appliance is named, its address
-is asked for, and what a check saw is told to it. Exit status: 0 done, or closed; 1 a port is open; 2 it could not be
-done, or nothing answered.
+It works without a state directory, on any machine with this program. From a running appliance it gets the address, and
+reports the result of a check to it. Exit status: 0 done, or closed; 1 a port is open; 2 failed, or no answer.
 """
 
 import json
@@ -15,8 +14,8 @@ from urllib.parse import urlsplit
 import typer
 
 from appliance.channel.admin import HostPorts, StatusWanted
-from appliance.cli.admin_client import NotRunningError
-from appliance.cli.target import Appliance, speaks
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.network import close_ports as protection
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.namespaces import Namespace, NetworkError
@@ -26,23 +25,23 @@ OPEN_STATUS, ERROR_STATUS = 1, 2
 _SHOWN = 20  # open ports named on a terminal
 _MOST_TOLD = 100
 
-HELP = """Nodes listen on ports of the local port range. Without a verb the nftables file is only printed.
+HELP = """Nodes listen on ports of the local port range. Without --apply, --check or --remove, print the nftables rules.
 
 \b
-  rosrv protect --appliance 192.168.1.20                    look at it
-  rosrv protect --state /var/lib/rosrv                      the appliance that runs on this machine
+  rosrv protect --appliance 192.168.1.20                    print the rules
+  rosrv protect --state /var/lib/rosrv                      rules for the appliance on this machine
   sudo rosrv protect --appliance 192.168.1.20 --open tcp/40022 --apply
   rosrv protect --check 192.168.1.10                        on ANOTHER machine: is it closed?
-  rosrv protect --check 192.168.1.10 --api https://192.168.1.20:8443      and tell the appliance (role operator)
+  rosrv protect --check 192.168.1.10 --api https://192.168.1.20:8443      and report to the appliance (role operator)
   sudo rosrv protect --remove
 
 \b
-It holds until the next boot. To keep it, install the file:
+The rules last until the next boot. To keep them, install the file:
   rosrv protect --appliance 192.168.1.20 | sudo tee /etc/rosrv-protect.nft
   echo 'include "/etc/rosrv-protect.nft"' | sudo tee -a /etc/nftables.conf
   sudo systemctl enable --now nftables
 
-The check tries TCP. Run it from a machine that is not the appliance: the appliance is let in.
+The check tries TCP. Run it on a machine other than the appliance, which is allowed in.
 """
 
 
@@ -59,7 +58,7 @@ def protect(
     ] = None,
     open_services: Annotated[
         list[str] | None,
-        typer.Option("--open", metavar="SERVICES", help="Stays open to all: tcp/22,udp/123. Repeatable."),
+        typer.Option("--open", metavar="SERVICES", help="Keep open to all: tcp/22,udp/123. Repeatable."),
     ] = None,
     ports: Annotated[
         str | None,
@@ -68,7 +67,7 @@ def protect(
         ),
     ] = None,
     apply: Annotated[
-        bool, typer.Option("--apply", help="Put it in force now, replacing an earlier one.")
+        bool, typer.Option("--apply", help="Apply the rules now, replacing earlier ones.")
     ] = False,
     check: Annotated[
         str | None, typer.Option(metavar="HOST", help="Try the ports of another machine from here.")
@@ -76,23 +75,23 @@ def protect(
     name: Annotated[
         str | None,
         typer.Option(
-            "--as", metavar="NAME", help="Check: the machine's name as an enrolled host, to be told."
+            "--as", metavar="NAME", help="Check: report the result under this name of an enrolled host."
         ),
     ] = None,
-    remove: Annotated[bool, typer.Option("--remove", help="Take it away.")] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove the rules.")] = False,
     seconds: Annotated[
-        float, typer.Option(min=0.05, max=60, help="Check: how long to wait for an answer of each port.")
+        float, typer.Option(min=0.05, max=60, help="Check: seconds to wait for each port.")
     ] = 1.0,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
-    """Dispatch on the verb; see HELP."""
+    """Print, apply, check or remove the rules; `HELP` replaces this text."""
     if sum((apply, check is not None, remove)) > 1:
         _fail("--apply, --check and --remove exclude one another")
     try:
         services = protection.parse_services(open_services or ())
         chosen = protection.parse_ports(ports) if ports is not None else protection.local_port_range()
         if check is not None:
-            _check(_Checked(check, name, chosen, services, seconds), running, as_json)
+            _check(_CheckTarget(check, name, chosen, services, seconds), running, as_json)
         elif remove:
             _remove(as_json)
         else:
@@ -107,7 +106,7 @@ protect.__doc__ = HELP
 def _make(
     appliances: list[str],
     ports: PortRange,
-    services: tuple[protection.Service, ...],
+    services: tuple[protection.OpenService, ...],
     apply: bool,
     as_json: bool,
 ) -> None:
@@ -121,8 +120,8 @@ def _make(
         protection.apply(text)
         if Namespace.own().lacks_syn_cookies():
             sys.stderr.write(
-                "rosrv: warning: net.ipv4.tcp_syncookies is 0 on this machine: whoever forges first packets under the"
-                " appliance's address keeps it out. sysctl -w net.ipv4.tcp_syncookies=1\n"
+                "rosrv: warning: net.ipv4.tcp_syncookies is 0 on this machine: forged SYN packets from the appliance's"
+                " address can lock the appliance out. Run: sysctl -w net.ipv4.tcp_syncookies=1\n"
             )
         _say(
             as_json,
@@ -142,17 +141,17 @@ def _remove(as_json: bool) -> None:
 
 
 @dataclass(frozen=True)
-class _Checked:
-    """What is tried, under which name it is told; a None is the address that was tried."""
+class _CheckTarget:
+    """The target of a check; its result is reported under `name`, or under the address if that is None."""
 
     host: str
     name: str | None
     ports: PortRange
-    services: tuple[protection.Service, ...]
+    services: tuple[protection.OpenService, ...]
     seconds: float
 
     def wanted(self) -> list[int]:
-        """The TCP ports that are to be closed."""
+        """Return the TCP ports that should be closed."""
         stay_open = {
             port
             for service in self.services
@@ -162,7 +161,7 @@ class _Checked:
         return [port for port in range(self.ports.first, self.ports.last + 1) if port not in stay_open]
 
 
-def _check(checked: _Checked, running: Appliance, as_json: bool) -> None:
+def _check(checked: _CheckTarget, running: Appliance, as_json: bool) -> None:
     results = [scan(address, checked.wanted(), checked.seconds) for address in addresses_of(checked.host)]
     opened = any(result.open for result in results)
     unknown = not all(result.answered and not result.untried for result in results)
@@ -180,7 +179,7 @@ def _check(checked: _Checked, running: Appliance, as_json: bool) -> None:
         found = sorted({port for result in results for port in result.open})[:_MOST_TOLD]
         name = checked.name or results[0].address
         body = running.ask_or_exit(HostPorts(name, state, found, time.time()))
-        sys.stderr.write(f"rosrv: the appliance knows it: the ports of {body.name} are {state}\n")
+        sys.stderr.write(f"rosrv: reported to the appliance: the ports of {body.name} are {state}\n")
     if opened:
         raise typer.Exit(OPEN_STATUS)
     if unknown:
@@ -188,18 +187,20 @@ def _check(checked: _Checked, running: Appliance, as_json: bool) -> None:
 
 
 def _own(running: Appliance) -> str:
-    """The address of the appliance that runs on this machine. Raises `ValueError`."""
+    """Return the address of the appliance on this machine. Raises `ValueError`."""
     hint = "give its address as this machine sees it: --appliance 192.168.1.20"
     if running.place is not None:
-        raise ValueError(f"how this machine sees the appliance is not known over REST; {hint}")
+        raise ValueError(f"REST does not know the appliance's address on this machine's network; {hint}")
     try:
         answer = running.ask(StatusWanted())
     except NotRunningError as error:
-        raise ValueError(f"which appliance may reach this machine? {error}; or {hint}") from None
+        raise ValueError(f"the appliance's address is unknown: {error}; or {hint}") from None
     if not answer.ok:
         raise ValueError(f"{answer.error}; {hint}")
     if answer.given().isolation == "none":
-        raise ValueError(f"the appliance runs on this machine without isolation, as loopback; {hint}")
+        raise ValueError(
+            f"the appliance on this machine has no isolation and only a loopback address; {hint}"
+        )
     return str(urlsplit(answer.given().master).hostname)
 
 
@@ -210,13 +211,13 @@ def _sentence(result: ScanResult, ports: PortRange) -> str:
         return f"{result.address}: OPEN: TCP {named}{more} of {ports}\n"
     if result.untried:
         return (
-            f"{result.address}: {result.untried} ports of {ports} could not be tried: {result.obstacle}; whether they "
-            "are closed is not known. Does this machine have a route there (ip route get)?\n"
+            f"{result.address}: {result.untried} ports of {ports} could not be tried: {result.obstacle}; they may be "
+            "open. Check this machine's route there: ip route get\n"
         )
     if not result.answered:
         return (
-            f"{result.address}: no port of {ports} answered: the machine is off, or drops what it refuses; "
-            "that it is closed is not known\n"
+            f"{result.address}: no port of {ports} answered: the machine is off, or drops packets silently; "
+            "its ports may be open\n"
         )
     return f"{result.address}: closed: no port of {ports} accepts a connection from here\n"
 

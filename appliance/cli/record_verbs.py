@@ -1,4 +1,4 @@
-"""`rosrv record now|list|show|timeline|messages|fetch|remove`: what the flight recorder has of the robot's messages."""
+"""`rosrv record now|list|show|timeline|messages|fetch|remove`: the flight recorder."""
 
 import hashlib
 import os
@@ -13,23 +13,23 @@ import msgspec
 import typer
 
 from appliance.audit.record_format import rfc3339
-from appliance.audit.timestamps import parse_moment
 from appliance.base.atomic_files import name_to_make
+from appliance.base.timestamps import parse_timestamp
 from appliance.channel import admin
 from appliance.channel.answers.recording_answers import RecordedMessages, Recording, Timeline
 from appliance.cli import completion
-from appliance.cli.admin_client import AdminSocket, NotRunningError
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
-from appliance.cli.target import Appliance, speaks
 from appliance.cli.topic_verbs import lines_of
-from appliance.recorder.bag_reader import Place
+from appliance.recorder.bag_reader import MessagePosition
 from appliance.recorder.mcap import as_mcap
 from appliance.recorder.timeline import MOST_COLUMNS, MOST_NEIGHBOURS, NEIGHBOURS, messages_around, timeline
 from rosmop.tool.terminal import counted, printable, refused, say
 
 if TYPE_CHECKING:
-    from appliance.cli.rest.orders import RestWay
+    from appliance.cli.connection.rest_orders import RestWay
 
 _Id = Annotated[str, typer.Argument(metavar="ID", show_default=False, autocompletion=completion.recordings)]
 _SECOND = 1_000_000_000
@@ -43,29 +43,29 @@ def now(
     *,
     before: Annotated[
         str | None,
-        typer.Option(help="How much of the past: 30s, 2m (default: recorder.before)", show_default=False),
+        typer.Option(help="Time before now to keep: 30s, 2m (default: recorder.before)", show_default=False),
     ] = None,
     after: Annotated[
         str | None,
-        typer.Option(help="How much of what comes: 10s (default: recorder.after)", show_default=False),
+        typer.Option(help="Time after now to record: 10s (default: recorder.after)", show_default=False),
     ] = None,
     note: Annotated[
-        str, typer.Option(help="What happened; it stands in the recording and the audit log")
+        str, typer.Option(help="Description of the event, for the recording and the audit log")
     ] = "",
 ) -> None:
-    """Record the last seconds, and the next ones, of what the robot says.
+    """Record the robot's messages of the last and the next seconds.
 
     Example: rosrv record now --after 30s --note "the arm hit the door"
     """
     request = admin.RecordNow(_seconds("--before", before), _seconds("--after", after), note)
     body = appliance.answer_or_exit(request)
     say(body.id)
-    typer.echo(f"rosrv: it is there from {_moment(body.ends)} on: rosrv record fetch {body.id}", err=True)
+    typer.echo(f"rosrv: ready at {_moment(body.ends)}: rosrv record fetch {body.id}", err=True)
 
 
 @speaks
 def list_recordings(appliance: Appliance) -> None:
-    """List the recordings that are kept, the oldest first.
+    """List the recordings, oldest first.
 
     Example: rosrv record list
     """
@@ -76,12 +76,12 @@ def list_recordings(appliance: Appliance) -> None:
         else:
             say(f"{row.id}  {_moment(row.began)}  {_summary(row)}")
     if not rows and not appliance.as_json:
-        say("nothing has been recorded: rosrv record now (what is being recorded is listed when it ends)")
+        say("no recordings; make one: rosrv record now (a recording is listed once it ends)")
 
 
 @speaks
 def show(appliance: Appliance, recording: _Id) -> None:
-    """Show why a recording was made, and what it has.
+    """Show a recording's triggers and contents.
 
     Example: rosrv record show 1879f3c2a4b5d6e7f012
     """
@@ -96,16 +96,14 @@ def show_timeline(
     recording: _Id,
     *,
     since: Annotated[
-        str | None, typer.Option(help="From this moment on (RFC 3339)", show_default=False)
+        str | None, typer.Option(help="From this time on (RFC 3339)", show_default=False)
     ] = None,
-    until: Annotated[
-        str | None, typer.Option(help="Up to this moment (RFC 3339)", show_default=False)
-    ] = None,
+    until: Annotated[str | None, typer.Option(help="Up to this time (RFC 3339)", show_default=False)] = None,
     columns: Annotated[
-        int, typer.Option(min=1, max=MOST_COLUMNS, help="Parts that the time is divided into")
+        int, typer.Option(min=1, max=MOST_COLUMNS, help="Number of columns to divide the time into")
     ] = 60,
 ) -> None:
-    """Show what flowed on each topic of a recording, and what happened, on one time line.
+    """Show the messages on each topic and the events of a recording on one time line.
 
     Example: rosrv record timeline 1879f3c2a4b5d6e7f012
     """
@@ -132,21 +130,22 @@ def messages(
     at: Annotated[
         str | None,
         typer.Option(
-            help="A moment (RFC 3339), a record that triggered it, or the place of a message"
+            help="A time (RFC 3339), a record that triggered the recording, or a message's position"
             " (default: its first trigger)",
             show_default=False,
         ),
     ] = None,
     topic: Annotated[
-        list[str] | None, typer.Option(help="Of this topic alone (repeat for more)", show_default=False)
+        list[str] | None, typer.Option(help="Only this topic (repeatable)", show_default=False)
     ] = None,
     neighbours: Annotated[
-        int, typer.Option(min=1, max=MOST_NEIGHBOURS, help="How many before it, and after")
+        int, typer.Option(min=1, max=MOST_NEIGHBOURS, help="Number of messages before and after it")
     ] = NEIGHBOURS,
 ) -> None:
-    """Show the messages of a recording around a moment; it is recorded who read them.
+    """Show the messages of a recording around a point in time. The audit log records the request.
 
-    As they were sent, before monitors changed or dropped them. Long strings and arrays are cut, bytes are hexadecimal.
+    Messages are shown as sent, before monitors changed or dropped them. Long strings and arrays are cut, bytes are
+    hexadecimal.
 
     Example: rosrv record messages 1879f3c2a4b5d6e7f012 --topic /cmd_vel
     """
@@ -156,7 +155,7 @@ def messages(
     text = next(iter(moments.values())) if at is None else moments.get(at, at)
     way = appliance.way
     if isinstance(way, AdminSocket):
-        place = Place.parsed(text) or _moment_given("--at", text)
+        place = MessagePosition.parsed(text) or _moment_given("--at", text)
         assert place is not None  # noqa: S101  it is text
         appliance.ask_or_exit(admin.RecordingRead(recording, topics))
         found = _read(lambda: messages_around(body, _bag(way, body), place, topics, neighbours))
@@ -181,19 +180,20 @@ def fetch(
     recording: _Id,
     *,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The file (default: rosrv-ID.bag)", show_default=False)
+        Path | None,
+        typer.Option("--out", "-o", help="File to write (default: rosrv-ID.bag)", show_default=False),
     ] = None,
     mcap: Annotated[
         bool, typer.Option("--mcap", help="As MCAP (rosrv-ID.mcap), for Foxglove and others")
     ] = False,
 ) -> None:
-    """Write a recording's bag to a file; it is recorded who fetched it.
+    """Write a recording to a bag file. The audit log records the request.
 
     Example: rosrv record fetch 1879f3c2a4b5d6e7f012 && rosbag info rosrv-1879f3c2a4b5d6e7f012.bag
     """
     target = out or Path(f"rosrv-{recording}.{'mcap' if mcap else 'bag'}")
     if os.path.lexists(target):
-        raise usage_error(f"{target} is there already")
+        raise usage_error(f"{target} already exists: remove it, or name another file with --out")
     part = name_to_make(target)
     try:
         os.close(_private(part))
@@ -215,7 +215,7 @@ def fetch(
     finally:
         part.unlink(missing_ok=True)
     if not whole:
-        raise refused([f"rosrv: the bag of {body.id} is not the one that was recorded: its hash is another"])
+        raise refused([f"rosrv: the bag of {body.id} was changed after it was recorded: its hash differs"])
     if appliance.as_json:
         say_json({"file": str(target), "sha256": body.sha256, "format": "mcap" if mcap else "bag"})
     else:
@@ -224,7 +224,7 @@ def fetch(
 
 @speaks
 def remove(appliance: Appliance, recording: _Id) -> None:
-    """Remove a recording; it is recorded who removed it.
+    """Remove a recording. The audit log records the request.
 
     Example: rosrv record remove 1879f3c2a4b5d6e7f012
     """
@@ -233,17 +233,17 @@ def remove(appliance: Appliance, recording: _Id) -> None:
 
 
 def bag_of(appliance: Appliance, recording: str, part: Path) -> Path:
-    """The bag where it lies, or over REST in `part`, once it is on record who takes it. Raises `OSError`."""
+    """Audit the request; return the bag's path in the state directory, or `part` filled over REST. Raises `OSError`."""
     way = appliance.way
     if isinstance(way, AdminSocket):
         return _bag(way, appliance.ask_or_exit(admin.RecordingFetch(recording)))
-    from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
+    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
     try:
         with way.client.streamed("GET", f"/v1/recordings/{recording}/bag") as answer, part.open("wb") as file:
             for piece in answer.iter_bytes():
                 file.write(piece)
-    except (ProblemError, NotRunningError) as error:
+    except (RestProblemError, NotRunningError) as error:
         raise usage_error(str(error)) from None
     return part
 
@@ -253,13 +253,13 @@ def _bag(way: AdminSocket, recording: Recording) -> Path:
 
 
 def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> _T:
-    """What REST answers. Ends the program with 2 where it makes no sense or none answers, 1 when it is refused."""
-    from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
+    """Return REST's answer. Exits with status 2 for bad input or without an answer, 1 for a rejected request."""
+    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
     given = {name: value for name, value in query.items() if value is not None}
     try:
         return msgspec.convert(way.client.call("GET", f"/v1/recordings/{path}", params=given), kind)
-    except ProblemError as problem:
+    except RestProblemError as problem:
         if problem.kind == "bad-input":
             raise usage_error(str(problem)) from None
         raise refused([f"rosrv: {problem}"]) from None
@@ -268,7 +268,7 @@ def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> 
 
 
 def _read(what: Callable[[], _T]) -> _T:
-    """What is read of a bag. Ends the program with 2 when that is not possible."""
+    """Return the result of reading a bag. Exits with status 2 if the bag cannot be read."""
     try:
         return what()
     except OSError as error:
@@ -278,15 +278,15 @@ def _read(what: Callable[[], _T]) -> _T:
 
 
 def _moment_given(option: str, text: str | None) -> int | None:
-    """Nanoseconds since the epoch. Ends the program with 2 when it is no moment."""
+    """Return nanoseconds since the epoch. Exits with status 2 if `text` is not a time."""
     try:
-        return None if text is None else parse_moment(text, time.time_ns())
+        return None if text is None else parse_timestamp(text, time.time_ns())
     except ValueError as error:
         raise usage_error(f"{option}: {error}") from None
 
 
 def _drawn(found: Timeline) -> Iterator[str]:
-    """A line for each topic and kind of event, with a bar for each column; then the events."""
+    """Yield a line of bars for each topic and kind of event, then the events."""
     yield f"{found.id}  {_moment(found.since)} to {_moment(found.until)}"
     lanes = [(flow.topic, flow.counts, "message", flow.senders) for flow in found.topics]
     lanes += [(mark.kind, mark.counts, "event", []) for mark in found.marks]
@@ -304,16 +304,16 @@ def _drawn(found: Timeline) -> Iterator[str]:
         what = f"{event.event}: {event.reason}" if event.reason else event.event
         yield f"  +{offset:.3f} s  {event.kind}  {printable(who)}  {printable(what)}  (record {event.record})"
     if found.more_events:
-        yield f"  {counted(found.more_events, 'more event')}: a shorter time (--since, --until) lists them"
+        yield f"  {counted(found.more_events, 'more event')}: list them with a shorter time (--since, --until)"
 
 
 def _private(path: Path) -> int:
-    """A new file for its owner only: what the robot said is not for whoever uses this machine. Raises `OSError`."""
+    """Create a file for its owner only, since messages are private to the robot's operators. Raises `OSError`."""
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
 
 
 def _convert(bag: Path, target: Path) -> None:
-    """Write the bag as MCAP. Raises `OSError`; ends the program with 1 where a message type makes no sense."""
+    """Write the bag as MCAP. Raises `OSError`; exits with status 1 if a message type is invalid."""
     made = name_to_make(target)
     with os.fdopen(_private(made), "wb") as file:
         try:
@@ -324,7 +324,7 @@ def _convert(bag: Path, target: Path) -> None:
             made.unlink()
             if not isinstance(error, ValueError):
                 raise
-            raise refused([f"rosrv: it cannot be made MCAP, fetch the bag: {error}"]) from None
+            raise refused([f"rosrv: cannot convert to MCAP: {error}; fetch the bag without --mcap"]) from None
 
 
 def _seconds(option: str, given: str | None) -> float | None:

@@ -1,4 +1,4 @@
-"""`rosrv sign`: sign policies and specifications with a key of the site."""
+"""`rosrv sign`: sign policies and specifications with a site key."""
 
 from pathlib import Path
 from typing import Annotated
@@ -24,8 +24,8 @@ def sign(
 ) -> None:
     """Sign policies, specifications and message definitions; the signature of FILE is written to FILE.sig.
 
-    The public half of the key (KEY.pub) goes into `site_keys` of appliance.yaml: then nothing comes into force that no
-    such key signed. `ssh-keygen -Y sign -n rosrv -f KEY FILE` makes the same, also with a passphrase or an agent.
+    Add the public key (KEY.pub) to `site_keys` of appliance.yaml: from then on, only signed files come into force.
+    `ssh-keygen -Y sign -n rosrv -f KEY FILE` makes the same signature, also with a passphrase or an agent.
 
     Example: rosrv sign policies/default.ini --key site
     """
@@ -57,13 +57,13 @@ def _private(file: Path) -> Ed25519PrivateKey:
     except (ValueError, UnsupportedAlgorithm):
         key = None
     if not isinstance(key, Ed25519PrivateKey):
-        why = f"{file} is no private Ed25519 key (ssh-keygen -t ed25519 -f KEY makes one)"
+        why = f"{file} is not a private Ed25519 key; create one: ssh-keygen -t ed25519 -f KEY"
         raise usage_error(why, verb="rosrv sign")
     return key
 
 
 def _text(file: Path) -> str:
-    """What the appliance will read: it does not know a byte order mark, nor the line ends of other systems."""
+    """Return the file's text. Exits with status 2 for anything but UTF-8 with LF, which the appliance reads."""
     try:
         text = read_given(file).decode("utf-8")
     except OSError as error:

@@ -1,7 +1,8 @@
 """`rosrv status`: the running appliance on one screen."""
 
+import datetime
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated
 
 import typer
@@ -9,19 +10,28 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from appliance.api.alarms import open_alarms
 from appliance.api.moments import in_full
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.host_answers import PortsSeen
-from appliance.channel.answers.status import FirewallState, IpsecState, PolicyState, ProcessInfo, Status
-from appliance.channel.status_summary import no_relay, probe_failed
+from appliance.channel.answers.status import (
+    ClockState,
+    FirewallState,
+    IpsecState,
+    PolicyState,
+    ProcessInfo,
+    Status,
+)
+from appliance.channel.status_summary import process_names
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import moment, say_json
-from appliance.cli.status_view import age, doubted_clock, lacking_walls, processes_table, shortened
-from appliance.cli.target import Appliance, speaks
+from rosmop.tool.tables import table_of
 from rosmop.tool.terminal import counted
 
 _PORT_STATES = ("closed", "open", "unknown")
 _MOST_NAMED = 8
 _MOST_TROUBLES = 5
+_COLUMN = 38  # characters for one process
 _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
 
@@ -31,7 +41,7 @@ def status(
 ) -> None:
     """Show the running appliance: processes, isolation, policy, graph, audit log.
 
-    Exit status: 0 in service, 1 something needs a person, 2 not running.
+    Exit status: 0 in service, 1 needs attention, 2 not running.
 
     Example: rosrv status --state /var/lib/rosrv
     """
@@ -45,52 +55,16 @@ def status(
 
 
 def troubles_of(body: Status) -> list[str]:
-    """What a person should look at, most pressing first."""
-    found = []
-    if body.audit.failed:
-        found.append(f"the audit log cannot be written: {body.audit.failed}")
-    if body.audit.degraded:
-        found.append(f"the audit log is behind: {body.audit.degraded}")
-    forwarding = body.audit.forwarding
-    if forwarding is not None and forwarding.trouble:
-        found.append(
-            f"the audit log is not forwarded to {forwarding.to}, {counted(forwarding.behind, 'record')} wait:"
-            f" {forwarding.trouble}"
-        )
-    if body.recorder is not None and not body.recorder.running:
-        found.append("the flight recorder does not run: nothing is recorded at the moment")
-    if probe_failed(body):
-        found.append(f"the ROS Master is not hidden: {body.probe}")
-    monitors = body.monitors
-    if monitors.refused:
-        found.append(f"the relay does not take the specifications: {monitors.refused[0]}")
-    if monitors.held:
-        why = "".join(f" ({name}: {reason})" for name, reason in monitors.why_held.items())
-        found.append(f"topics are held{why}: rosrv monitor resume {' '.join(monitors.held)}")
-    if monitors.failing:
-        found.append(f"monitors fail: {', '.join(monitors.failing)}; their messages are dropped")
-    found += [
-        f"{off.what} since {moment(off.since)}: {off.again}" for off in body.switched_off if off.forgotten
+    """Return the problems that need attention, most urgent first: alarms without notices and audit-only sections."""
+    return [
+        alarm.text
+        for alarm in open_alarms(body)
+        if alarm.severity != "notice" and alarm.kind != "policy-audit-only"
     ]
-    relay = no_relay(body.relay)
-    if relay is not None:
-        found.append(relay)
-    if body.rosmaster != "reachable":
-        found.append("the ROS Master is being rebuilt: calls wait")
-    found += body.ipsec.troubles
-    found += [_failing(process) for process in body.processes if process.failing]
-    for what, verb, deadline in (
-        ("the policy goes", "policy", body.policy.confirm_by),
-        ("the specifications go", "monitor", monitors.confirm_by),
-    ):
-        if deadline is not None:
-            left = max(0, round(deadline - time.time()))
-            found.append(f"{what} back in {left} s unless confirmed: rosrv {verb} confirm")
-    return found
 
 
 def show(body: Status, troubles: list[str]) -> None:
-    """Print a status for a person, what is wrong first."""
+    """Print a status as text, problems first."""
     console = Console(highlight=False)
     audit = body.audit
     for trouble in shortened(troubles, _MOST_TROUBLES):
@@ -99,9 +73,9 @@ def show(body: Status, troubles: list[str]) -> None:
     grid.add_row("appliance", f"{body.version} at {body.master}, for {age(body.since)}")
     isolation = Text(_isolation(body), style=_YELLOW if body.isolation == "none" else _GREEN)
     grid.add_row("isolation", isolation)
-    lacking = lacking_walls(body.processes)
+    lacking = missing_sandbox(body.processes)
     if lacking is not None:
-        grid.add_row("walls", Text(lacking, style=_YELLOW))
+        grid.add_row("sandbox", Text(lacking, style=_YELLOW))
     doubted = doubted_clock(body.clock)
     if doubted is not None:
         grid.add_row("clock", Text(doubted, style=_YELLOW))
@@ -111,13 +85,13 @@ def show(body: Status, troubles: list[str]) -> None:
     monitors = body.monitors
     loaded = counted(monitors.loaded, "monitor")
     shown = f"revision {monitors.revision}, {monitors.enabled} of {loaded} enabled"
-    if monitors.trials:
-        shown += f", {len(monitors.trials)} in shadow mode"
+    if monitors.shadow:
+        shown += f", {len(monitors.shadow)} in shadow mode"
     if monitors.differs_from_folder:
-        shown += f"; loaded by {monitors.who}, not what the folder has"
+        shown += f"; loaded by {monitors.who}, differs from the folder"
     grid.add_row("monitors", shown)
     for off in body.switched_off:
-        end = "without an end" if off.until is None else f"until {moment(off.until)}"
+        end = "indefinitely" if off.until is None else f"until {moment(off.until)}"
         grid.add_row("switched off", Text(f"{off.what} since {moment(off.since)}, {end}", style=_YELLOW))
     shadows = f" ({body.shadows} lost, awaited)" if body.shadows else ""
     grid.add_row(
@@ -128,7 +102,7 @@ def show(body: Status, troubles: list[str]) -> None:
     dropped = f", {body.dropped} dropped at slow subscribers" if body.dropped else ""
     relay = Text(f"{counted(body.connections, 'connection')}, {counted(body.messages, 'message')}{dropped}")
     if body.relaying == "monitored":
-        relay.append("; only what is monitored: NO BOUNDARY, the rest passes it by", style=_YELLOW)
+        relay.append("; only monitored topics: NO BOUNDARY, the rest bypasses the relay", style=_YELLOW)
     grid.add_row("relay", relay)
     grid.add_row("tunnels", _tunnels(body.ipsec))
     grid.add_row("hosts' ports", _ports(body.ipsec.ports))
@@ -143,25 +117,16 @@ def show(body: Status, troubles: list[str]) -> None:
     console.print(table)
 
 
-def _failing(process: ProcessInfo) -> str:
-    """Why a process is started again and again, and what it printed last."""
-    lines = "".join(f"\n    {line}" for line in process.output)
-    printed = f"; it printed last:{lines}" if lines else ""
-    return (
-        f"{process.role} is failing, after {counted(process.restarts, 'restart')}: {process.failing}{printed}"
-    )
-
-
 def _policy(policy: PolicyState) -> Text:
     differs = ""
     if policy.differs_from_file:
         theirs = policy.who != "disk"
-        differs = f"; loaded by {policy.who}, not what the file has" if theirs else "; the file now differs"
-        differs += "" if theirs else ": rosrv policy reload takes the file"
+        differs = f"; loaded by {policy.who}, differs from the file" if theirs else "; the file has changed"
+        differs += "" if theirs else ", load it: rosrv policy reload"
     warnings = f", {counted(policy.warnings, 'warning')}" if policy.warnings else ""
     line = Text(f"revision {policy.revision} of {policy.file}{warnings}{differs}")
     if policy.audit_only:
-        line.append(f"; AUDIT-ONLY: refuses nothing by {', '.join(policy.audit_only)}", style=_YELLOW)
+        line.append(f"; AUDIT-ONLY: denies nothing by {', '.join(policy.audit_only)}", style=_YELLOW)
     return line
 
 
@@ -175,34 +140,94 @@ def _tunnels(ipsec: IpsecState) -> str:
 
 
 def _ports(known: dict[str, PortsSeen]) -> str:
-    """Whether machines on which nodes run are known to be closed to all but the appliance."""
+    """Summarize whether the machines of nodes are closed to all but the appliance."""
     by_state = {
         state: [name for name, ports in known.items() if ports.state == state] for state in _PORT_STATES
     }
     if not known:
-        return "no other machine has nodes"
+        return "no other machine runs nodes"
     words = [f"{state}: {', '.join(names[:_MOST_NAMED])}" for state, names in by_state.items() if names]
     return "; ".join(words) + (" (rosrv protect --check)" if by_state["unknown"] else "")
 
 
 def _others_rules(firewall: FirewallState) -> Iterator[tuple[str, str]]:
-    """What chains of other programs do on the host of isolation netns; their names are in the JSON object."""
+    """Yield a row about other programs' firewall chains on the host (isolation netns); --json lists their names."""
     translating, dropping = firewall.translations or [], firewall.obstacles or []
     words = []
     if translating:
         words.append(
-            f"{counted(len(translating), 'chain')} to translate addresses, not towards the appliance"
+            f"{counted(len(translating), 'chain')} translating addresses, none towards the appliance"
         )
     if dropping:
-        words.append(f"{counted(len(dropping), 'chain')} to drop what is forwarded")
+        words.append(f"{counted(len(dropping), 'chain')} dropping forwarded packets")
     if words:
         yield "others' rules", f"{'; '.join(words)}: --json"
 
 
 def _isolation(body: Status) -> str:
     if body.isolation == "none":
-        return "none: NO FIREWALL, every user of this machine reaches the ROS Master"
+        return "none: NO FIREWALL, every user of this machine can reach the ROS master"
     back_end = body.firewall.backend or "no back end reported"
-    told = all(row.walls for row in body.processes if row.role != "supervisor")
-    walled = ", processes walled in" if told and lacking_walls(body.processes) is None else ""
-    return f"{body.isolation}, firewall {back_end}, probe {body.probe or 'not run yet'}{walled}"
+    reported = all(row.sandbox for row in body.processes if row.role != "supervisor")
+    sandboxed = ", processes sandboxed" if reported and missing_sandbox(body.processes) is None else ""
+    return f"{body.isolation}, firewall {back_end}, probe {body.probe or 'not run yet'}{sandboxed}"
+
+
+def processes_table(rows: Sequence[ProcessInfo], width: int, now: float | None = None) -> Table:
+    """Return the processes in as many columns as fit, read downwards; processes of one role are numbered from 0."""
+    across = max(1, min(3, width // _COLUMN))
+    high = -(-len(rows) // across)
+    table = table_of(*["process", "pid", "for", "restarts"] * across)
+    shown = [_cells(row, name, now) for row, name in zip(rows, process_names(rows), strict=True)]
+    for line in range(high):
+        cells: list[Text] = []
+        for place in range(line, len(shown), high):
+            cells += shown[place]
+        table.add_row(*cells)
+    return table
+
+
+def _cells(row: ProcessInfo, name: str, now: float | None) -> list[Text]:
+    since = datetime.datetime.fromisoformat(row.since).timestamp()
+    restarts = Text(str(row.restarts), style=_YELLOW if row.restarts else "")
+    return [Text(name), Text(str(row.pid)), Text(age(since, now)), restarts]
+
+
+def missing_sandbox(rows: Sequence[ProcessInfo]) -> str | None:
+    """Return what this kernel lacks for the processes' sandbox, on one line; None if it lacks nothing."""
+    lacking = [f"{row.role}: {what}" for row in rows for what in row.lacks]
+    if not lacking:
+        return None
+    return lacking[0] + (f" and {len(lacking) - 1} more (rosrv status --json)" if len(lacking) > 1 else "")
+
+
+def doubted_clock(clock: ClockState) -> str | None:
+    """Return why the times of records are unreliable; None if they are reliable."""
+    if clock.before_program_seconds:
+        days = clock.before_program_seconds / 86_400
+        return f"wrong: {days:.0f} days before this program was built; set it before hosts get certificates"
+    if clock.behind_seconds:
+        return f"set back: {clock.behind_seconds:.0f} s before the last record"
+    if clock.synchronised is None:
+        return "synchronisation unknown: the kernel does not report it"
+    return None if clock.synchronised else "not synchronised: run chrony or systemd-timesyncd"
+
+
+def age(since: float, now: float | None = None) -> str:
+    """Return the age of a time (seconds since the epoch) in at most two units."""
+    seconds = max(0, int((time.time() if now is None else now) - since))
+    days, rest = divmod(seconds, 86_400)
+    hours, rest = divmod(rest, 3_600)
+    minutes, left = divmod(rest, 60)
+    if days:
+        return f"{days} d {hours} h"
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {left} s" if minutes else f"{left} s"
+
+
+def shortened(lines: Sequence[str], most: int) -> list[str]:
+    """Return at most `most` lines; the last one counts those left out."""
+    if len(lines) <= most:
+        return list(lines)
+    return [*lines[: most - 1], f"and {len(lines) - most + 1} more: rosrv status --json"]

@@ -1,4 +1,4 @@
-"""`rosrv token add|list|revoke`: who may use REST, and as what."""
+"""`rosrv token add|list|revoke`: access tokens for REST and their roles."""
 
 import datetime
 from typing import Annotated
@@ -8,9 +8,9 @@ import typer
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.cli import completion
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json
-from appliance.cli.target import Appliance, speaks
 from rosmop.tool.terminal import say
 
 
@@ -18,18 +18,18 @@ from rosmop.tool.terminal import say
 def add(
     appliance: Appliance,
     name: Annotated[
-        str, typer.Argument(help="Who will hold it: it stands in the audit log", show_default=False)
+        str, typer.Argument(help="Name of its holder, shown in the audit log", show_default=False)
     ],
     role: Annotated[
         TokenRole,
         typer.Option(
-            help="viewer: look; operator: also reload and roll back; admin: also load new policies; investigator: look,"
+            help="viewer: read; operator: also reload and roll back; admin: also load new policies; investigator: read,"
             " and fetch the messages of recordings"
         ),
     ] = "viewer",
-    expires: Annotated[str, typer.Option(help="After this time it ends: 12h, 90d, 52w")] = "90d",
+    expires: Annotated[str, typer.Option(help="Time until it expires: 12h, 90d, 52w")] = "90d",
 ) -> None:
-    """Make a token. Its text is printed once, here, and kept nowhere.
+    """Create a token. It is printed once and stored nowhere.
 
     Example: rosrv token add alice --role operator --expires 30d
     """
@@ -37,14 +37,14 @@ def add(
     body = appliance.answer_or_exit(TokenAdd(name, role, seconds))
     say(body.token)
     typer.echo(
-        f"rosrv: {body.role} {body.name}, until {moment(body.expires)}. This is the only time it is shown.",
+        f"rosrv: {body.role} {body.name}, until {moment(body.expires)}. It is not shown again.",
         err=True,
     )
 
 
 @speaks
 def list_tokens(appliance: Appliance) -> None:
-    """List all tokens that were made, without their secrets.
+    """List all tokens, without their secrets.
 
     Example: rosrv token list
     """
@@ -57,7 +57,7 @@ def list_tokens(appliance: Appliance) -> None:
             end = f"revoked {moment(row.revoked)}"
         else:
             end = f"{'expired' if row.expires <= now else 'until'} {moment(row.expires)}"
-        say(f"{row.name:<24} {row.role:<12} {row.id}  made {moment(row.created)}  {end}")
+        say(f"{row.name:<24} {row.role:<12} {row.id}  created {moment(row.created)}  {end}")
 
 
 @speaks
@@ -65,12 +65,10 @@ def revoke(
     appliance: Appliance,
     name: Annotated[
         str,
-        typer.Argument(
-            help="The name it was made with", show_default=False, autocompletion=completion.tokens
-        ),
+        typer.Argument(help="Name of the token", show_default=False, autocompletion=completion.tokens),
     ],
 ) -> None:
-    """End a token now; exit status 1 when there is none of this name.
+    """Revoke a token now. Exit status 1 if no token has this name.
 
     Example: rosrv token revoke alice
     """

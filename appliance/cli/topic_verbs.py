@@ -1,4 +1,4 @@
-"""`rosrv topic echo|info`: what is said on a topic of the running robot, by whom and to whom."""
+"""`rosrv topic echo|info`: a topic's messages, publishers and subscribers on the running robot."""
 
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
@@ -10,12 +10,12 @@ from appliance.api.moments import in_full
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Topic, TopicMessage
 from appliance.cli import completion
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, usage_error
-from appliance.cli.target import Appliance, speaks
 from rosmop.tool.terminal import printable, refused, say
 from roswire.message_view import CUT
 
-_AT_ONCE = 20  # messages of one look
+_AT_ONCE = 20  # messages in one request
 _Topic = Annotated[str, typer.Argument(metavar="TOPIC", show_default=False, autocompletion=completion.topics)]
 
 
@@ -27,16 +27,15 @@ def echo(
     count: Annotated[
         int, typer.Option("-n", "--count", min=1, max=100_000, help="How many messages to wait for")
     ] = 1,
-    seconds: Annotated[
-        float, typer.Option(min=0.1, max=10.0, help="How long the next message is waited for")
-    ] = 5.0,
+    seconds: Annotated[float, typer.Option(min=0.1, max=10.0, help="Seconds to wait for each message")] = 5.0,
     field: Annotated[
         str | None, typer.Option(metavar="NAME", help="Only this field, such as pose.position.x or ranges.3")
     ] = None,
 ) -> None:
-    """Show the next messages of a topic as subscribers get them, after the monitors; it is recorded who looked.
+    """Show the next messages of a topic as subscribers receive them, after the monitors.
 
-    Long strings and arrays are cut, bytes are hexadecimal. Exit status 1 when no message came in time.
+    The audit log records the request. Long strings and arrays are cut, bytes are hexadecimal.
+    Exit status 1 if no message came in time.
 
     Example: rosrv topic echo /odom -n 3 --field pose.pose.position
     """
@@ -53,7 +52,7 @@ def echo(
 
 @speaks
 def info(appliance: Appliance, topic: _Topic) -> None:
-    """Show who publishes a topic, who hears it, and how much flows.
+    """Show the publishers, subscribers and rates of a topic.
 
     Example: rosrv topic info /scan
     """
@@ -93,7 +92,7 @@ def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
 
 
 def part_of(fields: Any, path: str) -> Any:
-    """A field of a field, or the sign that it is left out (`… 704 more`). Ends the program with 2 if there is none."""
+    """Return a nested field, or the mark of left-out values (`… 704 more`). Exits with status 2 if there is none."""
     value = fields
     for name in path.split("."):
         if isinstance(value, Mapping) and name in value:
@@ -104,12 +103,12 @@ def part_of(fields: Any, path: str) -> Any:
             return sign
         else:
             known = ", ".join(map(str, value)) if isinstance(value, Mapping) else "no fields"
-            raise usage_error(f"there is no field {path}: {name} is not among {known}")
+            raise usage_error(f"no field {path}: {name!r} is not one of: {known}")
     return value
 
 
 def _left_out(value: Any, name: str) -> str:
-    """The sign that what is asked for may be there and is not shown; empty where there is none."""
+    """Return the mark of left-out values if a field may be among them; otherwise an empty string."""
     if isinstance(value, Mapping):
         return str(value.get(CUT, ""))
     last = value[-1] if isinstance(value, list) and value else value
@@ -118,7 +117,7 @@ def _left_out(value: Any, name: str) -> str:
 
 
 def lines_of(value: Any, depth: int) -> Iterator[str]:
-    """A value as rostopic shows it: a field a line, fit for a terminal."""
+    """Yield a value as rostopic prints it, one field per line, without control characters."""
     indent = "  " * depth
     if isinstance(value, Mapping):
         for name, inner in value.items():
@@ -137,7 +136,7 @@ def lines_of(value: Any, depth: int) -> Iterator[str]:
 
 
 def _is_deep(value: Any) -> bool:
-    """Whether it has fields, which take a line each."""
+    """Whether a value has fields, which take a line each."""
     return isinstance(value, Mapping) or (isinstance(value, list) and any(map(_is_deep, value)))
 
 

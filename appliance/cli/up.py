@@ -1,6 +1,6 @@
-"""`rosrv up`: start the appliance and stay until it is told to stop."""
+"""`rosrv up`: start the appliance and run until a signal stops it."""
 
-from appliance.supervisor.logs import configure_logs  # before whoever imports structlog: see there
+from appliance.supervisor.logs import configure_logs  # before the first import of structlog: see there
 
 # isort: split
 import contextlib
@@ -27,16 +27,16 @@ from appliance.supervisor.supervisor import ControlReady
 _MOST_WARNINGS = 10
 
 _ISOLATIONS = {
-    "netns": "a network namespace of its own on this host",
-    "container": "it is in a container, which is its namespace",
-    "none": "no namespace and no firewall: for development",
+    "netns": "in a network namespace of this host",
+    "container": "in a container, in the container's namespace",
+    "none": "without namespace and firewall, for development",
 }
 
 log = structlog.get_logger()
 
 
 def _isolations(incomplete: str) -> list[tuple[str, str]]:
-    """Where the appliance may live, each with what it is."""
+    """Complete the kinds of isolation, each with its description."""
     return [(name, text) for name, text in _ISOLATIONS.items() if name.startswith(incomplete)]
 
 
@@ -45,38 +45,42 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
         Path | None, typer.Option(help="Configuration file (default: ./appliance.yaml)")
     ] = None,
     policy: Annotated[
-        Path | None, typer.Option(help="Access policy; read again by `rosrv policy reload`")
+        Path | None, typer.Option(help="Access policy file; `rosrv policy reload` reads it again")
     ] = None,
     monitors: Annotated[
-        Path | None, typer.Option(help="Folder of specifications (.rv); read again by `rosrv monitor reload`")
+        Path | None,
+        typer.Option(help="Folder of specifications (.rv); `rosrv monitor reload` reads it again"),
     ] = None,
     enable: Annotated[
         str | None,
-        typer.Option(help="Monitors enabled at start: all, none, NAME,…, or all in shadow mode: shadow"),
+        typer.Option(help="Monitors to enable at start: all, none, NAME,…, or shadow (all in shadow mode)"),
     ] = None,
     state: Annotated[
-        Path | None, typer.Option(help="Directory of everything that survives a restart")
+        Path | None, typer.Option(help="State directory: everything that survives a restart")
     ] = None,
     listen: Annotated[
-        str | None, typer.Option(help="HOST:PORT where nodes find their master; port 0: any")
+        str | None, typer.Option(help="HOST:PORT of RVMaster for ROS_MASTER_URI; port 0: any")
     ] = None,
-    rosmaster_port: Annotated[int | None, typer.Option(help="Port of the hidden ROSMaster; 0: any")] = None,
+    rosmaster_port: Annotated[int | None, typer.Option(help="Port of the hidden ROS master; 0: any")] = None,
     isolation: Annotated[
         str | None, typer.Option(help="container, netns or none", autocompletion=_isolations)
     ] = None,
     relay: Annotated[
-        str | None, typer.Option(help="all, or monitored: only what [Monitor] or a specification names")
+        str | None,
+        typer.Option(help="all, or monitored: only topics that [Monitor] or a specification names"),
     ] = None,
     mediation: Annotated[
-        str | None, typer.Option(help="full, or monitored: nodes are told real URIs (with --relay monitored)")
+        str | None, typer.Option(help="full, or monitored: nodes get real URIs (with --relay monitored)")
     ] = None,
     api: Annotated[str | None, typer.Option(help="HOST:PORT of REST; port 0: any; or off")] = None,
     api_tls: Annotated[
         str | None, typer.Option(help="on, or off: clear text, on a loopback address only")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Say in JSON when nodes may connect")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print a JSON object when nodes may connect")
+    ] = False,
 ) -> None:
-    """Start the appliance; ends on SIGTERM or Ctrl-C.
+    """Start the appliance and run until SIGTERM or Ctrl-C.
 
     Example: rosrv up --policy policies/default.ini --state /var/lib/rosrv
     """
@@ -110,7 +114,7 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
 
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
-    """Say that nodes may connect. Raises `StartError`, with nothing said, when the first token can be kept nowhere."""
+    """Print that nodes may connect. Raises `StartError`, and prints nothing, if the first token cannot be stored."""
     rest = _rest_url(settings)
     more: list[str] = []
     if as_json:
@@ -146,10 +150,10 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
     try:
         sys.stdout.write(line + "\n")
         sys.stdout.flush()
-    except OSError as error:  # nobody reads it, the disk it goes to is full, the terminal is gone
+    except OSError as error:  # closed pipe, full disk, closed terminal
         kept = None if said.token is None else str(_keep_token(settings.state, said.token))
         shown = None if said.token else line
-        log.warning("standard output takes nothing", error=error.strerror, first_token=kept, line=shown)
+        log.warning("cannot write to standard output", error=error.strerror, first_token=kept, line=shown)
     with contextlib.suppress(OSError):
         typer.echo("".join(f"{line}\n" for line in more), err=True, nl=False)
 
@@ -165,7 +169,7 @@ def _rest_url(settings: Settings) -> str | None:
 
 
 def _keep_token(state: Path, token: str) -> Path:
-    """Write the first token where only its owner reads it. Raises `StartError`; nothing is left of it then."""
+    """Write the first token to a file for its owner only. Raises `StartError` and leaves no file behind."""
     path = state / "first-token"
     try:
         path.unlink(missing_ok=True)
@@ -179,7 +183,7 @@ def _keep_token(state: Path, token: str) -> Path:
             os.close(descriptor)
     except OSError as error:
         raise StartError(
-            f"the first access token cannot be written to {path}: {error.strerror}; make it possible and start again: "
-            "the next start makes another token"
+            f"cannot write the first access token to {path}: {error.strerror}; make the directory writable and start "
+            "again: the next start creates another token"
         ) from error
     return path

@@ -1,7 +1,7 @@
-"""What `rosrv up` is given to read, read before anything is started or made: the policy and the specifications.
+"""Validate the policy and the specifications before `rosrv up` starts anything.
 
-RVMaster reads both again and has the last word. What it would not read is not required here: a policy or specifications
-that an operator brought into force while the appliance ran outlast a restart, whatever file and folder have.
+RVMaster reads both again and decides. A policy or specifications that an operator loaded survive a restart; RVMaster
+then does not read the file or the folder, so they may be invalid.
 """
 
 import contextlib
@@ -12,27 +12,27 @@ from pathlib import Path
 
 from appliance.base.input_files import read_given_text
 from appliance.configuration.settings import Settings
-from appliance.policy.judgement import Known, judge
+from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.policy.policy_findings import PolicyError
 from appliance.signing.site_keys import read_signature
 from appliance.supervisor.errors import StartError
 
 _DISK = "disk"
-_IN_ORDER = "in order"
+_VALID = "valid"
 
 
 def read_inputs(settings: Settings) -> range:
-    """Read them; the ports that the policy's file gives to nodes.
+    """Validate both; return the range of ports that the policy file gives to nodes.
 
-    Raises `StartError` with all that is wrong with the policy, or with the specifications.
+    Raises `StartError` with every error of the policy or of the specifications.
     """
     state = settings.state / "control" / "state.db"
     if settings.monitors is not None and _is_read_at_start(state, "monitor_revision"):
         _require_specifications(settings.monitors, settings.site_keys)
     try:
         text, signature = _text(settings.policy), read_signature(settings.policy)
-        known = Known(site_keys=settings.site_keys)
+        known = PolicyContext(site_keys=settings.site_keys)
         return judge(text, str(settings.policy), known, signature).policy.ports
     except (PolicyError, StartError) as error:
         if not _is_read_at_start(state, "policy_revision"):
@@ -49,26 +49,26 @@ def _text(file: Path) -> str:
         why = error.strerror
     except UnicodeDecodeError as error:
         why = f"it is not UTF-8 text: {error.reason}"
-    raise StartError(f"{file}: the policy cannot be read: {why}; nothing was started (--policy FILE)")
+    raise StartError(f"{file}: cannot read the policy: {why}; nothing was started (--policy FILE)")
 
 
 def _require_specifications(folder: Path, site_keys: Sequence[str]) -> None:
-    """In a process of its own: this one becomes the supervisor, and what the compiler takes up would stay in it."""
+    """Compile in a child process: this process becomes the supervisor and would keep the compiler's memory."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
         with contextlib.suppress(BaseException), open(writer, "w", encoding="utf-8") as answer:  # noqa: PTH123  a pipe
-            answer.write(_wrong_with(folder, site_keys) or _IN_ORDER)
+            answer.write(_errors_in(folder, site_keys) or _VALID)
         os._exit(0)
     os.close(writer)
     with open(reader, encoding="utf-8") as answer:  # noqa: PTH123  as above
-        said = answer.read()
+        result = answer.read()
     os.waitpid(child, 0)
-    if said != _IN_ORDER:
-        raise StartError(said or f"{folder}: the specifications were not read: what read them ended")
+    if result != _VALID:
+        raise StartError(result or f"{folder}: the process that read the specifications ended early")
 
 
-def _wrong_with(folder: Path, site_keys: Sequence[str]) -> str:
+def _errors_in(folder: Path, site_keys: Sequence[str]) -> str:
     from appliance.specifications.checking import check  # noqa: PLC0415  the compiler: only in this child
     from appliance.specifications.specification_files import (  # noqa: PLC0415  as above
         SpecificationsRefusedError,
@@ -83,9 +83,9 @@ def _wrong_with(folder: Path, site_keys: Sequence[str]) -> str:
 
 
 def _is_read_at_start(state: Path, table: str) -> bool:
-    """Whether RVMaster will read what is on disk, and not what an operator brought into force since.
+    """Whether RVMaster will read the files on disk, rather than a revision that an operator loaded.
 
-    Not where that cannot be told: statements that an earlier life left beside the database may say otherwise.
+    False if unknown: an earlier run may have left statements beside the database that are not in it yet.
     """
     try:
         if not state.exists():

@@ -1,17 +1,17 @@
-"""`rosrv version`: what is installed here, or what a running appliance is."""
+"""`rosrv version`: show the installed version, or that of a running appliance."""
 
 from appliance.channel.admin import InventoryWanted
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json
-from appliance.cli.target import Appliance, speaks
 from appliance.configuration.inventory import inventory
 from rosmop.tool.terminal import say
 
 
 @speaks
 def version(appliance: Appliance) -> None:
-    """Show which version this is, and what it stands on.
+    """Show the version of rosrv, Python and the system.
 
-    With --state or --api: of the appliance that runs there.
+    With --state or --api: those of the running appliance.
 
     Example: rosrv version --json
     """

@@ -1,1 +1,1 @@
-"""`rosrv audit`: the review of the audit log."""
+"""`rosrv audit`: review the audit log."""

@@ -1,4 +1,4 @@
-"""What goes wrong when the audit log is read, in words and with an exit status."""
+"""Print the errors of the audit verbs, and exit with their statuses."""
 
 import os
 import sys
@@ -7,19 +7,19 @@ from typing import NoReturn
 import typer
 
 from appliance.audit.copies import CopiesUnreadableError
-from appliance.audit.export_proof import ExportUnreadableError
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import FilterError
 from appliance.audit.record_format import printable
 from appliance.audit.signatures import KeyUnreadableError
-from appliance.audit.timestamps import MomentError
-from appliance.cli.admin_client import NotRunningError
+from appliance.base.timestamps import TimestampError
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.evidence.export_verification import ExportUnreadableError
 
 CANNOT_READ = 2
 
 
 class Errors:
-    """Says in words what went wrong, and ends with the exit status for it."""
+    """A context manager that prints an error of the audit log and exits with its status."""
 
     def __enter__(self) -> None:
         pass
@@ -28,10 +28,10 @@ class Errors:
         match error:
             case LogUnreadableError() | KeyUnreadableError() | CopiesUnreadableError() | NotRunningError():
                 fail(str(error), CANNOT_READ)
-            case FilterError() | MomentError() | ExportUnreadableError():
+            case FilterError() | TimestampError() | ExportUnreadableError():
                 fail(str(error), CANNOT_READ)
             case BrokenPipeError():
-                # The reader (head, less) has enough: what is still buffered has nowhere to go.
+                # The reader (head, less) has ended: discard what is still buffered.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 raise typer.Exit(0)
             case KeyboardInterrupt():
@@ -42,12 +42,12 @@ class Errors:
                 fail(f"{error.filename or 'output'}: {error.strerror}", CANNOT_READ)
 
 
-def tell(text: str) -> None:
-    """A line beside the output."""
+def note(text: str) -> None:
+    """Write a line to standard error."""
     sys.stderr.write(f"rosrv: {text}\n")
 
 
 def fail(text: str, status: int) -> NoReturn:
-    """Say what is wrong and end."""
-    tell(printable(text))
+    """Print an error and exit with `status`."""
+    note(printable(text))
     raise typer.Exit(status)

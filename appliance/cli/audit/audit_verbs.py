@@ -1,7 +1,7 @@
-"""`rosrv audit tail|search|show|verify|checkpoints|export`: the review of the audit log.
+"""`rosrv audit tail|search|show|verify|checkpoints|export`: review the audit log.
 
-With a state directory they read the log's file, so they work while the appliance runs, when it is stopped, and on a
-copy; with `--api` they read the running appliance's log over REST.
+With a state directory the verbs read the file of the log; the appliance may be stopped, and the directory a copy. With
+`--api` they read the running appliance's log over REST.
 """
 
 import json
@@ -16,12 +16,11 @@ import msgspec
 import typer
 
 from appliance.audit.copies import read_copies
-from appliance.audit.export_proof import verify_export
 from appliance.audit.query import Filter
-from appliance.audit.record_format import Entry, as_json, as_object
+from appliance.audit.record_format import LogEntry, as_json, as_object
 from appliance.audit.search import LARGEST_PAGE
 from appliance.audit.signatures import read_public_key
-from appliance.cli.audit.audit_errors import Errors, fail, tell
+from appliance.cli.audit.audit_errors import Errors, fail, note
 from appliance.cli.audit.filter import filtered
 from appliance.cli.audit.record_table import (
     line,
@@ -31,13 +30,16 @@ from appliance.cli.audit.record_table import (
     print_verification,
     write,
 )
-from appliance.cli.target import Appliance, speaks
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.evidence.export_verification import verify_export
 from rosmop.tool.progress_bar import progress
 
-_CHECKPOINT_SECONDS = 5.0  # between two looks: one is made a minute, and a look over REST is itself recorded
-_TOLD_EVERY = 1000
+_CHECKPOINT_SECONDS = (
+    5.0  # between two queries: a checkpoint is made once a minute, and REST queries are recorded
+)
+_PROGRESS_EVERY = 1000  # records
 _Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJSON)")]
-_AlwaysJson = Annotated[bool, typer.Option("--json", help="NDJSON, which it always is")]
+_AlwaysJson = Annotated[bool, typer.Option("--json", help="Accepted; the output is always NDJSON")]
 
 
 @speaks
@@ -46,9 +48,11 @@ def search(
     appliance: Appliance,
     wanted: Filter,
     *,
-    limit: Annotated[int, typer.Option("--limit", min=1, max=LARGEST_PAGE, help="At most")] = 100,
-    oldest_first: Annotated[bool, typer.Option("--oldest-first", help="From the first record on")] = False,
-    cursor: Annotated[str | None, typer.Option("--cursor", help="Go on where a search ended")] = None,
+    limit: Annotated[
+        int, typer.Option("--limit", min=1, max=LARGEST_PAGE, help="Largest number of records")
+    ] = 100,
+    oldest_first: Annotated[bool, typer.Option("--oldest-first", help="Start with the first record")] = False,
+    cursor: Annotated[str | None, typer.Option("--cursor", help="Continue where a search ended")] = None,
     as_json_lines: _Json = False,
 ) -> None:
     """Find records, newest first.
@@ -61,7 +65,7 @@ def search(
     else:
         print_entries(page.entries)
     if page.cursor is not None:
-        tell(f"more records match: --cursor {page.cursor}, or a larger --limit")
+        note(f"more records match: --cursor {page.cursor}, or a larger --limit")
 
 
 @speaks
@@ -70,8 +74,10 @@ def tail(
     appliance: Appliance,
     wanted: Filter,
     *,
-    lines: Annotated[int, typer.Option("--lines", "-n", min=0, max=LARGEST_PAGE, help="At first")] = 10,
-    follow: Annotated[bool, typer.Option(help="Wait for more, until interrupted")] = True,
+    lines: Annotated[
+        int, typer.Option("--lines", "-n", min=0, max=LARGEST_PAGE, help="Records to show first")
+    ] = 10,
+    follow: Annotated[bool, typer.Option(help="Wait for new records until interrupted")] = True,
     as_json_lines: _Json = False,
 ) -> None:
     """Show the last records and follow the log.
@@ -85,18 +91,20 @@ def tail(
 @speaks
 def show(
     appliance: Appliance,
-    record_id: Annotated[str, typer.Argument(metavar="ID", help="The record's id, or its sequence")],
-    neighbours: Annotated[int, typer.Option("--neighbours", min=0, max=1000, help="How many around it")] = 5,
+    record_id: Annotated[str, typer.Argument(metavar="ID", help="Id or sequence number of the record")],
+    neighbours: Annotated[
+        int, typer.Option("--neighbours", min=0, max=1000, help="Records to show around it")
+    ] = 5,
     as_json_lines: _Json = False,
 ) -> None:
-    """Show one record in full, and what the same host or caller did around it.
+    """Show one record in full, with the records of the same host or caller around it.
 
     Example: rosrv audit show 18e9aa02efc40abb0e51
     """
     with Errors():
         shown = appliance.audit().show(record_id, neighbours)
         if shown is None:
-            fail(f"no record with the id {record_id!a} is in the log", 1)
+            fail(f"no record in the log has the id {record_id!a}; list them: rosrv audit search", 1)
         if as_json_lines:
             around = {
                 "before": [as_object(record) for record in shown.before],
@@ -119,16 +127,17 @@ def verify(
     ] = None,
     export_file: Annotated[
         Path | None,
-        typer.Option("--export", help="What `rosrv audit export` wrote, on any machine; with --key"),
+        typer.Option(
+            "--export", help="Deprecated: verify this output of `rosrv audit export` instead; needs --key"
+        ),
     ] = None,
     as_json_lines: _Json = False,
 ) -> None:
-    """Prove that the log is complete and unchanged: exit status 0, else 1; 2 if it cannot be read.
+    """Verify that the log is complete and unchanged. Exit status: 0 yes, 1 no, 2 cannot be read.
 
-    The key is the one pinned beside the log, unless --key gives one that was kept elsewhere. The checkpoints
-    are also held against what the signer remembers, if its directory can be read; with --checkpoints, the log against
-    what another machine was given, which nobody here can change, root neither. With --export, records that were
-    exported, held against the public key alone: neither the log nor the appliance is asked.
+    Signatures are checked with the key beside the log, or with --key. Checkpoints are also compared with the signer's
+    own records if they are readable, and with --checkpoints against copies on another machine, which even root on
+    this one cannot change. To prove records without the log, use `rosrv evidence export` and `rosrv evidence verify`.
 
     Example: rosrv audit verify --key /media/safe/audit.pub --checkpoints /media/safe/checkpoints.ndjson
     """
@@ -139,8 +148,8 @@ def verify(
         source = appliance.audit()
         copies = None if checkpoints is None else read_copies(checkpoints)
         public_key = None if key is None else read_public_key(key)
-        with progress("checking the chain", source.last) as told:
-            result = source.verify(public_key, copies, told)
+        with progress("checking the chain", source.last) as report:
+            result = source.verify(public_key, copies, report)
         if as_json_lines:
             write(json.dumps(msgspec.to_builtins(result)))
         else:
@@ -153,10 +162,13 @@ def _verify_export(file: Path, key: Path | None, *, copies: bool, as_json_lines:
     with Errors():
         if key is None or copies:
             fail(
-                "--export takes --key, the appliance's public key (control/audit.pub in its state directory), and no"
-                " --checkpoints: the export has its own",
+                "--export needs --key, the appliance's public key (control/audit.pub in its state directory), and does"
+                " not take --checkpoints: the export has its own",
                 2,
             )
+        note(
+            "--export is deprecated: use `rosrv evidence export`, and `rosrv evidence verify` for its bundle"
+        )
         result = verify_export(file, read_public_key(key))
         if as_json_lines:
             write(json.dumps(msgspec.to_builtins(result)))
@@ -169,11 +181,13 @@ def _verify_export(file: Path, key: Path | None, *, copies: bool, as_json_lines:
 @speaks
 def checkpoints(
     appliance: Appliance,
-    after: Annotated[int, typer.Option("--after", min=0, help="Only those with a greater number")] = 0,
-    follow: Annotated[bool, typer.Option("--follow", help="Wait for more, until interrupted")] = False,
+    after: Annotated[int, typer.Option("--after", min=0, help="Only checkpoints with a greater number")] = 0,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Wait for new checkpoints until interrupted")
+    ] = False,
     as_json_lines: _AlwaysJson = True,  # noqa: ARG001  every verb takes --json
 ) -> None:
-    """Write the signed checkpoints as NDJSON: keep them on another machine, for `verify --checkpoints`.
+    """Write the signed checkpoints as NDJSON. Keep them on another machine for `verify --checkpoints`.
 
     Example: rosrv audit checkpoints --follow | ssh keeper 'cat >> checkpoints.ndjson'
     """
@@ -201,25 +215,25 @@ def export(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
     as_json_lines: _AlwaysJson = True,  # noqa: ARG001  every verb takes --json
 ) -> None:
-    """Write all records that match as NDJSON, oldest first, each with its place in the hash chain.
+    """Write all matching records as NDJSON, oldest first, each with its position in the hash chain.
 
-    It proves itself elsewhere: `rosrv audit verify --export week.ndjson --key audit.pub`.
+    To prove records on another machine, use `rosrv evidence export`.
 
     Example: rosrv audit export --since 7d --output week.ndjson
     """
     source = appliance.audit()
     entries = source.evidence(wanted)
-    with progress("exporting", source.last, shares_screen=output is None) as told:
+    with progress("exporting", source.last, shares_screen=output is None) as report:
         if output is None:
-            count = _write_all(entries, told, sys.stdout)
+            count = _write_all(entries, report, sys.stdout)
         else:
             with _new_file(output) as file:
-                count = _write_all(entries, told, file)
+                count = _write_all(entries, report, file)
     if output is not None:
-        tell(f"{count} records in {output}")
+        note(f"{count} records in {output}")
 
 
-def _print_lines(entries: list[Entry], as_json_lines: bool) -> None:
+def _print_lines(entries: list[LogEntry], as_json_lines: bool) -> None:
     formatted = as_json if as_json_lines else line
     for entry in entries:
         write(formatted(entry))
@@ -228,23 +242,23 @@ def _print_lines(entries: list[Entry], as_json_lines: bool) -> None:
 
 @contextmanager
 def _new_file(path: Path) -> Iterator[TextIO]:
-    """A file that is not there yet; one that is not whole is none."""
+    """Open a new file; remove it again if writing fails."""
     file = path.open("x", encoding="ascii")
     try:
         with file:
             yield file
     except BaseException as error:
         path.unlink()
-        if isinstance(error, OSError):  # a full disk: the system does not say of which file
+        if isinstance(error, OSError):  # such as a full disk: the error does not name the file
             error.filename = error.filename or str(path)
         raise
 
 
-def _write_all(lines: Iterable[tuple[int, str]], told: Callable[[int], None], file: TextIO) -> int:
+def _write_all(lines: Iterable[tuple[int, str]], report: Callable[[int], None], file: TextIO) -> int:
     count = 0
     for count, (sequence, line_of) in enumerate(lines, 1):
         file.write(line_of + "\n")
-        if count % _TOLD_EVERY == 0:
-            told(sequence)
+        if count % _PROGRESS_EVERY == 0:
+            report(sequence)
     file.flush()
     return count

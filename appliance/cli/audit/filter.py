@@ -1,4 +1,4 @@
-"""What the audit verbs look for: one set of options for `search`, `tail` and `export`."""
+"""Define the filter options of `rosrv audit search`, `tail` and `export`."""
 
 import functools
 import inspect
@@ -12,10 +12,10 @@ from appliance.api.unrecorded import unrecorded
 from appliance.audit.query import Filter
 from appliance.audit.record import Severity
 from appliance.audit.record_format import printable
-from appliance.audit.timestamps import MomentError, parse_moment
-from appliance.cli.audit.audit_errors import Errors, tell
+from appliance.base.timestamps import TimestampError, parse_timestamp
+from appliance.cli.audit.audit_errors import Errors, note
+from appliance.cli.connection.target import Appliance
 from appliance.cli.durations import Since, Until
-from appliance.cli.target import Appliance
 
 _P = ParamSpec("_P")
 
@@ -23,43 +23,45 @@ _P = ParamSpec("_P")
 def _filter(
     *,
     deny: Annotated[
-        bool, typer.Option("--deny", help="Only what was denied (and summaries of denials)")
+        bool, typer.Option("--deny", help="Only denied requests (and summaries of denials)")
     ] = False,
-    allow: Annotated[bool, typer.Option("--allow", help="Only what was allowed")] = False,
+    allow: Annotated[bool, typer.Option("--allow", help="Only allowed requests")] = False,
     would_deny: Annotated[
-        bool, typer.Option("--would-deny", help="Only what a trial policy would have denied")
+        bool, typer.Option("--would-deny", help="Only requests that an audit-only policy would have denied")
     ] = False,
     since: Since = None,
     until: Until = None,
     topic: Annotated[
         str | None,
-        typer.Option("--topic", "--resource", help="Topic, service, parameter, call; a glob: '/cmd_*'"),
+        typer.Option(
+            "--topic", "--resource", help="Topic, service, parameter or call; a glob such as '/cmd_*'"
+        ),
     ] = None,
     host: Annotated[str | None, typer.Option("--host", help="Address of the peer; a glob")] = None,
-    caller: Annotated[str | None, typer.Option("--caller", help="Name the node gave; a glob")] = None,
+    caller: Annotated[str | None, typer.Option("--caller", help="Name that the node gave; a glob")] = None,
     event: Annotated[str | None, typer.Option("--event", help="Name of the event; a glob")] = None,
     category: Annotated[
         str | None, typer.Option("--category", help="Category of the request; a glob")
     ] = None,
     severity: Annotated[
-        Severity | None, typer.Option("--severity", help="This severity or a graver one")
+        Severity | None, typer.Option("--severity", help="This severity or a higher one")
     ] = None,
     rule: Annotated[
         str | None, typer.Option("--rule", help="Section or key of the policy rule; a glob")
     ] = None,
     text: Annotated[
-        str | None, typer.Option("--text", help="Found anywhere in names, reason and details")
+        str | None, typer.Option("--text", help="Text anywhere in names, reason and details")
     ] = None,
     who: Annotated[
-        str | None, typer.Option("--who", help="Name of the token that asked, or operator; a glob")
+        str | None, typer.Option("--who", help="Name of the token of a REST request, or operator; a glob")
     ] = None,
 ) -> Filter:
     now = time.time_ns()
     wanted = {"deny": deny, "allow": allow, "would deny": would_deny}
-    begin = None if since is None else parse_moment(since, now)
-    end = None if until is None else parse_moment(until, now)
+    begin = None if since is None else parse_timestamp(since, now)
+    end = None if until is None else parse_timestamp(until, now)
     if begin is not None and end is not None and begin > end:
-        raise MomentError(f"--since {since} is later than --until {until}: nothing is between them")
+        raise TimestampError(f"--since {since} is later than --until {until}")
     found = Filter(
         decision=tuple(name for name, asked in wanted.items() if asked),
         since=begin,
@@ -74,15 +76,15 @@ def _filter(
         text=text,
         who=who,
     )
-    for note in unrecorded(found):
-        tell(printable(note))
+    for warning in unrecorded(found):
+        note(printable(warning))
     return found
 
 
 def filtered(
     verb: Callable[Concatenate[Appliance, Filter, _P], None],
 ) -> Callable[Concatenate[Appliance, _P], None]:
-    """Give a verb whose second parameter is a `Filter` the options that say what is looked for."""
+    """Replace the second parameter of a verb, a `Filter`, by the filter options."""
     options = inspect.signature(_filter).parameters
 
     @functools.wraps(verb)

@@ -1,6 +1,6 @@
-"""How audit records look to a person: a table on a terminal, plain lines in a pipe.
+"""Print audit records as text: a table on a terminal, lines in a pipe.
 
-Strangers' text is escaped (`printable`) and handed to the terminal as text, never as markup.
+Text from the network is escaped (`printable`) and printed as text, never as markup.
 """
 
 import sys
@@ -11,19 +11,19 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from appliance.audit.chain_findings import Elsewhere, Kind, Verification
-from appliance.audit.export_proof import ExportVerification
-from appliance.audit.record import Record, Severity
-from appliance.audit.record_format import Entry, fields_of, printable, rfc3339, rule_text
-from appliance.audit.search import Shown
+from appliance.audit.chain_findings import Elsewhere, FindingKind, Verification
+from appliance.audit.record import AuditRecord, Severity
+from appliance.audit.record_format import LogEntry, fields_of, printable, rfc3339, rule_text
+from appliance.audit.search import RecordInContext
+from appliance.evidence.export_verification import ExportVerification
 
 _STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
 _FOLDED = ("denials folded", "repetitions folded")
 _MILLISECONDS = 23
 
 
-def print_entries(entries: list[Entry]) -> None:
-    """Records in the order given."""
+def print_entries(entries: list[LogEntry]) -> None:
+    """Print records in the order given."""
     if sys.stdout.isatty():
         console = Console(highlight=False)
         console.print(_table(entries))
@@ -32,8 +32,8 @@ def print_entries(entries: list[Entry]) -> None:
             write(line(entry))
 
 
-def line(entry: Entry) -> str:
-    """One record as one line: time, sequence, decision, event, who, what, why."""
+def line(entry: LogEntry) -> str:
+    """Return a record as one line: time, sequence, decision, event, host, caller, resource, reason."""
     record = entry.record
     parts = [
         rfc3339(record.time),
@@ -49,8 +49,8 @@ def line(entry: Entry) -> str:
     return shown + (f": {_why(record)}" if _why(record) else "")
 
 
-def print_shown(shown: Shown) -> None:
-    """One record in full, between its neighbours."""
+def print_shown(shown: RecordInContext) -> None:
+    """Print a record in full, then the records before and after it."""
     record = shown.entry.record
     fields = {
         "id": record.id,
@@ -65,24 +65,22 @@ def print_shown(shown: Shown) -> None:
             write(f"{printable(name):<12} {printable(value)}")
     for title, entries in (("before", shown.before), ("after", shown.after)):
         write(
-            f"\n{title}, same host or caller:" if entries else f"\nnothing {title} of the same host or caller"
+            f"\n{title}, same host or caller:" if entries else f"\nnothing {title} by the same host or caller"
         )
         for entry in entries:
             write("  " + line(entry))
 
 
 def print_verification(result: Verification) -> None:
-    """What was checked, and each thing that is wrong on a line of its own."""
+    """Print the result of a verification, with one line for each finding."""
     for finding in result.findings:
         write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
     write(f"{result.records} records ({result.first} to {result.last}), log {printable(result.log)}")
     if result.removed:
-        write(
-            f"records up to {result.removed} were removed by retention, which is recorded{_vouched(result)}"
-        )
+        write(f"records up to {result.removed} were removed by retention, as recorded{_vouched(result)}")
     write(
         f"{result.signed_checkpoints} of {result.checkpoints} checkpoints are signed; records up to"
-        f" {result.signed_through} are proven by a signature, {result.unsealed} after it by the chain only"
+        f" {result.signed_through} are proven by a signature, the {result.unsealed} after it by the chain only"
     )
     if result.elsewhere is not None:
         for text in _elsewhere(result.elsewhere):
@@ -92,61 +90,64 @@ def print_verification(result: Verification) -> None:
 
 
 def print_export_verification(result: ExportVerification) -> None:
-    """What of an export is proven, and each thing that is wrong on a line of its own."""
+    """Print the result of verifying an export, with one line for each finding."""
     for finding in result.findings:
-        write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
+        write(f"WRONG: {printable(finding)}")
     write(
         f"{result.records} records ({result.first} to {result.last}), log {', '.join(result.logs) or 'unknown'}"
     )
     write(f"{result.proven} are proven by a signed checkpoint")
     if result.unsealed:
         write(
-            f"{result.unsealed} come after the last signed checkpoint: nothing proves them yet; export later"
+            f"{result.unsealed} come after the last signed checkpoint and are not proven yet; export again later"
         )
     if result.left_out:
         write(f"{result.left_out} records between them are not in the export")
     write(f"key: {result.key}")
     write(
-        "The records are as they were written."
+        "The records are unchanged."
         if result.ok
-        else "The export was tampered with, or is not of this key."
+        else "The export was tampered with, or belongs to another key."
     )
 
 
 def _vouched(result: Verification) -> str:
     if result.removal == "signed":
-        return "; the signer has signed that they had to go"
-    return "; the signer did not sign that: nothing proves that they had to go"
+        return "; the signer confirmed their removal"
+    return "; the signer did not confirm it: their removal is not proven"
 
 
 def _verdict(result: Verification) -> str:
+    if result.ok and not result.signed_through:
+        return "The log is consistent, but nothing is signed yet: its completeness is not proven. Verify again later."
     if result.ok:
         return "The log is complete and unchanged."
-    if all(finding.kind is Kind.PROVES_NOTHING for finding in result.findings):
-        return "Nothing is wrong in the log itself, but the checkpoints kept elsewhere prove nothing of it."
+    if all(finding.kind is FindingKind.PROVES_NOTHING for finding in result.findings):
+        return "The log itself is consistent, but the checkpoints kept elsewhere do not confirm it."
     return "The log was tampered with or is damaged."
 
 
 def _elsewhere(found: Elsewhere) -> Iterator[str]:
     if found.checkpoints:
         yield (
-            f"{found.checkpoints} checkpoints kept elsewhere agree: records up to {found.through} are as they were"
-            f" at {rfc3339(found.time)}"
+            f"{found.checkpoints} checkpoints kept elsewhere agree: records up to {found.through} are unchanged"
+            f" since {rfc3339(found.time)}"
         )
     else:
-        yield "no checkpoint kept elsewhere proves anything of this log"
+        yield "no checkpoint kept elsewhere belongs to this log"
     if found.other_logs:
         yield f"checkpoints of other logs: {', '.join(found.other_logs)}"
 
 
 def write(text: str) -> None:
-    """A line on standard output; ASCII where the terminal or pipe takes no more."""
+    """Write a line to standard output; escape characters that its encoding lacks."""
     encoding = sys.stdout.encoding or "ascii"
     sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
 
 
-def _table(entries: list[Entry]) -> Table:
+def _table(entries: list[LogEntry]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("record", no_wrap=True, justify="right")
     table.add_column("time (UTC)", no_wrap=True)
     table.add_column("decision", no_wrap=True)
     for name in ("event", "who", "what", "why"):
@@ -155,6 +156,7 @@ def _table(entries: list[Entry]) -> Table:
         record = entry.record
         alarming = record.severity is Severity.ALARM
         table.add_row(
+            str(entry.sequence),
             rfc3339(record.time)[:_MILLISECONDS].replace("T", " "),
             Text(printable(record.decision or ""), style=_STYLES.get(record.decision or "", "")),
             Text(printable(record.event), style="bold red" if alarming else ""),
@@ -169,8 +171,8 @@ def _joined(*parts: str | None) -> str:
     return " ".join(printable(part) for part in parts if part)
 
 
-def _why(record: Record) -> str:
-    """The reason; the rule unless the reason names its place; how often, where one record stands for many."""
+def _why(record: AuditRecord) -> str:
+    """Return the reason, with the rule unless the reason names it, and the count of a folded record."""
     rule = record.rule
     named = rule is None or f"{Path(rule.file).name}:{rule.line}" in record.reason
     why = record.reason if named else f"{record.reason} ({rule_text(record.rule)})"

@@ -1,1 +1,1 @@
-"""`rosrv host`: who may come through a tunnel."""
+"""`rosrv host`: manage the hosts with a tunnel."""

@@ -1,4 +1,4 @@
-"""`rosrv host add|list|kit|reload|revoke`: who may come through a tunnel."""
+"""`rosrv host add|list|kit|reload|revoke`: hosts with an IPsec tunnel."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,22 +6,24 @@ from typing import Annotated
 import typer
 from msgspec.structs import replace
 
-from appliance.api.kits import Wishes
+from appliance.api.kits import KitOptions
 from appliance.base.validation_messages import meant
 from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
 from appliance.channel.answers.host_answers import Host, PortsSeen
 from appliance.cli import completion
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
-from appliance.cli.host.kit_files import KitWriter, placed, wishes_of, write_script
+from appliance.cli.host.kit_files import key_and_request, placed, wishes_of, write_kit, write_script
 from appliance.cli.host.private_output import new_output, usage_error
 from appliance.cli.output import moment, say_json
-from appliance.cli.target import Appliance, speaks
 from rosmop.tool.terminal import printable, say
 
 _Name = Annotated[
     str,
     typer.Argument(
-        help="The host's name: `host:NAME` in the policy", show_default=False, autocompletion=completion.hosts
+        help="Name of the host, `host:NAME` in the policy",
+        show_default=False,
+        autocompletion=completion.hosts,
     ),
 ]
 _Endpoint = Annotated[
@@ -34,9 +36,9 @@ _Endpoint = Annotated[
 ]
 _Csr = Annotated[
     Path | None,
-    typer.Option(help="Signing request (PEM) of a key that the host made: the kit has no private key then"),
+    typer.Option(help="Signing request (PEM) for the host's own key; the kit then has no private key"),
 ]
-_Days = Annotated[float, typer.Option(help="Days until the certificate ends")]
+_Days = Annotated[float, typer.Option(help="Days until the certificate expires")]
 _Out = Annotated[
     Path | None,
     typer.Option(
@@ -44,11 +46,9 @@ _Out = Annotated[
         " standard output"
     ),
 ]
-_Open = Annotated[
-    list[str] | None, typer.Option("--open", help="Services of the host that stay open: tcp/22")
-]
+_Open = Annotated[list[str] | None, typer.Option("--open", help="Services of the host to keep open: tcp/22")]
 _Ports = Annotated[str, typer.Option(help="The host's local port range, where ROS nodes listen")]
-_Within = Annotated[str, typer.Option(help="With --token: how long it is good: 30m, 1h, 7d")]
+_Within = Annotated[str, typer.Option(help="With --token: how long the token is valid: 30m, 1h, 7d")]
 
 
 @speaks
@@ -61,7 +61,9 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     ] = None,
     token: Annotated[
         bool,
-        typer.Option("--token", help="Print a one-time token and write a script; the host makes its own key"),
+        typer.Option(
+            "--token", help="Print a one-time token and write a script; the host creates its own key"
+        ),
     ] = False,
     within: _Within = "1h",
     csr: _Csr = None,
@@ -70,7 +72,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     opened: _Open = None,
     ports: _Ports = "32768-60999",
 ) -> None:
-    """Enrol a host: write its kit, one archive with all it needs; or with --token, let it enrol itself.
+    """Enrol a host. Write its kit, one archive with everything it needs, or let it enrol itself with --token.
 
     Example: rosrv host add ocu-1 --token
     """
@@ -78,7 +80,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     if token:
         if csr is not None:
             raise usage_error(
-                "--csr and --token are two ways: with a token the host brings its request itself"
+                "--csr and --token exclude each other: with a token the host sends its own request"
             )
         order = HostToken(name, token_seconds=_seconds(within), days=days, address=address, new=True)
         _write_script(running, order, wishes, out)
@@ -92,7 +94,7 @@ def kit(  # noqa: PLR0917  as above
     name: _Name,
     appliance: _Endpoint = None,
     token: Annotated[
-        bool, typer.Option("--token", help="A one-time token instead: the host comes with another key")
+        bool, typer.Option("--token", help="Print a one-time token instead; the host creates a new key")
     ] = False,
     within: _Within = "1h",
     csr: _Csr = None,
@@ -101,7 +103,7 @@ def kit(  # noqa: PLR0917  as above
     opened: _Open = None,
     ports: _Ports = "32768-60999",
 ) -> None:
-    """Write a new kit for an enrolled host: a new certificate; the one before is revoked and its tunnel closed.
+    """Write a new kit for an enrolled host. Its old certificate is revoked and its tunnel closed.
 
     Example: rosrv host kit ocu-1
     """
@@ -118,7 +120,7 @@ def list_hosts(
     running: Appliance,
     group: Annotated[str | None, typer.Option(help="Only hosts of this group of hosts.yaml")] = None,
 ) -> None:
-    """List the hosts that are enrolled, awaited or declared, with their tunnels; and machines in clear text.
+    """List enrolled, awaited and declared hosts with their tunnels, and machines that connect in clear text.
 
     Example: rosrv host list
     """
@@ -137,7 +139,7 @@ def list_hosts(
     if running.as_json or group is not None:
         return
     if not body.hosts:
-        say("no host is enrolled, awaited or declared: rosrv host add NAME")
+        say("no hosts; enrol one: rosrv host add NAME")
     for machine in body.machines:
         nodes = f"{machine.nodes} nodes in clear text"
         say("  ".join([f"{machine.address:<37} {nodes:<13}", _ports_words(machine.ports)]))
@@ -147,13 +149,13 @@ def list_hosts(
 
 @speaks
 def reload(running: Appliance) -> None:
-    """Read hosts.yaml again. It opens and closes tunnels that it wants or does not want; it enrols and revokes nobody.
+    """Read hosts.yaml again and open or close tunnels as it declares. No host is enrolled or revoked.
 
     Example: rosrv host reload
     """
     body = running.answer_or_exit(HostsReload())
     say(f"{len(body.declared)} hosts are declared")
-    for word, names in (("may come again", body.opened), ("tunnel closed", body.closed)):
+    for word, names in (("tunnel allowed again", body.opened), ("tunnel closed", body.closed)):
         if names:
             say(f"{word}: {', '.join(names)}")
     for difference in body.divergence:
@@ -162,15 +164,15 @@ def reload(running: Appliance) -> None:
 
 @speaks
 def revoke(running: Appliance, name: _Name) -> None:
-    """Let a host in no more, close its tunnel and take back what it has, now; or await it no longer.
+    """Revoke a host now: close its tunnel, remove its registrations and grants, and cancel its one-time token.
 
     Example: rosrv host revoke ocu-1
     """
     body = running.answer_or_exit(HostRevoke(name))
     if not body.serial:
-        say(f"{body.name} is awaited no longer: its one-time token opens nothing")
+        say(f"{body.name} is no longer awaited: its one-time token is invalid")
     else:
-        say(f"{body.name} ({body.address}) is revoked; {body.taken_back} registrations and grants taken back")
+        say(f"{body.name} ({body.address}) is revoked; {body.taken_back} registrations and grants removed")
 
 
 def _seconds(within: str) -> float:
@@ -178,16 +180,16 @@ def _seconds(within: str) -> float:
 
 
 def _write_kit(
-    running: Appliance, order: HostAdd | HostRenew, csr: Path | None, wishes: Wishes, out: Path | None
+    running: Appliance, order: HostAdd | HostRenew, csr: Path | None, wishes: KitOptions, out: Path | None
 ) -> None:
     with new_output(out, f"rosrv-{order.name}.tar.gz", as_json=running.as_json) as output:
-        writer = KitWriter(output, csr=csr)
+        key, request = key_and_request(csr)
         wishes, reason = placed(running, wishes)
-        body = running.ask_or_exit(replace(order, request=writer.request))
-        writer.write(body, wishes, reason, as_json=running.as_json)
+        body = running.ask_or_exit(replace(order, request=request))
+        write_kit(output, body, key, wishes, reason, as_json=running.as_json)
 
 
-def _write_script(running: Appliance, order: HostToken, wishes: Wishes, out: Path | None) -> None:
+def _write_script(running: Appliance, order: HostToken, wishes: KitOptions, out: Path | None) -> None:
     asked = replace(order, endpoint=wishes.endpoint or None, ports=wishes.ports, open=[*wishes.opened])
     with new_output(out, f"rosrv-{order.name}-join.sh", as_json=running.as_json) as output:
         write_script(output, running.ask_or_exit(asked), as_json=running.as_json)

@@ -1,4 +1,4 @@
-"""What `rosrv host` writes for a host: its kit, or the script by which it enrols itself."""
+"""Write the kit of a host, or the script with which it enrols itself."""
 
 import re
 from dataclasses import replace
@@ -6,13 +6,13 @@ from pathlib import Path
 
 import typer
 
-from appliance.api.kits import Wishes, kit_of
+from appliance.api.kits import KitOptions, kit_of
 from appliance.base.input_files import open_given
 from appliance.channel.admin import HostEndpoint
 from appliance.channel.answers.host_answers import EnrolmentToken, KitParts
+from appliance.cli.connection.target import Appliance
 from appliance.cli.host.private_output import Output, usage_error
 from appliance.cli.output import moment, say_json
-from appliance.cli.target import Appliance
 from appliance.ipsec.enrolment_kit import archive
 from appliance.ipsec.requests import make_key, signing_request
 
@@ -21,23 +21,23 @@ _LONGEST_REQUEST = 16 << 10
 _SHOWN = ("name", "address", "appliance", "master", "serial", "expires")
 
 
-def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> Wishes:
-    """What the flags ask for; the endpoint is empty where they leave it to the appliance.
+def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> KitOptions:
+    """Return the kit's options; the endpoint is empty if the appliance should choose it.
 
-    Ends the program with 2 when that makes no sense.
+    Exits with status 2 for invalid options.
     """
     if appliance is not None and not _ENDPOINT.fullmatch(appliance):
         raise usage_error(f"--appliance {appliance!r} is neither an address nor a name")
     try:
-        return Wishes(appliance or "", ports, tuple(opened or ()))
+        return KitOptions(appliance or "", ports, tuple(opened or ()))
     except ValueError as error:
         raise usage_error(str(error)) from None
 
 
-def placed(running: Appliance, wishes: Wishes) -> tuple[Wishes, str]:
-    """The wishes with the address of the appliance, and why it is that where nobody said it.
+def placed(running: Appliance, wishes: KitOptions) -> tuple[KitOptions, str]:
+    """Return the options with an endpoint, and the reason for an endpoint that the appliance chose.
 
-    Ends the program with 1 when it cannot be told.
+    Exits with status 1 if the appliance cannot choose one.
     """
     if wishes.endpoint:
         return wishes, ""
@@ -45,54 +45,49 @@ def placed(running: Appliance, wishes: Wishes) -> tuple[Wishes, str]:
     return replace(wishes, endpoint=found.endpoint), found.reason
 
 
-class KitWriter:
-    """Checks everything that can be wrong before the appliance is asked, makes the key, writes the archive."""
+def key_and_request(csr: Path | None) -> tuple[str | None, str]:
+    """Return a new key with its signing request; or no key and the request in `csr`, in PEM."""
+    if csr is not None:
+        return None, _read_request(csr)
+    key = make_key()
+    return key.decode(), signing_request(key, "host").decode()
 
-    def __init__(self, output: Output, *, csr: Path | None) -> None:
-        self._output = output
-        self._key: str | None = None
-        if csr is None:
-            key = make_key()
-            self._key = key.decode()
-            self.request = signing_request(key, "host").decode()
-        else:
-            self.request = _read_request(csr)
 
-    def write(self, body: KitParts, wishes: Wishes, reason: str, *, as_json: bool) -> None:
-        """Write the archive; `reason`: why the appliance's address is that, empty where it was said."""
-        output = self._output
-        again = (
-            f"{body.name} is enrolled, its kit is not written:"
-            f" rosrv host kit {body.name} --appliance {wishes.endpoint} --out FILE"
+def write_kit(
+    output: Output, body: KitParts, key: str | None, wishes: KitOptions, reason: str, *, as_json: bool
+) -> None:
+    """Write the archive; `reason` explains an endpoint that the appliance chose, else it is empty."""
+    again = (
+        f"{body.name} is enrolled, but its kit was not written; run:"
+        f" rosrv host kit {body.name} --appliance {wishes.endpoint} --out FILE"
+    )
+    output.write(archive(kit_of(body, wishes, key)), again)
+    if body.warning:
+        typer.echo(f"rosrv: {body.warning}", err=True)
+    if not body.rest_url:
+        typer.echo(
+            f"rosrv: {body.name} cannot renew its certificate automatically: {body.rest_trouble}",
+            err=True,
         )
-        output.write(archive(kit_of(body, wishes, self._key)), again)
-        if body.warning:
-            typer.echo(f"rosrv: {body.warning}", err=True)
-        if not body.rest_url:
-            typer.echo(
-                f"rosrv: {body.name} cannot renew its certificate by itself: {body.rest_trouble}", err=True
-            )
-        if as_json:
-            where = {"endpoint": wishes.endpoint, "endpoint_reason": reason}
-            say_json({key: getattr(body, key) for key in _SHOWN} | where | {"kit": str(output.path)})
-            return
-        output.say(f"{body.name} is enrolled as {body.address}, until {moment(body.expires)}")
-        kit = "standard output" if output.is_standard else str(output.path)
-        output.say(
-            f"its kit: {kit}" + ("" if self._key else " (without the private key, which the host has)")
-        )
-        if reason:
-            output.say(_taken(wishes.endpoint, reason))
-        output.say("on the host: unpack it, then sudo ./join.sh")
+    if as_json:
+        where = {"endpoint": wishes.endpoint, "endpoint_reason": reason}
+        say_json({key: getattr(body, key) for key in _SHOWN} | where | {"kit": str(output.path)})
+        return
+    output.say(f"{body.name} is enrolled as {body.address}, until {moment(body.expires)}")
+    kit = "standard output" if output.is_standard else str(output.path)
+    output.say(f"its kit: {kit}" + ("" if key else " (without the private key, which the host has)"))
+    if reason:
+        output.say(_chosen(wishes.endpoint, reason))
+    output.say("on the host: unpack it, then run sudo ./join.sh")
 
 
-def _taken(endpoint: str, reason: str) -> str:
-    return f"the appliance is at {endpoint} ({reason}); another: --appliance"
+def _chosen(endpoint: str, reason: str) -> str:
+    return f"the appliance is at {endpoint} ({reason}); override it with --appliance"
 
 
 def write_script(output: Output, made: EnrolmentToken, *, as_json: bool) -> None:
-    """Write the script of a host that was given a one-time token, and print the token."""
-    output.write(made.script.encode(), "the token is lost: ask for another one")
+    """Write the script of a host with a one-time token, and print the token."""
+    output.write(made.script.encode(), "the token is lost: create another one")
     if as_json:
         shown = {
             key: getattr(made, key) for key in ("name", "address", "token", "endpoint", "endpoint_reason")
@@ -101,10 +96,10 @@ def write_script(output: Output, made: EnrolmentToken, *, as_json: bool) -> None
         return
     output.say(made.token)
     if made.endpoint_reason:
-        typer.echo(f"rosrv: {_taken(made.endpoint, made.endpoint_reason)}", err=True)
+        typer.echo(f"rosrv: {_chosen(made.endpoint, made.endpoint_reason)}", err=True)
     typer.echo(
         f"rosrv: {made.name} is awaited as {made.address} until {moment(made.expires)}; the token is"
-        f" good once and shown only here.\nrosrv: on the host: sudo sh {output.name}   (it asks for the token)",
+        f" valid once and not shown again.\nrosrv: on the host: sudo sh {output.name}   (it asks for the token)",
         err=True,
     )
 

@@ -1,7 +1,7 @@
-"""Where a kit or a script goes: a new file of its owner only, or standard output.
+"""Write a kit or a script to a new file for its owner only, or to standard output.
 
-An order to the appliance cannot be taken back: a new kit revokes the certificate before, a token is shown once. So the
-file is made, and has room, before anything is asked; when nothing comes of the order it is gone again.
+Enrolment cannot be undone: a new kit revokes the old certificate, and a token is shown once. So the file is created,
+with disk space reserved, before the request. It is removed if the request fails.
 """
 
 import contextlib
@@ -19,11 +19,11 @@ from rosmop.tool.terminal import printable, refused, say
 
 STANDARD_OUTPUT = Path("-")
 usage_error = functools.partial(output.usage_error, verb="rosrv host")
-_ROOM = 64 << 10  # bytes; a kit has ten thousand or so
+_RESERVED = 64 << 10  # bytes; a kit has about ten thousand
 
 
 class Output:
-    """A new file, or standard output. `written`: whether it has what it is for; `name`: what a host calls it."""
+    """A new file, or standard output. `written`: whether it has the data; `name`: the file's name on the host."""
 
     def __init__(self, path: Path, name: str, file: BinaryIO) -> None:
         self.path = path
@@ -33,11 +33,11 @@ class Output:
 
     @property
     def is_standard(self) -> bool:
-        """Whether it is standard output."""
+        """Whether this is standard output."""
         return self.path == STANDARD_OUTPUT
 
     def write(self, data: bytes, lost: str) -> None:
-        """Write it all, once. Where that fails, `lost` says what to do; ends the program with 1."""
+        """Write all data, once. If that fails, print `lost`, which says what to do, and exit with status 1."""
         try:
             self._file.write(data)
             if not self.is_standard:
@@ -48,7 +48,7 @@ class Output:
         self.written = True
 
     def say(self, line: str) -> None:
-        """Tell the person: on standard output, or beside it where that is taken."""
+        """Print a line to standard output, or to standard error if the data goes to standard output."""
         if self.is_standard:
             typer.echo(printable(line), err=True)
         else:
@@ -57,16 +57,16 @@ class Output:
 
 @contextlib.contextmanager
 def new_output(out: Path | None, default: str, *, as_json: bool) -> Iterator[Output]:
-    """Where to write, `default` where nobody said it. Nothing that is there is replaced.
+    """Open `out`, or the file `default`. Existing files are never replaced.
 
-    Ends the program with 2 where it cannot be written. A file that was not written in the block is taken away.
+    Exits with status 2 if the file cannot be created. A file that the block did not write is removed.
     """
     name = default.replace("/", "_")
     if out == STANDARD_OUTPUT:
         if as_json:
-            raise usage_error("--out - and --json both want standard output: give one")
+            raise usage_error("--out - and --json both use standard output: give one")
         if sys.stdout.isatty():
-            raise usage_error("standard output is this terminal: --out - > FILE")
+            raise usage_error("standard output is a terminal; redirect it: --out - > FILE")
         yield Output(out, name, sys.stdout.buffer)
         return
     path = out or Path(name)
@@ -84,11 +84,11 @@ def _opened(path: Path) -> BinaryIO:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     except FileExistsError:
-        raise usage_error(f"{shown} is there already: remove it, or name another with --out") from None
+        raise usage_error(f"{shown} already exists: remove it, or name another file with --out") from None
     except OSError as error:
         raise usage_error(f"{shown}: {error.strerror}; name another: --out FILE, or --out - > FILE") from None
     try:
-        os.posix_fallocate(descriptor, 0, _ROOM)
+        os.posix_fallocate(descriptor, 0, _RESERVED)
     except OSError as error:
         os.close(descriptor)
         path.unlink()

@@ -1,1 +1,1 @@
-"""`rosrv monitor`: specifications judged, tried and switched."""
+"""`rosrv monitor`: check, try, load and switch specifications."""

@@ -1,23 +1,21 @@
-"""`rosrv monitor list|margins|enable|disable|load|remove|reload|resume`: the monitors of the running appliance."""
+"""`rosrv monitor list|enable|promote|disable|load|remove|reload|resume`: monitors of the running appliance."""
 
 from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from msgspec import to_builtins
 from msgspec.structs import asdict
 from rich.table import Column
-from rich.text import Text
 
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
-from appliance.channel.answers.monitor_answers import MonitorState, Replaced, Switched
+from appliance.channel.answers.monitor_answers import MonitorState, Replacement, Switched
 from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
-from appliance.cli.output import moment, say_json, usage_error
-from appliance.cli.target import Appliance, speaks
+from appliance.cli.output import moment, say_json
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import counted, printable, say
 
@@ -28,18 +26,16 @@ _Names = Annotated[
 _SHADOW = "shadow mode"
 _Shadow = Annotated[
     bool,
-    typer.Option(
-        "--shadow", help="In shadow mode: change and drop nothing, record what they would have done"
-    ),
+    typer.Option("--shadow", help="Shadow mode: only record what the monitors would have done"),
 ]
 _Force = Annotated[
-    bool, typer.Option("--force", help="Even if a topic is cut whose publisher has another type")
+    bool, typer.Option("--force", help="Load even if this cuts a topic whose publisher has another type")
 ]
 
 
 @speaks
 def list_monitors(appliance: Appliance) -> None:
-    """Show every monitor: enabled or not, what it listens to, what it did.
+    """List the monitors with their state, topics and counts.
 
     Example: rosrv monitor list --json
     """
@@ -49,71 +45,31 @@ def list_monitors(appliance: Appliance) -> None:
             say_json(row)
         return
     if body.refused:
-        say(f"the relay does not take them: {body.refused[0]}", "red")
+        say(f"the relay rejected them: {body.refused[0]}", "red")
     sliced = ("slices",) if any(row.slice_limit for row in body.monitors) else ()
     table = table_of(
         "monitor", "state", Column("listens to", overflow="fold"), "events", "verdicts", "drops", "changes", "faults",
         *sliced,
     )  # fmt: skip
     for row in body.monitors:
-        done = (f"({row.would_drop})", f"({row.would_change})") if row.trial else (row.drops, row.changes)
+        done = (f"({row.would_drop})", f"({row.would_change})") if row.shadow else (row.drops, row.changes)
         counts = map(str, (row.events, row.verdicts, *done, row.faults))
         slices = (f"{row.slices} of {row.slice_limit}" if row.slice_limit else "",) if sliced else ()
         table.add_row(row.name, _state(row), "\n".join(row.topics + row.services), *counts, *slices)
     if body.monitors:
         say_table(table)
     else:
-        say("no monitor is loaded: rosrv monitor load FILE…")
-    if any(row.trial for row in body.monitors):
-        say("(in brackets: what a monitor in shadow mode would have dropped and changed)", "dim")
+        say("no monitors; load some: rosrv monitor load FILE…")
+    if any(row.shadow for row in body.monitors):
+        say("(in brackets: messages that a monitor in shadow mode would have dropped or changed)", "dim")
     _say_held(body.monitors)
     source = f" ({body.folder})" if body.folder else ""
     differs = (
-        "; not what the folder has (rosrv monitor reload takes that, and removes nothing)"
+        "; differs from the folder (load the folder's, removing nothing: rosrv monitor reload)"
         if body.folder and body.differs_from_folder
         else ""
     )
     say(f"revision {body.revision} of the specifications{source}, by {body.who}{differs}")
-
-
-@speaks
-def margins(
-    appliance: Appliance,
-    names: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[MONITOR…]", show_default=False, autocompletion=completion.monitors),
-    ] = None,
-) -> None:
-    """Show how close conditions on numbers came, today and since they were loaded.
-
-    Of each comparison the nearest while it was true and the nearest while it was not; every message counts. AT is where
-    its constant would have to stand to be reached by the nearest since it was loaded.
-
-    Example: rosrv monitor margins safeTrigger
-    """
-    rows = appliance.ask_or_exit(admin.MonitorsWanted()).monitors
-    unknown = sorted(set(names or ()) - {row.name for row in rows})
-    if unknown:
-        raise usage_error(f"no monitor is called {', '.join(unknown)}", "rosrv monitor")
-    found = [(row, margin) for row in rows if not names or row.name in names for margin in row.margins]
-    if appliance.as_json:
-        for row, margin in found:
-            say_json({"monitor": row.name, "file": row.file, **to_builtins(margin)})
-        return
-    if not found:
-        say("no comparison of numbers has come up yet")
-        return
-    table = table_of(
-        "monitor", "line", Column("condition", overflow="fold"), "was", "today", "since load", "at"
-    )
-    for row, margin in found:
-        load, today = margin.since_load, margin.today
-        table.add_row(
-            row.name, f"{row.file}:{margin.line}", Text(printable(margin.condition)), str(margin.holds).lower(),
-            "-" if today is None else f"{today.distance:.6g}", f"{load.distance:.6g}",
-            "-" if load.threshold_at is None else f"{load.threshold_at:.6g}",
-        )  # fmt: skip
-    say_table(table)
 
 
 @speaks
@@ -123,9 +79,7 @@ def enable(
     *,
     shadow: Annotated[
         bool,
-        typer.Option(
-            "--shadow", help="Shadow mode: change and drop nothing, record what they would have done"
-        ),
+        typer.Option("--shadow", help="Shadow mode: only record what the monitors would have done"),
     ] = False,
     trial: Annotated[bool, typer.Option("--trial", hidden=True, help="The former name of --shadow.")] = False,
 ) -> None:
@@ -134,7 +88,7 @@ def enable(
     Example: rosrv monitor enable safeTrigger --shadow
     """
     if trial:
-        typer.echo("rosrv: --trial is deprecated: say --shadow", err=True)
+        typer.echo("rosrv: --trial is deprecated: use --shadow", err=True)
     if shadow or trial:
         _switch(appliance, admin.MonitorShadow(names, True), _SHADOW)
     else:
@@ -143,9 +97,9 @@ def enable(
 
 @speaks
 def promote(appliance: Appliance, names: _Names, *, force: _Force = False) -> None:
-    """Bring monitors from shadow mode into force, with the state that they have.
+    """Move monitors from shadow mode into force, keeping their state.
 
-    A monitor that was not given all messages in shadow mode begins in its initial state; the answer names it.
+    A monitor that missed messages in shadow mode starts in its initial state; the output names it.
 
     Example: rosrv monitor promote safeTrigger
     """
@@ -162,9 +116,9 @@ def disable(
         typer.Option("--for", metavar="TIME", help="Enable them again after this time (30s, 10m, 2h, 1d)"),
     ] = None,
 ) -> None:
-    """Let messages pass these monitors untouched; their variables stay.
+    """Disable monitors: messages pass them unchanged, and their variables keep their values.
 
-    With --for they are enabled again automatically, whatever is restarted meanwhile.
+    With --for they are enabled again automatically, even if the appliance restarts meanwhile.
 
     Example: rosrv monitor disable safeTrigger --for 10m
     """
@@ -180,30 +134,30 @@ def load(
     files: Annotated[list[Path], typer.Argument(metavar="FILE…", show_default=False)],
     msg: Annotated[
         list[Path] | None,
-        typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
+        typer.Option("--msg", metavar="DIR", help="Folder of message definitions (repeatable)"),
     ] = None,
     *,
-    note: Annotated[str, typer.Option(help="Why; kept with the revision")] = "",
+    note: Annotated[str, typer.Option(help="Reason, kept with the revision")] = "",
     confirm_within: ConfirmWithin = None,
     shadow: _Shadow = False,
     force: _Force = False,
 ) -> None:
-    """Load specifications while the robot runs; a file of the same name is replaced.
+    """Load specifications while the robot runs; files of the same name are replaced.
 
-    They are compiled first, and compared with the topics of the robot: with an error nothing changes and the exit
-    status is 1. With --shadow their monitors only record what they would have done, from the start. Definitions of
-    messages are taken from `msg/` beside the files and from --msg.
+    They are compiled and compared with the robot's topics first. After an error nothing changes and the exit status is
+    1. With --shadow, monitors only record what they would have done. Message definitions come from `msg/` beside the
+    files and from --msg.
 
     Example: rosrv monitor load safe_zone.rv --shadow
     """
-    from appliance.cli.monitor.sources_to_send import read_to_send  # noqa: PLC0415  it takes a while, and is for this verb only
+    from appliance.cli.monitor.sources_to_send import read_to_send  # noqa: PLC0415  slow to import
     from rosmop.text.errors import SpecificationError  # noqa: PLC0415  as above
 
     try:
         sent = read_to_send(files, msg or [])
     except SpecificationError as error:
         found = [printable(str(finding)) for finding in error.findings]
-        appliance.body_or_exit(AdminAnswer(False, error="refused here: nothing was sent", findings=found))
+        appliance.body_or_exit(AdminAnswer(False, error="nothing was sent", findings=found))
         return
     order = admin.MonitorLoad(
         sent.files,
@@ -231,13 +185,15 @@ def remove(appliance: Appliance, names: _Names, confirm_within: ConfirmWithin = 
 @speaks
 def reload(
     appliance: Appliance,
-    prune: Annotated[bool, typer.Option("--prune", help="Also remove what the folder does not have")] = False,
+    prune: Annotated[
+        bool, typer.Option("--prune", help="Also remove specifications that the folder lacks")
+    ] = False,
     confirm_within: ConfirmWithin = None,
     *,
     shadow: _Shadow = False,
     force: _Force = False,
 ) -> None:
-    """Take what the folder of specifications has now; what it does not have stays in force, and is named.
+    """Load the folder of specifications again. Specifications that it lacks stay in force and are listed.
 
     Example: rosrv monitor reload
     """
@@ -246,23 +202,23 @@ def reload(
     body = appliance.answer_or_exit(order)
     say_replaced(body)
     if body.kept:
-        say(f"not of the folder, and still in force: {', '.join(body.kept)} (--prune removes them)", "yellow")
+        say(f"in force but not in the folder: {', '.join(body.kept)} (--prune removes them)", "yellow")
     _say_idle(appliance, [*body.added, *body.changed])
 
 
 @speaks
 def resume(appliance: Appliance, names: _Names) -> None:
-    """Let the topics go on that these monitors hold: their state was lost, or they are declared `hold`.
+    """Release the topics that these monitors hold because their state was lost or they are declared `hold`.
 
     Example: rosrv monitor resume safeTrigger
     """
     body = appliance.answer_or_exit(admin.MonitorResume(names))
-    say(f"resumed: {', '.join(body.names) or 'none was held'}")
+    say(f"resumed: {', '.join(body.names) or 'none, no topic was held'}")
 
 
 @speaks
 def rv_state(appliance: Appliance) -> None:
-    """ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried."""
+    """Print what `-rvstate` of the original ROSRV prints: master ports, and the ports of each monitor's topics."""
     body = appliance.ask_or_exit(admin.MonitorsWanted())
     real, port, rows = body.rv_state
     if appliance.as_json:
@@ -285,13 +241,13 @@ def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str
             }
         )
         return
-    say(f"{word}: {', '.join(body.names) or 'nothing, it was so already'}")
+    say(f"{word}: {', '.join(body.names) or 'no change, it was so already'}")
     if body.began:
-        say(f"{', '.join(body.began)} began in the initial state", "yellow")
+        say(f"{', '.join(body.began)} started in the initial state", "yellow")
 
 
 def _state(row: MonitorState) -> str:
-    if row.trial:
+    if row.shadow:
         return f"shadow mode, {row.missed} missed" if row.missed else _SHADOW
     if row.held:
         return "holds its topics"
@@ -302,8 +258,8 @@ def _state(row: MonitorState) -> str:
     return "disabled" if row.off_until is None else f"disabled until {moment(row.off_until)}"
 
 
-def say_replaced(body: Replaced) -> None:
-    """What a change of the specifications did."""
+def say_replaced(body: Replacement) -> None:
+    """Print the result of a change of the specifications."""
     for warning in body.warnings:
         say(warning, "yellow")
     parts = [
@@ -311,22 +267,22 @@ def say_replaced(body: Replaced) -> None:
         for word, files in (("added", body.added), ("changed", body.changed), ("removed", body.removed))
         if files
     ]
-    what = "; ".join(parts) or "nothing is different"
+    what = "; ".join(parts) or "no difference"
     say(f"revision {body.revision} of the specifications is in force (was {body.replaced}): {what}")
     if body.moved:
         names = ", ".join(body.moved)
-        say(f"{names} began anew: another relay process has it now, with what it has in common", "yellow")
+        say(f"{names} started in the initial state in another relay process", "yellow")
     if body.warnings:
         say(counted(len(body.warnings), "warning"), "yellow")
     say_deadline(body.confirm_by, "monitor")
 
 
 def _say_idle(appliance: Appliance, files: Collection[str]) -> None:
-    """Name the loaded monitors that do not act, and the command that lets them."""
+    """List the loaded monitors that do not act, and the command that enables them."""
     rows = [row for row in appliance.ask_or_exit(admin.MonitorsWanted()).monitors if row.file in files]
     for word, verb, names in (
-        ("disabled", "enable", [row.name for row in rows if not row.enabled and not row.trial]),
-        ("in shadow mode", "promote", [row.name for row in rows if row.trial]),
+        ("disabled", "enable", [row.name for row in rows if not row.enabled and not row.shadow]),
+        ("in shadow mode", "promote", [row.name for row in rows if row.shadow]),
     ):
         if names:
             say(f"{word}: {', '.join(names)}; rosrv monitor {verb} {' '.join(names)}", "yellow")
@@ -334,6 +290,6 @@ def _say_idle(appliance: Appliance, files: Collection[str]) -> None:
 
 
 def _say_held(rows: Collection[MonitorState]) -> None:
-    """Print why monitors hold their topics because their state was lost, and what lets them go on."""
+    """List the monitors that hold their topics, with the reason and the command that releases them."""
     for row in (row for row in rows if row.why_held):
         say(f"{row.name} holds its topics: {row.why_held}; rosrv monitor resume {row.name}", "yellow")

@@ -1,7 +1,6 @@
-"""`rosrv monitor`, as the command of the monitor language knows it."""
+"""Define `rosrv monitor` as a program of the monitor language."""
 
-from appliance.base.input_files import open_given, read_given
 from appliance.cli.output import write_told
-from rosmop.tool.program import Program
+from rosmop.tool.command_context import CommandContext
 
-MONITOR = Program("rosrv monitor", "rosrv-appliance", read_given, open_given, write_told)
+MONITOR = CommandContext("rosrv monitor", "rosrv-appliance", write_told)

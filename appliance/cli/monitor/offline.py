@@ -1,4 +1,4 @@
-"""`rosrv monitor reset`: the way back to the folder's specifications when the appliance does not start with its own."""
+"""`rosrv monitor reset`: return a stopped appliance to the folder's specifications."""
 
 import os
 import time
@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from appliance.cli.connection.target import DEFAULT_STATE
 from appliance.cli.output import Json, say_json, usage_error
-from appliance.cli.target import DEFAULT_STATE
 from appliance.specifications.specification_revisions import forget_revision
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
@@ -20,20 +20,20 @@ _STATE, _VERB = "state.db", "rosrv monitor"
 
 def reset(
     state: Annotated[
-        Path, typer.Option(envvar="ROSRV_STATE", help="State directory of the appliance, which must not run")
+        Path, typer.Option(envvar="ROSRV_STATE", help="State directory of the stopped appliance")
     ] = DEFAULT_STATE,
     as_json: Json = False,
 ) -> None:
-    """Give up the specifications that were loaded by command: the next start takes those of the folder.
+    """Discard the specifications that were loaded by command; the next start loads those of the folder.
 
-    For an appliance that does not start with them (while it runs, `rosrv monitor reload` does the same). Which monitors
-    are switched off stays as it is. The revision that is given up stays in the state directory.
+    Use it if the appliance fails to start with them; for a running appliance use `rosrv monitor reload`. Disabled
+    monitors stay disabled. The discarded revision stays in the state directory.
 
     Example: rosrv monitor reset --state /var/lib/rosrv
     """
     home = state / "control"
     if not (home / _STATE).exists():
-        raise usage_error(f"there is no state of an appliance in {state} (name it with --state DIR)", _VERB)
+        raise usage_error(f"{state} is not a state directory; give the appliance's with --state DIR", _VERB)
     directory = StateDirectory(state)
     try:
         revision = _forget(home)
@@ -42,10 +42,10 @@ def reset(
     if as_json:
         say_json({"given_up": revision})
     elif revision is None:
-        say("nothing to give up: the last specifications in force were the folder's")
+        say("nothing to discard: the last specifications in force were the folder's")
     else:
         say(
-            f"revision {revision} is given up: the next start takes the specifications of the folder (--monitors)"
+            f"revision {revision} is discarded: the next start loads the specifications of the folder (--monitors)"
         )
 
 
@@ -62,7 +62,7 @@ def _forget(home: Path) -> int | None:
             raise StoreError(troubles[-1])
         return revision
     except StoreError as error:
-        raise refused([f"{_VERB}: the state cannot be changed: {error}"]) from error
+        raise refused([f"{_VERB}: cannot change the state: {error}"]) from error
     finally:
         if os.geteuid() == 0:
             for path in home.glob("state.*"):

@@ -1,4 +1,4 @@
-"""What the flight recorder of the running appliance has of a span of time: its recordings, and its memory."""
+"""Read a period from the running appliance's flight recorder: its recordings and its memory."""
 
 import tempfile
 import time
@@ -9,20 +9,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 from appliance.audit.record_format import rfc3339
-from appliance.audit.timestamps import parse_moment
+from appliance.base.timestamps import parse_timestamp
 from appliance.channel import admin
 from appliance.channel.answers.recording_answers import Recording, Recordings
-from appliance.cli.admin_client import NotRunningError
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.target import Appliance
 from appliance.cli.monitor.monitor_program import MONITOR
 from appliance.cli.record_verbs import bag_of
-from appliance.cli.target import Appliance
 from rosmop.tool.terminal import refused
 
 _SECOND = 1_000_000_000
 
 
 class Span(NamedTuple):
-    """From a moment to another, both belong to it: nanoseconds since the epoch."""
+    """A period in nanoseconds since the epoch, both ends included."""
 
     since: int
     until: int
@@ -36,32 +36,32 @@ EVER = Span(0, 1 << 63)
 
 
 class Piece(NamedTuple):
-    """A bag of the recorder: how it is called, and of which time it is read (no piece before has that)."""
+    """A bag of the recorder, its name, and the period to read from it. Periods of pieces do not overlap."""
 
     name: str
     bag: Path
     span: Span
     why_not: str
-    """What is missing in it; empty when nothing is."""
+    """Why the bag is incomplete; empty if it is complete."""
 
 
 def span_of(since: str | None, until: str | None) -> Span:
-    """The time that was asked for. Ends the program with 2 when it is none."""
+    """Return the period of --since and --until. Exits with status 2 if it is invalid."""
     now = time.time_ns()
     try:
         span = Span(
-            0 if since is None else parse_moment(since, now),
-            now if until is None else min(now, parse_moment(until, now)),
+            0 if since is None else parse_timestamp(since, now),
+            now if until is None else min(now, parse_timestamp(until, now)),
         )
     except ValueError as error:
         raise MONITOR.usage_error(str(error)) from None
     if span.since >= span.until:
-        raise MONITOR.usage_error("--since is not before --until")
+        raise MONITOR.usage_error("--since must be before --until")
     return span
 
 
 def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
-    """End the program with 2 when one of these topics (name to type) is never recorded."""
+    """Exit with status 2 if one of these topics (name to type) is never recorded."""
     for topic, kind in topics.items():
         if not any(fnmatchcase(topic, glob) for glob in known.topics):
             raise MONITOR.usage_error(
@@ -74,10 +74,10 @@ def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
 
 @contextmanager
 def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[list[Piece]]:
-    """The recordings of this time and what is in memory, the oldest first; each is fetched, which is on record.
+    """Fetch the recordings of a period and the recorder's memory, oldest first. The audit log records it.
 
-    They are open until the end: what is removed meanwhile can be read all the same.
-    Ends the program with 1 when there is nothing, or when the appliance refuses.
+    The files stay open in the block, so that a recording removed meanwhile remains readable.
+    Exits with status 1 if nothing was recorded or the appliance rejects the request.
     """
     found: list[tuple[Span, Recording]] = []
     for row in sorted(known.recordings, key=lambda row: row.began):
@@ -100,19 +100,17 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
                 try:
                     file = opened.enter_context(bag.open("rb"))
                 except OSError as error:
-                    raise MONITOR.usage_error(
-                        f"the bag of {row.id} is not there any more: {error.strerror}"
-                    ) from None
+                    raise MONITOR.usage_error(f"the bag of {row.id} was removed: {error.strerror}") from None
                 bags[row.id] = Path(f"/proc/self/fd/{file.fileno()}")
             pieces.append(Piece("memory" if row is lent else row.id, bags[row.id], part, row.why_not))
         if not pieces:
-            text = f"nothing is recorded of {span}: {_there(known.recordings)}"
+            text = f"nothing is recorded of {span}: {_available(known.recordings)}"
             raise refused([f"rosrv monitor: {text}; the memory has the last {known.before:g} s"])
         yield pieces
 
 
 def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
-    """The times of the span that no part has, in their order, as the parts are."""
+    """Yield the periods of the span between the ordered parts."""
     at = span.since
     for part in parts:
         if part.since > at:
@@ -123,7 +121,7 @@ def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
 
 
 def _lent(appliance: Appliance, span: Span) -> Recording | None:
-    """What is in memory of a time, as a recording; None when nothing is. Ends the program with 1 when it is refused."""
+    """Return the recorder's memory of a period as a recording, or None. Exits with status 1 if it is rejected."""
     try:
         answer = appliance.ask(admin.RecordingOfMemory(*span))
     except NotRunningError as error:
@@ -131,8 +129,8 @@ def _lent(appliance: Appliance, span: Span) -> Recording | None:
     return None if answer.trouble == "unknown" else appliance.body_or_exit(answer)
 
 
-def _there(recordings: Sequence[Recording]) -> str:
+def _available(recordings: Sequence[Recording]) -> str:
     if not recordings:
-        return "no recording is kept"
+        return "there are no recordings"
     first, last = min(row.began for row in recordings), max(row.ended for row in recordings)
-    return f"the recordings that are kept are of {rfc3339(first)} to {rfc3339(last)}"
+    return f"the recordings cover {rfc3339(first)} to {rfc3339(last)}"

@@ -1,4 +1,4 @@
-"""`rosrv monitor replay`: what a monitor would have dropped and changed of recordings, where, and how often."""
+"""`rosrv monitor replay`: run a monitor on recordings and report what it would have done."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,25 +11,24 @@ import typer
 from rich.table import Column
 
 from appliance.channel import admin
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor.monitor_program import MONITOR
 from appliance.cli.monitor.recorder_input import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
 from appliance.cli.output import say_json
-from appliance.cli.target import Appliance, speaks
 from rosmop.check.sources import compiled_from
 from rosmop.fast.wasm_build import fast_path_of
 from rosmop.form.connected_groups import sharing
 from rosmop.form.positions import Position, line_of
-from rosmop.run.engine import Margin, MonitorSet
+from rosmop.run.engine import MonitorSet
+from rosmop.run.margins import Margin, MarginReader
 from rosmop.run.outcomes import Outcome, bound
-from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
-from rosmop.text.parser import parse
-from rosmop.tool.bag import Replayed, definitions_of, open_bag, refusals, replay
+from rosmop.tool.bag import ReplayStep, definitions_of, open_bag, refusals, replay
 from rosmop.tool.bounded_bag import BoundedReader
 from rosmop.tool.monitor_output import BILLION, because
 from rosmop.tool.options import Folders
 from rosmop.tool.progress_bar import progress
-from rosmop.tool.specification_input import read_definitions, read_specifications
+from rosmop.tool.specification_input import read_definitions, read_specifications, topics_of
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import counted, refused, say
 from roswire.definitions import Definitions
@@ -37,11 +36,11 @@ from roswire.standard import standard_definitions
 
 _KINDS = ("drop", "change", "verdict", "warning", "fault")
 _WOULD = {"drop": "would drop it", "change": "would change it"}
-_TOLD_EVERY = 1000
+_PROGRESS_EVERY = 1000  # messages
 
 
 class _Found(NamedTuple):
-    """Something that a monitor would have done."""
+    """An effect that a monitor would have had."""
 
     monitor: str
     kind: str
@@ -68,30 +67,35 @@ def replay_monitor(
         str | None,
         typer.Option(
             "--since",
-            help="Without --bag: what the flight recorder has from this moment on: 1h (ago), a date, or RFC 3339",
+            help="Without --bag: read the flight recorder from this time on: 1h (ago), a date, or RFC 3339",
             show_default=False,
         ),
     ] = None,
     until: Annotated[
-        str | None, typer.Option("--until", help="The same up to this moment", show_default=False)
+        str | None,
+        typer.Option("--until", help="Read the flight recorder up to this time", show_default=False),
     ] = None,
     topics: Annotated[
         list[str] | None,
-        typer.Option("--topic", metavar="PATTERN", help="Only these topics; `*` fits anything (repeatable)"),
+        typer.Option(
+            "--topic", metavar="PATTERN", help="Only these topics; `*` matches anything (repeatable)"
+        ),
     ] = None,
     most: Annotated[
-        int, typer.Option("--most", min=0, metavar="N", help="Places shown of each monitor, topic and kind")
+        int,
+        typer.Option(
+            "--most", min=0, metavar="N", help="Number of places to show for each monitor, topic and kind"
+        ),
     ] = 10,
     margins: Annotated[
-        bool, typer.Option("--margins", help="Also how close each comparison of numbers came (takes longer)")
+        bool, typer.Option("--margins", help="Also show how close each comparison of numbers came (slower)")
     ] = False,
     msg: Folders = None,
 ) -> None:
-    """Say what a monitor would have dropped and changed of recordings, where, and how often.
+    """Show which messages of recordings a monitor would have dropped or changed, and count them.
 
-    Of bags, or (--since) of what the flight recorder of the running appliance has in its recordings and in memory; what
-    of that time it does not have is said. Each recording begins in the monitor's initial state. With --json all
-    places, one object each.
+    Read bags (--bag), or the running appliance's flight recorder (--since), with its recordings and its memory; gaps
+    are reported. Each recording starts in the monitor's initial state. With --json, print every place.
 
     Example: rosrv monitor replay safeTrigger --since 1h
     """
@@ -133,35 +137,31 @@ def replay_monitor(
 def _specifications(
     appliance: Appliance, what: str, folders: Sequence[Path]
 ) -> tuple[dict[str, str], Definitions, str | None]:
-    """Texts and definitions; of the running appliance all, and whose they are that were asked for."""
+    """Return texts, definitions and the monitor's name; for a file the name is None."""
     path = Path(what)
     if path.suffix == ".rv" or path.is_file():
         return read_specifications(MONITOR, [path]), read_definitions(MONITOR, [path], folders), None
     loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
     names = [row.name for row in loaded.monitors]
     if what not in names:
-        known = ", ".join(names) or "none is loaded"
-        raise MONITOR.usage_error(f"{what} is no file (.rv), and no monitor: there are: {known}")
+        known = ", ".join(names) or "no monitor is loaded"
+        raise MONITOR.usage_error(f"{what} is neither a file (.rv) nor a loaded monitor ({known})")
     own = Definitions.from_files(loaded.definitions or {})
     definitions = standard_definitions().extended(own)
     return loaded.files or {}, definitions, what
 
 
 def _topics(texts: Mapping[str, str], chosen: str | None, patterns: Sequence[str]) -> dict[str, str]:
-    """The topics, with their types, that the monitor (None: any of these files) listens to and that are to be read."""
+    """Return the selected topics, with their types, of a monitor or (None) of all monitors in the texts."""
     return {
-        event.trigger.topic: event.trigger.type
-        for name, text in texts.items()
-        for specification in parse(text, name).specifications
-        if chosen in (None, specification.name)
-        for event in specification.events
-        if isinstance(event.trigger, tree.MessageTrigger) and event.trigger.part is None
-        if any(fnmatchcase(event.trigger.topic, pattern) for pattern in patterns)
+        topic: kind
+        for topic, kind in topics_of(texts, chosen).items()
+        if any(fnmatchcase(topic, pattern) for pattern in patterns)
     }
 
 
 def _only(chosen: str | None, monitors: MonitorSet) -> MonitorSet:
-    """A set in which only this one, with those that it shares variables with, is enabled (None: all are)."""
+    """Enable only the chosen monitor and those that share variables with it; None enables all."""
     if chosen is not None:
         uses = {monitor.name: monitor.code.uses for monitor in monitors.monitors}
         together = next(group for group in sharing(uses) if chosen in group)
@@ -170,7 +170,7 @@ def _only(chosen: str | None, monitors: MonitorSet) -> MonitorSet:
 
 
 class _Closest(NamedTuple):
-    """How close a comparison came, and when."""
+    """The smallest distance of a comparison, and where it occurred."""
 
     margin: Margin
     bag: str
@@ -179,7 +179,7 @@ class _Closest(NamedTuple):
 
 
 class _Report:
-    """Says what is found in recordings, the first of each monitor, topic and kind, and counts it."""
+    """Prints the first effects of each monitor, topic and kind, and counts all of them."""
 
     def __init__(self, most: int, as_json: bool) -> None:
         self._most = most
@@ -188,8 +188,8 @@ class _Report:
         self._closest: dict[tuple[Position, int, bool], _Closest] = {}
 
     def cover(self, pieces: Sequence[Piece], span: Span) -> None:
-        """Say what of this time the pieces do not have."""
-        # Of all that there is none is before the first.
+        """Print the gaps between the pieces, and which pieces are incomplete."""
+        # Without --since, the time before the first piece is not a gap.
         began = span.since or pieces[0].span.since
         for gap in gaps([piece.span for piece in pieces], Span(began, span.until)):
             if self._as_json:
@@ -200,28 +200,28 @@ class _Report:
             if self._as_json:
                 say_json({"kind": "incomplete", "bag": name, "text": why_not})
             else:
-                say(f"{name} is not complete: {why_not}", "yellow")
+                say(f"{name} is incomplete: {why_not}", "yellow")
 
     def of(self, monitors: MonitorSet, reader: BoundedReader, piece: Piece, topics: Sequence[str]) -> int:
-        """A recording; how many messages there were."""
-        given = 0
-        with progress("replaying", lambda: reader.message_count, shares_screen=True) as told:
+        """Replay a recording, print its effects and return the number of messages."""
+        given, margins = 0, MarginReader(monitors)
+        with progress("replaying", lambda: reader.message_count, shares_screen=True) as report:
             for number, replayed in enumerate(replay(monitors, reader, None, topics, piece.span)):
                 given += replayed.topic is not None
                 for found in _found(replayed.outcome):
                     self._say(piece.name, replayed, found)
-                for margin in monitors.take_margins():
+                for margin in margins.take():
                     known = self._closest.get(key := (margin.position, margin.number, not margin.holds))
                     if known is None or margin.distance < known.margin.distance:
                         self._closest[key] = _Closest(
                             margin, piece.name, replayed.outcome.time, replayed.index
                         )
-                if not number % _TOLD_EVERY:
-                    told(given)
+                if not number % _PROGRESS_EVERY:
+                    report(given)
         return given
 
     def show_margins(self, texts: Mapping[str, str]) -> None:
-        """How close each comparison came, while it was true and while it was not."""
+        """Print the smallest distance of each comparison, while it was true and while it was false."""
         for _key, (margin, bag, time, number) in sorted(self._closest.items()):
             position = margin.position
             if self._as_json:
@@ -239,7 +239,7 @@ class _Report:
                 sides = f"{margin.left:.6g} against {margin.right:.6g}"
                 say(f"{position}: {line}: {word} by {margin.distance:.6g} at the closest, {sides} ({where})")
 
-    def _say(self, bag: str, replayed: Replayed, found: _Found) -> None:
+    def _say(self, bag: str, replayed: ReplayStep, found: _Found) -> None:
         where, outcome = replayed.topic or replayed.outcome.timer or "", replayed.outcome
         self._counts[found.monitor, where, found.kind] += 1
         if self._as_json:
@@ -254,12 +254,10 @@ class _Report:
             say(f"{bag} {outcome.time / BILLION:.3f} {place}: {found.monitor} {words}: {found.text}")
 
     def show(self) -> None:
-        """How often, by monitor and topic."""
+        """Print the counts by monitor and topic."""
         counts = self._counts
         if not counts:
-            say(
-                "nothing: not a message would have been dropped or changed, and there was no verdict", "green"
-            )
+            say("no message would have been dropped or changed, and no monitor reached a verdict", "green")
             return
         heads = ("would drop", "would change", "verdicts", "warnings", "faults")
         table = table_of(

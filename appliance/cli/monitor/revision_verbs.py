@@ -1,4 +1,4 @@
-"""`rosrv monitor revisions|show|diff|rollback|confirm`: the specifications that were in force, and the way back."""
+"""`rosrv monitor revisions|show|diff|rollback|confirm`: revisions of the specifications."""
 
 import difflib
 from typing import Annotated
@@ -8,12 +8,12 @@ import typer
 from appliance.channel.admin import MonitorConfirm, MonitorRevisions, MonitorRevisionWanted, MonitorRollback
 from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.cli.commit_confirm import verbs_of
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor.in_force import say_replaced
 from appliance.cli.output import say_json, usage_error
-from appliance.cli.target import Appliance, speaks
 from rosmop.tool.terminal import say
 
-_Revision = Annotated[int | None, typer.Argument(help="A kept revision; without it, the one in force")]
+_Revision = Annotated[int | None, typer.Argument(help="A kept revision (default: the one in force)")]
 
 
 revisions, rollback, confirm = verbs_of(
@@ -44,10 +44,10 @@ def show(appliance: Appliance, revision: _Revision = None) -> None:
 @speaks
 def diff(
     appliance: Appliance,
-    old: Annotated[int | None, typer.Argument(help="A kept revision; without it, the one before")] = None,
+    old: Annotated[int | None, typer.Argument(help="A kept revision (default: the previous one)")] = None,
     new: _Revision = None,
 ) -> None:
-    """Show what a revision changed of the texts; exit status 1 when they are different.
+    """Show the changes of a revision. Exit status: 0 no difference, 1 differences.
 
     Example: rosrv monitor diff 6 7
     """

@@ -12,23 +12,23 @@ from rosmop.text.errors import SpecificationError
 from rosmop.tool.specification_input import definition_folders, definition_texts, read_specifications
 
 _NOT_UTF_8 = re.compile("[\udc80-\udcff]")
-_SAVE_AS_UTF_8 = "these bytes are no UTF-8; save the file as UTF-8"
+_SAVE_AS_UTF_8 = "these bytes are not UTF-8; save the file as UTF-8"
 _STRING_CONSTANT = re.compile(r"\s*string\s+\w+\s*=")  # whose value goes to the end of the line
 
 
 def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
-    """Specifications by the names that the appliance knows them by, and the definitions for them, as files.
+    """Return specifications and message definitions by file name.
 
-    The same files are taken and refused as by `read_specifications` and `read_definitions`; what the definitions say is
-    judged where they are sent to. Raises `SpecificationError`.
+    Accepts and rejects the same files as `read_specifications` and `read_definitions`; the appliance validates the
+    contents of definitions. Raises `SpecificationError`.
     """
     named: dict[str, Path] = {}
     for file in files:
         other = named.setdefault(file.name, file)
         if os.path.realpath(other) != os.path.realpath(file):
             raise MONITOR.usage_error(
-                f"{other} and {file} have one name, and the appliance knows specifications by the names of their "
-                "files: load them under different names"
+                f"{other} and {file} have the same file name, by which the appliance identifies specifications; "
+                "rename one of them"
             )
     definitions: dict[str, str] = {}
     for folder in definition_folders(MONITOR, files, folders):
@@ -47,13 +47,13 @@ def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
 
 
 def _sendable(text: str, place: str) -> str:
-    """The same in UTF-8. Old definitions have comments in other encodings, which mean nothing; all else would."""
+    """Return the text in valid UTF-8. Replace other bytes in comments of old definitions; reject them elsewhere."""
     lines = text.split("\n")
     for number, line in enumerate(lines):
         if line.isascii() or not _NOT_UTF_8.search(line):
             continue
-        said = line if _STRING_CONSTANT.match(line) else line.partition("#")[0]
-        if _NOT_UTF_8.search(said):
+        content = line if _STRING_CONSTANT.match(line) else line.partition("#")[0]
+        if _NOT_UTF_8.search(content):
             raise SpecificationError.at(Position(place, number + 1, 1), _SAVE_AS_UTF_8)
         lines[number] = _NOT_UTF_8.sub("\N{REPLACEMENT CHARACTER}", line)
     return "\n".join(lines)

@@ -1,1 +1,1 @@
-"""`rosrv policy`: a policy judged, learnt and loaded."""
+"""`rosrv policy`: check, test, learn and load policies."""

@@ -1,4 +1,4 @@
-"""`rosrv policy grant`: what would grant a request that was refused, as the smallest change of the policy in force."""
+"""`rosrv policy grant` and `rosrv audit why`: explain an audit record, and grant a denied request."""
 
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -6,28 +6,28 @@ from typing import Annotated, Any, NoReturn
 import msgspec
 import typer
 
-from appliance.audit.record import Record
+from appliance.audit.record import AuditRecord
 from appliance.base.input_files import read_given
 from appliance.channel.admin import PolicyLoad, PolicyWanted
 from appliance.channel.answers.policy_answers import Granted, Why
-from appliance.cli.admin_client import NotRunningError
 from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, usage_error, write_told
 from appliance.cli.policy.live_verbs import say_loaded
-from appliance.cli.target import Appliance, speaks
 from rosmop.tool.terminal import printable, say
 
 
 @speaks
 def why(
     appliance: Appliance,
-    record: Annotated[str, typer.Argument(metavar="RECORD", help="The record's id, or its sequence")],
+    record: Annotated[str, typer.Argument(metavar="RECORD", help="Id or sequence number of the record")],
 ) -> None:
-    """Say why what a record tells happened: who, which events and values, which line; what would allow a refusal.
+    """Explain a record: who, which events and values, which line, and which rule would allow a denied request.
 
-    The named events alone give a monitor's verdict. The record may be of a log whose appliance is stopped; only what
-    would allow a refusal is asked of the running appliance.
+    The listed events alone lead to a monitor's verdict. The appliance may be stopped; only the rule that would allow a
+    denied request needs the running appliance.
 
     Example: rosrv audit why 18e9aa02efc40abb0e51
     """
@@ -52,7 +52,10 @@ def _explained(appliance: Appliance, record: str) -> Why:
         try:
             known = appliance.ask(PolicyWanted()).given() if asks_policy(found) else None
         except NotRunningError as error:
-            typer.echo(f"rosrv audit: {error}; what would allow it is not known without it", err=True)
+            typer.echo(
+                f"rosrv audit: {error}; without it, the rule that would allow the request is unknown",
+                err=True,
+            )
             known = None
         return explained(found, known)
 
@@ -60,24 +63,26 @@ def _explained(appliance: Appliance, record: str) -> Why:
 @speaks
 def grant(
     appliance: Appliance,
-    record: Annotated[str, typer.Argument(metavar="RECORD", help="The id of a refusal's audit record")],
+    record: Annotated[
+        str, typer.Argument(metavar="RECORD", help="Id or sequence number of a denied request's record")
+    ],
     *,
     write: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the whole policy with the change to this file")
+        Path | None, typer.Option(metavar="FILE", help="Write the changed policy to this file")
     ] = None,
-    load: Annotated[bool, typer.Option("--load", help="Bring the policy with the change into force")] = False,
+    load: Annotated[bool, typer.Option("--load", help="Bring the changed policy into force")] = False,
     confirm_within: ConfirmWithin = None,
 ) -> None:
-    """Show the smallest change of the policy in force that grants what a record says was refused.
+    """Show the smallest change of the policy in force that grants a denied request.
 
-    It is tried against the policy's tests; nothing is changed unless --write or --load says so. Exit status 1 when no
-    line of a policy grants it, or a test fails.
+    The change is checked with the policy's tests. Only --write and --load change anything. Exit status 1 if no rule
+    can grant the request or a test fails.
 
     Example: rosrv policy grant 18e9aa02efc40abb0e51 --load --confirm-within 5m
     """
     within = seconds_within(confirm_within, "policy")
     if within is not None and not load:
-        raise usage_error("--confirm-within is for --load")
+        raise usage_error("--confirm-within needs --load")
     found = _granted(appliance, record)
     if appliance.as_json:
         say_json(found)
@@ -100,16 +105,16 @@ def grant(
 
 
 def _with_ends_of(file: Path, text: str) -> bytes:
-    """The text with lines that end as those of the file that is there; what is in force has none but LF."""
+    """Return the text with the line ends of an existing file, else LF."""
     ends = b"\r\n" if file.is_file() and b"\r\n" in read_given(file) else b"\n"
     return text.encode().replace(b"\n", ends)
 
 
 def _show(found: Granted) -> None:
-    say(f"refused: {printable(found.reason)}")
+    say(f"denied: {printable(found.reason)}")
     if not found.added:
         say(
-            "the policy in force grants it: it was refused for another reason, or before this revision",
+            "the policy in force grants it: it was denied for another reason, or before this revision",
             "yellow",
         )
     for line in found.diff:
@@ -119,7 +124,7 @@ def _show(found: Granted) -> None:
 
 
 def _granted(appliance: Appliance, record: str) -> Granted:
-    """Over REST the appliance works it out, over the socket this program."""
+    """Compute the change in this program, or over REST in the appliance."""
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "grant"), Granted)
     from appliance.api.dry_run_policy import granted  # noqa: PLC0415  not for every verb
@@ -134,7 +139,7 @@ def _granted(appliance: Appliance, record: str) -> Granted:
             fail(str(error), 1)
 
 
-def _record(appliance: Appliance, record: str) -> Record:
+def _record(appliance: Appliance, record: str) -> AuditRecord:
     shown = appliance.audit().show(record, 0)
     if shown is None:
         _unknown(record)
@@ -142,19 +147,19 @@ def _record(appliance: Appliance, record: str) -> Record:
 
 
 def _unknown(record: str) -> NoReturn:
-    fail(f"no record with the id {record!a} is in the log", 1)
+    fail(f"no record in the log has the id {record!a}; list them: rosrv audit search", 1)
 
 
 def _over_rest(appliance: Appliance, record: str, what: str) -> dict[str, Any]:
-    from appliance.cli.audit.log_over_rest import ID  # noqa: PLC0415  as below
-    from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
+    from appliance.cli.connection.audit_over_rest import ID  # noqa: PLC0415  as below
+    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
     if not ID.fullmatch(record):
         _unknown(record)
     with Errors():
         try:
             return appliance.rest.call("GET", f"/v1/audit/{record}/{what}")
-        except ProblemError as problem:
+        except RestProblemError as problem:
             if problem.status == 404:
                 _unknown(record)
             fail(problem.lines[0], 1)

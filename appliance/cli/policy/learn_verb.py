@@ -1,4 +1,4 @@
-"""`rosrv policy learn`: a least-privilege policy out of the audit log."""
+"""`rosrv policy learn`: derive a least-privilege policy from the audit log."""
 
 import os
 import sys
@@ -11,13 +11,13 @@ import typer
 
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
-from appliance.audit.timestamps import MomentError, parse_moment
-from appliance.cli.admin_client import NotRunningError
+from appliance.base.timestamps import TimestampError, parse_timestamp
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import Since
 from appliance.cli.output import say_json
 from appliance.cli.policy.policy_input import Robot, networks_of, request_of, usage_error
-from appliance.cli.target import Appliance, speaks
-from appliance.policy.learn import Learned, Observation, learn
+from appliance.policy.learn import LearnedPolicy, Observation, learn
 from appliance.policy.model import Category
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
@@ -34,20 +34,21 @@ def learn_policy(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
     robot: Robot = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object: the text, and what it stands on")
+        bool,
+        typer.Option("--json", help="One JSON object: the policy, and the number of requests it is based on"),
     ] = False,
 ) -> None:
-    """Write the policy that grants what was done according to the audit log, and nothing else.
+    """Write a policy that grants the requests in the audit log and no others.
 
-    Run the robot with `audit-only = all` below [Options] first. Exit status 1 when nothing was found.
+    Run the robot with `audit-only = all` below [Options] first. Exit status 1 if the log has no requests.
 
     Example: rosrv policy learn --state /var/lib/rosrv --robot 192.168.1.10 --output learned.ini
     """
     learned = learn(_observations(appliance, since), networks_of(robot))
     if not learned.requests:
-        begun = f" since {since}" if since is not None else ""
+        start = f" since {since}" if since is not None else ""
         hint = "run the robot with `audit-only = all` below [Options] first"
-        raise refused([f"rosrv: no request that passed is in the audit log{begun}: {hint}"])
+        raise refused([f"rosrv: the audit log has no allowed requests{start}: {hint}"])
     _check(learned, robot)
     if output is not None:
         _write(output, learned.text)
@@ -56,15 +57,15 @@ def learn_policy(
         return
     if output is None:
         sys.stdout.write(learned.text)
-    told = f"rosrv: learned from {counted(learned.requests, 'request')}"
+    summary = f"rosrv: learned from {counted(learned.requests, 'request')}"
     if learned.left_out:
-        told += f"; {counted(learned.left_out, 'request')} left out that no rule can grant"
-    typer.echo(told, err=True)
+        summary += f"; left out {counted(learned.left_out, 'request')} that no rule can grant"
+    typer.echo(summary, err=True)
 
 
 def _observations(appliance: Appliance, since: str | None) -> Iterator[Observation]:
     try:
-        start = None if since is None else parse_moment(since, time.time_ns())
+        start = None if since is None else parse_timestamp(since, time.time_ns())
         passed = Filter(decision=("allow", "would deny"), event="decision", since=start)
         for entry in appliance.audit().export(passed):
             record = entry.record
@@ -75,15 +76,15 @@ def _observations(appliance: Appliance, since: str | None) -> Iterator[Observati
             )
             detail = record.detail
             yield Observation(request, str(detail.get("call", "")), str(detail.get("key", "")))
-    except (LogUnreadableError, NotRunningError, MomentError, FilterError) as error:
+    except (LogUnreadableError, NotRunningError, TimestampError, FilterError) as error:
         raise usage_error(str(error)) from error
 
 
-def _check(learned: Learned, robot: list[str] | None) -> None:
+def _check(learned: LearnedPolicy, robot: list[str] | None) -> None:
     try:
         compile_policy(learned.text, file="learned", robot=networks_of(robot))
     except PolicyError as error:
-        what = "rosrv: what was learned is no policy (see above): these names need a rule by hand"
+        what = "rosrv: the learned policy is invalid (see above): write rules for these names by hand"
         raise refused([*error.findings, what]) from error
 
 

@@ -1,17 +1,51 @@
-"""`rosrv policy reload|rollback|confirm|revisions`: the policy in force of the running appliance."""
+"""`rosrv policy show|reload|rollback|confirm|revisions`: the running appliance's policy."""
 
-from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
+from typing import Annotated
+
+import typer
+
+from appliance.channel.admin import (
+    PolicyConfirm,
+    PolicyReload,
+    PolicyRevisions,
+    PolicyRevisionWanted,
+    PolicyRollback,
+)
 from appliance.channel.answers.policy_answers import Loaded
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within, verbs_of
-from appliance.cli.target import Appliance, speaks
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.output import say_json
 from rosmop.tool.terminal import counted, say
 
 
 @speaks
-def reload(appliance: Appliance, confirm_within: ConfirmWithin = None) -> None:
-    """Read the policy file again: check, test, swap at once, and take back what it no longer allows.
+def show(
+    appliance: Appliance,
+    revision: Annotated[
+        int | None,
+        typer.Argument(help="A kept revision (default: the one in force)"),
+    ] = None,
+) -> None:
+    """Print the text of the policy in force, or of a revision.
 
-    A bad file changes nothing; every error is shown and the exit status is 1.
+    Example: rosrv policy show > policy.ini
+    """
+    if revision is None:
+        rows = appliance.ask_or_exit(PolicyRevisions()).revisions
+        revision = next(row.revision for row in rows if row.in_force)
+    body = appliance.ask_or_exit(PolicyRevisionWanted(revision))
+    if appliance.as_json:
+        say_json(body)
+    else:
+        for line in body.text.splitlines():
+            say(line)
+
+
+@speaks
+def reload(appliance: Appliance, confirm_within: ConfirmWithin = None) -> None:
+    """Read the policy file again, check it, test it, and bring it into force; revoke what it no longer allows.
+
+    An invalid file changes nothing: all errors are shown and the exit status is 1.
 
     Example: rosrv policy reload --confirm-within 5m
     """
@@ -20,7 +54,7 @@ def reload(appliance: Appliance, confirm_within: ConfirmWithin = None) -> None:
 
 
 def say_loaded(body: Loaded) -> None:
-    """What a change of the policy did."""
+    """Print the result of a change of the policy."""
     for warning in body.warnings:
         say(warning, "yellow")
     say(

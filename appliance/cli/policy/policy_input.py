@@ -1,4 +1,4 @@
-"""What the policy verbs read: policies, who is who, and requests out of files or the audit log."""
+"""Read the input of the policy verbs: policies, addresses of hosts, and requests from files or the audit log."""
 
 import functools
 import ipaddress
@@ -16,18 +16,19 @@ from appliance.audit.query import Filter, FilterError
 from appliance.base.input_files import read_given_text
 from appliance.channel.admin import RegistrationsWanted
 from appliance.cli import output
-from appliance.cli.admin_client import NotRunningError
-from appliance.cli.target import Appliance
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.target import Appliance
 from appliance.policy.actions import BadWordError, find_hosts
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
-from appliance.policy.judgement import Known
-from appliance.policy.live_rights import Live
+from appliance.policy.judgement import PolicyContext
+from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
 
 usage_error = functools.partial(output.usage_error, verb="rosrv policy")
 Robot = Annotated[
-    list[str] | None, typer.Option("--robot", metavar="ADDRESS", help="What the group robot is (repeatable)")
+    list[str] | None,
+    typer.Option("--robot", metavar="ADDRESS", help="Address of the group robot (repeatable)"),
 ]
 Enrolled = Annotated[
     list[str] | None,
@@ -36,22 +37,24 @@ Enrolled = Annotated[
 
 
 def read_text(file: Path) -> str:
-    """The text of a file; what is no UTF-8 becomes U+FFFD, which no policy may contain outside comments."""
+    """Return a file's text. Invalid UTF-8 becomes U+FFFD, which policies allow only in comments."""
     try:
         return read_given_text(file, errors="replace")
     except OSError as error:
         raise usage_error(f"cannot read {file}: {error.strerror}") from error
 
 
-def known_of(robot: list[str] | None, enrolled: list[str] | None, running: Known | None = None) -> Known:
-    """What the options say, before what the running appliance knows."""
-    known = running or Known()
+def known_of(
+    robot: list[str] | None, enrolled: list[str] | None, running: PolicyContext | None = None
+) -> PolicyContext:
+    """Return the known hosts; options override what the running appliance knows."""
+    known = running or PolicyContext()
     hosts = dict(_enrolled(text) for text in enrolled or ())
     return replace(known, hosts={**known.hosts, **hosts}, robot=networks_of(robot) or known.robot)
 
 
 def networks_of(robot: list[str] | None) -> list[Network]:
-    """What `--robot` says."""
+    """Return the networks given with `--robot`. Exits with status 2 for an invalid one."""
     return [_network(text) for text in robot or ()]
 
 
@@ -71,18 +74,18 @@ def _enrolled(text: str) -> tuple[str, Address]:
 
 
 def find_host(text: str, policy: Policy) -> Address:
-    """The address somebody asks from; `robot` with several addresses is its first."""
+    """Return the address that an address, `robot` (its first) or `host:NAME` means. Raises `BadWordError`."""
     try:
         return find_hosts(text, policy)[0]
     except BadWordError as error:
         for word, option in (("robot", "--robot ADDRESS"), ("host:", "--enrolled NAME=ADDRESS")):
             if text.startswith(word):
-                raise BadWordError(f"{error}; say it with {option}") from None
+                raise BadWordError(f"{error}; give it with {option}") from None
         raise
 
 
 def requests_of_file(file: Path) -> Iterator[Request]:
-    """Requests from NDJSON with `host`, `caller_id`, `category`, `resource`, one object per line."""
+    """Yield requests from NDJSON with `host`, `caller_id`, `category`, `resource`."""
     for number, line in enumerate(read_text(file).split("\n"), start=1):
         if not line.strip():
             continue
@@ -95,22 +98,19 @@ def requests_of_file(file: Path) -> Iterator[Request]:
 
 
 def request_of(host: str, caller_id: str, category: str, resource: str) -> Request:
-    """A request from the strings it was written as; raises ValueError."""
+    """Parse a request. Raises `ValueError`."""
     address = canonical_address(ipaddress.ip_address(host))
     return Request(address, str(caller_id or ""), Category(category), str(resource))
 
 
-def live_now(appliance: Appliance) -> list[Live]:
-    """What is live at the running appliance. Raises `NotRunningError`."""
+def live_now(appliance: Appliance) -> list[LiveRight]:
+    """Return the running appliance's live connections and registrations. Raises `NotRunningError`."""
     answer = appliance.ask(RegistrationsWanted())
-    return [Live.of(asdict(row)) for row in answer.given().registrations] if answer.ok else []
+    return [LiveRight.of(asdict(row)) for row in answer.given().registrations] if answer.ok else []
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
-    """Every request that an appliance's audit log has a decision on.
-
-    Records that sum up many different requests name none and are left out.
-    """
+    """Yield the decided requests in the audit log, without folded records, which do not name their requests."""
     decided = Filter(decision=("allow", "deny", "would deny"))
     try:
         for entry in appliance.audit().export(decided):

@@ -1,6 +1,6 @@
-"""`rosrv policy check|explain|test|diff|learn`: judge a policy before it is in force; no appliance needs to run.
+"""`rosrv policy check|explain|test|diff`: check a policy before it is in force, without an appliance.
 
-Exit status: 0 allowed, right, no difference; 1 denied, errors, a failed case, a difference; 2 usage.
+Exit status: 0 allowed, valid, no difference; 1 denied, errors, a failed case, a difference; 2 usage.
 """
 
 import contextlib
@@ -11,8 +11,10 @@ from typing import Annotated
 
 import typer
 
-from appliance.cli.admin_client import NotRunningError
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import Json, say_json
+from appliance.cli.policy.policy_impact import PolicyImpact, impact_of
 from appliance.cli.policy.policy_input import (
     Enrolled,
     Robot,
@@ -24,16 +26,14 @@ from appliance.cli.policy.policy_input import (
     requests_of_file,
     usage_error,
 )
-from appliance.cli.policy.trial import Trial, try_policy
-from appliance.cli.target import Appliance, speaks
 from appliance.policy.actions import BadWordError, check_resource
-from appliance.policy.decision_reasons import Explanation, explain, render
+from appliance.policy.decision_reasons import DecisionExplanation, explain, render
 from appliance.policy.diff import Difference, diff
-from appliance.policy.grant import Asked, UngrantableError
+from appliance.policy.grant import DecidedRequest, UngrantableError
 from appliance.policy.grant import grant as grant_of
-from appliance.policy.judgement import Judged, judge
+from appliance.policy.judgement import PolicyJudgement, judge
 from appliance.policy.model import Category, Decision, Request
-from appliance.policy.policy_findings import Finding, PolicyError, Severity
+from appliance.policy.policy_findings import FindingSeverity, PolicyError, PolicyFinding
 from appliance.policy.rights import needs_node, rights_of
 from rosmop.tool.terminal import counted, refused, say
 
@@ -42,38 +42,38 @@ _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_d
 
 @speaks
 def check(appliance: Appliance, file: _File, *, robot: Robot = None, enrolled: Enrolled = None) -> None:
-    """Report every error and warning with its place; exit status 1 if there is an error.
+    """Report every error and warning with its place. Exit status 1 if there is an error.
 
-    With --state or --api the running appliance says who is enrolled, and what is live and the policy would end.
+    With --state or --api, use the running appliance's enrolled hosts, and list the live connections that would end.
 
     Example: rosrv policy check policies/landshark.ini --state /var/lib/rosrv
     """
-    trial = _tried(appliance, file, robot, enrolled)
-    findings = trial.findings
-    errors = sum(finding.severity is Severity.ERROR for finding in findings)
+    impact = _impact(appliance, file, robot, enrolled)
+    findings = impact.findings
+    errors = sum(finding.severity is FindingSeverity.ERROR for finding in findings)
     for finding in findings:
         _say_finding(finding, as_json=appliance.as_json)
     if not appliance.as_json:
         warnings = len(findings) - errors
-        verdict = f"{counted(errors, 'error')}: the file is refused" if errors else f"{file} is right"
+        verdict = f"{counted(errors, 'error')}: the file is invalid" if errors else f"{file} is valid"
         say(
             f"{verdict}, {counted(warnings, 'warning')}" if warnings else verdict,
             "red" if errors else "green",
         )
-    for ending in trial.ends:
+    for ending in impact.ends:
         if appliance.as_json:
             fields = asdict(ending)
             say_json({"ends": fields.pop("what"), **fields})
         else:
             whose = f"{ending.caller_id or 'a client'} on {ending.host}"
             say(f"would end: {ending.what} {ending.resource} of {whose}: {ending.reason}", "yellow")
-    if trial.ends and not appliance.as_json:
-        say(f"{counted(len(trial.ends), 'live connection')} would end", "yellow")
+    if impact.ends and not appliance.as_json:
+        say(f"{counted(len(impact.ends), 'live connection')} would end", "yellow")
     raise typer.Exit(1 if errors else 0)
 
 
-def _say_finding(finding: Finding, *, as_json: bool) -> None:
-    """Write an error or a warning."""
+def _say_finding(finding: PolicyFinding, *, as_json: bool) -> None:
+    """Print an error or a warning."""
     if as_json:
         say_json(asdict(finding))
     else:
@@ -81,30 +81,32 @@ def _say_finding(finding: Finding, *, as_json: bool) -> None:
 
 
 def _decision_fields(decision: Decision) -> dict[str, object]:
-    """A decision as the audit log writes it."""
+    """Return a decision's fields as in the audit log."""
     place = asdict(decision.rule) if decision.rule else None
     return {"decision": decision.word, "rule": place, "reason": decision.reason}
 
 
-def _tried(appliance: Appliance, file: Path, robot: list[str] | None, enrolled: list[str] | None) -> Trial:
+def _impact(
+    appliance: Appliance, file: Path, robot: list[str] | None, enrolled: list[str] | None
+) -> PolicyImpact:
     if appliance.said:
         try:
-            return try_policy(appliance, file, robot, enrolled)
+            return impact_of(appliance, file, robot, enrolled)
         except NotRunningError as error:
             typer.echo(f"rosrv policy: {error}; checked without it", err=True)
     try:
-        return Trial(list(_judge(file, robot, enrolled).policy.warnings), [])
+        return PolicyImpact(list(_judge(file, robot, enrolled).policy.warnings), [])
     except PolicyError as error:
-        return Trial(error.findings, [])
+        return PolicyImpact(error.findings, [])
 
 
 def _allowing(
     file: Path, request: Request, robot: list[str] | None, enrolled: list[str] | None
 ) -> Iterator[str]:
-    """The smallest change of the policy that would allow it."""
+    """Yield the smallest change of the policy that would allow the request."""
     try:
         found = grant_of(
-            read_text(file), str(file), known_of(robot, enrolled), Asked(request, rights_of(request))
+            read_text(file), str(file), known_of(robot, enrolled), DecidedRequest(request, rights_of(request))
         )
     except UngrantableError as error:
         yield str(error)
@@ -115,8 +117,10 @@ def _allowing(
 def explain_request(
     file: _File,
     *,
-    host: Annotated[str, typer.Option(help="Who asks: an address, robot, or host:NAME")],
-    node: Annotated[str, typer.Option(help="Its node name (caller_id), where a node is needed")] = "",
+    host: Annotated[str, typer.Option(help="The requesting host: an address, robot, or host:NAME")],
+    node: Annotated[
+        str, typer.Option(help="The requesting node's name (caller_id), if the request needs one")
+    ] = "",
     publish: Annotated[str | None, typer.Option(metavar="TOPIC", help="publish a topic")] = None,
     subscribe: Annotated[str | None, typer.Option(metavar="TOPIC", help="subscribe to a topic")] = None,
     command: Annotated[str | None, typer.Option(metavar="CALL", help="make a call")] = None,
@@ -129,7 +133,7 @@ def explain_request(
     enrolled: Enrolled = None,
     as_json: Json = False,
 ) -> None:
-    """Say whether a request is allowed, by which rule, and which rules lost; exit status 1 if it is denied.
+    """Explain whether a request is allowed, by which rule, and which rules were overridden. Exit status 1 if denied.
 
     Example: rosrv policy explain policies/landshark.ini --host 10.0.0.9 --node /joystick --publish /cmd_vel
     """
@@ -145,7 +149,7 @@ def explain_request(
     }
     chosen = [(category, name) for category, name in asked.items() if name is not None]
     if len(chosen) != 1:
-        raise usage_error("say one thing that the host does: --publish TOPIC, --command CALL, …")
+        raise usage_error("give exactly one action of the host: --publish TOPIC, --command CALL, …")
     policy = _judge_or_exit(file, robot, enrolled).policy
     category, name = chosen[0]
     try:
@@ -153,7 +157,7 @@ def explain_request(
     except BadWordError as error:
         raise usage_error(str(error)) from error
     if needs_node(request) and not node:
-        raise usage_error("this makes a node part of the graph: say its name with --node /NAME")
+        raise usage_error("this request needs a node: give its name with --node /NAME")
     explanation = explain(policy, request)
     if as_json:
         say_json(_explanation_fields(explanation))
@@ -166,7 +170,7 @@ def explain_request(
     raise typer.Exit(0 if explanation.allowed else 1)
 
 
-def _explanation_fields(explanation: Explanation) -> dict[str, object]:
+def _explanation_fields(explanation: DecisionExplanation) -> dict[str, object]:
     fields: dict[str, object] = {
         **explanation.request.fields(),
         **_decision_fields(explanation.decision),
@@ -196,13 +200,13 @@ def _explanation_fields(explanation: Explanation) -> dict[str, object]:
 def test(
     file: _File,
     cases: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The cases (default: FILE.tests.yaml)")
+        Path | None, typer.Option(metavar="FILE", help="File of test cases (default: FILE.tests.yaml)")
     ] = None,
     robot: Robot = None,
     enrolled: Enrolled = None,
     as_json: Json = False,
 ) -> None:
-    """Run the cases beside a policy; exit status 1 if one of them is decided otherwise.
+    """Run the test cases of a policy. Exit status 1 if one fails.
 
     Example: rosrv policy test policies/landshark.ini
     """
@@ -226,8 +230,8 @@ def test(
 @speaks
 def compare(
     appliance: Appliance,
-    old: Annotated[Path, typer.Argument(metavar="OLD", help="The policy now", show_default=False)],
-    new: Annotated[Path, typer.Argument(metavar="NEW", help="The policy to be", show_default=False)],
+    old: Annotated[Path, typer.Argument(metavar="OLD", help="The current policy", show_default=False)],
+    new: Annotated[Path, typer.Argument(metavar="NEW", help="The new policy", show_default=False)],
     *,
     requests: Annotated[
         Path | None,
@@ -236,13 +240,13 @@ def compare(
     robot: Robot = None,
     enrolled: Enrolled = None,
 ) -> None:
-    """Show the requests that were seen and would be decided differently; exit status 1 if there are any.
+    """Show recorded requests that the new policy decides differently. Exit status 1 if there are any.
 
     Example: rosrv policy diff policies/now.ini policies/next.ini --state /var/lib/rosrv
     """
     if requests is None and not appliance.said:
         raise usage_error(
-            "say where the requests are: --state DIR or --api URL (the audit log), or --requests FILE"
+            "give the source of requests: --state DIR or --api URL (the audit log), or --requests FILE"
         )
     before, after = (_judge_or_exit(file, robot, enrolled).policy for file in (old, new))
     differences = diff(before, after, _requests(requests, appliance))
@@ -287,7 +291,7 @@ def _difference_fields(difference: Difference) -> dict[str, object]:
 
 def _judge(
     file: Path, robot: list[str] | None, enrolled: list[str] | None, cases: Path | None = None
-) -> Judged:
+) -> PolicyJudgement:
     known, text = known_of(robot, enrolled), read_text(file)
     if cases is not None and cases.exists():
         known = replace(known, cases_file=str(cases), cases=read_text(cases))
@@ -296,7 +300,7 @@ def _judge(
 
 def _judge_or_exit(
     file: Path, robot: list[str] | None, enrolled: list[str] | None, cases: Path | None = None
-) -> Judged:
+) -> PolicyJudgement:
     try:
         return _judge(file, robot, enrolled, cases)
     except PolicyError as error:

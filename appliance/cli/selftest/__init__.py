@@ -1,1 +1,1 @@
-"""`rosrv selftest`: whether this machine, its files and the running appliance are in order."""
+"""`rosrv selftest`: check this machine, its files and the running appliance."""

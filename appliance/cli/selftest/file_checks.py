@@ -1,4 +1,4 @@
-"""Is what an operator wrote right, and what the appliance keeps in order: configuration, policy, monitors, state."""
+"""Check the files of the operator and the appliance: policy, specifications, hosts, state directory."""
 
 import datetime
 import os
@@ -14,11 +14,11 @@ from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.base.input_files import read_given, read_given_text
 from appliance.base.shipped import SHIPPED, before_program
-from appliance.cli.selftest.selftest_findings import Found, fail, ok, skip, told, warn
+from appliance.cli.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
 from appliance.configuration.settings import Settings
 from appliance.hosts.hosts_file import DeclaredHostsError, read_declared
 from appliance.policy.cases import run_cases
-from appliance.policy.judgement import Known, judge
+from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
 from appliance.signing.site_keys import read_signature
@@ -31,22 +31,22 @@ _SOON_DAYS = 30
 _AHEAD_SECONDS = 60.0
 
 
-def files(settings: Settings) -> Iterator[Found]:
-    """What the configuration names, and the state directory."""
-    yield from told("policy", lambda: _policy(settings.policy, settings.site_keys))
-    yield from told("monitors", lambda: _monitors(settings.monitors, settings.site_keys))
-    yield from told("hosts", lambda: _hosts(settings.hosts))
-    yield from told("state", lambda: _state(settings.state))
+def files(settings: Settings) -> Iterator[SelftestFinding]:
+    """Check the files that the configuration names, and the state directory."""
+    yield from run_check("policy", lambda: _policy(settings.policy, settings.site_keys))
+    yield from run_check("monitors", lambda: _monitors(settings.monitors, settings.site_keys))
+    yield from run_check("hosts", lambda: _hosts(settings.hosts))
+    yield from run_check("state", lambda: _state(settings.state))
 
 
-def _policy(file: Path, site_keys: Sequence[str]) -> Iterator[Found]:
+def _policy(file: Path, site_keys: Sequence[str]) -> Iterator[SelftestFinding]:
     try:
         text = read_given_text(file)
-        policy = judge(text, str(file), Known(site_keys=site_keys), read_signature(file)).policy
+        policy = judge(text, str(file), PolicyContext(site_keys=site_keys), read_signature(file)).policy
     except OSError as error:
         if isinstance(error, FileNotFoundError) and file == Settings().policy.absolute():
             first = SHIPPED / "policies" / "default.ini"
-            yield warn("policy", f"{file}: nobody has written one yet", f"to begin with: --policy {first}")
+            yield warn("policy", f"{file}: does not exist yet", f"to begin with: --policy {first}")
             return
         yield fail(
             "policy",
@@ -55,7 +55,7 @@ def _policy(file: Path, site_keys: Sequence[str]) -> Iterator[Found]:
         )
         return
     except UnicodeDecodeError:
-        yield fail("policy", f"{file}: is not UTF-8", "save the file as UTF-8")
+        yield fail("policy", f"{file}: not UTF-8", "save the file as UTF-8")
         return
     except PolicyError as error:
         yield fail("policy", str(error.findings[0]), f"rosrv policy check {file}")
@@ -63,11 +63,11 @@ def _policy(file: Path, site_keys: Sequence[str]) -> Iterator[Found]:
     if policy.warnings:
         yield warn("policy", f"{file}: {len(policy.warnings)} warnings", f"rosrv policy check {file}")
     else:
-        yield ok("policy", f"{file} is right")
+        yield ok("policy", f"{file} is valid")
     yield from _cases(file, policy)
 
 
-def _cases(file: Path, policy: Policy) -> Iterator[Found]:
+def _cases(file: Path, policy: Policy) -> Iterator[SelftestFinding]:
     beside = file.with_name(file.name + ".tests.yaml")
     try:
         results = run_cases(policy, read_given_text(beside), str(beside))
@@ -83,7 +83,7 @@ def _cases(file: Path, policy: Policy) -> Iterator[Found]:
         yield ok("policy tests", f"{len(results)} passed")
 
 
-def _monitors(folder: Path | None, site_keys: Sequence[str]) -> Iterator[Found]:
+def _monitors(folder: Path | None, site_keys: Sequence[str]) -> Iterator[SelftestFinding]:
     if folder is None:
         yield skip("monitors", "no folder of specifications is configured")
         return
@@ -101,48 +101,46 @@ def _monitors(folder: Path | None, site_keys: Sequence[str]) -> Iterator[Found]:
         yield ok("monitors", text)
 
 
-def _hosts(file: Path) -> Iterator[Found]:
+def _hosts(file: Path) -> Iterator[SelftestFinding]:
     try:
         declared = read_declared(file)
     except DeclaredHostsError as error:
-        yield fail("hosts", str(error), "mend the file; nobody is enrolled by it meanwhile")
+        yield fail("hosts", str(error), "correct the file; until then it declares no hosts")
         return
-    yield ok("hosts", f"{len(declared)} declared in {file}" if declared else "none is declared")
+    yield ok("hosts", f"{len(declared)} declared in {file}" if declared else "no hosts are declared")
 
 
-def _state(state: Path) -> Iterator[Found]:
+def _state(state: Path) -> Iterator[SelftestFinding]:
     if not state.exists():
         parent = next(folder for folder in state.absolute().parents if folder.exists())
         if os.access(parent, os.W_OK):
-            yield ok("state", f"{state} will be made")
+            yield ok("state", f"{state} will be created")
         else:
             yield fail(
-                "state", f"{state} cannot be made in {parent}", "run as root, or name another: --state DIR"
+                "state", f"{state} cannot be created in {parent}", "run as root, or use another: --state DIR"
             )
         return
     mode = state.stat().st_mode
     if not stat.S_ISDIR(mode):
-        yield fail("state", f"{state} is no directory", "name another: --state DIR")
+        yield fail("state", f"{state} is not a directory", "use another: --state DIR")
         return
     if os.access(state, os.R_OK) and (reason := foreign(state)) is not None:
-        yield fail("state", reason, "name another, empty or to be made: --state DIR")
+        yield fail("state", reason, "use another, empty or new: --state DIR")
         return
     if mode & 0o022:
-        yield fail("state", f"{state}: others may write (mode {mode & 0o777:o})", f"chmod 711 {state}")
+        yield fail("state", f"{state}: other users may write (mode {mode & 0o777:o})", f"chmod 711 {state}")
     elif not os.access(state, os.W_OK):
-        yield warn(
-            "state", f"{state}: may not be written by this user", "run as the appliance's owner, or root"
-        )
+        yield warn("state", f"{state}: this user may not write", "run as the appliance's owner, or root")
     else:
         yield ok("state", f"{state}, mode {mode & 0o777:o}")
-    yield from told("secrets", lambda: _secrets(state))
-    yield from told("space", lambda: _space(state))
-    yield from told("clock", lambda: _clock(state))
-    yield from told("certificates", lambda: _certificates(state))
+    yield from run_check("secrets", lambda: _secrets(state))
+    yield from run_check("space", lambda: _space(state))
+    yield from run_check("clock", lambda: _clock(state))
+    yield from run_check("certificates", lambda: _certificates(state))
 
 
-def _secrets(state: Path) -> Iterator[Found]:
-    """Keys and tokens that others could read."""
+def _secrets(state: Path) -> Iterator[SelftestFinding]:
+    """Find keys and tokens that other users could read."""
     open_to_others = []
     for path in (
         *state.glob("signer/*.key"),
@@ -157,30 +155,32 @@ def _secrets(state: Path) -> Iterator[Found]:
         if mode & 0o007:
             open_to_others.append(f"{path} ({mode & 0o777:o})")
     if open_to_others:
-        yield fail("secrets", f"others may read {', '.join(open_to_others)}", "chmod o= what is named")
+        yield fail("secrets", f"other users may read {', '.join(open_to_others)}", "chmod o= these files")
     if (state / "first-token").exists():
-        advice = f"keep it elsewhere, then: rm {state / 'first-token'}"
-        yield warn("first token", f"{state / 'first-token'} is still there", advice)
+        advice = f"store it in a safe place, then: rm {state / 'first-token'}"
+        yield warn("first token", f"{state / 'first-token'} still exists", advice)
 
 
-def _space(state: Path) -> Iterator[Found]:
+def _space(state: Path) -> Iterator[SelftestFinding]:
     room = os.statvfs(state)
     free = room.f_bavail * room.f_frsize
     shown = f"{free / (1 << 30):.1f} GiB free"
     if free < _NO_SPACE:
-        yield fail("space", shown, "make room: requests are denied when the audit log cannot be written")
+        yield fail(
+            "space", shown, "free disk space: requests are denied while the audit log cannot be written"
+        )
     elif free < _LITTLE_SPACE:
-        yield warn("space", shown, "make room, or bound the log: audit.retention_bytes in appliance.yaml")
+        yield warn(
+            "space", shown, "free disk space, or limit the log: audit.retention_bytes in appliance.yaml"
+        )
     else:
         yield ok("space", shown)
 
 
-def _clock(state: Path) -> Iterator[Found]:
+def _clock(state: Path) -> Iterator[SelftestFinding]:
     before = before_program()
     if before:
-        yield fail(
-            "clock", f"it stands {before / 86_400:.0f} days before this program was made", "set the clock"
-        )
+        yield fail("clock", f"{before / 86_400:.0f} days before this program was built", "set the clock")
         return
     log = state / "control" / "audit.db"
     if not os.access(log, os.R_OK):
@@ -199,7 +199,7 @@ def _clock(state: Path) -> Iterator[Found]:
         yield ok("clock", datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%MZ"))
 
 
-def _certificates(state: Path) -> Iterator[Found]:
+def _certificates(state: Path) -> Iterator[SelftestFinding]:
     for path in (state / "api" / "certificate.pem", state / "signer" / "ca.pem"):
         try:
             certificate = x509.load_pem_x509_certificate(read_given(path))
@@ -207,13 +207,15 @@ def _certificates(state: Path) -> Iterator[Found]:
             continue
         except ValueError:
             yield fail(
-                "certificate", f"{path} is no certificate", "restore it, or remove it: a new one is made"
+                "certificate",
+                f"{path} is not a certificate",
+                "restore it, or remove it: a new one is created",
             )
             continue
         left = certificate.not_valid_after_utc - datetime.datetime.now(datetime.UTC)
         if left.days < 0:
-            yield fail("certificate", f"{path} has expired", "remove it, restart: a new one is made")
+            yield fail("certificate", f"{path} has expired", "remove it and restart: a new one is created")
         elif left.days < _SOON_DAYS:
-            yield warn("certificate", f"{path} ends in {left.days} days", "renew it before then")
+            yield warn("certificate", f"{path} expires in {left.days} days", "renew it before then")
         else:
             yield ok("certificate", f"{path.name} of {path.parent.name}: {left.days} days left")

@@ -1,4 +1,4 @@
-"""Does the running appliance do what it must: its own status, a call through RVMaster, a message through the relay."""
+"""Check the running appliance: its status, a call through RVMaster, a message through the relay."""
 
 import secrets
 import time
@@ -9,69 +9,69 @@ from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.status import ProcessInfo, Status
-from appliance.cli.admin_client import NotRunningError
-from appliance.cli.selftest.probe_nodes import TOPIC, RefusedError, call, message_through_the_relay
-from appliance.cli.selftest.selftest_findings import Found, fail, ok, skip, told, warn
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.target import Appliance
+from appliance.cli.selftest.probe_nodes import TOPIC, ProbeError, call, message_through_the_relay
+from appliance.cli.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
 from appliance.cli.status_verb import troubles_of
-from appliance.cli.target import Appliance
 
-_CALLER = "/rosrv_selftest"  # and a number of its own each time: what one caller reads again is counted only
+_CALLER = "/rosrv_selftest"  # followed by a random number: repeated reads by one caller are only counted
 _MANY_RESTARTS = 3
 _MANY_RECORDS = 200_000
 _RECORD_SECONDS = 5.0
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 1.0
 
 
-def running(appliance: Appliance) -> Iterator[Found]:
-    """Everything of the running appliance."""
+def running(appliance: Appliance) -> Iterator[SelftestFinding]:
+    """Check the running appliance."""
     try:
         answer = appliance.ask(StatusWanted())
     except NotRunningError as error:
         yield fail(
             "appliance",
             str(error),
-            "start it (rosrv up), or leave --state and --api out to try the machine only",
+            "start it (rosrv up), or omit --state and --api to check only the machine",
         )
         return
     if not answer.ok:
-        yield fail("appliance", answer.error, "the log of rosrv up says why")
+        yield fail("appliance", answer.error, "see the log of rosrv up")
         return
     status = answer.given()
     yield ok(
         "appliance", f"{status.version}, {len(status.processes)} processes, nodes find it at {status.master}"
     )
-    yield from told("status", lambda: _status(status))
-    yield from told("processes", lambda: _processes(status.processes))
-    yield from told("audit log", lambda: _audit(appliance))
+    yield from run_check("status", lambda: _status(status))
+    yield from run_check("processes", lambda: _processes(status.processes))
+    yield from run_check("audit log", lambda: _audit(appliance))
     master = _reachable(appliance, status.master)
-    yield from told("RVMaster", lambda: check_call(appliance, master))
-    yield from told("relay", lambda: _message(master))
+    yield from run_check("RVMaster", lambda: check_call(appliance, master))
+    yield from run_check("relay", lambda: _message(master))
 
 
-def _status(status: Status) -> Iterator[Found]:
+def _status(status: Status) -> Iterator[SelftestFinding]:
     troubles = list(troubles_of(status))
     for trouble in troubles:
         yield fail("status", trouble, "rosrv status")
     if not troubles:
         probe = status.probe or "not run yet"
-        hidden = "no firewall" if status.isolation == "none" else f"probe of the ROS Master {probe}"
+        hidden = "no firewall" if status.isolation == "none" else f"probe of the ROS master {probe}"
         yield ok("status", f"isolation {status.isolation}, {hidden}")
 
 
-def _processes(rows: list[ProcessInfo]) -> Iterator[Found]:
+def _processes(rows: list[ProcessInfo]) -> Iterator[SelftestFinding]:
     restarted = [f"{row.role} {row.restarts} times" for row in rows if row.restarts >= _MANY_RESTARTS]
     if restarted:
-        yield warn("processes", f"started again: {', '.join(restarted)}", "the log of rosrv up says why")
+        yield warn("processes", f"restarted: {', '.join(restarted)}", "see the log of rosrv up")
     else:
-        yield ok("processes", f"{len(rows)} run")
+        yield ok("processes", f"{len(rows)} running")
 
 
-def _audit(appliance: Appliance) -> Iterator[Found]:
+def _audit(appliance: Appliance) -> Iterator[SelftestFinding]:
     source = appliance.audit()
     try:
         last = source.last()
         if last > _MANY_RECORDS:
-            yield skip("audit log", f"{last} records are not proven here", "rosrv audit verify")
+            yield skip("audit log", f"{last} records take too long to verify here", "rosrv audit verify")
             return
         result = source.verify(None, None, lambda _sequence: None)
     except (LogUnreadableError, NotRunningError, FilterError) as error:
@@ -84,7 +84,7 @@ def _audit(appliance: Appliance) -> Iterator[Found]:
 
 
 def _reachable(appliance: Appliance, master: str) -> str:
-    """Where RVMaster is for this machine: over REST the appliance is where REST is, if it names only itself."""
+    """Return RVMaster's URI for this machine; REST's host replaces a loopback address."""
     place = appliance.place
     parts = urlsplit(master)
     if place is None or parts.hostname not in ("127.0.0.1", "::1", "localhost"):
@@ -94,20 +94,20 @@ def _reachable(appliance: Appliance, master: str) -> str:
     return urlunsplit((parts.scheme, f"{shown}:{parts.port}", "", "", ""))
 
 
-def check_call(appliance: Appliance, master: str) -> Iterator[Found]:
-    """A call as any tool makes it: it must be answered, and be in the audit log."""
+def check_call(appliance: Appliance, master: str) -> Iterator[SelftestFinding]:
+    """Make a ROS master API call; the appliance must answer and audit it."""
     before = _last(appliance)
     caller = f"{_CALLER}_{secrets.token_hex(4)}"
     began, refusal = time.monotonic(), ""
     try:
         call(master, "getPid", caller)
         text = "a call was allowed"
-    except RefusedError as error:
+    except ProbeError as error:
         refusal = str(error)
-        text = f"a call was refused by the policy ({refusal[:120]})"
+        text = f"a call was denied by the policy ({refusal[:120]})"
     except OSError as error:
         yield fail(
-            "RVMaster", f"{master} does not answer: {error}", "is this machine let in (network, firewall)?"
+            "RVMaster", f"{master} does not answer: {error}", "check this machine's network and firewall"
         )
         return
     text += f" in {(time.monotonic() - began) * 1000:.1f} ms"
@@ -117,7 +117,7 @@ def check_call(appliance: Appliance, master: str) -> Iterator[Found]:
     try:
         recorded = _recorded(appliance, before, caller, refusal)
     except (LogUnreadableError, NotRunningError) as error:
-        yield skip("RVMaster", f"{text}; whether it was recorded cannot be seen: {error}")
+        yield skip("RVMaster", f"{text}; cannot read the audit log: {error}")
         return
     if recorded:
         yield ok("RVMaster", f"{text}, and recorded")
@@ -133,10 +133,10 @@ def _last(appliance: Appliance) -> int | None:
 
 
 def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> bool:
-    """Whether a record after the sequence `before` is of our call; a refusal names its record.
+    """Whether a record after the sequence `before` is of our call, or the denial in `refusal` names its record.
 
-    Looked for again and again, for over REST each look is a request: the pauses grow. Raises `LogUnreadableError` or
-    `NotRunningError` where the last look failed.
+    Polls for some seconds, with growing pauses. Raises `LogUnreadableError` or `NotRunningError` if the last query
+    failed.
     """
     source, deadline, pause = appliance.audit(), time.monotonic() + _RECORD_SECONDS, _FIRST_PAUSE
     while True:
@@ -152,16 +152,16 @@ def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> b
                 return True
             if is_last:
                 return False
-        time.sleep(pause)  # noqa: TID251  nothing on the other side tells who only asks
+        time.sleep(pause)  # noqa: TID251  polling: the log has no notification
         pause = min(2 * pause, _LONGEST_PAUSE)
 
 
-def _message(master: str) -> Iterator[Found]:
-    """A message from a publisher to a subscriber here, through the relay."""
+def _message(master: str) -> Iterator[SelftestFinding]:
+    """Send a message through the relay, from a publisher to a subscriber in this process."""
     began = time.monotonic()
     try:
         message = message_through_the_relay(master)
-    except RefusedError as error:
+    except ProbeError as error:
         yield skip(
             "relay",
             f"not tried, the policy does not let this machine: {str(error)[:120]}",

@@ -1,7 +1,7 @@
-"""Can this machine run the appliance: programs, users, namespaces, firewall, tunnels, ports.
+"""Check whether this machine can run the appliance: programs, users, namespaces, firewall, tunnels, ports.
 
-What the kernel says it can do is not believed: a namespace is made, rules are put into it and tried, and it is taken
-away again. Nothing outside of it is touched.
+The checks create a network namespace, try firewall rules and interfaces in it, and delete it again. Nothing outside
+the namespace changes.
 """
 
 import os
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from appliance.cli.selftest.selftest_findings import Found, fail, ok, skip, told, warn
+from appliance.cli.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
 from appliance.configuration.settings import Settings
 from appliance.network import interfaces
 from appliance.network.esp import TUN, choose_esp
@@ -31,24 +31,24 @@ _SECONDS = 10.0
 _CHARON = Path("/usr/sbin/charon-systemd")
 
 
-def machine(settings: Settings, *, running: bool) -> Iterator[Found]:
-    """Everything of this machine. `running`: an appliance with these settings holds its ports."""
-    yield from told("python", _python)
-    yield from told("programs", _programs)
-    yield from told("users", _users)
-    yield from told("kernel", lambda: _kernel(settings))
+def machine(settings: Settings, *, running: bool) -> Iterator[SelftestFinding]:
+    """Check this machine. `running`: whether an appliance with these settings already uses its ports."""
+    yield from run_check("python", _python)
+    yield from run_check("programs", _programs)
+    yield from run_check("users", _users)
+    yield from run_check("kernel", lambda: _kernel(settings))
     if running:
-        yield ok("ports", "held by the running appliance")
+        yield ok("ports", "in use by the running appliance")
     else:
-        yield from told("ports", lambda: _ports(settings))
+        yield from run_check("ports", lambda: _ports(settings))
 
 
-def _python() -> Iterator[Found]:
+def _python() -> Iterator[SelftestFinding]:
     version = ".".join(map(str, sys.version_info[:3]))
     yield ok("python", f"{version}, {sys.executable}")
 
 
-def _programs() -> Iterator[Found]:
+def _programs() -> Iterator[SelftestFinding]:
     for name, path, package, missing in (
         ("rosmaster", ROSMASTER, "python3-rosmaster", fail),
         ("rosout", ROSOUT, "rosout", warn),
@@ -58,7 +58,7 @@ def _programs() -> Iterator[Found]:
     ):
         found = path if path is not None and path.exists() else shutil.which(name)
         if not found:
-            yield missing(name, "is not installed", f"apt install {package}")
+            yield missing(name, "not installed", f"apt install {package}")
         else:
             yield ok(name, f"{found}{_version(package)}")
 
@@ -72,7 +72,7 @@ def _version(package: str) -> str:
     return f" ({package} {done.stdout})" if done.returncode == 0 and done.stdout else ""
 
 
-def _users() -> Iterator[Found]:
+def _users() -> Iterator[SelftestFinding]:
     named, numbered = [], []
     for user, number in NUMERIC_IDS.items():
         if _name_of_user(user) is not None:
@@ -80,14 +80,14 @@ def _users() -> Iterator[Found]:
         elif (owner := _name_of_number(number)) is not None:
             yield fail(
                 "users",
-                f"the number {number}, which {user} would have, is the user {owner}",
-                f"make the user: useradd --system {user}",
+                f"uid {number}, meant for {user}, belongs to the user {owner}",
+                f"create the user: useradd --system {user}",
             )
         else:
             numbered.append(str(number))
     there = f"{len(named)} by name" if named else ""
     rest = f"{len(numbered)} by number ({numbered[0]} to {numbered[-1]})" if numbered else ""
-    yield ok("users", ", ".join(filter(None, (there, rest))) or "none is missing")
+    yield ok("users", ", ".join(filter(None, (there, rest))) or "none missing")
 
 
 def _name_of_user(user: str) -> str | None:
@@ -104,15 +104,15 @@ def _name_of_number(number: int) -> str | None:
         return None
 
 
-def _kernel(settings: Settings) -> Iterator[Found]:
+def _kernel(settings: Settings) -> Iterator[SelftestFinding]:
     if settings.isolation == "none":
         yield warn(
             "isolation",
-            "isolation none: no firewall hides the ROS Master",
-            "for a robot use netns or container",
+            "isolation none: no firewall hides the ROS master",
+            "use netns or container on a robot",
         )
     if os.geteuid() != 0:
-        yield skip("kernel", "namespaces and the firewall can be tried as root only", "sudo rosrv selftest")
+        yield skip("kernel", "checks of namespaces and the firewall need root", "sudo rosrv selftest")
         return
     namespace = Namespace(f"rosrv-selftest-{os.getpid()}")
     try:
@@ -124,25 +124,25 @@ def _kernel(settings: Settings) -> Iterator[Found]:
         )
         return
     try:
-        yield ok("namespaces", "a network namespace can be made")
-        yield from told("veth", lambda: _veth(namespace))
+        yield ok("namespaces", "a network namespace can be created")
+        yield from run_check("veth", lambda: _veth(namespace))
         interfaces.set_link(namespace, "lo", up=True)
-        yield from told("firewall", lambda: _firewall(settings, namespace))
-        yield from told("esp", lambda: _esp(namespace))
+        yield from run_check("firewall", lambda: _firewall(settings, namespace))
+        yield from run_check("esp", lambda: _esp(namespace))
     finally:
         namespace.delete()
 
 
-def _veth(namespace: Namespace) -> Iterator[Found]:
+def _veth(namespace: Namespace) -> Iterator[SelftestFinding]:
     try:
         interfaces.create_veth(namespace, "try0", namespace, "try1")
     except NetworkError as error:
         yield fail("veth", str(error), "load the kernel module: modprobe veth")
     else:
-        yield ok("veth", "a cable between namespaces can be made")
+        yield ok("veth", "a veth pair can be created")
 
 
-def _firewall(settings: Settings, namespace: Namespace) -> Iterator[Found]:
+def _firewall(settings: Settings, namespace: Namespace) -> Iterator[SelftestFinding]:
     refused = []
     for backend in (NftBackend(namespace), IptablesBackend(namespace)):
         if settings.firewall.backend not in ("auto", backend.name):
@@ -152,31 +152,29 @@ def _firewall(settings: Settings, namespace: Namespace) -> Iterator[Found]:
         except FirewallError as error:
             refused.append(f"{backend.name}: {error}")
         else:
-            yield ok(
-                "firewall", f"{backend.name}: a rule was put in force, refused another user, and let us pass"
-            )
+            yield ok("firewall", f"{backend.name}: a test rule rejected another user and accepted this one")
             return
     advice = "load nf_tables, or ip_tables with xt_owner; `isolation: none` goes without a firewall"
     yield fail("firewall", "; ".join(refused), advice)
 
 
-def _esp(namespace: Namespace) -> Iterator[Found]:
+def _esp(namespace: Namespace) -> Iterator[SelftestFinding]:
     try:
         where = choose_esp(namespace)
     except NetworkError as error:
-        yield warn("esp", str(error), "only tunnels of trusted hosts need it")
+        yield warn("esp", str(error), "only IPsec tunnels need it")
     else:
-        tun = "" if TUN.exists() else f", {TUN} is not there"
+        tun = "" if TUN.exists() else f", {TUN} does not exist"
         if where == "kernel":
             yield ok("esp", f"in the {where}{tun}")
         elif os.access(TUN, os.R_OK | os.W_OK):
-            yield ok("esp", f"in {where}, over {TUN}, which its user is given")
+            yield ok("esp", f"in {where}, over {TUN}, which charon's user will own")
         else:
             yield warn("esp", f"in {where}, and {TUN} cannot be opened", "load the kernel module `tun`")
 
 
-def _ports(settings: Settings) -> Iterator[Found]:
-    places = {"RVMaster": settings.listen_address, "ROSMaster": ("127.0.0.1", settings.rosmaster_port)}
+def _ports(settings: Settings) -> Iterator[SelftestFinding]:
+    places = {"RVMaster": settings.listen_address, "ROS master": ("127.0.0.1", settings.rosmaster_port)}
     if settings.api_address is not None:
         places["REST"] = settings.api_address
     for name, (host, port) in places.items():
@@ -184,6 +182,6 @@ def _ports(settings: Settings) -> Iterator[Found]:
             require_free(host, port)
         except StartError as error:
             what = re.sub(r": stop that.*", "", str(error))
-            yield fail(f"port of {name}", what, "stop that, or choose another port in appliance.yaml")
+            yield fail(f"port of {name}", what, "stop that program, or choose another port in appliance.yaml")
         else:
             yield ok(f"port of {name}", f"{host}:{port} is free" if port else "any")

@@ -1,4 +1,4 @@
-"""What a self-test finds, one line each."""
+"""Define the findings of a self-test."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ Outcome = Literal["ok", "warn", "fail", "skip"]
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """One thing that was tried: `advice` says what to do where it is not well."""
+class SelftestFinding:
+    """The result of one check; `advice` says how to correct it."""
 
     check: str
     outcome: Outcome
@@ -17,31 +17,31 @@ class Found:
     advice: str = ""
 
 
-def ok(check: str, text: str) -> Found:
-    """It is as it should be."""
-    return Found(check, "ok", text)
+def ok(check: str, text: str) -> SelftestFinding:
+    """Return a passed check."""
+    return SelftestFinding(check, "ok", text)
 
 
-def warn(check: str, text: str, advice: str) -> Found:
-    """The appliance works, but somebody should look."""
-    return Found(check, "warn", text, advice)
+def warn(check: str, text: str, advice: str) -> SelftestFinding:
+    """Return a check that needs attention although the appliance works."""
+    return SelftestFinding(check, "warn", text, advice)
 
 
-def fail(check: str, text: str, advice: str) -> Found:
-    """The appliance will not work, or does not."""
-    return Found(check, "fail", text, advice)
+def fail(check: str, text: str, advice: str) -> SelftestFinding:
+    """Return a check that prevents the appliance from working."""
+    return SelftestFinding(check, "fail", text, advice)
 
 
-def skip(check: str, text: str, advice: str = "") -> Found:
-    """It could not be tried here."""
-    return Found(check, "skip", text, advice)
+def skip(check: str, text: str, advice: str = "") -> SelftestFinding:
+    """Return a check that could not be run here."""
+    return SelftestFinding(check, "skip", text, advice)
 
 
-def told(check: str, tries: Callable[[], Iterable[Found]]) -> Iterator[Found]:
-    """What a check finds; one that breaks is a failure of its own, and the others go on."""
+def run_check(check: str, tries: Callable[[], Iterable[SelftestFinding]]) -> Iterator[SelftestFinding]:
+    """Yield the findings of a check; turn an unexpected exception into a failed check."""
     try:
         yield from tries()
-    except Exception as error:  # noqa: BLE001  whatever happens on a strange machine is a finding
+    except Exception as error:  # noqa: BLE001  any error on an unknown machine is a finding
         yield fail(
-            check, f"cannot be tried: {type(error).__name__}: {error}", "report this: a defect of rosrv"
+            check, f"the check failed: {type(error).__name__}: {error}", "please report this defect in rosrv"
         )

@@ -1,4 +1,4 @@
-"""`rosrv selftest`: what an operator runs on a fresh machine, or when in doubt."""
+"""`rosrv selftest`: check a fresh machine, or a running appliance."""
 
 import os
 import sys
@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from appliance.cli.admin_client import ADMIN_SOCKET, AdminSocket
+from appliance.cli.connection.admin_client import ADMIN_SOCKET, AdminSocket
+from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json
-from appliance.cli.selftest.selftest_findings import Found, fail
-from appliance.cli.target import Appliance, speaks
+from appliance.cli.selftest.selftest_findings import SelftestFinding, fail
 from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings, load_resolved
 from rosmop.tool.tables import say_table
@@ -32,12 +32,11 @@ def selftest(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object for each check")] = False,
 ) -> None:
-    """Try whether this machine can run the appliance, and whether the running one does what it must.
+    """Check whether this machine can run the appliance, and whether a running appliance works.
 
-    Without --api: programs, users, namespaces, firewall, tunnels, ports, and the files of the configuration.
-    Where an appliance runs also its status, its audit log, a call through RVMaster and a message through the relay.
-    With --api only the running appliance is tried, from here. Exit status: 0 nothing failed (warnings or not), 1
-    something failed.
+    Without --api: check programs, users, namespaces, firewall, tunnels, ports, and the files of the configuration.
+    For a running appliance, also check its status, its audit log, a call through RVMaster and a message through the
+    relay. With --api: check only the running appliance, from here. Exit status: 0 no failures, 1 failures.
 
     Example: sudo rosrv selftest
     """
@@ -66,8 +65,8 @@ def selftest(
     raise typer.Exit(1 if failed else 0)
 
 
-def _all(appliance: Appliance, config: Path | None) -> Iterator[Found]:
-    from appliance.cli.selftest.live_checks import running  # noqa: PLC0415  after what can be said without it
+def _all(appliance: Appliance, config: Path | None) -> Iterator[SelftestFinding]:
+    from appliance.cli.selftest.live_checks import running  # noqa: PLC0415  slow to import
 
     if appliance.place is not None:
         yield from running(appliance)
@@ -77,9 +76,9 @@ def _all(appliance: Appliance, config: Path | None) -> Iterator[Found]:
         yield from running(appliance)
 
 
-def _here(appliance: Appliance, config: Path | None) -> Iterator[Found]:
-    from appliance.cli.selftest.file_checks import files  # noqa: PLC0415  what it imports is slow
-    from appliance.cli.selftest.machine_checks import machine  # noqa: PLC0415  the same
+def _here(appliance: Appliance, config: Path | None) -> Iterator[SelftestFinding]:
+    from appliance.cli.selftest.file_checks import files  # noqa: PLC0415  slow to import
+    from appliance.cli.selftest.machine_checks import machine  # noqa: PLC0415  slow to import
 
     try:
         settings = _settings(appliance, config)
@@ -92,14 +91,14 @@ def _here(appliance: Appliance, config: Path | None) -> Iterator[Found]:
 
 
 def _settings(appliance: Appliance, config: Path | None) -> Settings:
-    """Of the running appliance where one runs, else those that `rosrv up` would have here."""
+    """Return the settings of the running appliance, else those that `rosrv up` would use here."""
     state = _state(appliance)
     resolved = None if state is None else state / "run" / "config.json"
     if config is None and resolved is not None and _runs(appliance):
         try:
             return load_resolved(resolved)
         except (OSError, ValueError):
-            pass  # not ours to read: the configuration here is what there is
+            pass  # unreadable for this user: use the local configuration
     environment = {name: value for name, value in os.environ.items() if name != "ROSRV_STATE"}
     return resolve(config, environment, {"state": state if appliance.said else None})
 

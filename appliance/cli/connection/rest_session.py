@@ -1,12 +1,12 @@
-"""Asks the running appliance over REST.
+"""Send requests to the running appliance over REST.
 
 Invariants:
 
-1. The token leaves this machine encrypted, for a server whose certificate is trusted (`--api-ca`, else the system's
-   authorities), or not at all: there is no way to switch that off. Clear text is for loopback addresses.
+1. A credential leaves this machine only encrypted, to a server whose certificate is trusted (`--api-ca`, else the
+   system's authorities); that cannot be switched off. Clear text is for loopback addresses only.
 2. The token comes from the environment, never from the command line, which every user of the machine can see. It
-   does not leave the program: its reading key is sent, and each order is signed (`order_proof.py`).
-3. Nothing is followed elsewhere: no redirect, no proxy, no credentials from `.netrc`.
+   does not leave the program: its reading key is sent, and each order is signed (`request_signing.py`).
+3. No redirect, proxy or credentials from `.netrc` are used.
 """
 
 import json
@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from appliance.base.input_files import read_given_text
-from appliance.cli.admin_client import SECONDS, UNKNOWN, NotRunningError
+from appliance.cli.connection.admin_client import SECONDS, UNKNOWN, NotRunningError
 from appliance.configuration.settings import is_loopback
 from appliance.signing.request_signing import HEADER, proof_of, reading_key, statement
 from appliance.store.access_tokens import parse_token
@@ -30,13 +30,13 @@ _LONGEST_ERROR = 1 << 20
 _MAKE = "make one on its machine: rosrv token add NAME"
 
 
-class ProblemError(Exception):
-    """REST refused what was asked; `lines` is what it says, the first line the sum of it."""
+class RestProblemError(Exception):
+    """Report a request that REST denied or rejected; `lines` is the text, the first line a summary."""
 
     def __init__(
         self, status: int, kind: str, lines: list[str], findings: list[dict[str, Any]] | None = None
     ) -> None:
-        """`findings`: the places of a text that are wrong, where it is about one."""
+        """Store the problem; `findings` are the errors in a text that was sent, with their places."""
         super().__init__(lines[0])
         self.findings = findings
         self.status = status
@@ -45,10 +45,10 @@ class ProblemError(Exception):
 
 
 class RestClient:
-    """Makes requests for the holder of a token; raises `NotRunningError` and `ProblemError`."""
+    """A REST client for the holder of a token; its methods raise `NotRunningError` and `RestProblemError`."""
 
     def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
-        """Raises ValueError when it is no place to send a token to."""
+        """Prepare the connection. Raises `ValueError` if a token must not be sent to this URL."""
         self.url, secure = _place_of(url)
         self._token = _checked_token(token)
         if authority is not None and not secure:
@@ -63,7 +63,7 @@ class RestClient:
         )
 
     def close(self) -> None:
-        """End the connections that are kept for the next request."""
+        """Close the connections that are kept for the next request."""
         self._client.close()
 
     def call(
@@ -77,9 +77,9 @@ class RestClient:
         match: bool = False,
         order: bool = True,
     ) -> dict[str, Any]:
-        """The answer's body. `match`: whatever is in force is changed (`If-Match: *`).
+        """Return the answer's body. `match`: change whatever is in force (`If-Match: *`).
 
-        What is no GET is signed, unless it is no `order`: a dry run.
+        An `order` is signed unless it is a GET; a dry run is not an order.
         """
         headers = {"If-Match": "*"} if match else {}
         with self.streamed(
@@ -91,7 +91,9 @@ class RestClient:
         except (ValueError, RecursionError):
             found = None
         if not isinstance(found, dict):
-            raise NotRunningError(f"{self.url} is not the REST of an appliance: its answer is no JSON object")
+            raise NotRunningError(
+                f"{self.url} is not the REST of an appliance: its answer is not a JSON object"
+            )
         return found
 
     @contextmanager
@@ -106,7 +108,7 @@ class RestClient:
         headers: Mapping[str, str] | None = None,
         order: bool = True,
     ) -> Iterator[httpx.Response]:
-        """An answer while it comes."""
+        """Yield an answer while it arrives."""
         signed = order and method != "GET"
         challenge = str(self.call("GET", "/v1/challenge").get("challenge", "")) if signed else ""
         request = self._client.build_request(
@@ -166,19 +168,19 @@ class RestClient:
         match answer.status_code:
             case 401:
                 return NotRunningError(
-                    f"{self.url}: the token in ROSRV_TOKEN is not taken: {detail}; {_MAKE}"
+                    f"{self.url}: the token in ROSRV_TOKEN is not accepted: {detail}; {_MAKE}"
                 )
             case 403 | 421:
                 return NotRunningError(f"{self.url}: {detail}")
             case 429 | 503 if wait is not None:
                 return NotRunningError(f"{self.url}: {detail}; try again in {wait} s")
         if kind == "unknown-path":
-            return NotRunningError(f"{self.url}: this appliance's version does not know that over REST")
-        return ProblemError(answer.status_code, kind, detail.split("\n"), problem.get("findings"))
+            return NotRunningError(f"{self.url}: this appliance's version does not offer that over REST")
+        return RestProblemError(answer.status_code, kind, detail.split("\n"), problem.get("findings"))
 
 
 def _unknown(method: str) -> str:
-    """What to say of an order that was not answered."""
+    """Return the hint for an order without an answer."""
     return "" if method == "GET" else f"; {UNKNOWN}"
 
 
@@ -194,14 +196,14 @@ def _stated(request: httpx.Request, challenge: str) -> bytes:
 
 
 def _place_of(url: str) -> tuple[str, bool]:
-    """Scheme, host and port, and whether that is encrypted. Raises ValueError."""
+    """Return a URL's scheme, host and port, and whether it is encrypted. Raises `ValueError`."""
     try:
         parts = urlsplit(url)
         host, _port = parts.hostname, parts.port
     except ValueError as error:
-        raise ValueError(f"--api {url!r} is no URL: {error}") from None
+        raise ValueError(f"--api {url!r} is not a URL: {error}") from None
     if parts.scheme not in ("http", "https") or not host:
-        raise ValueError(f"--api {url!r} is no URL: write https://HOST:PORT, as `rosrv up` prints it")
+        raise ValueError(f"--api {url!r} is not a URL: write https://HOST:PORT, as `rosrv up` prints it")
     if parts.username is not None or parts.path.strip("/") or parts.query or parts.fragment:
         raise ValueError(f"--api {url!r}: write scheme, host and port only: {parts.scheme}://HOST:PORT")
     if parts.scheme == "http" and not is_loopback(host):
@@ -214,7 +216,7 @@ def _checked_token(token: str | None) -> str:
     if not text:
         raise ValueError(f"no access token: put it into the environment as ROSRV_TOKEN; {_MAKE}")
     if parse_token(text) is None:
-        raise ValueError(f"what is in ROSRV_TOKEN is no access token; {_MAKE}")
+        raise ValueError(f"ROSRV_TOKEN is not an access token; {_MAKE}")
     return text
 
 
@@ -222,7 +224,7 @@ def _context(authority: Path | None) -> ssl.SSLContext:
     try:
         if authority is None:
             return ssl.create_default_context()
-        # Without a text it would be the system's authorities.
+        # An empty text would select the system's authorities.
         text = read_given_text(authority, "ascii", "ignore") or "no certificate"
         return ssl.create_default_context(cadata=text)
     except ssl.SSLError:

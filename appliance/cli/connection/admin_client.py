@@ -1,4 +1,4 @@
-"""Asks the running appliance over the admin socket in its state directory, which is for its owner and root."""
+"""The client of the admin socket in the state directory, which only its owner and root may use."""
 
 import socket
 from pathlib import Path
@@ -9,39 +9,37 @@ import msgspec
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, decode
 
 if TYPE_CHECKING:
-    from appliance.cli.audit.source import FileLog
+    from appliance.cli.connection.audit_file import FileLog
 
 ADMIN_SOCKET = "admin.sock"
 SECONDS = 60.0
-"""How long an answer may take: longer than control's slowest, a host that waits for charon, a set that is compiled."""
-
-
+"""Longer than control's slowest answers: enrolling a host through charon, compiling specifications."""
 _GRACE_SECONDS = 10.0
 UNKNOWN = (
-    "an order may have taken effect; if it has not by now, it never will. What took effect:"
+    "a change may have taken effect; if it has not by now, it never will. List what took effect:"
     " rosrv audit search --since 5m"
 )
 
 
 class NotRunningError(Exception):
-    """No appliance can be asked at this place, or not by this user or token; the text says what to do."""
+    """Report that no appliance answers, or not for this user or token; the text says what to do."""
 
 
 class AdminSocket:
-    """The appliance that runs with a state directory; an answer may take so many seconds."""
+    """A client of the appliance that runs with a state directory; each answer may take `seconds`."""
 
     def __init__(self, state: Path, seconds: float = SECONDS) -> None:
         self.state = state
         self._seconds = seconds
 
     def audit(self) -> "FileLog":
-        """The audit log's file, which can be read without a running appliance."""
-        from appliance.cli.audit.source import FileLog  # noqa: PLC0415  only for the verbs that read it
+        """Return the audit log, read from its file even while the appliance is stopped."""
+        from appliance.cli.connection.audit_file import FileLog  # noqa: PLC0415  only for the verbs that read it
 
         return FileLog(self.state)
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        """Ask the running appliance one thing. Raises `NotRunningError`."""
+        """Send one request to the running appliance. Raises `NotRunningError`."""
         line = encoded(request)
         path = self.state / ADMIN_SOCKET
         if not self.state.is_dir():
@@ -56,10 +54,10 @@ class AdminSocket:
                 answer = self._read(sock)
         except FileNotFoundError:
             raise NotRunningError(
-                f"{self.state}: no appliance runs with this state directory; start it: rosrv up"
+                f"{self.state}: no appliance is running with this state directory; start it: rosrv up"
             ) from None
         except PermissionError:
-            raise NotRunningError(f"{path} is for its owner and root only; run this as one of them") from None
+            raise NotRunningError(f"{path}: only its owner and root have access; use sudo") from None
         except ConnectionRefusedError:
             raise NotRunningError(
                 f"{self.state}: the appliance that used this state directory has ended"
@@ -75,7 +73,7 @@ class AdminSocket:
             raise NotRunningError(f"{path}: an appliance of another version answers: {error}") from None
 
     def _read(self, sock: socket.socket) -> bytes:
-        """Return the answer; when it does not come in time, withdraw the request and wait for what became of it."""
+        """Read the answer. After the time-out, withdraw the request and wait for its outcome."""
         line = bytearray()
         try:
             _read_line(sock, line)
@@ -87,17 +85,17 @@ class AdminSocket:
 
 
 def encoded(request: AdminRequest[Any]) -> bytes:
-    """The request as it is sent. Raises `NotRunningError` for words that no appliance can be asked for."""
+    """Encode a request. Raises `NotRunningError` for text that is not valid UTF-8."""
     try:
         return msgspec.json.encode(request)
     except UnicodeEncodeError as error:
         word = error.object[max(0, error.start - 20) : error.end + 20]
         shown = word.encode("utf-8", "backslashreplace").decode()
-        raise NotRunningError(f"'{shown}' is not UTF-8: write it anew in that encoding") from None
+        raise NotRunningError(f"'{shown}' is not valid UTF-8") from None
 
 
 def _read_line(sock: socket.socket, line: bytearray) -> None:
-    """Read the rest of a line."""
+    """Append to `line` until it is complete."""
     while not line.endswith(b"\n"):
         piece = sock.recv(65536)
         if not piece:

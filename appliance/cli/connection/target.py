@@ -1,8 +1,8 @@
-"""Which running appliance a verb is for, and how it is asked: over the socket in its state directory, or over REST.
+"""Choose the running appliance for a verb: over the socket in its state directory, or over REST.
 
-A verb that speaks to an appliance takes an `Appliance` first and is decorated with `speaks`, which gives it the
-options `--state`, `--api` and `--api-ca`. Whatever way is taken, the same question has the same answer. What is said
-on the command line goes before the environment, and of the environment REST before the socket.
+A verb takes an `Appliance` as its first parameter and is decorated with `speaks`, which adds the options `--state`,
+`--api` and `--api-ca`. Both ways give the same answers. The command line overrides the environment; in the
+environment, REST overrides the socket.
 """
 
 import functools
@@ -17,27 +17,27 @@ import msgspec
 import typer
 
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
-from appliance.cli.admin_client import AdminSocket, NotRunningError
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.output import Json, say_json, usage_error
 from rosmop.tool.terminal import printable
 
 if TYPE_CHECKING:
-    from appliance.cli.audit.log_over_rest import RestLog
-    from appliance.cli.audit.source import FileLog
-    from appliance.cli.rest.orders import RestWay
-    from appliance.cli.rest.session import RestClient
+    from appliance.cli.connection.audit_file import FileLog
+    from appliance.cli.connection.audit_over_rest import RestLog
+    from appliance.cli.connection.rest_orders import RestWay
+    from appliance.cli.connection.rest_session import RestClient
 
 DEFAULT_STATE = Path(
     "/var/lib/rosrv"
-)  # as appliance.configuration.settings has it, which is not imported for every verb
-TOKEN = "ROSRV_TOKEN"  # noqa: S105  the name of the variable that has it
+)  # the default in appliance.configuration.settings, which is slow to import
+TOKEN = "ROSRV_TOKEN"  # noqa: S105  the name of an environment variable
 State = Annotated[
     Path,
     typer.Option(
         "--state",
         envvar="ROSRV_STATE",
         help="State directory of the running appliance",
-        readable=False,  # it may be passed through, not looked into; who may not connect is told so
+        readable=False,  # search permission is enough
     ),
 ]
 Api = Annotated[
@@ -46,7 +46,7 @@ Api = Annotated[
         "--api",
         metavar="URL",
         envvar="ROSRV_API_URL",
-        help=f"Ask over REST instead; the access token is in {TOKEN}",
+        help=f"Use REST instead; put the access token into {TOKEN}",
     ),
 ]
 ApiCa = Annotated[
@@ -55,7 +55,7 @@ ApiCa = Annotated[
         "--api-ca",
         metavar="FILE",
         envvar="ROSRV_API_CA",
-        help="Certificate that REST is trusted by (STATE/api/certificate.pem of the appliance)",
+        help="Certificate to trust for REST (STATE/api/certificate.pem of the appliance)",
     ),
 ]
 _P = ParamSpec("_P")
@@ -63,10 +63,10 @@ _P = ParamSpec("_P")
 
 @dataclass(frozen=True)
 class Appliance:
-    """The appliance that a verb is for.
+    """The appliance that a verb talks to.
 
-    `said`: it was named, on the command line or in the environment. `place` is the URL of REST; None over the socket.
-    `as_json`: what is shown of its answers is for programs.
+    `said`: whether the command line or the environment names it. `place`: the URL of REST; None over the socket.
+    `as_json`: whether to print answers as JSON.
     """
 
     way: "AdminSocket | RestWay"
@@ -76,27 +76,27 @@ class Appliance:
 
     @property
     def rest(self) -> "RestClient":
-        """What calls REST, of an appliance that has a `place`."""
-        assert not isinstance(self.way, AdminSocket)  # noqa: S101  it has none
+        """Return the REST client of an appliance with a `place`."""
+        assert not isinstance(self.way, AdminSocket)  # noqa: S101  it has no place
         return self.way.client
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        """Ask the running appliance one thing. Raises `NotRunningError`."""
+        """Send one request to the running appliance. Raises `NotRunningError`."""
         return self.way.ask(request)
 
     def audit(self) -> "FileLog | RestLog":
-        """Its audit log; over the state directory it need not run."""
+        """Return its audit log; with a state directory the appliance may be stopped."""
         return self.way.audit()
 
     def ask_or_exit(self, request: AdminRequest[A]) -> A:
-        """The answer's body. Ends the program with 1 when it refuses, 2 when none can be asked."""
+        """Return the answer's body. Exits with status 1 for a rejected request, 2 if no appliance answers."""
         try:
             return self.body_or_exit(self.way.ask(request))
         except NotRunningError as error:
             raise usage_error(str(error)) from None
 
     def answer_or_exit(self, request: AdminRequest[A]) -> A:
-        """The same for a person to read: with --json the answer is written here as it is, and the verb ends."""
+        """Return the answer's body like `ask_or_exit`; with --json, print it and exit instead."""
         body = self.ask_or_exit(request)
         if self.as_json:
             say_json(body)  # type: ignore[arg-type]  # each answer is a struct
@@ -104,7 +104,7 @@ class Appliance:
         return body
 
     def body_or_exit(self, answer: AdminAnswer[A]) -> A:
-        """The answer's body; a refusal is shown whole and ends the program with status 1."""
+        """Return the answer's body; print a rejection with its findings and exit with status 1."""
         if answer.ok:
             return answer.given()
         if self.as_json:
@@ -117,7 +117,7 @@ class Appliance:
 
 
 def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
-    """Give a verb whose first parameter is an `Appliance` the options that say which, and --json if it has none."""
+    """Replace a verb's first parameter, an `Appliance`, by the options that choose it; add --json if it is missing."""
     own = inspect.signature(verb, eval_str=True)
     its_json = next(filter(lambda name: name.startswith("as_json"), own.parameters), None)
 
@@ -149,17 +149,17 @@ _PLACES = [
 
 
 def _chosen(context: typer.Context, state: Path, api: str | None, authority: Path | None) -> Appliance:
-    """The appliance at one of both places. Ends the program with 2 when that makes no sense."""
+    """Return the appliance that the options choose. Exits with status 2 for options that exclude each other."""
     sources = {name: context.get_parameter_source(name) for name in ("state", "api", "api_ca")}
     said = {name: getattr(source, "name", "") for name, source in sources.items()}
     typed = {name for name, source in said.items() if source == "COMMANDLINE"}
     if {"state", "api"} <= typed:
-        raise usage_error("--state and --api are two ways to the appliance: give one")
+        raise usage_error("--state and --api exclude each other: give one")
     if api is None or "state" in typed:
         if "api_ca" in typed:
-            raise usage_error("--api-ca is for --api URL, which is not given")
+            raise usage_error("--api-ca needs --api URL")
         return Appliance(AdminSocket(state), said=said["state"] in ("COMMANDLINE", "ENVIRONMENT"))
-    from appliance.cli.rest.orders import RestWay  # noqa: PLC0415  httpx is not imported for the socket
+    from appliance.cli.connection.rest_orders import RestWay  # noqa: PLC0415  httpx is not imported for the socket
 
     try:
         way = RestWay(api, os.environ.get(TOKEN), authority)

@@ -1,4 +1,4 @@
-"""The running appliance's audit log, read over REST."""
+"""Read the running appliance's audit log over REST."""
 
 import json
 import re
@@ -12,30 +12,30 @@ import msgspec
 from appliance.audit.chain_findings import Verification
 from appliance.audit.copies import SignedCheckpoint
 from appliance.audit.query import Filter, FilterError
-from appliance.audit.record_format import Entry, entry_of, rfc3339
-from appliance.audit.search import Page, Shown
-from appliance.cli.admin_client import NotRunningError
-from appliance.cli.audit.source import Progress
-from appliance.cli.rest.session import ProblemError, RestClient
+from appliance.audit.record_format import LogEntry, entry_of, rfc3339
+from appliance.audit.search import RecordInContext, SearchPage
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.audit_file import Progress
+from appliance.cli.connection.rest_session import RestClient, RestProblemError
 
 _PATH = "/v1/audit"
 _PAGE = 1000
-ID = re.compile("[0-9a-f]{1,20}")  # of a record, or its sequence; anything else is no record's
+ID = re.compile("[0-9a-f]{1,20}")  # of a record, or its sequence
 _VERIFY_SECONDS = 3600.0
-_SILENCE_SECONDS = 60.0  # a stream says something every 15 s
+_SILENCE_SECONDS = 60.0  # a stream sends at least a comment every 15 s
 _AGAIN_SECONDS = 1.0
 _MOST_FAILURES = 5
 
 
 class RestLog:
-    """Reads the log with the token of a client."""
+    """The audit log over REST; it has the methods of `FileLog`, which here raise `NotRunningError`."""
 
     def __init__(self, client: RestClient) -> None:
         self._client = client
 
-    def search(self, wanted: Filter, cursor: str | None, limit: int, *, newest_first: bool) -> Page:
-        """A page of records."""
-        entries: list[Entry] = []
+    def search(self, wanted: Filter, cursor: str | None, limit: int, *, newest_first: bool) -> SearchPage:
+        """Return at most `limit` records from `cursor` on."""
+        entries: list[LogEntry] = []
         order = "newest" if newest_first else "oldest"
         while True:
             size = min(_PAGE, limit - len(entries))
@@ -47,36 +47,36 @@ class RestLog:
                 entries += map(entry_of, page["records"])
                 cursor = page["cursor"]
             if cursor is None or len(entries) >= limit:
-                return Page(entries, cursor)
+                return SearchPage(entries, cursor)
 
-    def show(self, record_id: str, neighbours: int) -> Shown | None:
-        """One record with its neighbours; None when there is none."""
+    def show(self, record_id: str, neighbours: int) -> RecordInContext | None:
+        """Return one record with its neighbours; None if the log has no such record."""
         if not ID.fullmatch(record_id):
             return None
         try:
             with self._refusals():
                 found = self._get(f"/{record_id}", {"neighbours": neighbours})
                 before, after = ([*map(entry_of, found[name])] for name in ("before", "after"))
-                return Shown(entry_of(found["record"]), before, after)
+                return RecordInContext(entry_of(found["record"]), before, after)
         except _NothingThereError:
             return None
 
-    def export(self, wanted: Filter) -> Iterator[Entry]:
-        """All records that match, the oldest first."""
+    def export(self, wanted: Filter) -> Iterator[LogEntry]:
+        """Yield all records that match, the oldest first."""
         with self._lines("/export", _parameters(wanted), _SILENCE_SECONDS) as lines:
             for line in lines:
                 if line:
                     yield entry_of(json.loads(line))
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
-        """The same with their places in the chain, as the appliance gives them: sequences and lines."""
+        """Yield the sequence and the NDJSON line of all matching records, oldest first."""
         with self._lines("/export", _parameters(wanted), _SILENCE_SECONDS) as lines:
             for line in lines:
                 if line:
                     yield int(json.loads(line)["sequence"]), line
 
-    def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[Entry]]:
-        """The last records that match, then those that come; a connection that breaks is made anew."""
+    def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:
+        """Yield the last matching records, then new ones; reconnect when the connection breaks."""
         position = self.last()
         if lines:
             yield self.search(wanted, str(position + 1), lines, newest_first=True).entries[::-1]
@@ -85,9 +85,9 @@ class RestLog:
             try:
                 with self._lines(
                     "/stream", {**_parameters(wanted), "after": position}, _SILENCE_SECONDS
-                ) as said:
+                ) as stream:
                     failures = 0
-                    for entry in self._records(said):
+                    for entry in self._records(stream):
                         position = entry.sequence
                         yield [entry]
             except _EndedError:
@@ -101,23 +101,23 @@ class RestLog:
     def verify(
         self, key: bytes | None, copies: Sequence[SignedCheckpoint] | None, progress: Progress
     ) -> Verification:
-        """Whether it is complete and unchanged, as the appliance finds."""
-        del progress  # REST does not say how far it is
+        """Return the appliance's own verification of its log."""
+        del progress  # REST does not report it
         if key is not None or copies is not None:
             raise FilterError(
-                "--key and --checkpoints are held against the log's file: verify it on its machine (--state)"
+                "--key and --checkpoints need the log's file: run this on the appliance's machine with --state"
             )
         with self._refusals():
             return msgspec.convert(self._get("/verify", {}, _VERIFY_SECONDS), Verification)
 
     def checkpoints(self, after: int) -> list[SignedCheckpoint]:
-        """Signed checkpoints after a number, in order."""
+        """Return signed checkpoints after a number, in order."""
         with self._refusals():
             found = self._get("/checkpoints", {"after": after})["checkpoints"]
             return msgspec.convert(found, list[SignedCheckpoint])
 
     def last(self) -> int:
-        """The sequence of the last record."""
+        """Return the sequence of the last record; 0 for an empty log."""
         with self._refusals():
             found = self._get("", {"limit": 1})["records"]
             return int(found[0]["sequence"]) if found else 0
@@ -128,7 +128,7 @@ class RestLog:
 
     @contextmanager
     def _lines(self, path: str, params: dict[str, Any], seconds: float) -> Iterator[Iterator[str]]:
-        """The lines of an answer while it comes; what is in them may be read inside."""
+        """Stream the lines of an answer; translate errors, also those raised inside the block."""
         with (
             self._refusals(),
             self._client.streamed("GET", _PATH + path, params=params, seconds=seconds) as answer,
@@ -137,10 +137,10 @@ class RestLog:
 
     @contextmanager
     def _refusals(self) -> Iterator[None]:
-        """A refusal is told as it is when the log's file is read; so is an answer that is none."""
+        """Translate REST's problems and malformed answers into errors for the caller."""
         try:
             yield
-        except ProblemError as problem:
+        except RestProblemError as problem:
             if problem.status == 404:
                 raise _NothingThereError(str(problem)) from None
             if problem.status == 422:
@@ -153,7 +153,7 @@ class RestLog:
                 f"{self._client.url} is not the REST of an appliance: its answer is not as documented"
             ) from None
 
-    def _records(self, lines: Iterator[str]) -> Iterator[Entry]:
+    def _records(self, lines: Iterator[str]) -> Iterator[LogEntry]:
         event = ""
         for line in lines:
             name, _colon, value = line.partition(": ")
@@ -166,11 +166,11 @@ class RestLog:
 
 
 class _NothingThereError(Exception):
-    """There is no such record."""
+    """Report a record that the log does not have."""
 
 
 class _EndedError(NotRunningError):
-    """The stream is over for good."""
+    """Report that the appliance ended the stream."""
 
 
 def _parameters(wanted: Filter) -> dict[str, Any]:

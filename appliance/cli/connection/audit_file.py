@@ -1,4 +1,4 @@
-"""Where the audit verbs read: the log's file here. `RestLog` reads the running appliance's, with the same methods."""
+"""Read the audit log from its file in a state directory; `RestLog` has the same methods over REST."""
 
 import os
 import threading
@@ -10,8 +10,8 @@ from appliance.audit.chain_proofs import evidence, evidence_line
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter
-from appliance.audit.record_format import Entry
-from appliance.audit.search import Follower, Page, Shown, export, last_sequence, search, show
+from appliance.audit.record_format import LogEntry
+from appliance.audit.search import Follower, RecordInContext, SearchPage, export, last_sequence, search, show
 from appliance.audit.verification import verify
 
 _POLL_SECONDS = 0.2
@@ -19,9 +19,9 @@ Progress = Callable[[int], None]
 
 
 class FileLog:
-    """The log in a state directory; works while the appliance runs, when it is stopped, and on a copy.
+    """The log in a state directory of a running or stopped appliance, or in a copy of one.
 
-    All raise `LogUnreadableError`, those of `RestLog` `NotRunningError`.
+    All methods raise `LogUnreadableError`.
     """
 
     def __init__(self, state: Path) -> None:
@@ -31,30 +31,30 @@ class FileLog:
     def _path(self) -> Path:
         if not self._state.is_dir():
             raise LogUnreadableError(
-                f"{self._state}: no such directory; is the state directory right (--state)?"
+                f"{self._state}: no such directory; give the appliance's state directory with --state"
             )
         return self._state / "control" / "audit.db"
 
-    def search(self, wanted: Filter, cursor: str | None, limit: int, *, newest_first: bool) -> Page:
-        """A page of records."""
+    def search(self, wanted: Filter, cursor: str | None, limit: int, *, newest_first: bool) -> SearchPage:
+        """Return at most `limit` records from `cursor` on."""
         return search(self._path, wanted, cursor, limit, newest_first=newest_first)
 
-    def show(self, record_id: str, neighbours: int) -> Shown | None:
-        """One record with its neighbours; None when there is none."""
+    def show(self, record_id: str, neighbours: int) -> RecordInContext | None:
+        """Return one record with its neighbours; None if the log has no such record."""
         return show(self._path, record_id, neighbours)
 
-    def export(self, wanted: Filter) -> Iterator[Entry]:
-        """All records that match, the oldest first."""
+    def export(self, wanted: Filter) -> Iterator[LogEntry]:
+        """Yield all records that match, the oldest first."""
         return export(self._path, wanted)
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
-        """The same as evidence: sequences, and lines of NDJSON with their places in the chain."""
+        """Yield the sequence and the NDJSON line of all matching records, oldest first."""
         return (
             (entry.sequence, evidence_line(entry, chain)) for entry, chain in evidence(self._path, wanted)
         )
 
-    def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[Entry]]:
-        """The last records that match, the oldest first; then, if `on`, those that come, without end."""
+    def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:
+        """Yield the last matching records, oldest first; then, if `on`, new ones without end."""
         path = self._path
         follower = Follower(path, wanted)
         if lines:
@@ -67,9 +67,9 @@ class FileLog:
     def verify(
         self, key: bytes | None, copies: Sequence[SignedCheckpoint] | None, progress: Progress
     ) -> Verification:
-        """Whether it is complete and unchanged, held against the signer's memory if that can be read.
+        """Verify the log, also against the signer's own records if they are readable.
 
-        `progress` is told the sequence that was looked at last.
+        `progress` is called with the sequence verified last.
         """
         path = self._path
         signer = path.parent.parent / "signer"
@@ -77,9 +77,9 @@ class FileLog:
         return verify(path, key, signer if may else None, copies, progress)
 
     def checkpoints(self, after: int) -> list[SignedCheckpoint]:
-        """Signed checkpoints after a number, in order; some of them, none when there is no more."""
+        """Return some of the signed checkpoints after a number, in order; empty at the end."""
         return signed_checkpoints(self._path, after)
 
     def last(self) -> int:
-        """The sequence of the last record."""
+        """Return the sequence of the last record; 0 for an empty log."""
         return last_sequence(self._path)

@@ -1,0 +1,1 @@
+"""The connection to a running appliance: its admin socket, or REST."""

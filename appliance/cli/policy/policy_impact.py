@@ -1,0 +1,64 @@
+"""Compute the impact of a policy on the running appliance, for `rosrv policy check --state` (or `--api`).
+
+Over the socket this program checks the policy with the hosts, robot and test cases that a reload would use. Over REST
+the appliance does a dry run.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from msgspec.structs import asdict
+
+from appliance.channel.admin import AdminAnswer, PolicyWanted
+from appliance.cli.connection.target import Appliance
+from appliance.cli.policy.policy_input import known_of, live_now, read_text
+from appliance.policy.judgement import PolicyContext, judge
+from appliance.policy.live_rights import Ending, endings
+from appliance.policy.policy_findings import FindingSeverity, PolicyError, PolicyFinding
+from appliance.signing.site_keys import read_signature
+
+
+@dataclass(frozen=True)
+class PolicyImpact:
+    """The errors and warnings of a policy, and the live connections that it would end."""
+
+    findings: list[PolicyFinding]
+    ends: list[Ending]
+
+
+def impact_of(
+    appliance: Appliance, file: Path, robot: list[str] | None, enrolled: list[str] | None
+) -> PolicyImpact:
+    """Check a policy; `robot` and `enrolled` override what the appliance knows. Raises `NotRunningError`."""
+    if appliance.place is not None:
+        return _by_dry_run(appliance, file)
+    known = known_of(robot, enrolled, PolicyContext.of(asdict(appliance.ask(PolicyWanted()).given())))
+    try:
+        policy = judge(read_text(file), str(file), known, read_signature(file)).accepted()
+    except PolicyError as error:
+        return PolicyImpact(error.findings, [])
+    return PolicyImpact(list(policy.warnings), endings(policy, live_now(appliance)))
+
+
+def _by_dry_run(appliance: Appliance, file: Path) -> PolicyImpact:
+    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
+
+    query, text = {"dry_run": "1"}, {"text": read_text(file), "signature": read_signature(file)}
+    try:
+        report = appliance.rest.call("POST", "/v1/policy", params=query, body=text, order=False)
+    except RestProblemError as problem:
+        if problem.findings is None:
+            replace(appliance, as_json=False).body_or_exit(AdminAnswer(False, error=problem.lines[0]))
+            raise
+        return PolicyImpact([_finding(finding, file) for finding in problem.findings], [])
+    warnings = [_finding(row, file) for row in report["warnings"]]
+    return PolicyImpact(warnings, [Ending(**row) for row in report["ends"]])
+
+
+def _finding(given: dict[str, Any], file: Path) -> PolicyFinding:
+    """Convert a finding of REST, which calls the policy's file `policy`."""
+    named = str(file) if given["file"] == "policy" else given["file"]
+    return PolicyFinding(
+        named, given["line"], given["column"], FindingSeverity(given["severity"]), given["text"]
+    )

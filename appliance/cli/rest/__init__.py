@@ -1,1 +1,0 @@
-"""The running appliance asked over REST."""
