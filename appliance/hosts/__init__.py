@@ -1,1 +1,1 @@
-"""The hosts that come through tunnels: their table, certificates, enrolment and tunnels."""
+"""The hosts with an IPsec tunnel: their table, certificates, enrolment and tunnels."""

@@ -1,4 +1,4 @@
-"""Control's questions to the certificate authority, which is in the signer: asked over the link, awaited."""
+"""Send control's requests to the certificate authority, which runs in the signer, and await the answers."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -13,7 +13,7 @@ M = TypeVar("M", messages.AuthorityStated, messages.CertificateMade, messages.Re
 
 
 class AuthorityError(Exception):
-    """There is no answer: `refused` when the authority says no to this request, else it is away."""
+    """Report a request without a result: `refused` if the authority rejected it, else it did not answer."""
 
     def __init__(self, reason: str, *, refused: bool = False) -> None:
         super().__init__(reason)
@@ -21,21 +21,21 @@ class AuthorityError(Exception):
 
 
 class Authority:
-    """The authority; every question raises `AuthorityError` when it is refused or not answered in time."""
+    """A client of the authority; every method raises `AuthorityError` for a rejection or a missing answer."""
 
     def __init__(self, signer: Link) -> None:
         self._signer = signer
 
     async def certificate(self) -> bytes:
-        """The authority's own certificate, in PEM."""
-        return (await self._ask(messages.AuthorityWanted, messages.AuthorityStated)).certificate
+        """Return the authority's own certificate, in PEM."""
+        return (await self._ask(messages.AuthorityRequest, messages.AuthorityStated)).certificate
 
     async def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> messages.CertificateMade:
-        """A certificate in this name for the key of a signing request.
+        """Return a certificate in this name for the key of a signing request.
 
-        `proof`: the request's signature by the key of the certificate `former` (PEM), without which none is made.
+        If `former` (a certificate in PEM) is given, `proof` must be the request's signature by its key.
         """
         return await self._ask(
             lambda number: messages.CertificateWanted(number, request, name, days, proof, former),
@@ -43,10 +43,10 @@ class Authority:
         )
 
     async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
-        """The signed list (PEM) of these: serial number and moment."""
+        """Return the signed list (PEM) of these serial numbers and times of revocation."""
         rows = [messages.RevokedCertificate(serial, moment) for serial, moment in revoked]
         made = await self._ask(
-            lambda number: messages.RevocationsWanted(number, rows), messages.RevocationsMade
+            lambda number: messages.RevocationsRequest(number, rows), messages.RevocationsMade
         )
         return made.revocations
 

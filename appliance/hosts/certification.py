@@ -1,10 +1,9 @@
-"""Certificates of hosts: asked of the signer, kept, told to charon, and given out as what a kit is made of.
+"""Request certificates of hosts from the signer, store them, pass them to charon, and return the parts of kits.
 
 Invariants:
 
-1. What is under way for a name (an enrolment, a renewal) is refused when the name is revoked meanwhile, however it
-   was begun.
-2. Every certificate that is given or taken is recorded.
+1. An enrolment or renewal in progress fails if its name is revoked meanwhile, whether an operator or the host began it.
+2. Every certificate that is issued or revoked is recorded.
 """
 
 import asyncio
@@ -18,9 +17,9 @@ from appliance.channel import admin
 from appliance.channel.answers.host_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
 from appliance.hosts.certificate_requests import Authority, AuthorityError
-from appliance.hosts.enrolment_tokens import Awaited
+from appliance.hosts.enrolment_tokens import EnrolmentTokens
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError, HostTable
-from appliance.hosts.rest_place import RestPlace
+from appliance.hosts.rest_address import RestAddress
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.hosts.view import soon
 from appliance.store.state_file import StateStore
@@ -31,9 +30,9 @@ _SERVED_SECONDS = 10.0
 
 
 class Certification:
-    """What enrolment by an operator and by a host itself have in common.
+    """The common part of enrolment by an operator and by a host itself.
 
-    `changed()` is called when it has changed who is enrolled, and says how much was taken back for that.
+    `changed()` is called after a change of the enrolled hosts; it returns the number of rights revoked for that.
     """
 
     def __init__(
@@ -45,7 +44,7 @@ class Certification:
         tunnels: Tunnels,
         *,
         master_port: int,
-        rest: RestPlace,
+        rest: RestAddress,
         changed: Callable[[], int],
     ) -> None:
         self.store = store
@@ -53,28 +52,28 @@ class Certification:
         self.table = table
         self.tunnels = tunnels
         self.rest = rest
-        self.awaited = Awaited(store.hosts)
+        self.awaited = EnrolmentTokens(store.hosts)
         self.changing = asyncio.Lock()
         self.changed = changed
         self._authority = authority
         self._master_port = master_port
-        self._revocations: Counter[str] = Counter()  # of each name, in this life
+        self._revocations: Counter[str] = Counter()  # of each name, since this process started
         self._warned: set[str] = set()  # serials
         self.pin = ""
         self._served = asyncio.Event()
 
     def served_by(self, pin: str) -> None:
-        """The api says by what hosts recognise it."""
+        """Store the pin by which hosts recognise the api."""
         self.pin = pin
         self._served.set()
 
     def revoked(self, name: str) -> None:
-        """A name is revoked: what is under way for it comes to nothing."""
+        """Note that a name is revoked, so that its orders in progress fail."""
         self._revocations[name] += 1
 
     @contextlib.contextmanager
     def unless_revoked(self, name: str) -> Iterator[None]:
-        """What a block awaits comes to nothing when the name is revoked meanwhile."""
+        """Raise at the end of the block if the name was revoked meanwhile."""
         before = self._revocations[name]
         yield
         if self._revocations[name] != before:
@@ -83,7 +82,7 @@ class Certification:
     async def issue(
         self, name: str, request: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> CertificateMade:
-        """Ask the authority. Raises `HostRefusedError`."""
+        """Return a new certificate from the authority. Raises `HostRefusedError`."""
         self.table.require_room(name)
         try:
             return await self._authority.issue(request.encode(), name, days, proof=proof, former=former)
@@ -91,7 +90,7 @@ class Certification:
             raise HostRefusedError(str(error), ours=not error.refused) from error
 
     def enrolled(self, name: str, address: str, made: CertificateMade, who: str, **more: Any) -> None:
-        """A host has its first certificate, or another after it was revoked."""
+        """Store and record a host's first certificate, or its first one after a revocation."""
         self.awaited.forget(name)
         self.keep(name, address, made)
         self.trail.happened(
@@ -106,7 +105,7 @@ class Certification:
         )
 
     def renewed(self, name: str, before: str, serial: str, expires: float, who: str) -> None:
-        """Record that a host has another certificate in the place of the one before."""
+        """Record that a host has replaced its certificate."""
         self.trail.happened(
             "host renewed",
             f"{name} has a new certificate; its tunnel comes back with it",
@@ -118,15 +117,15 @@ class Certification:
         )
 
     def keep(self, name: str, address: str, made: CertificateMade) -> None:
-        """This is the certificate of the host now; charon and the policy are told."""
+        """Make this the host's certificate, for charon and the policy as well."""
         self.table.keep(name, address, made)
         self.tunnels.state_anew()
         self.changed()
 
     async def finish(self, name: str, kept: dict[str, str] | None = None) -> KitParts:
-        """The answer to an enrolment, when all of it is on the disk and charon knows it; `kept`: with its token.
+        """Wait until an enrolment is on disk and charon has it; return the kit's parts, with a warning without charon.
 
-        Raises `HostRefusedError`, `StoreError`.
+        `kept` are the options stored with the host's token. Raises `HostRefusedError`, `StoreError`.
         """
         try:
             await self.store.settled()
@@ -138,7 +137,7 @@ class Certification:
         return await self.kit(name, warning, kept)
 
     async def kit(self, name: str, warning: str | None, kept: dict[str, str] | None = None) -> KitParts:
-        """What a host's kit is made of. Raises `HostRefusedError`."""
+        """Return the parts of a host's kit. Raises `HostRefusedError`."""
         if self.rest.inner_port is not None and not await self.until_served():
             warning = warning or "REST is not there: the kit cannot renew its certificate by itself"
         authority = await self.authority_certificate()
@@ -163,27 +162,29 @@ class Certification:
             kept=kept or {},
         )
 
+    @admin.answers(admin.RevocationsWanted)
     async def revocations(self, _request: admin.RevocationsWanted) -> RevocationList:
-        """The authority's list of revoked certificates, in PEM. Raises `HostRefusedError`."""
+        """Return the authority's list of revoked certificates, in PEM. Raises `HostRefusedError`."""
         try:
             listed = await self.tunnels.revocations.signed()
         except AuthorityError as error:
             raise HostRefusedError(str(error), ours=True) from error
         return RevocationList(listed.decode())
 
+    @admin.answers(admin.AuthorityWanted)
     async def authority(self, _request: admin.AuthorityWanted) -> AuthorityCertificate:
-        """The authority's certificate, in PEM. Raises `HostRefusedError`."""
+        """Return the authority's certificate, in PEM. Raises `HostRefusedError`."""
         return AuthorityCertificate((await self.authority_certificate()).decode())
 
     async def authority_certificate(self) -> bytes:
-        """The authority's own, in PEM. Raises `HostRefusedError`."""
+        """Return the authority's own certificate, in PEM. Raises `HostRefusedError`."""
         try:
             return await self._authority.certificate()
         except AuthorityError as error:
             raise HostRefusedError(str(error), ours=True) from error
 
     async def until_served(self) -> bool:
-        """Wait until the api, which starts after control, is there; False when it does not come in time."""
+        """Wait for the api, which starts after control; return False if it does not connect in time."""
         try:
             await asyncio.wait_for(self._served.wait(), _SERVED_SECONDS)
         except TimeoutError:
@@ -191,7 +192,7 @@ class Certification:
         return True
 
     def each_hour(self) -> None:
-        """Certificates that follow ended ones count; those that end soon are recorded, once each."""
+        """Replace ended certificates by their stored next ones; record each that ends soon, once."""
         now = time.time()
         self.table.revoked.forget_ended()
         for row in self.table.enrolled():

@@ -1,4 +1,4 @@
-"""Whether machines' ROS ports are closed to all but the appliance, as somebody saw who tried from outside."""
+"""Keep the results of checks from outside: whether a machine's ROS ports are closed to all but the appliance."""
 
 import ipaddress
 import time
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from appliance.audit.record import Severity
 from appliance.channel import admin
-from appliance.channel.answers.host_answers import PortsTold
+from appliance.channel.answers.host_answers import PortsReport
 from appliance.hosts.certification import Certification
 from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.view import HostView
@@ -16,8 +16,8 @@ _CLOCKS_DIFFER = 86_400.0
 _MOST_PORTS = 100
 
 
-class CheckedPorts:
-    """What was told of ports; `machines()` is the number of nodes by address."""
+class PortChecks:
+    """The results of port checks; `machines()` returns the number of nodes by address."""
 
     def __init__(
         self, certification: Certification, view: HostView, machines: Callable[[], dict[str, int]]
@@ -29,8 +29,9 @@ class CheckedPorts:
         self._view = view
         self._machines = machines
 
-    async def tell(self, request: admin.HostPorts, who: str) -> PortsTold:
-        """What somebody saw of a machine's ports from outside. Raises `HostRefusedError`, `HostsChangedError`."""
+    @admin.answers(admin.HostPorts, who=True)
+    async def tell(self, request: admin.HostPorts, who: str) -> PortsReport:
+        """Store and record the result of a check. Raises `HostRefusedError`, `HostsChangedError`."""
         self._table.require(request.expected)
         key, state = self._known_machine(request.name), request.state
         now = time.time()
@@ -50,10 +51,10 @@ class CheckedPorts:
             who=who,
         )
         await self._certification.store.settled()
-        return PortsTold(self._table.revision, key, self._view.ports(key))
+        return PortsReport(self._table.revision, key, self._view.ports(key))
 
     def in_clear_text(self) -> dict[str, int]:
-        """Machines on which nodes run without a tunnel."""
+        """Return the number of nodes on each machine that connects without a tunnel, by address."""
         pool = self._table.pool
         return {
             address: nodes
@@ -67,7 +68,7 @@ class CheckedPorts:
         try:
             address = str(ipaddress.ip_address(name))
         except ValueError:
-            self._table.enrolled_row(name)  # says which there are
+            self._table.enrolled_row(name)  # raises an error that lists the enrolled hosts
             raise
         behind = [tunnel.name for tunnel in self._tunnels.seen.values() if tunnel.remote == address]
         row = self._table.at(address)

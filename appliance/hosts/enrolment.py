@@ -1,13 +1,14 @@
-"""The hosts that come through tunnels, as operators deal with them: enrolled, awaited, given kits, revoked.
+"""Carry out operators' requests about hosts with a tunnel: enrol, issue kits and one-time tokens, revoke.
 
-Each request about hosts is answered by the method that takes it, here, of `itself`, of `ports` or of `Certification`.
+A method here, of `itself`, of `ports` or of `Certification` answers each request.
 
 Invariants:
 
-1. A revoked host is out of the policy, and its registrations are taken back, before anything is awaited.
-2. No answer but the one to `token` has a token in it, and no answer has a private key.
+1. A revocation removes the host from the policy, and its registrations, before it awaits anything.
+2. Only the answer to `token` contains a token, and no answer contains a private key.
 """
 
+import asyncio
 import hashlib
 import ipaddress
 import ssl
@@ -16,26 +17,29 @@ from collections.abc import Awaitable, Callable
 from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
 from appliance.channel.answers import host_answers as answers
+from appliance.channel.answers.host_answers import Endpoint
 from appliance.channel.answers.status import IpsecState
+from appliance.channel.messages import EndpointFound
+from appliance.configuration.settings import Settings
 from appliance.hosts.certification import Certification
-from appliance.hosts.checked_ports import CheckedPorts
+from appliance.hosts.checked_ports import PortChecks
 from appliance.hosts.enrolment_tokens import LONGEST_SECONDS, MOST
 from appliance.hosts.host_table import LONGEST_DAYS, HostRefusedError
 from appliance.hosts.hosts_file import DeclaredHostsError
-from appliance.hosts.self_service import SelfService
+from appliance.hosts.rest_address import NO_TUNNELS
+from appliance.hosts.self_service import HostSelfService
 from appliance.hosts.view import HostView
 from appliance.ipsec.enrolment_kit import filled
 from appliance.policy.model import Address
-from appliance.store.host_tables import AwaitedRow
+from appliance.store.host_tables import EnrolmentTokenRow
 
 
-class Hosts:
-    """All hosts; `itself` is what they do themselves.
+class HostEnrolment:
+    """The operators' requests about hosts; `itself` serves the requests of hosts.
 
-    `expel(address, reason)` takes back what a host has, and says how much that was. `find_endpoint()` finds where hosts
-    reach the appliance, as `appliance.hosts.tunnel_address` has it; `machines()` is the number of nodes by address.
-    `carried_out()` waits until the relays have carried out what they were told: who was told that a host is out finds
-    its connections closed.
+    `expel(address, reason)` removes a host's registrations and grants and returns their number. `find_endpoint()`
+    returns where hosts reach the appliance; `machines()` returns the number of nodes by address. `carried_out()` waits
+    for the relays, so that the connections of an expelled host are closed when the operator gets the answer.
     """
 
     def __init__(
@@ -54,16 +58,17 @@ class Hosts:
         self._tunnels = certification.tunnels
         self._awaited = certification.awaited
         self._view = HostView(self._table, self._awaited, self._tunnels)
-        self.itself = SelfService(certification)
-        self.ports = CheckedPorts(certification, self._view, machines)
+        self.itself = HostSelfService(certification)
+        self.ports = PortChecks(certification, self._view, machines)
         self._find_endpoint = find_endpoint
         self._expel = expel
         self._carried_out = carried_out
 
     # --- what others ask ---
 
+    @admin.answers(admin.HostList)
     async def listed(self, _request: admin.HostList) -> answers.Hosts:
-        """Every host and machine, and how the tunnels stand."""
+        """Return every host and machine, and the state of the tunnels."""
         machines = self.ports.in_clear_text()
         status = self._view.status(machines)
         return answers.Hosts(
@@ -74,26 +79,29 @@ class Hosts:
         )
 
     def status(self) -> IpsecState:
-        """For `rosrv status`."""
+        """Return the state of the tunnels for `rosrv status`."""
         return self._view.status(self.ports.in_clear_text())
 
     def rows(self) -> list[answers.Host]:
-        """Every host, enrolled, awaited or declared."""
+        """Return every host, enrolled, awaited or declared."""
         return self._view.rows()
 
+    @admin.answers(admin.HostEndpoint)
     async def endpoint(self, _request: admin.HostEndpoint) -> answers.Endpoint:
-        """Where hosts reach the appliance."""
+        """Return the address at which hosts reach the appliance."""
         return await self._find_endpoint()
 
+    @admin.answers(admin.HostKit)
     async def kit(self, request: admin.HostKit) -> answers.KitParts:
-        """What an enrolled host's kit is made of now. Raises `HostRefusedError`."""
+        """Return the parts of an enrolled host's kit. Raises `HostRefusedError`."""
         self._table.enrolled_row(request.name)
         return await self._certification.kit(request.name, None)
 
     # --- what operators do ---
 
+    @admin.answers(admin.HostAdd, who=True)
     async def add(self, request: admin.HostAdd, who: str) -> answers.KitParts:
-        """Enrol a host; what its kit is made of. Raises `HostRefusedError`, `HostsChangedError`."""
+        """Enrol a host; return the parts of its kit. Raises `HostRefusedError`, `HostsChangedError`."""
         name = request.name
         async with self._certification.changing:
             self._table.require(request.expected)
@@ -107,8 +115,9 @@ class Hosts:
             self._certification.enrolled(name, wanted, made, who)
             return await self._certification.finish(name)
 
+    @admin.answers(admin.HostRenew, who=True)
     async def renew(self, request: admin.HostRenew, who: str) -> answers.KitParts:
-        """A new certificate for a host, the one before revoked. Raises as `add`."""
+        """Replace and revoke a host's certificate; return the parts of its kit. Raises as `add`."""
         name = request.name
         async with self._certification.changing:
             self._table.require(request.expected)
@@ -121,8 +130,9 @@ class Hosts:
             self._certification.renewed(name, row.serial, made.serial, made.expires, who)
             return await self._certification.finish(name)
 
+    @admin.answers(admin.HostToken, who=True)
     async def token(self, request: admin.HostToken, who: str) -> answers.EnrolmentToken:
-        """A one-time token for a host. Raises as `add`."""
+        """Return a one-time token for a host. Raises as `add`."""
         name = request.name
         found = answers.Endpoint(request.endpoint, "") if request.endpoint else await self._find_endpoint()
         async with self._certification.changing:
@@ -167,8 +177,8 @@ class Hosts:
             await self._store.settled()
             place = f"[{found.endpoint}]" if ":" in found.endpoint else found.endpoint
             url = f"https://{place}:{self._certification.rest.port}"
-            # The script makes the key on the host, which it never leaves, and has no token. It knows the appliance by
-            # the pin of REST's key and the fingerprint of the authority: who stands in between gets and gives nothing.
+            # The script contains no token and makes the key on the host, which the key never leaves. It checks the pin
+            # of REST's key and the fingerprint of the authority, so a host in between learns nothing.
             known = {"url": url, "pin": self._certification.pin, "authority": _fingerprint(authority)}
             return answers.EnrolmentToken(
                 revision=self._table.revision,
@@ -182,8 +192,9 @@ class Hosts:
                 script=filled("enrol.sh", {"name": name, **known}),
             )
 
+    @admin.answers(admin.HostRevoke, who=True)
     async def revoke(self, request: admin.HostRevoke, who: str) -> answers.Revoked:
-        """Let a host in no more and cut what it has; or await it no longer. Raises as `add`."""
+        """Revoke an enrolled host and close its connections, or revoke an awaited host's token. Raises as `add`."""
         name = request.name
         self._table.require(request.expected)
         self._certification.revoked(name)
@@ -210,8 +221,9 @@ class Hosts:
         await self._carried_out()
         return answers.Revoked(self._table.revision, name, row.address, row.serial, taken)
 
+    @admin.answers(admin.HostsReload, who=True)
     async def reload(self, request: admin.HostsReload, who: str) -> answers.Reloaded:
-        """Read hosts.yaml again: which tunnels are wanted. Raises as `add`; a bad file changes nothing."""
+        """Read hosts.yaml again and open or close tunnels. Raises as `add`; an invalid file changes nothing."""
         self._table.require(request.expected)
         before = {row.name for row in self._table.admitted()}
         try:
@@ -229,7 +241,7 @@ class Hosts:
             taken += self._expel(address, f"hosts.yaml no longer wants the tunnel of {name}")
         meant = self._tunnels.addresses
         await self._tunnels.start()
-        if self._tunnels.addresses != meant:  # the first tunnel of all: only now is clear text kept out
+        if self._tunnels.addresses != meant:  # the first tunnel: only now does the firewall block clear text
             taken += self._certification.changed()
         divergence = [f"{row.name}: {row.divergence}" for row in self._view.rows() if row.divergence]
         self._trail.happened(
@@ -257,7 +269,7 @@ class Hosts:
                 f"{name} is enrolled already: `rosrv host kit {name}` gives it a new certificate"
             )
 
-    async def _await_no_longer(self, awaited: AwaitedRow, who: str) -> answers.Revoked:
+    async def _await_no_longer(self, awaited: EnrolmentTokenRow, who: str) -> answers.Revoked:
         self._table.changed()
         self._trail.happened(
             "host awaited no longer",
@@ -271,8 +283,34 @@ class Hosts:
 
 
 def _fingerprint(certificate: bytes) -> str:
-    """SHA-256 of a certificate (PEM), in hexadecimal."""
+    """Return the SHA-256 of a certificate (PEM), in hexadecimal."""
     return hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate.decode("ascii"))).hexdigest()
 
 
 _OVERVIEW = ("esp", "key_exchange", "post_quantum", "pool", "address", "hosts_file", "troubles")
+
+
+_ENDPOINT_SECONDS = 20.0
+
+
+async def find_endpoint(settings: Settings, look: Callable[[], Awaitable[EndpointFound]]) -> Endpoint:
+    """Return the configured address at which hosts reach the appliance, else the one that the supervisor found.
+
+    Raises `HostRefusedError` with the options that set the address.
+    """
+    if settings.isolation == "none":
+        raise HostRefusedError(NO_TUNNELS)
+    configured = settings.ipsec.endpoint
+    if configured is not None:
+        return Endpoint(configured, "ipsec.endpoint of the configuration")
+    try:
+        found = await asyncio.wait_for(look(), _ENDPOINT_SECONDS)
+    except TimeoutError:
+        raise HostRefusedError("the supervisor did not answer: try again", ours=True) from None
+    if found.address is None:
+        raise HostRefusedError(
+            f"at which address the host reaches the appliance cannot be told: {found.reason}; give it:"
+            " --appliance ADDRESS (REST: `endpoint`), or for all hosts `ipsec: {endpoint: ADDRESS}` in appliance.yaml"
+            " (compose: ROSRV_ENDPOINT=ADDRESS in .env)"
+        )
+    return Endpoint(found.address, found.reason)

@@ -1,11 +1,9 @@
-"""The table of hosts that come through tunnels: names, addresses, certificates. What is kept, no questions to anybody.
+"""The table of hosts with a tunnel: names, addresses, certificates. It only keeps state.
 
-Invariants:
-
-1. A name has one virtual address for good; the address of a revoked host is given to no other, nor is one that is
-   kept for an awaited or declared host.
-2. A certificate that is no longer its host's is among the revoked ones, from the same moment on.
-3. `revision` grows with every change that an operator or a host made, over restarts too.
+1. A name keeps its virtual address for good: no other host gets it, even after a revocation. An address promised with a
+   token is also reserved; one that hosts.yaml declares goes to another host only on request.
+2. A replaced or revoked certificate is on the list of revoked certificates at once.
+3. `revision` grows with every change by an operator or a host, also across restarts.
 """
 
 import datetime
@@ -15,9 +13,15 @@ import re
 import time
 
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
-from appliance.hosts.hosts_file import Declared
+from appliance.hosts.hosts_file import DeclaredHosts
 from appliance.hosts.revoked_certificates import RevokedCertificates
-from appliance.store.host_tables import CertificateRow, HostRow, NextCertificate, PortsRow, RevokedRow
+from appliance.store.host_tables import (
+    CertificateRow,
+    HostRow,
+    NextCertificate,
+    PortsRow,
+    RevokedCertificateRow,
+)
 from appliance.store.state_file import StateStore
 
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
@@ -28,7 +32,7 @@ MOST_MACHINES = 1024
 
 
 class HostRefusedError(Exception):
-    """It is not done; the text says why. `ours`: the appliance cannot do it now."""
+    """Report a rejected request, with the reason. `ours`: the appliance cannot carry it out now."""
 
     def __init__(self, reason: str, *, ours: bool = False) -> None:
         super().__init__(reason)
@@ -36,21 +40,21 @@ class HostRefusedError(Exception):
 
 
 class UnknownHostError(HostRefusedError):
-    """There is no such host."""
+    """Report an unknown host."""
 
 
 class HostForbiddenError(HostRefusedError):
-    """Whoever asks may not."""
+    """Report a request that the caller may not make."""
 
 
 class HostsChangedError(Exception):
-    """A change was meant for another state of the table."""
+    """Report a change that was meant for another revision of the table."""
 
 
 class HostTable:
     """All hosts that were ever enrolled; `own_address` is the appliance's, the first of the pool."""
 
-    def __init__(self, store: StateStore, pool: ipaddress.IPv4Network, declared: Declared) -> None:
+    def __init__(self, store: StateStore, pool: ipaddress.IPv4Network, declared: DeclaredHosts) -> None:
         self._store = store
         self._kept = store.hosts
         self.pool = pool
@@ -63,31 +67,31 @@ class HostTable:
 
     @property
     def own_address(self) -> str:
-        """The appliance's address in the tunnels."""
+        """Return the appliance's address in the tunnels."""
         return str(self.pool.network_address + 1)
 
     def require(self, expected: int | None) -> None:
-        """Raises `HostsChangedError` when a change is meant for another revision."""
+        """Raise `HostsChangedError` if a change is meant for another revision."""
         if expected not in (None, self.revision):
             raise HostsChangedError(f"the table of hosts has revision {self.revision}, not {expected}")
 
     def changed(self) -> None:
-        """Somebody has changed something."""
+        """Note a change of the table."""
         self.revision += 1
         self._store.save_setting(_REVISION, str(self.revision))
 
-    # --- who is in it ---
+    # --- hosts in the table ---
 
     def enrolled(self) -> list[HostRow]:
-        """Hosts with a certificate that was not revoked."""
+        """Return the hosts with a certificate that was not revoked."""
         return [row for row in self.rows.values() if row.revoked is None]
 
     def admitted(self) -> list[HostRow]:
-        """Those of them whose tunnel hosts.yaml wants, or does not know."""
+        """Return the enrolled hosts, without those whose tunnel hosts.yaml closes."""
         return [row for row in self.enrolled() if self.declared.wants(row.name)]
 
     def enrolled_row(self, name: str) -> HostRow:
-        """A host that is enrolled. Raises `UnknownHostError`."""
+        """Return an enrolled host. Raises `UnknownHostError`."""
         row = self.rows.get(name)
         if row is None or row.revoked is not None:
             known = ", ".join(host.name for host in self.enrolled()[:20]) or "none"
@@ -95,19 +99,19 @@ class HostTable:
         return row
 
     def at(self, address: str) -> HostRow | None:
-        """The enrolled host with this virtual address."""
+        """Return the enrolled host with this virtual address."""
         return next((row for row in self.enrolled() if row.address == address), None)
 
-    def listed_as_revoked(self) -> list[RevokedRow]:
-        """What is on the list of revoked certificates."""
+    def listed_as_revoked(self) -> list[RevokedCertificateRow]:
+        """Return the list of revoked certificates."""
         return self.revoked.listed(self._enrolled_names())
 
     def missing_as_revoked(self) -> int:
-        """How many certificates that enrolled hosts had before are not on it, for it is full."""
+        """Return the number of enrolled hosts' revoked certificates that the full list leaves out."""
         return self.revoked.missing(self._enrolled_names())
 
     def require_room(self, name: str) -> None:
-        """Raises `HostRefusedError` when no other certificate of this name could be listed as revoked."""
+        """Raise `HostRefusedError` if the list of revoked certificates has no room for another one of this name."""
         if name not in self.rows:
             return
         until = self.revoked.wait_for_room(self._enrolled_names() | {name})
@@ -121,10 +125,10 @@ class HostTable:
     def _enrolled_names(self) -> set[str]:
         return {row.name for row in self.enrolled()}
 
-    # --- what can be had ---
+    # --- names and addresses ---
 
     def require_name(self, name: str) -> None:
-        """Raises `HostRefusedError` when no host can have this name, or there are too many."""
+        """Raise `HostRefusedError` if a host cannot have this name, or there are too many hosts."""
         if not _NAME.fullmatch(name) or name.lower() == APPLIANCE_NAME:
             raise HostRefusedError(
                 f"{name[:80]!r} is no name for a host: letters, digits and . _ -, beginning and ending with a"
@@ -139,7 +143,7 @@ class HostTable:
             raise HostRefusedError(f"there are {MOST_HOSTS} hosts, revoked ones counted: the table is full")
 
     def address_for(self, name: str, wanted: str | None, awaited: dict[str, str]) -> str:
-        """The address that a host shall have; `awaited` has those promised to others, with their names.
+        """Return the address for a host; `awaited` has the addresses reserved for others, with their names.
 
         Raises `HostRefusedError`.
         """
@@ -174,7 +178,7 @@ class HostTable:
     # --- changes ---
 
     def keep(self, name: str, address: str, made: CertificateMade) -> HostRow:
-        """A host has this certificate now, and no other."""
+        """Make this the only certificate of a host."""
         before, now = self.rows.get(name), time.time()
         if before is not None and before.revoked is None:
             self._revoke_certificates(before)
@@ -185,7 +189,7 @@ class HostTable:
         return row
 
     def keep_next(self, name: str, made: CertificateMade) -> None:
-        """A host was given a certificate that is to follow its present one."""
+        """Store the certificate that will follow a host's present one."""
         row = self.certificates.get(name)
         before = row.certificate if row is not None else ""
         since = row.made if row is not None else time.time()
@@ -196,7 +200,7 @@ class HostTable:
         self.changed()
 
     def take_next(self, name: str) -> HostRow | None:
-        """The certificate that was to follow is the host's now; None when there is none."""
+        """Replace a host's certificate by the stored next one; return None if there is none."""
         row, certificate = self.rows[name], self.certificates.get(name)
         if certificate is None or certificate.next is None:
             return None
@@ -208,14 +212,14 @@ class HostTable:
         return taken
 
     def revoke(self, name: str) -> HostRow:
-        """No certificate of this host is good any more."""
+        """Revoke all certificates of a host."""
         row = self.enrolled_row(name)
         self._revoke_certificates(row)
         self.changed()
         return self._set(row._replace(revoked=time.time()))
 
     def keep_ports(self, row: PortsRow) -> None:
-        """What somebody saw of a machine's ports. Raises `HostRefusedError`."""
+        """Keep the result of a check of a machine's ports. Raises `HostRefusedError`."""
         if row.name not in self.ports and len(self.ports) >= MOST_MACHINES:
             raise HostRefusedError(f"the ports of {MOST_MACHINES} machines are known: that is the limit")
         self.ports[row.name] = row

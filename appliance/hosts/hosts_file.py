@@ -1,12 +1,12 @@
-"""`ipsec/hosts.yaml`: the hosts that are meant to be enrolled. Read at start and on reload, never written.
+"""Read `ipsec/hosts.yaml`, the hosts that are meant to be enrolled, at start and on reload. It is never written.
 
 hosts:
   - name: ocu-1
-    address: 10.113.11.20   # optional: kept for it
+    address: 10.113.11.20   # optional: reserved for it
     groups: [operators]     # optional
     tunnel: true            # false: enrolled or not, its tunnel stays closed
 
-A file that cannot be understood changes nothing: what was read before holds, and the status says so.
+An invalid file changes nothing: the hosts that were read before stay declared, and the status reports the error.
 """
 
 import re
@@ -30,7 +30,7 @@ _GROUP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
 class DeclaredHostsError(Exception):
-    """The file cannot be understood; the text says where, why, and what to write."""
+    """Report an invalid file; the text says where, why, and what to write."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class DeclaredHost:
     wanted: bool = True
 
 
-class Declared:
-    """What the file said when it was last understood; `error` says why it is not what the file says now."""
+class DeclaredHosts:
+    """The content of the file when it was last valid; `error` is the reason if it is invalid now."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -57,11 +57,11 @@ class Declared:
 
     @property
     def there(self) -> bool:
-        """Whether anything is declared: without that nothing diverges from it."""
+        """Whether any host is declared; otherwise no host can diverge from the file."""
         return bool(self.hosts)
 
     def reload(self) -> None:
-        """Read the file again. Raises `DeclaredHostsError`; what was read before holds then."""
+        """Read the file again. Raises `DeclaredHostsError`; the earlier content is then kept."""
         try:
             self.hosts = read_declared(self.path)
         except DeclaredHostsError as error:
@@ -76,7 +76,7 @@ class Declared:
 
 
 def read_declared(path: Path) -> dict[str, DeclaredHost]:
-    """The declared hosts by name; none when there is no file. Raises `DeclaredHostsError`."""
+    """Return the declared hosts by name; none without a file. Raises `DeclaredHostsError`."""
     try:
         text = read_given_text(path)
     except FileNotFoundError:
@@ -143,7 +143,7 @@ _KEYS: dict[str, Callable[[object], object]] = {
 
 
 class _Reading:
-    """The hosts that were found in the file, and every mistake in it with its line and column."""
+    """The hosts found in the file, and each mistake with its line and column."""
 
     def __init__(self) -> None:
         self.found: dict[str, DeclaredHost] = {}

@@ -1,20 +1,20 @@
-"""The certificates that are no longer their hosts': kept until long after their end, and chosen for the list (CRL).
+"""Keep revoked certificates until long after their end, and select those for the revocation list (CRL).
 
 Invariants:
 
-1. A revoked certificate is on the list until a day after its own end. It is forgotten a good year later: a clock that
-   stood too late for a while, and is set back, lets none in again.
-2. The list fits into one value of vici (65,535 bytes, DER): a longer one, charon and swanctl do not take. Where that is
-   too little, certificates of names that are not enrolled are left out, for which charon has no configuration that
-   could match; and `require_room` refuses to replace certificates before the others need more.
+1. A revoked certificate is on the list until a day after its own end. It is deleted more than a year later, so that it
+   stays revoked if a clock that was ahead for a while is set back.
+2. The list fits into one value of vici (65,535 bytes in DER), because charon and swanctl reject a longer one. A list
+   that would be longer leaves out certificates of hosts that are not enrolled: charon has no connection that matches
+   them. Before the others need more room, `require_room` rejects the replacement of certificates.
 """
 
 import time
 from collections.abc import Iterable, Set
 
-from appliance.store.host_tables import HostTables, RevokedRow
+from appliance.store.host_tables import HostTables, RevokedCertificateRow
 
-AFTER_END_SECONDS = 86_400.0  # that clocks may differ by
+AFTER_END_SECONDS = 86_400.0  # the difference of clocks that is tolerated
 _KEPT_SECONDS = 400 * 86_400.0  # after the end
 ENTRIES_BYTES = 64_000  # of 65,535: names, extensions and the signature take less than 1,000
 _ENTRY_BYTES = 21  # besides the serial number
@@ -22,7 +22,7 @@ _AT_ONCE_BYTES = 2 * (_ENTRY_BYTES + 20)  # a certificate, and the one that was 
 
 
 class RevokedCertificates:
-    """All of them that count; `enrolled` are the names whose certificates charon takes."""
+    """The revoked certificates; `enrolled` are the names whose certificates charon accepts."""
 
     def __init__(self, kept: HostTables) -> None:
         self._kept = kept
@@ -30,14 +30,14 @@ class RevokedCertificates:
         self.forget_ended()
 
     def add(self, name: str, serial: str, expires: float) -> None:
-        """A certificate is its host's no more."""
-        row = RevokedRow(serial, name, time.time(), expires)
+        """Add a revoked certificate, once."""
+        row = RevokedCertificateRow(serial, name, time.time(), expires)
         if serial not in self._rows:
             self._rows[serial] = row
             self._kept.save_revoked(row)
 
     def forget_ended(self) -> None:
-        """Those that nobody could use any more, whatever time it is, are not kept."""
+        """Delete certificates that ended so long ago that no wrong clock could accept them."""
         before = time.time() - _KEPT_SECONDS
         ended = [row.serial for row in self._rows.values() if row.expires < before]
         for serial in ended:
@@ -45,8 +45,8 @@ class RevokedCertificates:
         if ended:
             self._kept.forget_revoked(before)
 
-    def listed(self, enrolled: Set[str]) -> list[RevokedRow]:
-        """What is on the list, the latest first."""
+    def listed(self, enrolled: Set[str]) -> list[RevokedCertificateRow]:
+        """Return the rows of the list, the last revoked first."""
         rows = self._not_ended()
         if _bytes_of(rows) > ENTRIES_BYTES:
             rows = [row for row in rows if _matters(row, enrolled)]
@@ -59,7 +59,7 @@ class RevokedCertificates:
         return kept
 
     def missing(self, enrolled: Set[str]) -> int:
-        """How many of enrolled names should be on the list and are not."""
+        """Return the number of certificates of enrolled names that the list has no room for."""
         rows = self._not_ended()
         if _bytes_of(rows) <= ENTRIES_BYTES:
             return 0
@@ -67,20 +67,20 @@ class RevokedCertificates:
         return sum(_matters(row, enrolled) and row.serial not in on_it for row in rows)
 
     def wait_for_room(self, enrolled: Set[str]) -> float:
-        """0 when another certificate of these names can be replaced, else when the next one leaves the list (epoch)."""
+        """Return 0 if another certificate of these names may be replaced, else the time when the list next has room."""
         rows = [row for row in self._not_ended() if _matters(row, enrolled)]
         if _bytes_of(rows) + _AT_ONCE_BYTES <= ENTRIES_BYTES:
             return 0.0
         return min(row.expires for row in rows) + AFTER_END_SECONDS
 
-    def _not_ended(self) -> list[RevokedRow]:
+    def _not_ended(self) -> list[RevokedCertificateRow]:
         before = time.time() - AFTER_END_SECONDS
         return [row for row in self._rows.values() if row.expires >= before]
 
 
-def _matters(row: RevokedRow, enrolled: Set[str]) -> bool:
+def _matters(row: RevokedCertificateRow, enrolled: Set[str]) -> bool:
     return not row.name or row.name in enrolled
 
 
-def _bytes_of(rows: Iterable[RevokedRow]) -> int:
+def _bytes_of(rows: Iterable[RevokedCertificateRow]) -> int:
     return sum(_ENTRY_BYTES + int(row.serial, 16).bit_length() // 8 + 1 for row in rows)

@@ -1,15 +1,13 @@
-"""What a host does itself: enrols with its one-time token, renews its certificate through its tunnel.
+"""Serve a host's own requests: enrol with a one-time token, renew its certificate through its tunnel.
 
-Invariants:
-
-1. A token is used up before the authority is asked, and is good again when no certificate was made: its bearer may
-   come with a better request. When its name was revoked meanwhile it is good for nothing any more.
-2. Who renews is at the virtual address of the name he says, which the firewall takes through IPsec only, and has the
+1. A token is used up before the authority is asked. If no certificate was issued, it is valid again, so that its bearer
+   can correct the request, unless its name was revoked meanwhile.
+2. A host that renews must have the virtual address of its name, which the firewall accepts through IPsec only, and the
    name's present key.
-3. Until the host says that the next certificate is in place, the present one is good: a host that is cut off in the
-   middle comes back with either.
-4. A host renews at most 20 times in the life of its certificate, over restarts too: each time makes the list of
-   revoked certificates longer.
+3. The present certificate is valid until the host reports that the next one is installed. So a host that is cut off in
+   between can use either.
+4. A host can renew once in a twentieth of its certificate's life, also across restarts, because each renewal makes the
+   list of revoked certificates longer.
 """
 
 import asyncio
@@ -26,12 +24,12 @@ from appliance.hosts.view import span
 from appliance.store.host_tables import HostRow
 
 _ANSWER_SECONDS = 1.0  # until the answer to a host has left through its tunnel
-_RENEWALS = 20  # in the life of a certificate: each leaves one on the list of revoked ones
+_RENEWALS = 20  # in the life of a certificate: each adds one to the list of revoked certificates
 _RENEWED = "hosts.renewed."
 
 
-class SelfService:
-    """Serves hosts."""
+class HostSelfService:
+    """Serves the requests that hosts make for themselves."""
 
     def __init__(self, certification: Certification) -> None:
         self._certification = certification
@@ -45,8 +43,9 @@ class SelfService:
             if name.startswith(_RENEWED)
         }
 
+    @admin.answers(admin.HostEnrol)
     async def enrol(self, request: admin.HostEnrol) -> KitParts:
-        """A host brings its one-time token and a signing request. Raises `HostRefusedError`."""
+        """Enrol a host by its one-time token and a signing request. Raises `HostRefusedError`."""
         async with self._certification.changing:
             try:
                 awaited = self._certification.awaited.take(request.token)
@@ -69,8 +68,9 @@ class SelfService:
             )
             return await self._certification.finish(name, awaited.kit)
 
+    @admin.answers(admin.HostRenewItself)
     async def renew(self, request: admin.HostRenewItself) -> NewCertificate:
-        """A host asks in its tunnel for its next certificate. Raises `HostRefusedError`."""
+        """Issue the next certificate to a host that asks through its tunnel. Raises `HostRefusedError`."""
         name = request.name
         async with self._certification.changing:
             row = self._in_its_tunnel(name, request.peer)
@@ -96,8 +96,9 @@ class SelfService:
                 name, made.serial, made.expires, made.certificate.decode(), authority.decode()
             )
 
+    @admin.answers(admin.HostRenewed)
     async def renewed(self, request: admin.HostRenewed) -> Renewed:
-        """A host has put its next certificate in place. Raises `HostRefusedError`."""
+        """Put a host's next certificate in force, once the host has installed it. Raises `HostRefusedError`."""
         name = request.name
         before = self._in_its_tunnel(name, request.peer).serial
         row = self._table.take_next(name)
@@ -122,7 +123,7 @@ class SelfService:
     def _require_patience(self, name: str, life: float) -> None:
         wait = life / _RENEWALS
         since = time.time() - self._renewals.get(name, -wait)
-        if 0 <= since < wait:  # a clock that was set back makes nobody wait
+        if 0 <= since < wait:  # a clock that was set back delays no request
             raise HostRefusedError(f"{name} renewed {span(since)} ago: again in {span(wait - since)}")
 
     def _note_renewal(self, name: str) -> None:

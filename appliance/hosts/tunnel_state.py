@@ -1,12 +1,12 @@
-"""The tunnels as they stand: the firewall around them, what charon is told, what it tells.
+"""Keep the state of the tunnels: their firewall, the configuration for charon, and charon's reports.
 
 Invariants:
 
-1. `open` first has the supervisor take the pool's addresses through IPsec only; before that, `enclosed` is False
-   and `addresses` is empty: where clear text is not kept out, they stand for nobody.
-2. What charon is to have is stated whole each time, in the order in which it came about.
-3. Every tunnel that comes up, moves, goes down or is refused is recorded; packets that charon dropped are counted.
-4. A certificate's end is the end of its tunnel.
+1. `open` first makes the supervisor accept the pool's addresses through IPsec only. Before that, `enclosed` is False
+   and `addresses` is empty: an address that also works in clear text does not identify a host.
+2. charon gets the complete wanted state each time, in the order of the changes.
+3. Every tunnel that comes up, moves, goes down or is rejected is recorded; packets that charon dropped are counted.
+4. A tunnel is closed when its certificate ends.
 """
 
 import asyncio
@@ -22,7 +22,6 @@ from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 from appliance.hosts.certificate_requests import Authority, AuthorityError
 from appliance.hosts.host_table import HostRefusedError, HostTable
-from appliance.hosts.revocation_list import RevocationList
 from appliance.policy.model import Address
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -33,10 +32,32 @@ _TAKEN_SECONDS = 10.0
 _RESTATE_SECONDS = 3600.0
 _AGAIN_SECONDS = 5.0
 _JUST_AFTER_SECONDS = 0.1
+_SIGNED_SECONDS = 60.0
+
+
+class SignedRevocations:
+    """The signed list of revoked certificates; it is signed again after a change of the table of hosts, or a minute."""
+
+    def __init__(self, table: HostTable, authority: Authority) -> None:
+        self._table = table
+        self._authority = authority
+        self._one_at_a_time = asyncio.Lock()
+        self._state = (0, 0)
+        self._signed = b""
+
+    async def signed(self) -> bytes:
+        """Return the list in PEM. Raises `AuthorityError`."""
+        async with self._one_at_a_time:
+            state = (self._table.revision, int(time.time() // _SIGNED_SECONDS))
+            if state != self._state:
+                rows = self._table.listed_as_revoked()
+                self._signed = await self._authority.revocations([(row.serial, row.moment) for row in rows])
+                self._state = state
+            return self._signed
 
 
 class Tunnels:
-    """All tunnels."""
+    """The tunnels of the enrolled hosts."""
 
     def __init__(
         self,
@@ -52,7 +73,7 @@ class Tunnels:
         self._authority = authority
         self._listen = listen
         self._say = say
-        self.revocations = RevocationList(table, authority)
+        self.revocations = SignedRevocations(table, authority)
         self.seen: dict[str, messages.TunnelSeen] = {}
         self.last: dict[str, float] = {}
         self.charon: messages.CharonStarted | None = None
@@ -62,11 +83,12 @@ class Tunnels:
         self._link = Link(self._received, self._lost)
         self._certificate: bytes | None = None
         self._dirty = asyncio.Event()
-        # Of the last statement: no number of an earlier life, which charon's process may still report, comes again.
+        # The number of the last statement. A clock's value does not repeat numbers of an earlier process, which may
+        # still be reported.
         self._number = time.time_ns()
         self._wake = asyncio.Event()
-        self._changes = 0  # that charon is to be told
-        self._stated: dict[int, int] = {}  # statements on their way, by number: which change they have last
+        self._changes = 0  # for charon
+        self._stated: dict[int, int] = {}  # unconfirmed statements: the last change that each includes
         self._taken_changes = 0
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -74,28 +96,28 @@ class Tunnels:
 
     @property
     def enclosed(self) -> bool:
-        """Whether the pool's addresses are taken through IPsec only."""
+        """Whether the firewall accepts the pool's addresses through IPsec only."""
         return self.esp is not None
 
     @property
     def esp(self) -> messages.Esp | None:
-        """Where ESP runs; None: no tunnels are open."""
+        """Return where ESP runs; None if no tunnels are open."""
         return None if self._enclosed is None else self._enclosed.esp
 
     @property
     def obstacle(self) -> str:
-        """Why no tunnels are open."""
+        """Return why no tunnels are open."""
         return self._enclosed.reason if self._enclosed else "the supervisor has not answered yet"
 
     @property
     def addresses(self) -> dict[str, Address]:
-        """What `host:NAME` means in the policy now."""
+        """Return the addresses that `host:NAME` means in the policy now."""
         if not self.enclosed:
             return {}
         return {row.name: ipaddress.ip_address(row.address) for row in self._table.admitted()}
 
     async def start(self) -> None:
-        """Before nodes are served: have the addresses closed to clear text, if any host is enrolled."""
+        """Open tunnels, if hosts are enrolled, before nodes are served; log a failure."""
         if not self._table.admitted():
             return
         try:
@@ -104,12 +126,12 @@ class Tunnels:
             _log.error("enrolled hosts stay outside", reason=str(error))
 
     def answered(self, message: messages.TunnelsEnclosed) -> None:
-        """The supervisor's answer to `open`."""
+        """Take the supervisor's answer to `open`."""
         self._enclosed = message
         self._answered.set()
 
     async def open(self) -> None:
-        """Have tunnels, if there are none yet. Raises `HostRefusedError`."""
+        """Make the supervisor close the pool to clear text, unless that is done. Raises `HostRefusedError`."""
         async with self._opening:
             if self.enclosed:
                 return
@@ -131,19 +153,19 @@ class Tunnels:
     # --- the process that runs charon ---
 
     def attach(self, link: Channel) -> None:
-        """A new life of that process; it asks for its certificate first."""
+        """Serve a new process for charon; it asks for its certificate first."""
         self._certificate = self.charon = None
         self._link.attach(link)
 
     def state_anew(self) -> None:
-        """Tell charon what it is to have, soon."""
+        """Send charon its whole configuration soon."""
         self._changes += 1
         self._dirty.set()
 
     async def run(self, each_hour: Callable[[], None]) -> None:
-        """State what charon is to have: when it changes, when a certificate ends, every hour (the list's age).
+        """Send charon its configuration: after a change, when a certificate ends, and every hour with a new list.
 
-        `each_hour()` is called before that.
+        `each_hour()` is called before each time.
         """
         while True:
             with contextlib.suppress(TimeoutError):
@@ -157,13 +179,13 @@ class Tunnels:
                 asyncio.get_running_loop().call_later(_AGAIN_SECONDS, self._dirty.set)
 
     def _until_it_changes(self) -> float:
-        """Seconds until something changes by itself: charon would keep a tunnel whose certificate has ended."""
+        """Return the seconds until the next certificate ends, at most an hour: charon would keep its tunnel."""
         now = time.time()
         ends = [row.expires - now for row in self._table.admitted() if row.expires > now]
         return min([_RESTATE_SECONDS, *(end + _JUST_AFTER_SECONDS for end in ends)])
 
     async def until_taken(self) -> bool:
-        """Wait until charon has what `state_anew` was called for; False when it does not come in time."""
+        """Wait until charon has confirmed the last `state_anew`; return False if it does not in time."""
         wanted = self._changes
         deadline = time.monotonic() + _TAKEN_SECONDS
         while self._taken_changes < wanted:
@@ -207,7 +229,7 @@ class Tunnels:
                 self._trail.happened("tunnel refused", reason, decision="deny", host=remote)
             case messages.TunnelsReported(taken, rows):
                 self._reported(rows)
-                # After the clock was set back, a greater number may be of an earlier life.
+                # After the clock was set back, a greater number may be of an earlier process.
                 if taken in self._stated:
                     for number in [statement for statement in self._stated if statement <= taken]:
                         self._taken_changes = self._stated.pop(number)
@@ -264,7 +286,7 @@ class Tunnels:
             self.seen[name] = row
 
     def _look_where(self, row: messages.TunnelSeen) -> None:
-        """A host that moves keeps its tunnel; a copy of its kit elsewhere would look like this, too."""
+        """Record a host whose outer address changes. Its tunnel stays open, but a stolen kit would look the same."""
         before = self.seen[row.name].remote
         if row.remote != before:
             self._trail.happened(

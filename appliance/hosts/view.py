@@ -1,4 +1,4 @@
-"""The hosts as operators see them: one row for each, what diverges from hosts.yaml, what to look at."""
+"""Show operators the hosts: a row for each, its difference from hosts.yaml, and what needs attention."""
 
 import math
 import time
@@ -7,10 +7,10 @@ from typing import cast
 
 from appliance.channel.answers.host_answers import Host, Machine, PortsSeen, PortsState, State
 from appliance.channel.answers.status import IpsecState
-from appliance.hosts.enrolment_tokens import Awaited
+from appliance.hosts.enrolment_tokens import EnrolmentTokens
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.tunnel_state import Tunnels
-from appliance.store.host_tables import AwaitedRow, HostRow
+from appliance.store.host_tables import EnrolmentTokenRow, HostRow
 
 SOON_SECONDS = 14 * 86_400.0
 _NEVER = PortsSeen("unknown", None, [], "")
@@ -24,20 +24,20 @@ def soon(table: HostTable, row: HostRow, now: float) -> bool:
 
 
 class HostView:
-    """Shows table, tokens and tunnels; `machines()` is the number of nodes by address, those in tunnels left out."""
+    """The operators' view of table, tokens and tunnels; `machines` are numbers of nodes by address, without tunnels."""
 
-    def __init__(self, table: HostTable, awaited: Awaited, tunnels: Tunnels) -> None:
+    def __init__(self, table: HostTable, awaited: EnrolmentTokens, tunnels: Tunnels) -> None:
         self._table = table
         self._awaited = awaited
         self._tunnels = tunnels
 
     def rows(self) -> list[Host]:
-        """Every host, enrolled, awaited or declared, by name."""
+        """Return every host, enrolled, awaited or declared, by name."""
         awaited = self._awaited.rows()
         names = {*self._table.rows, *self._table.declared.hosts, *awaited}
         return [self._row(name, awaited.get(name)) for name in sorted(names)]
 
-    def _row(self, name: str, awaited: AwaitedRow | None) -> Host:
+    def _row(self, name: str, awaited: EnrolmentTokenRow | None) -> Host:
         declared = self._table.declared.hosts.get(name)
         row, seen = self._table.rows.get(name), self._tunnels.seen.get(name)
         promised = awaited.address if awaited else declared.address if declared else None
@@ -67,7 +67,7 @@ class HostView:
         )
 
     def divergence(self, name: str) -> str | None:
-        """What is different from hosts.yaml; None also where nothing is declared at all."""
+        """Return a host's difference from hosts.yaml; None without a difference, or if hosts.yaml declares no host."""
         if not self._table.declared.there:
             return None
         declared, row = self._table.declared.hosts.get(name), self._table.rows.get(name)
@@ -82,14 +82,14 @@ class HostView:
         return None
 
     def ports(self, name: str) -> PortsSeen:
-        """What was last seen of its ROS ports from outside."""
+        """Return the last check of a machine's ROS ports from outside."""
         row = self._table.ports.get(name)
         if row is None:
             return _NEVER
         return PortsSeen(cast(PortsState, row.state), row.checked, row.open, row.who)
 
     def status(self, machines: Mapping[str, int]) -> IpsecState:
-        """How the tunnels stand, and what a person should look at."""
+        """Return the state of the tunnels, and what needs a person's attention."""
         charon = self._tunnels.charon
         return IpsecState(
             esp=self._tunnels.esp,
@@ -107,7 +107,7 @@ class HostView:
         )
 
     def machines(self, machines: Mapping[str, int]) -> list[Machine]:
-        """Machines in clear text on which nodes run, and those of which somebody told."""
+        """Return machines with nodes that connect in clear text, and other machines whose ports were checked."""
         told = self._table.ports.keys() - self._table.rows.keys() - self._table.declared.hosts.keys()
         return [
             Machine(address, machines.get(address, 0), self.ports(address))
@@ -115,7 +115,7 @@ class HostView:
         ]
 
     def _known_ports(self, machines: Mapping[str, int]) -> dict[str, PortsSeen]:
-        """Of every host that may have nodes, by name or address."""
+        """Return the last check of ports of each host that may have nodes, by name or address."""
         return {name: self.ports(name) for name in [*(row.name for row in self._table.enrolled()), *machines]}
 
     def _open_ports(self) -> list[str]:
@@ -161,7 +161,7 @@ class HostView:
 
 
 def span(seconds: float) -> str:
-    """Days, hours, minutes or seconds in words, whichever says enough."""
+    """Return a duration in words, in the unit that fits: days, hours, minutes or seconds."""
     if seconds >= 2 * 86_400:
         return f"{int(seconds // 86_400)} days"
     if seconds >= 7200:

@@ -1,1 +1,1 @@
-"""The signer, which holds the keys; certificates and tunnels come to it."""
+"""The signer with its keys, certificates, and the IPsec tunnels."""

@@ -1,7 +1,7 @@
-"""The authority's private key: made, kept encrypted where there is a passphrase, loaded.
+"""Make, store and load the authority's private key, encrypted if there is a passphrase.
 
-A key that was kept in the clear is encrypted in its place when a passphrase is given; what is wrong with a key or a
-passphrase is an error that says what to do, and nothing is replaced.
+An unencrypted key is encrypted in place when a passphrase is added. An invalid key or passphrase raises an error that
+says what to do; no file is replaced.
 """
 
 import os
@@ -24,19 +24,19 @@ from appliance.ipsec.key_files import SignerKeyError, require_private
 Kind = Literal["ecdsa", "ed25519"]
 Key = ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey
 SETTING, PASSPHRASE_SETTING = "ipsec.ca", "ipsec.ca_passphrase_file"
-_LONGEST_PASSPHRASE = 1023  # bytes, of OpenSSL
+_LONGEST_PASSPHRASE = 1023  # bytes, OpenSSL's limit
 _ENCRYPTED = b"-----BEGIN ENCRYPTED PRIVATE KEY-----"
 
 
 def make_key(kind: Kind) -> Key:
-    """A new key."""
+    """Return a new key."""
     return (
         ec.generate_private_key(ec.SECP384R1()) if kind == "ecdsa" else ed25519.Ed25519PrivateKey.generate()
     )
 
 
 def read_passphrase(descriptor: int) -> bytes:
-    """The first line of an open file, which is closed. Raises `SignerKeyError`, `OSError`."""
+    """Return the first line of an open file, and close it. Raises `SignerKeyError`, `OSError`."""
     with os.fdopen(descriptor, "rb") as file:
         line = file.read(_LONGEST_PASSPHRASE + 2).partition(b"\n")[0].rstrip(b"\r")
     if not line:
@@ -51,13 +51,13 @@ def read_passphrase(descriptor: int) -> bytes:
 
 
 def write_key(path: Path, key: Key, passphrase: bytes | None) -> None:
-    """Keep a key, for its owner only."""
+    """Write a key, readable by its owner only."""
     encryption = NoEncryption() if passphrase is None else BestAvailableEncryption(passphrase)
     write_whole(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption), 0o600)
 
 
 def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | None) -> Key:
-    """The kept key, which must be of this kind. Raises `SignerKeyError`, `OSError`."""
+    """Load the key. Raises `SignerKeyError`, also for a key of another kind, and `OSError`."""
     if not path.exists():
         raise SignerKeyError(
             f"{path}: missing, but its certificate is there; restore it from a backup, or remove"

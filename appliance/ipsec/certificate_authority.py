@@ -1,17 +1,14 @@
-"""The certificate authority of one appliance: its key, the certificates of the hosts, and the list of revoked ones.
+"""Run the certificate authority of an appliance: issue certificates of hosts, and sign the revocation list.
 
-Invariants:
-
-1. The key (ECDSA on P-384, or Ed25519) is made at the first use in the signer's own directory, mode 0600, encrypted
-   when there is a passphrase, and never leaves the process. A key without its certificate, a certificate of another
-   key, or a key that others may read is an error, never replaced.
-2. Of a request only the public key counts: the names, times and uses in a certificate are this module's.
-   The request must be signed by its own key, and the key must be ECDSA on P-384 or Ed25519.
-3. No certificate lives longer than the authority's own, or than `LONGEST_DAYS`.
-4. With a proof, a request is only good when the key of a certificate in the same name, which this authority made and
-   which has not ended, signed it.
-5. A list of revoked certificates has all that are given each time. Its number only grows, over restarts and with the
-   clock set back, too: charon keeps the list it has when one with a lower number comes.
+1. The key (ECDSA on P-384, or Ed25519) is made at the first use in the signer's own directory, mode 0600, encrypted if
+   there is a passphrase, and never leaves the process. A key without its certificate, a certificate of another key, or
+   a key that others may read is an error; nothing is replaced.
+2. Only the public key of a request is used: this module sets the names, times and usages of a certificate. The request
+   must be signed by its own key, which must be ECDSA on P-384 or Ed25519.
+3. No certificate outlives the authority's own, or `LONGEST_DAYS`.
+4. With a proof, the request must also be signed by the key of a valid certificate of this authority in the same name.
+5. A revocation list has all given serial numbers. Its own number always grows, also after restarts and with the clock
+   set back, because charon ignores a list with a lower number.
 """
 
 import contextlib
@@ -37,28 +34,28 @@ from appliance.ipsec.proof_of_possession import RequestRefusedError, require_pro
 
 KEY_FILE = "ca.key"
 CERTIFICATE_FILE = "ca.pem"
-LIST_FILE = "ca.list"  # has the number of the last list of revoked certificates, in decimal
+LIST_FILE = "ca.list"  # contains the number of the last revocation list, in decimal
 LONGEST_DAYS = 398
 AUTHORITY_DAYS = 3650
 REVOCATIONS_DAYS = 30
 LONGEST_REQUEST = 16 << 10  # bytes
 
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
-_SERIAL_BITS = 70  # random; 160 would be allowed, and the list of revoked ones would be a third longer
+_SERIAL_BITS = 70  # random; with the permitted 160 the revocation list would be a third longer
 _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
 
 @dataclass(frozen=True)
-class Issued:
-    """A certificate that was made: PEM, serial number in hexadecimal, end in seconds since the epoch."""
+class IssuedCertificate:
+    """A certificate: PEM, serial number in hexadecimal, end in seconds since the epoch."""
 
     certificate: bytes
     serial: str
     expires: float
 
 
-class Authority:
-    """The authority in `directory`, made with a key of this kind when there is none.
+class CertificateAuthority:
+    """The authority in `directory`, created with a key of this kind if missing.
 
     Raises `SignerKeyError`, `OSError`.
     """
@@ -86,22 +83,22 @@ class Authority:
 
     @property
     def certificate(self) -> bytes:
-        """The authority's own certificate, in PEM."""
+        """Return the authority's own certificate, in PEM."""
         return self._certificate.public_bytes(Encoding.PEM)
 
     def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
-    ) -> Issued:
-        """A certificate for the key of a signing request (PEM), in this name. Raises `RequestRefusedError`.
+    ) -> IssuedCertificate:
+        """Issue a certificate for the key of a signing request (PEM), in this name. Raises `RequestRefusedError`.
 
         `proof`: the signature over the request by the key of the certificate `former` (PEM).
         """
         if not _NAME.fullmatch(name):
             raise RequestRefusedError(
-                f"{name[:80]!r} is no name for a certificate: letters, digits and . _ -, at most 63"
+                f"{name[:80]!r} is not a name for a certificate: letters, digits and . _ -, at most 63"
             )
         if not 0 < days <= LONGEST_DAYS:
-            raise RequestRefusedError(f"a certificate is good for at most {LONGEST_DAYS} days")
+            raise RequestRefusedError(f"a certificate is valid for at most {LONGEST_DAYS} days")
         public_key = _key_of(request)
         now = datetime.datetime.now(datetime.UTC)
         if proof or former:
@@ -126,14 +123,14 @@ class Authority:
             .add_extension(self._identifier(), critical=False)
             .sign(self._key, self._hash)
         )
-        return Issued(
+        return IssuedCertificate(
             certificate.public_bytes(Encoding.PEM),
             f"{certificate.serial_number:x}",
             certificate.not_valid_after_utc.timestamp(),
         )
 
     def revocations(self, serials: Iterable[tuple[str, float]]) -> bytes:
-        """The signed list of revoked certificates (PEM): serial number in hexadecimal, and when (epoch)."""
+        """Return the signed revocation list (PEM) for serial numbers (hexadecimal) and times (epoch)."""
         now = datetime.datetime.now(datetime.UTC)
         builder = (
             x509.CertificateRevocationListBuilder()
@@ -154,7 +151,7 @@ class Authority:
 
     def _next_list(self) -> int:
         self._list_number = max(self._list_number + 1, time.time_ns())
-        # A full disk keeps nobody from revoking: this life knows the number.
+        # A full disk must not prevent a revocation; this process remembers the number.
         with contextlib.suppress(OSError):
             write_whole(self._list_path, b"%d" % self._list_number, 0o600)
         return self._list_number
@@ -164,7 +161,7 @@ class Authority:
 
 
 def _key_of(request: bytes) -> ec.EllipticCurvePublicKey | ed25519.Ed25519PublicKey:
-    """The public key of a request that proves to hold the private one."""
+    """Return the public key of a request. Raises `RequestRefusedError` unless its private key signed the request."""
     if len(request) > LONGEST_REQUEST:
         raise RequestRefusedError(f"the signing request is longer than {LONGEST_REQUEST} bytes")
     try:
@@ -202,7 +199,7 @@ def _create(key_path: Path, certificate_path: Path, kind: Kind, passphrase: byte
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
         .sign(key, hashes.SHA384() if kind == "ecdsa" else None)
     )
-    # The certificate first: one without its key (a crash in between) made nothing yet, and says what to do.
+    # The certificate first: the error for a certificate without its key, after a crash in between, has a remedy.
     write_whole(certificate_path, certificate.public_bytes(Encoding.PEM), 0o644)
     write_key(key_path, key, passphrase)
 

@@ -1,8 +1,8 @@
-"""charon as a child: started, provisioned over vici, watched. Blocking calls: the caller makes one at a time.
+"""Provision and watch charon over vici, with blocking calls, one at a time.
 
-Provisioning is a difference: what is wanted and was not loaded is loaded, what is no longer wanted is unloaded and its
-tunnel closed. A host whose certificate was replaced has its tunnel closed too: it comes back with the new one. An end
-that charon agrees to is not believed: what stands of a tunnel that was to end is closed again at each look.
+Only differences are applied: new hosts are loaded, removed hosts are unloaded and their tunnels closed. The tunnel of a
+host with a replaced certificate is also closed, and opened again with the new one. charon's confirmation is not
+trusted: each check closes the remains of a closed tunnel again.
 """
 
 import base64
@@ -21,40 +21,38 @@ from appliance.ipsec.strongswan import connection, connection_name, host_of, poo
 
 PROGRAM = Path("/usr/sbin/charon-systemd")
 _SECONDS = 10.0
-# Of vici's own, and what it raises for a value that is too long for it.
+# vici's own errors, and those for a value that is too long for it.
 _FAULTS = (
     CommandException, SessionException, EventUnknownException, DeserializationException, struct.error, OSError,
 )  # fmt: skip
 
 
 class CharonError(Exception):
-    """charon cannot be used; the message says why and what to do."""
+    """Report that charon cannot be used; the message says why and what to do."""
 
 
-class Vici:
-    """The conversation with a running charon. Raises `CharonError`."""
+class ViciClient:
+    """A connection to a running charon. Raises `CharonError`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._session = self._connect()
         self._loaded: dict[str, TunnelHost] = {}
-        self._former: dict[
-            str, set[bytes]
-        ] = {}  # of each host, what made up its tunnel with a certificate before
+        self._former: dict[str, set[bytes]] = {}  # by host: the ids of its tunnel with an earlier certificate
         self._stated: TunnelsStated | None = None
         self.proposals = proposals_of(self._key_exchanges())
 
     def close(self) -> None:
-        """End the conversation."""
+        """Close the connection."""
         self._session.transport.close()
 
     def load_key(self, key: bytes) -> None:
-        """Give charon the appliance's private key (PEM)."""
+        """Load the appliance's private key (PEM)."""
         with self._said("the appliance's key"):
             self._session.load_key({"type": "any", "data": key})
 
     def provision(self, stated: TunnelsStated) -> None:
-        """Make charon's tunnels exactly these. What is revoked is cut before anything new is loaded."""
+        """Make charon's tunnels exactly these. Revoked tunnels are closed before new ones are loaded."""
         before = self._stated
         if before is None or before.authority != stated.authority:
             with self._said("the authority's certificate"):
@@ -62,7 +60,7 @@ class Vici:
         if before is None or before.revocations != stated.revocations:
             with self._said("the list of revoked certificates"):
                 self._session.load_cert({"type": "x509crl", "data": _der_of(stated.revocations)})
-                # charon takes the first valid list that it finds, and its cache may hold the one before.
+                # charon uses the first valid list that it finds, which may be the old one in its cache.
                 self._session.flush_certs()
         earlier = dict(self._loaded)
         for name in earlier.keys() - {host.name for host in stated.hosts}:
@@ -82,10 +80,10 @@ class Vici:
         self._stated = stated
 
     def seen(self) -> list[TunnelSeen]:
-        """The tunnels that stand now.
+        """Return the tunnels that are up.
 
-        One of a host that is not wanted, or of a certificate that was replaced, is closed again: keys that were just
-        being made anew can outlive an end.
+        A tunnel of a removed host, or with a replaced certificate, is closed again, because a rekeying while it was
+        closed can keep it open.
         """
         found = self._standing()
         standing = {host for name, _ in found if (host := host_of(name)) is not None}
@@ -94,7 +92,7 @@ class Vici:
         for name, row in found:
             former, parts = self._former.get(host_of(name) or ""), _parts(row)
             if former is not None and not former.isdisjoint(parts):
-                former |= parts  # new keys of what was to end
+                former |= parts  # a rekeying of the tunnel to end
                 self._end(host_of(name), {"ike-id": _text(row, "uniqueid")})
         return [one for name, row in found if (one := _seen(name, row)) is not None]
 
@@ -103,18 +101,18 @@ class Vici:
             return [(name, row) for reply in self._session.list_sas() for name, row in reply.items()]
 
     def version(self) -> str:
-        """charon's version."""
+        """Return charon's version."""
         with self._said("its version"):
             return str(self._session.version()["version"].decode())
 
     def _key_exchanges(self) -> list[str]:
         with self._said("the list of its algorithms"):
             found = self._session.get_algorithms()
-        # Before strongSwan 6 the group was named after Diffie and Hellman.
+        # Before strongSwan 6 the group was named `dh`.
         return [str(name) for group in ("ke", "dh") for name in found.get(group, {})]
 
     def listen(self) -> Iterator[tuple[str, bool, str]]:
-        """Tunnels going up and down, on a connection of its own: host, up, real address. Ends when charon does."""
+        """Yield changes of tunnels from a separate connection: host, up, real address. Ends with charon."""
         session = self._connect(timeout=None)
         try:
             for _kind, event in session.listen(["child-updown"]):
@@ -138,7 +136,7 @@ class Vici:
         with self._said(f"the end of the tunnel of {name}"):
             self._session.unload_conn({"name": connection_name(name)})
             self._close(name)
-            with contextlib.suppress(CommandException):  # its address is in use until the tunnel is gone
+            with contextlib.suppress(CommandException):  # its address is in use until the tunnel is closed
                 self._session.unload_pool({"name": connection_name(name)})
         del self._loaded[name]
         self._former.pop(name, None)
@@ -148,7 +146,7 @@ class Vici:
 
     def _end(self, name: str | None, tunnel: dict[str, str]) -> None:
         with self._said(f"the end of the tunnel of {name}"), contextlib.suppress(CommandException):
-            # It says so when there is none to close.
+            # charon reports an error if no tunnel is open.
             list(self._session.terminate({**tunnel, "timeout": "-1", "force": "yes"}))
 
     def _connect(self, timeout: float | None = _SECONDS) -> Any:
@@ -170,7 +168,7 @@ class Vici:
 
 
 def _der_of(pem: bytes) -> bytes:
-    """A list in DER is a quarter shorter, and a value of vici has 65,535 bytes at most."""
+    """Return a list in DER: a quarter shorter, for vici's limit of 65,535 bytes."""
     return base64.b64decode(b"".join(pem.split(b"-----")[2:3]))
 
 
@@ -191,7 +189,7 @@ def _seen(name: str, row: Any) -> TunnelSeen | None:
 
 
 def _parts(row: Any) -> set[bytes]:
-    """The numbers of a tunnel and of what it carries, which charon gives once; new keys change one or the other."""
+    """Return charon's unique ids of a tunnel and its children; a rekeying changes one or the other."""
     carried = row.get("child-sas", {}).values()
     return {b"ike " + row["uniqueid"], *(b"child " + child["uniqueid"] for child in carried)}
 

@@ -1,8 +1,7 @@
-"""What an enrolled host is given: one archive with its certificate and all that joins it to the appliance. No I/O.
+"""Make the kit of an enrolled host: an archive with its certificate and all files for its tunnel. No I/O.
 
-The kit uses the host's own strongSwan in its own places (`/etc/swanctl`), so what confines that (AppArmor) and other
-tunnels of the host go on. The child's traffic selectors are the host's virtual address and the appliance's: the
-tunnel carries what goes to the appliance and nothing else.
+The kit uses the host's own strongSwan with its own paths (`/etc/swanctl`), so AppArmor and other tunnels of the host
+still work. The tunnel carries only traffic between the host's virtual address and the appliance's.
 """
 
 import io
@@ -22,10 +21,10 @@ _SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")
 
 @dataclass(frozen=True)
 class Kit:
-    """The parts of a kit: what control has of the `host`, and what is its own.
+    """The parts of a kit.
 
-    `endpoint` is the address or name at which the host reaches the appliance, `protect` an nftables file; `key` is None
-    where the host has made its own.
+    `endpoint` is the address or name by which the host reaches the appliance, `protect` an nftables file. `key` is None
+    if the host made its own.
     """
 
     host: KitParts
@@ -35,7 +34,7 @@ class Kit:
 
 
 def members(kit: Kit) -> list[tuple[str, str, int]]:
-    """The files of a kit: path, text, mode."""
+    """Return the files of a kit: path, text, mode."""
     host = kit.host
     found = [
         ("swanctl/swanctl.conf", swanctl_conf(kit), 0o644),
@@ -56,13 +55,13 @@ def members(kit: Kit) -> list[tuple[str, str, int]]:
 
 
 def filled(script: str, values: Mapping[str, str]) -> str:
-    """A script of `kit_files` with its values."""
+    """Return a script of `kit_files` with its values filled in."""
     text = files("appliance.ipsec").joinpath("kit_files", script).read_text(encoding="utf-8")
     return _Template(text).substitute(values)
 
 
 def archive(kit: Kit) -> bytes:
-    """The kit as `.tar.gz`: one folder, `rosrv-NAME`."""
+    """Return the kit as `.tar.gz`: one folder, `rosrv-NAME`."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
         for path, content, mode in members(kit):
@@ -74,7 +73,7 @@ def archive(kit: Kit) -> bytes:
 
 
 def swanctl_conf(kit: Kit) -> str:
-    """The host's tunnel as swanctl reads it."""
+    """Return the host's tunnel in swanctl's format."""
     return f"""\
 # The tunnel of {kit.host.name} to the ROSRV appliance. Made by `rosrv host add`.
 connections {{
@@ -114,7 +113,7 @@ connections {{
 
 
 class _Template(Template):
-    """`@name@` stands for a value: the scripts keep their `$`."""
+    """A template with `@name@` for values, so that the scripts keep their `$`."""
 
     delimiter = "@"
     pattern = r"""

@@ -1,15 +1,15 @@
-"""Key files: refused when others may read them."""
+"""Reject key files that others may read."""
 
 import stat
 from pathlib import Path
 
 
 class SignerKeyError(Exception):
-    """The key file cannot be used; the message says which, why, and what to do."""
+    """Report an unusable key file; the message says which, why, and what to do."""
 
 
 def require_private(path: Path) -> None:
-    """Raise `SignerKeyError` if others than its owner may read a private key."""
+    """Raise `SignerKeyError` if others may read a private key."""
     mode = path.stat().st_mode
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise SignerKeyError(

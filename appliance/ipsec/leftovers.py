@@ -1,8 +1,8 @@
-"""What a charon that was killed has left in the kernel: states and policies of IPsec, with their keys.
+"""Remove IPsec states and policies, with their keys, that a killed charon left in the kernel.
 
-The kernel goes on to take packets by them, also of a host that was revoked meanwhile; so they are taken away before
-charon is started again, and when the appliance ends. Foreign IPsec is left alone: ours are the states of ESP in UDP on
-port 4500, which is charon's alone, and the policies from and to the appliance's address in the tunnels.
+With them the kernel still accepts packets, even from a host that was revoked meanwhile. So they are removed before
+charon starts again, and when the appliance ends. Only the appliance's own are removed: the states of ESP in UDP on port
+4500, which only charon uses, and the policies from and to the appliance's address in the tunnels.
 """
 
 import itertools
@@ -17,11 +17,11 @@ _PORT = "4500"
 
 
 class LeftoversError(Exception):
-    """Something of an earlier life stays in the kernel; the message says what."""
+    """Report states or policies that stay in the kernel."""
 
 
 def clear_leftovers(own: str) -> int:
-    """Take away what is left in the namespace of the calling thread; how many that were. No charon may run there.
+    """Remove the leftovers in the namespace of the calling thread; return their number. No charon may run there.
 
     `own` is the appliance's address in the tunnels. Raises `LeftoversError`.
     """
@@ -35,7 +35,7 @@ def clear_leftovers(own: str) -> int:
 
 
 def state_orders(listed: str) -> list[str]:
-    """The orders that delete charon's states, from what `ip xfrm state list nokeys` says."""
+    """Return the commands that delete charon's states, from the output of `ip xfrm state list nokeys`."""
     starts = [*(found.start() for found in re.finditer(r"^src ", listed, re.MULTILINE)), len(listed)]
     orders = []
     for begin, end in itertools.pairwise(starts):
@@ -47,7 +47,7 @@ def state_orders(listed: str) -> list[str]:
 
 
 def policy_orders(listed: str, own: str) -> list[str]:
-    """The orders that delete the policies from and to `own`, from what `ip xfrm policy` says."""
+    """Return the commands that delete the policies from and to `own`, from the output of `ip xfrm policy`."""
     return [
         f"xfrm policy delete src {source} dst {destination} dir {direction}"
         for source, destination, direction in _POLICY.findall(listed)
@@ -65,5 +65,10 @@ def _ip(*arguments: str, text: str = "") -> str:
             ["ip", *arguments], input=text, capture_output=True, text=True, timeout=_SECONDS, check=False
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise LeftoversError(f"what an earlier charon left in the kernel cannot be told: {error}") from error
+        raise LeftoversError(f"what an earlier charon left in the kernel is not known: {error}") from error
+    # A kernel without IPsec rejects the protocol; it has nothing to list.
+    if done.returncode and not text and "not supported" not in done.stderr:
+        raise LeftoversError(
+            f"what an earlier charon left in the kernel is not known: {done.stderr.strip()[:200]}"
+        )
     return done.stdout

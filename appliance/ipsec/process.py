@@ -1,17 +1,14 @@
-"""The process that runs charon: it alone speaks to it, and it holds the appliance's own key for the tunnels.
+"""Run charon: the only process that talks to it, with the appliance's own key for the tunnels.
 
-Its life: it makes a key (once), asks control for a certificate for it, and is told the state that is wanted
-(`TunnelsStated`), whole each time. charon is started at the first one. When charon dies, this process ends too, and
-the supervisor starts both again; nothing is taken over from the life before.
-
-Invariants:
+It makes a key (once), requests a certificate from control, and gets the complete wanted state (`TunnelsStated`) each
+time; charon starts with the first one. If charon dies, this process also ends, and the supervisor starts both again
+without anything from the earlier run.
 
 1. The private key stays in this process's own directory (mode 0600) and in charon.
-2. charon has what this process has: a user of its own, and the capabilities to change the network and to bind the
+2. charon has the privileges of this process: its own user, and the capabilities to change the network and to bind the
    ports 500 and 4500. It dies with this process.
-3. Nothing that a stranger sends is parsed here but charon's log, as lines of text, and at most
-   `REFUSALS_PER_SECOND` of them are passed on.
-4. Of the calls that charon answers, one is made at a time: two on one session would read each other's answers.
+3. The only untrusted input parsed here is charon's log, as lines of text; at most `REFUSALS_PER_SECOND` are passed on.
+4. One call to charon is made at a time: two on one session would read each other's answers.
 """
 
 import asyncio
@@ -32,17 +29,17 @@ from appliance.base.atomic_files import write_whole
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
-from appliance.ipsec.charon import PROGRAM, CharonError, Vici
+from appliance.ipsec.charon import PROGRAM, CharonError, ViciClient
 from appliance.ipsec.key_files import SignerKeyError, require_private
 from appliance.ipsec.leftovers import clear_leftovers
-from appliance.ipsec.refusals import Refusal, Refusals
+from appliance.ipsec.refusals import Refusal, RefusalParser
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.ipsec.strongswan import configuration
 
 KEY_FILE = "appliance.key"
 TUN = Path("/dev/net/tun")
 REFUSALS_PER_SECOND = 20
-REFUSED_SOURCES = 20  # of packets, in one report
+REFUSED_SOURCES = 20  # of dropped packets, in one report
 REPORT_SECONDS = 2.0
 RENEW_SECONDS = 30 * 86_400.0
 _START_SECONDS = 15.0
@@ -55,7 +52,7 @@ _log = structlog.get_logger()
 
 
 class TunnelProcess:
-    """Serves one lifeline and the link to control until it is told to stop or charon has died."""
+    """The process: it serves its lifeline and the link to control until it is stopped or charon dies."""
 
     def __init__(self, lifeline: Channel, directory: Path, key: bytes) -> None:
         self._child = Child(lifeline, messages.TunnelLink, said=self._control_said, linked=self._linked)
@@ -66,18 +63,18 @@ class TunnelProcess:
         self._changed = asyncio.Event()
         self._taken = 0
         self._charon: asyncio.subprocess.Process | None = None
-        self._vici: Vici | None = None
+        self._vici: ViciClient | None = None
         self._one_at_a_time = asyncio.Lock()
         self._version = ""
-        self._refusals = Refusals()
-        self._packets: Counter[Refusal] = Counter()  # that ESP dropped since the last report
-        self._second = (0, 0)  # of the last refusals, and how many they were
+        self._refusals = RefusalParser()
+        self._packets: Counter[Refusal] = Counter()  # dropped by ESP since the last report
+        self._second = (0, 0)  # the last second with refusals, and their number
         self._tasks: set[asyncio.Future[Any]] = set()
-        self._output: deque[str] = deque(maxlen=_OUTPUT_LINES)  # what charon printed last
+        self._output: deque[str] = deque(maxlen=_OUTPUT_LINES)  # charon's last lines
         self.failed = False
 
     async def run(self) -> None:
-        """Serve until the end; `failed` says that it was no orderly one."""
+        """Serve until the end; afterwards `failed` is set unless the end was orderly."""
         self._loop = asyncio.get_running_loop()
         self._child.attach(messages.Ready())
         self._spawn(self._provision())
@@ -90,7 +87,7 @@ class TunnelProcess:
             self._charon.terminate()
             await self._charon.wait()
 
-    # --- what this process is told ---
+    # --- messages of control ---
 
     def _linked(self) -> None:
         self._ask()
@@ -123,7 +120,7 @@ class TunnelProcess:
             self._taken = wanted.number
             await self._say_how_it_stands(vici)
 
-    async def _start(self, wanted: messages.TunnelsStated) -> Vici:
+    async def _start(self, wanted: messages.TunnelsStated) -> ViciClient:
         if wanted.esp == "user space" and (obstacle := tun_obstacle()):
             raise CharonError(obstacle)
         if wanted.esp == "kernel":
@@ -152,20 +149,20 @@ class TunnelProcess:
         async with self._one_at_a_time:
             return await asyncio.to_thread(call)
 
-    def _say_what_it_is(self, vici: Vici) -> None:
+    def _say_what_it_is(self, vici: ViciClient) -> None:
         self._tell(messages.CharonStarted(self._version, vici.proposals.key_exchange))
 
-    async def _connect(self, path: Path) -> Vici:
+    async def _connect(self, path: Path) -> ViciClient:
         deadline = time.monotonic() + _START_SECONDS
         while True:
             try:
-                return Vici(path)
+                return ViciClient(path)
             except CharonError:
                 if time.monotonic() > deadline:
                     raise
             await asyncio.sleep(0.05)
 
-    def _listen(self, vici: Vici) -> None:
+    def _listen(self, vici: ViciClient) -> None:
         for host, up, remote in vici.listen():
             self._loop.call_soon_threadsafe(self._tell, messages.TunnelChanged(host, up, remote))
 
@@ -201,7 +198,7 @@ class TunnelProcess:
             if self._vici is not None and not self._changed.is_set():
                 await self._say_how_it_stands(self._vici)
 
-    async def _say_how_it_stands(self, vici: Vici) -> None:
+    async def _say_how_it_stands(self, vici: ViciClient) -> None:
         self._tell(messages.TunnelsReported(self._taken, await self._in_turn(vici.seen)))
 
     async def _renew(self) -> None:
@@ -228,7 +225,7 @@ class TunnelProcess:
 
 
 def main(lifeline_fd: int, directory: Path) -> None:
-    """Be this process: `lifeline_fd` is the lifeline's descriptor, `directory` its own."""
+    """Run this process: `lifeline_fd` is the lifeline's descriptor, `directory` its own."""
     lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
     try:
         key = _own_key(directory / KEY_FILE)
@@ -237,13 +234,13 @@ def main(lifeline_fd: int, directory: Path) -> None:
         sys.exit(1)
     process = TunnelProcess(lifeline, directory, key)
     asyncio.run(process.run())
-    # A thread may wait for charon's answer, and nothing is left to be written: no waiting for it.
+    # Do not wait for a thread that still waits for charon's answer: nothing is left to write.
     sys.stderr.flush()
     os._exit(1 if process.failed else 0)
 
 
 def tun_obstacle() -> str:
-    """Return why this process cannot open the TUN device, and what to do; empty when it can."""
+    """Return why this process cannot open the TUN device, and what to do; empty if it can."""
     try:
         os.close(os.open(TUN, os.O_RDWR | os.O_CLOEXEC))
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Whether a signing request was made by whoever has a certificate already. No I/O."""
+"""Verify that the holder of an earlier certificate made a signing request. No I/O."""
 
 import datetime
 
@@ -12,7 +12,7 @@ LONGEST_PROOF = 1024  # bytes
 
 
 class RequestRefusedError(Exception):
-    """No certificate is made; the message says why."""
+    """Report why no certificate is issued."""
 
 
 def require_proof(
@@ -26,7 +26,7 @@ def require_proof(
 ) -> None:
     """Raise `RequestRefusedError` unless the key of `former` (PEM) signed the bytes of the request.
 
-    `former` must be a certificate of the authority in this name that has not ended. ECDSA signs with SHA-384.
+    `former` must be a valid certificate of the authority in this name. ECDSA signs with SHA-384.
     """
     try:
         certificate = x509.load_pem_x509_certificate(former)

@@ -1,8 +1,8 @@
-"""From charon's log: whom it refused, and why. No I/O.
+"""Parse refusals in charon's log. No I/O.
 
-charon tells of tunnels that stand in events, of those that it refused only in its log. A worker thread handles one
-packet from its arrival to its answer, so the lines of one thread between the two belong together. Packets of tunnels
-are in the log, too, where ESP runs in charon: those sent again, and those under an address that the tunnel is not for.
+charon reports refused tunnels only in its log. A worker thread handles one packet from its arrival to its answer, so
+the lines of one thread in between belong together. If ESP runs in charon, the log also has packets that a tunnel
+dropped: replays, and packets with an address that the tunnel does not permit.
 """
 
 import re
@@ -43,7 +43,7 @@ _LONGEST = 400
 
 @dataclass(frozen=True)
 class Refusal:
-    """A host that was refused: its address, and charon's reasons. `packet`: a packet of a tunnel, not a request."""
+    """A refused host: its address, and charon's reasons. `packet`: a packet of a tunnel, not a request."""
 
     remote: str
     reason: str
@@ -56,14 +56,14 @@ class _Packet:
     reasons: list[str] = field(default_factory=list)
 
 
-class Refusals:
-    """Reads the log line by line."""
+class RefusalParser:
+    """A parser of the log, line by line."""
 
     def __init__(self) -> None:
         self._packets: dict[str, _Packet] = {}  # by worker thread: charon has 16
 
     def read(self, line: str) -> Refusal | None:
-        """The refusal that this line completes, if it does."""
+        """Return the refusal that this line completes, or None."""
         found = _LINE.match(line)
         if found is None:
             return None
@@ -88,7 +88,7 @@ class Refusals:
 
 
 def _packet(text: str) -> Refusal | None:
-    """A packet that ESP dropped, by the line that has its addresses."""
+    """Return the packet that ESP dropped, from the line with its addresses."""
     again = _SENT_AGAIN.match(text)
     if again is not None:
         return Refusal(again[1], "a packet of a tunnel was sent again", packet=True)

@@ -1,28 +1,28 @@
-"""Which removals of old audit records the signer signs: those that follow from the settings, by what it signed itself.
+"""Approve removals of old audit records that follow from the settings and the signer's own memory.
 
-Who can write the log could otherwise take out what happened a moment ago and have the log say that it was old. So the
-signer, which has the settings and its own memory, looks at neither the log nor what control says of it:
+Otherwise a process that can write the log could remove recent records as old ones. So the signer uses its settings and
+its memory, and trusts neither the log nor control:
 
-1. Records are removed up to a checkpoint that the signer signed, no further.
-2. By age (`retention_days`): it signed that checkpoint so long ago, by the clock of ages (`ages.py`).
-3. By size (`retention_bytes`): so many records were sealed since that a log of them can have that size, at
-   `LARGEST_RECORD` bytes each. The signer does not see how large they are, so this is a bound, not the size.
+1. Records are removed up to a checkpoint that the signer signed.
+2. By age (`retention_days`): it signed that checkpoint long enough ago, by the age clock.
+3. By size (`retention_bytes`): at `LARGEST_RECORD` bytes each, the records sealed since then fill that size. The signer
+   does not know their real sizes, so this is only a bound.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.ipsec.signed_checkpoints import SignedCheckpoints, read_checkpoint
+from appliance.ipsec.signed_checkpoints import CheckpointMemory, read_checkpoint
 from appliance.signing.signed_statements import Checkpoint, Removal, checkpoint_hash
 
 LARGEST_RECORD = 64 << 10
-"""Bytes of a record with the longest details; no log has larger ones on average."""
+"""Bytes of a record with the largest details; the average is smaller."""
 
 _DAY = 86_400_000_000_000
 
 
 class RemovalRefusedError(Exception):
-    """A removal that does not follow from the settings; the message says why. `early`: it will, as time passes."""
+    """Report a removal that does not follow from the settings. `early`: it will later."""
 
     def __init__(self, reason: str, *, early: bool = False) -> None:
         super().__init__(reason)
@@ -30,23 +30,23 @@ class RemovalRefusedError(Exception):
 
 
 @dataclass(frozen=True)
-class Kept:
-    """How long records are kept, as configured; None: for ever, and whatever the size."""
+class RetentionLimits:
+    """The configured limits of age and size; None: no limit."""
 
     days: float | None = None
     size: int | None = None
 
 
-class Removals:
-    """Approves removals from logs, by the memory `signed` and the settings `kept`."""
+class RemovalApprover:
+    """The approval of removals by the memory `signed` and the settings `kept`."""
 
-    def __init__(self, signed: SignedCheckpoints, kept: Kept, clock: Callable[[], int]) -> None:
+    def __init__(self, signed: CheckpointMemory, kept: RetentionLimits, clock: Callable[[], int]) -> None:
         self._signed = signed
         self._kept = kept
         self._clock = clock
 
     def approve(self, checkpoint: bytes, newest: bytes) -> bytes:
-        """What is signed for the removal of all records up to a checkpoint; `newest` is the last signed one.
+        """Return the text to sign for the removal of all records up to a checkpoint; `newest` is the last signed one.
 
         Both are texts of checkpoints. Raises `RemovalRefusedError`, `CheckpointRefusedError`, `OSError`.
         """

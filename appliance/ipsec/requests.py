@@ -1,4 +1,4 @@
-"""A key and its signing request, made where the key is to be used. No I/O."""
+"""Make a key and its signing request. No I/O."""
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
@@ -13,13 +13,13 @@ from cryptography.x509.oid import NameOID
 
 
 def make_key() -> bytes:
-    """A new ECDSA key on P-384, in PEM (PKCS #8)."""
+    """Return a new ECDSA key on P-384, in PEM (PKCS #8)."""
     key = ec.generate_private_key(ec.SECP384R1())
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
 
 
 def signing_request(key: bytes, name: str) -> bytes:
-    """The request (PKCS #10, PEM) for a certificate in this name, signed by a key that `make_key` made."""
+    """Return the request (PKCS #10, PEM) for a certificate in this name, signed by a key of `make_key`."""
     private = load_pem_private_key(key, password=None)
     if not isinstance(private, ec.EllipticCurvePrivateKey):
         raise ValueError("the key is not an ECDSA key: remove its file, and another is made")

@@ -1,15 +1,12 @@
-"""What the signer remembers of the audit checkpoints it signed, so that no second past can be signed.
+"""Remember the audit checkpoints that the signer signed, so that it never signs a second history.
 
-Invariants:
-1. For each log the hashes of its signed checkpoints stand in `<log>.signed`, by number, and the moments of signing in
-   `<log>.times`, by the clock of ages (`ages.py`); they only ever grow.
-2. A checkpoint is approved if it follows the last one (number and hash), or if it is exactly the one approved
-   under its number before (control lost the answer). A log that is not known yet may begin with any number.
-3. A checkpoint says how many records are removed before it; it is approved if the signer approved that removal
-   (`<log>.removed`, see `removals.py`), or if it is the first that says so, of a log that was begun before they did.
-   After it none that does not say so is approved.
-4. At most `MOST_LOGS` logs are remembered; a further one is refused, so control cannot fill the signer's disk
-   with names.
+1. For each log `<log>.signed` has the hashes of its signed checkpoints by number, and `<log>.times` the times of
+   signing by the age clock. Both only grow.
+2. A checkpoint is approved if it follows the last one (number and hash), or is exactly the one approved under its
+   number before (control lost the answer). An unknown log may begin with any number.
+3. A checkpoint has the number of removed records; it is approved if the signer approved that removal (`<log>.removed`,
+   see `removals.py`), or if it is the first one with this field in a log from an older version. Later ones need it.
+4. At most `MOST_LOGS` logs are remembered, so control cannot fill the signer's disk.
 """
 
 import hashlib
@@ -26,11 +23,11 @@ _NUMBER = 8
 
 
 class CheckpointRefusedError(Exception):
-    """A checkpoint that must not be signed; the message says why."""
+    """Report why a checkpoint must not be signed."""
 
 
 def read_checkpoint(text: bytes) -> Checkpoint:
-    """Raises `CheckpointRefusedError` for anything that is not exactly one."""
+    """Parse a checkpoint. Raises `CheckpointRefusedError`."""
     try:
         return parse_checkpoint(text)
     except ValueError:
@@ -38,14 +35,14 @@ def read_checkpoint(text: bytes) -> Checkpoint:
 
 
 def newest_signing(directory: Path) -> int | None:
-    """When a checkpoint of any log was signed last; None where none was."""
+    """Return the time of the last signature, or None."""
     times = (path.read_bytes() for path in directory.glob("*.times"))
     return max(
         (int.from_bytes(kept[-_NUMBER:], "big") for kept in times if len(kept) > _NUMBER), default=None
     )
 
 
-class SignedCheckpoints:
+class CheckpointMemory:
     """The memory of one signer, in its directory; `clock` gives nanoseconds since the epoch."""
 
     def __init__(self, directory: Path, clock: Callable[[], int]) -> None:
@@ -53,7 +50,7 @@ class SignedCheckpoints:
         self._clock = clock
 
     def approve(self, text: bytes) -> None:
-        """Remember a checkpoint as signed. Raises `CheckpointRefusedError`; `OSError` from the disk."""
+        """Remember a checkpoint as signed. Raises `CheckpointRefusedError`, `OSError`."""
         wanted = read_checkpoint(text)
         path = self._path(wanted.log, "signed")
         if not path.exists():
@@ -75,7 +72,7 @@ class SignedCheckpoints:
             os.close(descriptor)
 
     def signed_at(self, checkpoint: Checkpoint) -> int | None:
-        """When this checkpoint was signed; None if it was not. Before times were kept: what it says itself."""
+        """Return when this checkpoint was signed, or None. Without a stored time, return its own time."""
         path = self._path(checkpoint.log, "signed")
         if not path.exists():
             return None
@@ -90,12 +87,12 @@ class SignedCheckpoints:
         return int.from_bytes(moment, "big") if len(moment) == _NUMBER else checkpoint.time
 
     def removed(self, log: str) -> int | None:
-        """Up to which record of a log removals were approved; None where it never said how many are removed."""
+        """Return the last record whose removal was approved; None for a log without this field."""
         path = self._path(log, "removed")
         return int.from_bytes(path.read_bytes(), "big") if path.exists() else None
 
     def remember_removed(self, log: str, sequence: int) -> None:
-        """The removal of the records up to this one was approved."""
+        """Store that the removal of the records up to this one was approved."""
         write_whole(self._path(log, "removed"), sequence.to_bytes(_NUMBER, "big"), 0o600)
 
     def _may_be_removed(self, wanted: Checkpoint) -> None:
@@ -148,14 +145,14 @@ def _digest(checkpoint: Checkpoint) -> bytes:
 
 
 def _extent(descriptor: int) -> tuple[int, int]:
-    """The number of the first checkpoint remembered, and how many there are."""
+    """Return the number of the first remembered checkpoint, and how many are remembered."""
     first = int.from_bytes(os.pread(descriptor, _NUMBER, 0), "big")
-    # A hash cut short by a crash was not approved.
+    # A partial hash from a crash was not approved.
     return first, (os.fstat(descriptor).st_size - _NUMBER) // _HASH
 
 
 def _is_known(descriptor: int, wanted: Checkpoint, first: int, count: int) -> bool:
-    """Whether exactly this one was approved before; raises if it does not follow the last."""
+    """Whether a checkpoint was approved before. Raises `CheckpointRefusedError` if it does not follow the last one."""
     index = wanted.number - first
     if index < 0 or index > count:
         raise CheckpointRefusedError(f"checkpoint {wanted.number} does not follow number {first + count - 1}")

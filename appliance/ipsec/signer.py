@@ -1,14 +1,12 @@
-"""The signer: the process that holds the audit key and the authority's, and signs with them. It has no network.
+"""Run the signer: the process with the audit key and the authority's key. It has no network.
 
-Invariants:
-1. The private key is made at the first start in the signer's own directory (mode 0600) and never leaves the
-   process; a key file that is damaged or readable by others is an error, never replaced.
-2. It parses only the messages of its lifeline and its link to control (and the signing requests in them), and
-   signs only audit checkpoints, removals of old records that follow from the settings (`removals.py`), certificates of
-   the appliance's own authority and its list of revoked ones.
-3. It remembers what it signed (`checkpoints.py`) and signs no second past; `rosrv audit verify` holds the log
-   against that memory, so cutting the log's end or taking its signatures away is found.
-4. Every signing request is answered, whatever it does to the parser: what else was read with it is served.
+1. The private key is made at the first start in the signer's own directory (mode 0600) and never leaves the process. A
+   damaged key file, or one that others may read, is an error; it is never replaced.
+2. It parses only the messages of its lifeline and its link to control, and the signing requests in them. It signs only
+   audit checkpoints, removals of old records (`removals.py`), certificates and the revocation list.
+3. It remembers what it signed (`signed_checkpoints.py`) and never signs a second history. `rosrv audit verify` compares
+   the log with this memory, so a cut end or a removed signature is found.
+4. Every signing request is answered, whatever it does to the parser, so later messages are served.
 """
 
 import asyncio
@@ -34,11 +32,11 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.ipsec.authority_key import Kind, read_passphrase
-from appliance.ipsec.certificate_authority import Authority
+from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.key_files import SignerKeyError, require_private
 from appliance.ipsec.proof_of_possession import RequestRefusedError
-from appliance.ipsec.removals import Kept, RemovalRefusedError, Removals
-from appliance.ipsec.signed_checkpoints import CheckpointRefusedError, SignedCheckpoints, newest_signing
+from appliance.ipsec.removals import RemovalApprover, RemovalRefusedError, RetentionLimits
+from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError, newest_signing
 
 KEY_FILE = "audit.key"
 PUBLIC_KEY_FILE = "audit.pub"
@@ -54,7 +52,7 @@ class _Ipsec(msgspec.Struct):
 
 
 class _Settings(msgspec.Struct):
-    """What of the settings is read here, as the supervisor has written it; the signer takes no part in the rest."""
+    """The part of the supervisor's settings that the signer needs."""
 
     state: str
     audit: _Audit
@@ -62,7 +60,7 @@ class _Settings(msgspec.Struct):
 
 
 def load_or_create_key(directory: Path) -> Ed25519PrivateKey:
-    """The audit key in `directory`, made if there is none. Raises `SignerKeyError` or `OSError`."""
+    """Load the audit key in `directory`; create it if missing. Raises `SignerKeyError` or `OSError`."""
     path = directory / KEY_FILE
     if not path.exists():
         _create_key(directory)
@@ -91,16 +89,21 @@ def _create_key(directory: Path) -> None:
 
 
 class Signer:
-    """Answers one lifeline and the link to control until it is told to stop."""
+    """The signer: it serves its lifeline and the link to control until it is stopped."""
 
     def __init__(
-        self, lifeline: Channel, directory: Path, key: Ed25519PrivateKey, authority: Authority, kept: Kept
+        self,
+        lifeline: Channel,
+        directory: Path,
+        key: Ed25519PrivateKey,
+        authority: CertificateAuthority,
+        kept: RetentionLimits,
     ) -> None:
         self._child = Child(lifeline, messages.SignerLink, said=self._control_said)
         self._authority = authority
         clock = AgeClock(directory / "age", lambda: newest_signing(directory))
-        self._signed = SignedCheckpoints(directory, clock)
-        self._removals = Removals(self._signed, kept, clock)
+        self._signed = CheckpointMemory(directory, clock)
+        self._removals = RemovalApprover(self._signed, kept, clock)
         self._key = key
         self._public_key = key.public_key().public_bytes_raw()
 
@@ -121,11 +124,11 @@ class Signer:
                 return self._sign(number, text)
             case messages.RemovalWanted(number, checkpoint, newest):
                 return self._approve_removal(number, checkpoint, newest)
-            case messages.AuthorityWanted(number):
+            case messages.AuthorityRequest(number):
                 return messages.AuthorityStated(number, self._authority.certificate)
             case messages.CertificateWanted():
                 return self._issue(message)
-            case messages.RevocationsWanted(number, revoked):
+            case messages.RevocationsRequest(number, revoked):
                 rows = [(certificate.serial, certificate.moment) for certificate in revoked]
                 return messages.RevocationsMade(number, self._authority.revocations(rows))
             case _:
@@ -152,7 +155,7 @@ class Signer:
             )
         except RequestRefusedError as error:
             return messages.CertificateRefused(wanted.number, str(error))
-        except Exception as error:  # noqa: BLE001  a stranger's bytes: whatever they do to the parser, it is answered
+        except Exception as error:  # noqa: BLE001  untrusted bytes: every request is answered
             return messages.CertificateRefused(
                 wanted.number, f"the signing request cannot be used: {type(error).__name__}: {error}"
             )
@@ -160,9 +163,9 @@ class Signer:
 
 
 def main(lifeline_fd: int, config: Path, passphrase: int | None) -> None:
-    """Be the signer: `lifeline_fd` is the lifeline's descriptor, `passphrase` that of the file that has it."""
+    """Run the signer: `lifeline_fd` is the lifeline's descriptor, `passphrase` that of the passphrase file."""
     settings = msgspec.json.decode(config.read_bytes(), type=_Settings)
-    kept = Kept(settings.audit.retention_days, settings.audit.retention_bytes)
+    kept = RetentionLimits(settings.audit.retention_days, settings.audit.retention_bytes)
     serve(lifeline_fd, Path(settings.state, "signer"), settings.ipsec.ca, passphrase, kept)
 
 
@@ -171,14 +174,14 @@ def serve(
     directory: Path,
     kind: Kind = "ecdsa",
     passphrase: int | None = None,
-    kept: Kept = Kept(),  # noqa: B008  frozen
+    kept: RetentionLimits = RetentionLimits(),  # noqa: B008  frozen
 ) -> None:
-    """The same, with the directory of the keys, the kind of the authority's, and how long records are kept."""
+    """Run the signer with its directory, the kind of the authority's key, and the limits of the log."""
     lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
     try:
         os.umask(0o077)
         secret = read_passphrase(passphrase) if passphrase is not None else None
-        key, authority = load_or_create_key(directory), Authority(directory, kind, secret)
+        key, authority = load_or_create_key(directory), CertificateAuthority(directory, kind, secret)
     except (SignerKeyError, OSError) as error:
         lifeline.send(messages.Failed(f"the signer cannot use its key: {error}"))
         sys.exit(1)

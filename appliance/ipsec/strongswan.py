@@ -1,13 +1,11 @@
-"""What charon is told: its configuration file, and over vici the tunnels of the enrolled hosts. No I/O.
+"""Make charon's configuration: its file, and the tunnels of the enrolled hosts for vici. No I/O.
 
-Invariants:
-
-1. AES-256-GCM, SHA-384 and Curve25519 or ECP-384, with ML-KEM-768 beside Curve25519 where charon has it; nothing
-   weaker is offered or accepted.
-2. A host is let in by a certificate of the appliance's own authority that is on no list of revoked ones (without a
-   valid list: nobody), under the name in it; it gets the one address that is kept for this name, and nothing but
-   the appliance's address on the other side. A host that is not enrolled has no configuration that could match.
-3. charon loads the plugins named here and no others: none that runs programs or asks the network for lists.
+1. The only proposals are AES-256-GCM and SHA-384 with Curve25519 or ECP-384, and with ML-KEM-768 besides Curve25519 if
+   charon has it.
+2. A host needs a certificate of the appliance's own authority that is not revoked; without a valid revocation list no
+   host is accepted. The name in the certificate determines its only address, and it reaches only the appliance's. No
+   connection matches a host that is not enrolled.
+3. charon loads only the plugins listed here. None of them runs programs or requests lists from the network.
 """
 
 from collections.abc import Iterable, Mapping
@@ -29,13 +27,13 @@ _PREFIX = "host-"
 
 
 def plugins(esp: Esp) -> str:
-    """The plugins that charon loads, in order, on the appliance and on hosts."""
+    """Return the plugins that charon loads, in order."""
     kernel = ("kernel-libipsec",) if esp == "user space" else ()
     return " ".join((*_PLUGINS, *kernel, "kernel-netlink", "socket-default", "vici"))
 
 
 def configuration(directory: Path, esp: Esp) -> str:
-    """`strongswan.conf` of the appliance's charon, which keeps its socket in `directory` and logs to stderr."""
+    """Return `strongswan.conf` of the appliance's charon, with its socket in `directory` and its log on stderr."""
     return f"""\
 charon-systemd {{
   load = {plugins(esp)}
@@ -65,20 +63,20 @@ charon-systemd {{
 
 @dataclass(frozen=True)
 class Proposals:
-    """What is offered and accepted, the best first."""
+    """The offered and accepted proposals, the best first."""
 
     ike: tuple[str, ...] = IKE_PROPOSALS
     esp: tuple[str, ...] = ESP_PROPOSALS
 
     @property
     def key_exchange(self) -> list[str]:
-        """The methods of key exchange, for status: `x25519+mlkem768`, `x25519`, `ecp384`."""
+        """Return the key exchange methods for status: `x25519+mlkem768`, `x25519`, `ecp384`."""
         words = [proposal.removeprefix("aes256gcm16-prfsha384-") for proposal in self.ike]
         return [word.replace("-ke1_", "+") for word in words]
 
 
 def proposals_of(key_exchanges: Iterable[str]) -> Proposals:
-    """What a charon with these key exchanges (its own names) is let offer."""
+    """Return the proposals for a charon with these key exchanges (its own names)."""
     if _ML_KEM_ALGORITHM not in key_exchanges:
         return Proposals()
     return Proposals(
@@ -87,22 +85,22 @@ def proposals_of(key_exchanges: Iterable[str]) -> Proposals:
 
 
 def connection_name(host: str) -> str:
-    """The name of a host's connection and pool in charon."""
+    """Return the name of a host's connection and pool in charon."""
     return _PREFIX + host
 
 
 def host_of(connection: str) -> str | None:
-    """The host of a connection; None for one that is not ours (a handshake before it is known whose)."""
+    """Return the host of a connection; None for others (a handshake before its host is known)."""
     return connection.removeprefix(_PREFIX) if connection.startswith(_PREFIX) else None
 
 
 def pool(host: TunnelHost) -> dict[str, Any]:
-    """The one address of a host, for vici's `load-pool`."""
+    """Return the pool with the one address of a host, for vici's `load-pool`."""
     return {connection_name(host.name): {"addrs": f"{host.address}-{host.address}"}}
 
 
 def connection(host: TunnelHost, stated: TunnelsStated, proposals: Proposals) -> Mapping[str, Any]:
-    """The tunnel of a host, for vici's `load-conn`."""
+    """Return the tunnel of a host, for vici's `load-conn`."""
     child = {
         "local_ts": [f"{stated.address}/32"],
         "remote_ts": ["dynamic"],

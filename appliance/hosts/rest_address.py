@@ -1,4 +1,4 @@
-"""Where other machines and hosts in tunnels reach REST, as far as the configuration says. No I/O."""
+"""Derive from the configuration where other machines, and hosts in tunnels, reach REST. No I/O."""
 
 from dataclasses import dataclass
 
@@ -11,10 +11,10 @@ NO_TUNNELS = (
 
 
 @dataclass(frozen=True)
-class RestPlace:
-    """`port` is that for other machines; None: they cannot reach it, and `trouble` says what to do.
+class RestAddress:
+    """The ports of REST: `port` for other machines, or None, and `trouble` says what to do.
 
-    `inner_port` is that for hosts in their tunnels, at the appliance's own address there; None: they cannot.
+    `inner_port` is for hosts in tunnels, at the appliance's own address there; None if they cannot reach REST.
     """
 
     port: int | None
@@ -22,30 +22,30 @@ class RestPlace:
     inner_port: int | None
 
 
-def rest_place(settings: Settings) -> RestPlace:
-    """The place."""
+def rest_address(settings: Settings) -> RestAddress:
+    """Return the ports of REST by the configuration."""
     if settings.isolation == "none":
-        return RestPlace(None, NO_TUNNELS, None)
+        return RestAddress(None, NO_TUNNELS, None)
     if settings.api_address is None:
-        return RestPlace(None, "REST is off: hosts cannot enrol themselves; set `api: 0.0.0.0:8443`", None)
+        return RestAddress(None, "REST is off: hosts cannot enrol themselves; set `api: 0.0.0.0:8443`", None)
     host, port = settings.api_address
     if not settings.api_tls:
-        return RestPlace(None, "REST is in clear text (api_tls: off): hosts cannot enrol themselves", None)
+        return RestAddress(None, "REST is in clear text (api_tls: off): hosts cannot enrol themselves", None)
     everywhere = settings.isolation == "netns" or host in ("0.0.0.0", "::")  # noqa: S104  compared only
     inner = port if everywhere else None
     trouble = _trouble_outside(settings, host, port, everywhere=everywhere)
-    return RestPlace(None if trouble else port, trouble, inner)
+    return RestAddress(None if trouble else port, trouble, inner)
 
 
 def _trouble_outside(settings: Settings, host: str, port: int, *, everywhere: bool) -> str:
-    """Why other machines cannot reach it, and what to do; empty where they can."""
+    """Return why other machines cannot reach REST, and what to do; empty if they can."""
     if not everywhere and is_loopback(host):
         return f"REST listens on {host} only: for hosts to enrol themselves set `api: 0.0.0.0:{port}`"
     if not settings.api_published:
         return (
             "other machines cannot reach REST (api_published: off). For hosts to enrol themselves publish port"
             f" {port} of the container on an address of this machine, name their network in ROSRV_API_NETWORKS, and set"
-            " ROSRV_API_PUBLISHED (docs/enrol-a-laptop.md); a kit, without --token, needs none of it"
+            " ROSRV_API_PUBLISHED (docs/tunnels.md); a kit, without --token, needs none of it"
         )
     if not settings.api_networks:
         return (
