@@ -1,1 +1,1 @@
-"""What is given to others: Debian packages (`deb`), the image (`image`), an archive (`site`), signed (`release`)."""
+"""Build what is released: Debian packages (`deb`), the image (`image`), an archive (`site`), signed (`release`)."""

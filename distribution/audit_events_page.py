@@ -1,9 +1,8 @@
-"""The page of audit events, made from the registry and from what the program really records.
+"""Write the page of audit events from the registry and from the calls that record events.
 
-`python -m distribution.audit_events_page` prints docs/audit-events.md; a test holds the page against it. Severities
-that the registry does not have, and the fields of `detail`, are read off the calls that record an event, so they cannot
-be forgotten; what is recorded under
-names that are computed (the log's own records, what monitors did) is in `ELSEWHERE`.
+`python -m distribution.audit_events_page` prints docs/reference/audit-events.md; a test compares the page with it.
+Severities that the registry does not have, and the fields of `detail`, are read from the calls that record an event.
+Events whose names are computed (the log's own records, the actions of monitors) are in `ELSEWHERE`.
 """
 
 import ast
@@ -44,7 +43,7 @@ _MONITOR = (
 _LED = ("at", "events", "timer", "conditions")
 ELSEWHERE: dict[str, tuple[str, ...]] = {
     **_LOGS_OWN,
-    "decision": ("call", "key", "node", "subgraph", "needs", "parts", "stranger"),
+    "decision": ("call", "key", "node", "subgraph", "needs", "parts", "unknown_host", "stranger"),
     "revoked": ("call", "needs"),
     "denials folded": _FOLDED,
     "repetitions folded": _FOLDED,
@@ -54,14 +53,14 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
     "message dropped": (*_MONITOR, *_LED, "values", "handler", "why"),
     "monitor published": (*_MONITOR, "because_of", *_LED, "handler", "why"),
     "message changed": (*_MONITOR, "changed_by", *_LED),
-    "trial observed": (*_MONITOR, "changed_by", "trial", "would", *_LED, "values", "handler", "why"),
+    "shadow observed": (*_MONITOR, "changed_by", "shadow", "would", *_LED, "values", "handler", "why"),
 }  # fmt: skip
 
 _HEAD = """\
 # Audit events
 
 Every event by its stable name (`rosrv audit search --event NAME`), what it means, the severities it is recorded
-with, and the fields of its `detail`. The fields that every record has are in [audit.md](audit.md). A name is never
+with, and the fields of its `detail`. The fields that every record has are in [audit.md](../audit.md). A name is never
 renamed or given another meaning.
 
 | event | meaning | severity | fields of `detail` |
@@ -69,8 +68,8 @@ renamed or given another meaning.
 """
 
 
-class Use(NamedTuple):
-    """One place that records an event under a literal name."""
+class EventUse(NamedTuple):
+    """A call that records an event with a literal name."""
 
     event: str
     place: str
@@ -79,8 +78,8 @@ class Use(NamedTuple):
     denies: bool
 
 
-def uses() -> Iterator[Use]:
-    """Every such place in the program."""
+def uses() -> Iterator[EventUse]:
+    """Yield every call in the program that records an event with a literal name."""
     root = Path(appliance.__file__).parent
     for path in sorted(root.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -88,23 +87,23 @@ def uses() -> Iterator[Use]:
                 yield from _use(node, f"{path.relative_to(root)}:{node.lineno}")
 
 
-def _use(node: ast.Call, place: str) -> Iterator[Use]:
+def _use(node: ast.Call, place: str) -> Iterator[EventUse]:
     called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
     named = {one.arg: one.value for one in node.keywords if one.arg is not None}
-    if called == "Record" and "event" in named:
+    if called in ("AuditRecord", "WriteRecord") and "event" in named:
         event = named["event"]
-    elif called in ("happened", "_own", "_make", "Record", "_record") and node.args:
+    elif called in ("happened", "_own", "_make", "AuditRecord", "WriteRecord", "_record") and node.args:
         event = node.args[0]
     else:
         return
     fields = tuple(name for name in named if name not in _FIELDS) if called == "happened" else ()
     for name in _texts(event):
         denies = "decision" in named and any("deny" in _texts(one) for one in ast.walk(named["decision"]))
-        yield Use(name, place, _severities(node, called, name), fields, denies)
+        yield EventUse(name, place, _severities(node, called, name), fields, denies)
 
 
 def _texts(node: ast.AST) -> Iterator[str]:
-    """The texts an expression can be: a literal, or one of two."""
+    """Yield the possible texts of an expression: a literal, or one of two."""
     match node:
         case ast.Constant(value=str(text)):
             yield text
@@ -126,7 +125,7 @@ def _severities(node: ast.Call, called: str, event: str) -> frozenset[str]:
 
 
 def markdown() -> str:
-    """The page."""
+    """Return the page."""
     severities: dict[str, set[str]] = {name: set() for name in EVENTS}
     fields: dict[str, list[str]] = {name: list(ELSEWHERE.get(name, ())) for name in EVENTS}
     for use in uses():

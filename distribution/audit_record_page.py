@@ -1,6 +1,6 @@
-"""The tables of the reviewer's page, made from the code.
+"""Write the generated part of the page about audit records.
 
-`python -m distribution.audit_record_page` prints the generated part of docs/audit.md; a test holds the page against it.
+`python -m distribution.audit_record_page` prints it; a test compares it with the page.
 """
 
 import json
@@ -32,12 +32,12 @@ CHAIN: dict[str, Any] = {
 
 
 def markdown() -> str:
-    """The generated part of the reviewer's page."""
+    """Return the generated part of the page."""
     lines = ["## Fields of a record", "", "| field | meaning |", "|---|---|"]
     lines += [f"| `{name}` | {text} |" for name, (_form, text) in FIELDS.items()]
     lines += [
         "",
-        "The names of `event`, each with its fields of `detail`: [audit-events.md](audit-events.md).",
+        "The names of `event`, each with its fields of `detail`: [audit-events.md](reference/audit-events.md).",
     ]
     lines += ["", "## JSON schema", "", "```json", json.dumps(json_schema(), indent=2), "```", ""]
     lines += [

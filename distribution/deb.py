@@ -2,8 +2,8 @@
 
     python -m distribution.deb amd64 arm64
 
-The tree of the package is put together under build/package/ARCH, then debhelper makes the package of it. Every time in
-it is that of the newest commit, so two builds of one commit are the same, byte by byte.
+The tree of the package is made under build/package/ARCH, then debhelper packs it. All times in it are that of the
+newest commit, so two builds of one commit are equal, byte by byte.
 """
 
 import os
@@ -30,7 +30,7 @@ import os
 
 from appliance.cli.main import main
 
-# Whoever is elsewhere means the appliance of this machine, too.
+# In any other folder the appliance of this machine is meant.
 if not os.path.exists("appliance.yaml"):
     os.environ.setdefault("ROSRV_CONFIG", "/etc/rosrv/appliance.yaml")
 main()
@@ -38,14 +38,14 @@ main()
 
 
 def build(architecture: Architecture, *, moment: int) -> Path:
-    """Build the package of this architecture; `moment` (seconds since the epoch) is every time in it. Its path."""
+    """Build the package of this architecture with all times at `moment` (seconds since the epoch); return its path."""
     work = ROOT / "build/package" / architecture.debian
     shutil.rmtree(work, ignore_errors=True)
     source = work / "source"
     source.mkdir(parents=True)
     _gather(source, architecture, work, moment)
     _debian_folder(source / "debian", moment)
-    for path in source.rglob("*"):  # dpkg takes down what is later, but leaves what is earlier
+    for path in source.rglob("*"):  # dpkg lowers later times, but keeps earlier ones
         os.utime(path, (moment, moment), follow_symlinks=False)
     environment = {"SOURCE_DATE_EPOCH": str(moment), "DEB_BUILD_OPTIONS": "nocheck", "LC_ALL": "C.UTF-8"}
     subprocess.run(
@@ -66,7 +66,7 @@ def build(architecture: Architecture, *, moment: int) -> Path:
 
 
 def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -> None:
-    """Everything that the package installs, under `source/root`."""
+    """Copy all files of the package to `source/root`."""
     root = source / "root"
     library = root / LIBRARY
     make_environment(library, architecture, work)
@@ -81,7 +81,7 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     (shipped / "build.json").write_text(facts("package", architecture.debian, revision(), moment))
     (shipped / "scripts").mkdir()
     shutil.copy(ROOT / "scripts/build-roscpp", shipped / "scripts")
-    # Where the program looks, as in any environment that the wheel was installed to.
+    # The program's data path, as with the wheel.
     (library / "share").symlink_to("../../share")
     (root / "usr/bin").mkdir(parents=True)
     launcher = root / "usr/bin/rosrv"
@@ -107,17 +107,14 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
 
 
 def _make_virtual(library: Path) -> None:
-    """A virtual environment of Debian's interpreter, whichever of `INTERPRETERS` that is."""
+    """Make a virtual environment of Debian's interpreter, any of `INTERPRETERS`."""
     (library / "bin").mkdir()
     (library / "bin/python").symlink_to("/usr/bin/python3")
     (library / "pyvenv.cfg").write_text("home = /usr/bin\ninclude-system-site-packages = false\n")
 
 
 def _documentation(target: Path) -> None:
-    target.mkdir(parents=True)
-    for page in sorted((ROOT / "docs").glob("*.md")):
-        shutil.copyfile(page, target / page.name)
-    _copy(ROOT / "docs/pictures", target / "pictures")
+    _copy(ROOT / "docs", target)
     for name in ("README.md", "SECURITY.md"):
         shutil.copyfile(ROOT / name, target / name)
 
@@ -152,7 +149,7 @@ def _missing_packages() -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Build for the architectures that are named; exit status 1 with words when that is not possible."""
+    """Build for the given architectures; return exit status 1 with a message on failure."""
     unknown = [name for name in arguments if name not in ARCHITECTURES]
     if unknown or not arguments:
         sys.stderr.write(f"package: give architectures of {', '.join(ARCHITECTURES)}, not {unknown}\n")
@@ -161,7 +158,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"package: tools are missing: sudo apt-get install {' '.join(missing)}\n")
         return 1
     if re.fullmatch(r"\d+\.\d+\.\d+(~\w+)?", __version__) is None:
-        sys.stderr.write(f"package: version {__version__} is none of a package\n")
+        sys.stderr.write(f"package: {__version__} is not a package version\n")
         return 1
     moment = time_of_commit()
     for name in arguments:

@@ -1,11 +1,11 @@
-"""The locked Python environment for an architecture and all interpreters the package serves, as a tree of files.
+"""Make the locked Python environment of the package, for an architecture and all interpreters.
 
-    lib/python3.11/site-packages   what fits this interpreter only
+    lib/python3.11/site-packages   files for this interpreter only
     lib/python3.12/site-packages
-    common                         what is the same for all: each `site-packages` has a `common.pth` that leads to it
+    common                         files for all: each `site-packages` has a `common.pth` with its path
 
-The wheels are those of requirements.lock, by hash, for the architecture that is asked for: no code of theirs runs here.
-python-iptables comes as source; its one C file needs nothing but libc and is compiled here.
+The wheels are those of requirements.lock, by hash, for the given architecture; none of their code runs here.
+python-iptables comes as source; its one C file needs only libc and is compiled here.
 """
 
 import filecmp
@@ -26,14 +26,14 @@ _SOURCE_ONLY = "python-iptables"
 
 @dataclass(frozen=True)
 class Architecture:
-    """A Debian architecture, as the tools call it."""
+    """A Debian architecture with its names."""
 
     debian: str
     triplet: str
 
     @property
     def machine(self) -> str:
-        """As wheels and the kernel call it."""
+        """Return the architecture's name in wheels and the kernel."""
         return self.triplet.partition("-")[0]
 
 
@@ -44,7 +44,7 @@ ARCHITECTURES = {
 
 
 def make_environment(target: Path, architecture: Architecture, work: Path) -> None:
-    """Write the tree to `target`, which must not exist. Raises `subprocess.CalledProcessError`, `ValueError`."""
+    """Write the tree to the new folder `target`. Raises `subprocess.CalledProcessError`, `ValueError`."""
     wheels, source = _split_lock((ROOT / "requirements.lock").read_text(), work)
     trees = [target / f"lib/python{version}/site-packages" for version in INTERPRETERS]
     for version, tree in zip(INTERPRETERS, trees, strict=True):
@@ -59,7 +59,7 @@ def make_environment(target: Path, architecture: Architecture, work: Path) -> No
 
 
 def _split_lock(lock: str, work: Path) -> tuple[Path, Path]:
-    """Two lock files in `work`: what has wheels, and what comes as source."""
+    """Write two lock files to `work`: packages with wheels, and packages as source."""
     entries = re.split(r"\n(?=\S)", lock)
     own = [entry for entry in entries if entry.startswith(f"{_SOURCE_ONLY}==")]
     if len(own) != 1:
@@ -82,7 +82,7 @@ def _install_wheels(tree: Path, version: str, architecture: Architecture, lock: 
 def _install_iptables(tree: Path, version: str, architecture: Architecture, lock: Path, work: Path) -> None:
     folder = work / "iptables"
     if not folder.exists():
-        # pip asks the source for its name, which takes Debian's setuptools; nothing of it is installed by that.
+        # pip asks the source for its name, which needs Debian's setuptools; nothing is installed.
         _run(
             *(
                 str(PIP),
@@ -118,14 +118,14 @@ def _install_iptables(tree: Path, version: str, architecture: Architecture, lock
 
 
 def _leave_out(tree: Path) -> None:
-    """Programs and tests of the packages: nothing of them is needed."""
+    """Remove programs and tests of the packages."""
     shutil.rmtree(tree / "bin", ignore_errors=True)
     for tests in [path for path in tree.rglob("tests") if path.is_dir()]:
         shutil.rmtree(tests, ignore_errors=True)
     shutil.rmtree(tree / "apsw/sqlite_extra_binaries", ignore_errors=True)
     for name in (".lock", ".gitignore"):
         (tree / name).unlink(missing_ok=True)
-    # What the installer wrote about this machine, and lists of files that are not there any more.
+    # The installer's notes about this machine, and outdated lists of files.
     for record in [*tree.glob("*.dist-info/RECORD"), *tree.glob("*.dist-info/direct_url.json")]:
         record.unlink()
 
@@ -136,7 +136,7 @@ def _strip(tree: Path, architecture: Architecture) -> None:
 
 
 def _share(trees: list[Path], common: Path) -> None:
-    """Move to `common` each top-level entry that is the same in all trees."""
+    """Move each top-level entry that is equal in all trees to `common`."""
     common.mkdir(parents=True)
     first, *others = trees
     for entry in sorted(first.iterdir()):

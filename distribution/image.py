@@ -1,12 +1,12 @@
-"""`make image`: dist/rosrv-image_VERSION_ARCH.tar, for `docker load` and every tool that reads OCI images.
+"""`make image`: dist/rosrv-image_VERSION_ARCH.tar, for `docker load` and all OCI tools.
 
     python -m distribution.image [OPTIONS OF docker build …]
 
-The engine builds the target `appliance` of the Dockerfile with the Debian packages of image-packages.lock. What it
-made is written anew: no time in it is later than the newest commit, so that two builds of one commit can be equal,
-and one layer is added, with the list of all that is in the image (`sbom`) and what it was built from.
+The engine builds the target `appliance` of the Dockerfile with the Debian packages of image-packages.lock. The result
+is rewritten: no time in it is later than the newest commit, so that two builds of one commit can be equal. One layer is
+added, with the list of parts (`sbom`) and the origin of the build.
 
-    python -m distribution.image lock BASE [OPTIONS …]     image-packages.lock anew, from what Debian has now
+    python -m distribution.image lock BASE [OPTIONS …]     new image-packages.lock from Debian's present packages
 """
 
 import hashlib
@@ -24,7 +24,7 @@ from typing import IO, Any
 
 from appliance import __version__
 from distribution.checkout import ROOT, facts, revision, time_of_commit
-from distribution.sbom import Tree, make_sbom
+from distribution.sbom import ImageFiles, make_sbom
 
 NAME = f"rosrv/appliance:{__version__}"
 LOCK = ROOT / "distribution/image-packages.lock"
@@ -44,16 +44,16 @@ class Blob:
     size: int
 
     def described(self, media_type: str) -> dict[str, Any]:
-        """As manifests refer to it."""
+        """Return its descriptor for manifests."""
         return {"mediaType": media_type, "digest": f"sha256:{self.digest}", "size": self.size}
 
 
 def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
-    """Build the image; `moment` (seconds since the epoch) is the latest time in it. The image's and its list's path.
+    """Build the image with times up to `moment` (seconds since the epoch); return the paths of image and list.
 
     Raises `subprocess.CalledProcessError`.
     """
-    # Nothing is taken from an earlier build: what was made before the commit would keep its own times.
+    # No cache: older parts would keep their own times.
     pins = " ".join(line for line in LOCK.read_text().splitlines() if not line.startswith("#"))
     _docker(
         "build", "--no-cache", "--target", "appliance", "--tag", NAME, "--build-arg", f"PINS={pins}",
@@ -65,11 +65,11 @@ def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
     with tempfile.TemporaryDirectory(prefix="rosrv-image-", dir=folder) as work:
         saved = Path(work) / "saved.tar"
         _docker("save", "--output", str(saved), NAME)
-        return _write_anew(saved, Path(work), moment)
+        return _rewrite(saved, Path(work), moment)
 
 
 def lock(base: str, build_options: list[str]) -> None:
-    """Write image-packages.lock: what the image has beside its base, which has what its digest says."""
+    """Write image-packages.lock: the packages of the image that are not in its base."""
     options = ["--quiet", "--target", "appliance", str(ROOT)]
     listed = "dpkg-query --show --showformat '${Package}=${Version}\\n'"
     before, after = (
@@ -79,8 +79,8 @@ def lock(base: str, build_options: list[str]) -> None:
     LOCK.write_text(_HEAD + "\n".join(sorted(after - before)) + "\n")
 
 
-def _write_anew(saved: Path, work: Path, moment: int) -> tuple[Path, Path]:
-    tree = Tree()
+def _rewrite(saved: Path, work: Path, moment: int) -> tuple[Path, Path]:
+    tree = ImageFiles()
     with tarfile.open(saved) as archive:
         entry = json.loads(_opened(archive, "manifest.json").read())[0]
         config = json.loads(_opened(archive, entry["Config"]).read())
@@ -104,9 +104,9 @@ def _write_anew(saved: Path, work: Path, moment: int) -> tuple[Path, Path]:
 
 
 def _kept(
-    members: tarfile.TarFile, tree: Tree, moment: int
+    members: tarfile.TarFile, tree: ImageFiles, moment: int
 ) -> Iterator[tuple[tarfile.TarInfo, IO[bytes] | None]]:
-    """The entries of a layer without what differs from one build to the next; `tree` is told of each."""
+    """Yield the entries of a layer without values that differ between builds; add each to `tree`."""
     for member in members:
         member.mtime = min(int(member.mtime), moment)
         member.pax_headers = {
@@ -148,7 +148,7 @@ def _blob(path: Path) -> Blob:
 
 
 def _settled(config: dict[str, Any], layers: list[Blob], moment: int) -> dict[str, Any]:
-    """The configuration for these layers, without what only the building engine knows."""
+    """Return the configuration for these layers, without values of the building engine."""
     created = datetime.fromtimestamp(moment, UTC).isoformat().replace("+00:00", "Z")
     history = [{**step, "created": created} for step in config["history"]]
     history.append(
@@ -176,7 +176,7 @@ def _settled(config: dict[str, Any], layers: list[Blob], moment: int) -> dict[st
 
 
 def _write_oci(image: Path, config: dict[str, Any], layers: list[Blob], moment: int) -> None:
-    """An OCI layout as one archive, with the manifest.json that every `docker load` knows."""
+    """Write an OCI layout as one archive, with the manifest.json for `docker load`."""
     folder = layers[0].file.parent
 
     def document(name: str, content: Any) -> Blob:
@@ -216,7 +216,7 @@ def _write_oci(image: Path, config: dict[str, Any], layers: list[Blob], moment: 
 
 def _opened(archive: tarfile.TarFile, name: str) -> IO[bytes]:
     member = archive.extractfile(name)
-    assert member is not None, name  # noqa: S101  the engine has written it
+    assert member is not None, name  # noqa: S101  the engine wrote it
     return member
 
 
@@ -228,7 +228,7 @@ def _docker(*arguments: str) -> str:
 
 
 def attempt(options: list[str]) -> tuple[Path, ...]:
-    """`build`, and what came of it in words; nothing when the engine refused."""
+    """Build the image and print the result; return no paths if the engine fails."""
     try:
         made = build(options, moment=time_of_commit())
     except FileNotFoundError:
@@ -243,7 +243,7 @@ def attempt(options: list[str]) -> tuple[Path, ...]:
 
 
 def main(arguments: list[str]) -> int:
-    """Build the image, or with `lock` the list of its packages anew; the exit status."""
+    """Build the image, or with `lock` a new list of its packages; return the exit status."""
     if arguments[:1] == ["lock"]:
         lock(arguments[1], arguments[2:])
         return 0

@@ -1,4 +1,4 @@
-"""Man pages of `rosrv`, made of its own help: rosrv(1), and a page for each verb.
+"""Write the man pages of `rosrv` from its own help: rosrv(1), and a page for each verb.
 
 python -m distribution.man DIRECTORY DATE     (DATE as 2026-11-01: two builds write the same)
 """
@@ -9,10 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import typer
-
 from appliance import __version__ as VERSION  # noqa: N812  a constant
 from appliance.cli.main import app
+from distribution.command_line_page import commands
 
 _FILES = """\
 .SH FILES
@@ -31,26 +30,11 @@ The pages in \\fI/usr/share/doc/rosrv\\fR.
 
 
 def write_pages(directory: Path, date: str) -> None:
-    """Write `rosrv.1` and `rosrv-VERB.1` for each verb that is shown."""
-    root = typer.main.get_command(app)
-    context = root.make_context("rosrv", [], resilient_parsing=True)
+    """Write `rosrv.1` and `rosrv-VERB.1` for each visible verb."""
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / "rosrv.1").write_text("".join(_page("rosrv", root, context, date)) + _FILES)
-    for words, command, inner in _verbs(("rosrv",), root, context):
-        name = "-".join(words)
-        (directory / f"{name}.1").write_text("".join(_page(" ".join(words), command, inner, date)))
-
-
-def _verbs(words: tuple[str, ...], group: Any, context: Any) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
-    for name in group.list_commands(context):
-        command = group.get_command(context, name)
-        if command.hidden:
-            continue
-        inner = command.make_context(name, [], parent=context, resilient_parsing=True)
-        real = inner.command
-        yield (*words, name), real, inner
-        if hasattr(real, "list_commands"):
-            yield from _verbs((*words, name), real, inner)
+    for words, command, context in commands(("rosrv",), app):
+        text = "".join(_page(" ".join(words), command, context, date))
+        (directory / f"{'-'.join(words)}.1").write_text(text + (_FILES if len(words) == 1 else ""))
 
 
 def _page(title: str, command: Any, context: Any, date: str) -> Iterator[str]:
@@ -87,7 +71,7 @@ def _one_line(text: str) -> str:
 
 
 def _text(text: str) -> str:
-    """Text that roff takes as it stands."""
+    """Escape a text for roff."""
     escaped = text.replace("\\", "\\e").replace("-", "\\-").replace("'", "\\(aq")
     return re.sub(r"^\.", r"\\&.", escaped, flags=re.MULTILINE)
 

@@ -1,11 +1,11 @@
-"""`make release KEY=FILE`: what dist/ has, with its provenance, checksums and a signature of them.
+"""`make release KEY=FILE`: add provenance, checksums and a signature to the files in dist/.
 
-    provenance.json   what each file was built from (an in-toto statement, SLSA provenance 1)
+    provenance.json   the origin of each file (an in-toto statement, SLSA provenance 1)
     SHA256SUMS        of every file, as `sha256sum --check` reads them
     SHA256SUMS.sig    ECDSA P-256 over SHA256SUMS, as `cosign verify-blob` and `openssl dgst` check it
 
-The key is the releasing person's (`openssl ecparam -name prime256v1 -genkey -noout`); the public half is given to
-sites on a way of its own. The target builds everything anew before it signs, so that all is of one commit.
+The key is that of the person who releases (`openssl ecparam -name prime256v1 -genkey -noout`); sites get the public
+half separately. The target builds everything again before it signs, so that all files are of one commit.
 """
 
 import base64
@@ -27,10 +27,10 @@ _MATERIALS = ("requirements.lock", "requirements-dev.lock", "distribution/image-
 
 
 def release(folder: Path, key: Path) -> None:
-    """Write the three files to `folder`. Raises `ValueError` where the key is none or there is nothing to sign."""
+    """Write the three files to `folder`. Raises `ValueError` for an invalid key or an empty folder."""
     private = load_pem_private_key(key.read_bytes(), password=None)
     if not isinstance(private, ec.EllipticCurvePrivateKey) or private.curve.name != "secp256r1":
-        raise ValueError(f"{key} is no private key of the curve P-256")
+        raise ValueError(f"{key} is not a private key on the curve P-256")
     files = {
         path.name: _digest(path)
         for path in sorted(folder.iterdir())
@@ -74,7 +74,7 @@ def _provenance(files: dict[str, str]) -> dict[str, object]:
 
 
 def main(arguments: list[str]) -> int:
-    """Sign what is in dist/; exit status 1 with words when that is not possible, 2 without a key."""
+    """Sign the files in dist/; return exit status 1 with a message on failure, 2 without a key."""
     if len(arguments) != 1 or not arguments[0]:
         sys.stderr.write("release: give the file of the private key: make release KEY=FILE\n")
         return 2

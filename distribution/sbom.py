@@ -1,7 +1,6 @@
-"""What is in the image, as CycloneDX: Debian's packages, Python's, those of the console, each with its licences.
+"""List the parts of the image as CycloneDX: packages of Debian, Python and the console, with their licences.
 
-It is made from the image's files, not from what was asked for: from dpkg's own list, from the metadata of each Python
-package, from the console's manifest.
+The list comes from the image's files: dpkg's list, the metadata of each Python package, the console's manifest.
 """
 
 import json
@@ -30,20 +29,20 @@ _MANIFEST = f"{_PYTHON}appliance/api/console/vendor/manifest.json"
 _READ = (_DPKG, "usr/share/doc/*/copyright", f"{_PYTHON}*.dist-info/METADATA", _MANIFEST)
 
 
-class Tree:
-    """The files of an image, layer after layer: the text of those that tell what is in it."""
+class ImageFiles:
+    """The files of an image, layer after layer, with the texts that name its parts."""
 
     def __init__(self) -> None:
         self.texts: dict[str, str] = {}
         self._links: dict[str, str] = {}
 
     def wants(self, name: str) -> bool:
-        """Whether the content of this file must be given to `add`."""
+        """Whether `add` needs the content of this file."""
         name = name.removeprefix("./")
         return any(fnmatchcase(name, pattern) for pattern in _READ)
 
     def add(self, name: str, data: bytes, *, link: str = "") -> None:
-        """An entry of the next layer; `link` is what a symbolic link points to."""
+        """Add an entry of the next layer; `link` is the target of a symbolic link."""
         name = name.removeprefix("./")
         folder, _, last = name.rpartition("/")
         if last.startswith(".wh."):
@@ -57,17 +56,17 @@ class Tree:
             self._links[name] = posixpath.normpath(posixpath.join(folder, link))
 
     def copyright(self, package: str) -> str:
-        """What Debian says of a package's licences; "" where it says nothing."""
+        """Return the text about a Debian package's licences, or an empty string."""
         folder = f"usr/share/doc/{package}"
         return self.texts.get(f"{self._links.get(folder, folder)}/copyright", "")
 
     def matching(self, pattern: str) -> Iterator[str]:
-        """The texts of all files of this name, in the order of their names."""
+        """Return the texts of all files that match, in order of their names."""
         return (self.texts[name] for name in sorted(self.texts) if fnmatchcase(name, pattern))
 
 
-def make_sbom(tree: Tree, *, architecture: str, moment: int) -> str:
-    """The list as JSON, the same for the same tree; `moment` in seconds since the epoch."""
+def make_sbom(tree: ImageFiles, *, architecture: str, moment: int) -> str:
+    """Return the list as JSON, equal for equal trees; `moment` in seconds since the epoch."""
     itself = Component(
         name="rosrv/appliance", version=__version__, type=ComponentType.CONTAINER, bom_ref="rosrv/appliance",
         licenses=_licences(["Apache-2.0"]),
@@ -93,13 +92,13 @@ def _part(
 
 
 def _licences(names: Iterable[str]) -> list[License]:
-    """As CycloneDX wants them: one expression, or a list of single ones."""
+    """Return licences for CycloneDX: one expression, or a list of single ones."""
     factory = LicenseFactory()
     made = [factory.make_from_string(name) for name in sorted(set(names))]
     return made if len(made) == 1 else [factory.make_with_name(name) for name in sorted(set(names))]
 
 
-def _debian(tree: Tree) -> Iterator[Component]:
+def _debian(tree: ImageFiles) -> Iterator[Component]:
     for fields in debian_packages(tree.texts[_DPKG]):
         name = fields["Package"]
         qualifiers = {"arch": fields["Architecture"], "distro": SYSTEM}
@@ -107,7 +106,7 @@ def _debian(tree: Tree) -> Iterator[Component]:
         yield _part(PackageURL("deb", "debian", name, fields["Version"], qualifiers), licences)
 
 
-def _python(tree: Tree) -> Iterator[Component]:
+def _python(tree: ImageFiles) -> Iterator[Component]:
     for text in tree.matching(f"{_PYTHON}*.dist-info/METADATA"):
         fields = message_from_string(text)
         purl = PackageURL("pypi", None, re.sub(r"[-_.]+", "-", fields["Name"]).lower(), fields["Version"])
@@ -115,7 +114,7 @@ def _python(tree: Tree) -> Iterator[Component]:
     yield _part(PackageURL("generic", None, "rosrv", __version__), ["Apache-2.0"], ComponentType.APPLICATION)
 
 
-def _console(tree: Tree) -> Iterator[Component]:
+def _console(tree: ImageFiles) -> Iterator[Component]:
     for text in tree.matching(_MANIFEST):
         packages = [package for file in json.loads(text)["files"].values() for package in file["packages"]]
         for name, version, licence in sorted(

@@ -1,8 +1,8 @@
-"""`make site`: dist/rosrv-site_VERSION_ARCH.tar, all that a site without a network needs: docs/air-gapped.md.
+"""`make site`: dist/rosrv-site_VERSION_ARCH.tar, all that a site without a network needs: docs/install.md.
 
     python -m distribution.site [OPTIONS OF docker build …]
 
-The image with its list of parts, the compose files, policies, monitors, the pages, and the checksums of it all.
+It has the image with its list of parts, compose files, policies, monitors, pages, and the checksums of all files.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ BESIDE = ("compose.yaml", "compose.host.yaml", "LICENSE", "docs", "ipsec", "moni
 
 
 def pack(parts: tuple[Path, ...], *, moment: int) -> Path:
-    """Put these files of dist/ and what stands beside them into one archive; its path."""
+    """Pack these files of dist/ and `BESIDE` into one archive; return its path."""
     files = {part.name: part for part in parts}
     for name in BESIDE:
         found = [path for path in (ROOT / name).rglob("*") if path.is_file()] or [ROOT / name]
@@ -42,7 +42,7 @@ def pack(parts: tuple[Path, ...], *, moment: int) -> Path:
 
 
 def main(arguments: list[str]) -> int:
-    """Build the image, then the archive; exit status 1 where the engine refuses."""
+    """Build the image, then the archive; return exit status 1 if the engine fails."""
     made = image.attempt(arguments)
     if made:
         sys.stdout.write(f"{pack(made, moment=time_of_commit()).relative_to(ROOT)}\n")
