@@ -165,7 +165,7 @@ hidden byte i, j, list, number, flags;                           /* for the leng
 
 /* --- control: what subscribers are told ------------------------------------------------------------------- */
 
-/* = appliance/master/graph/graph.py Graph._tell_one */
+/* = appliance/master/graph/graph.py RosGraph._tell_one */
 inline tell(s) {
     list = 0;
     for (i : 0 .. PUBLISHERS - 1) {
@@ -178,7 +178,7 @@ inline tell(s) {
     news[s]!list
 }
 
-/* = appliance/master/graph/graph.py Graph.tell */
+/* = appliance/master/graph/graph.py RosGraph.tell */
 inline tell_all() {
     for (j : 0 .. SUBSCRIBERS - 1) {
         if
@@ -232,7 +232,7 @@ inline answer_policy() {
     }
 }
 
-/* = appliance/master/graph/graph.py Graph.revoked
+/* = appliance/master/graph/graph.py RosGraph.revoked
    = appliance/master/graph/revocation.py Revocation._take_back */
 inline revoke_publication(p) {
     may_publish[p] = false;
@@ -244,7 +244,7 @@ inline revoke_publication(p) {
     fi
 }
 
-/* = appliance/master/graph/graph.py Graph._give_up
+/* = appliance/master/graph/graph.py RosGraph._give_up
    = appliance/master/graph/graph.py _emptied
    = appliance/master/graph/revocation.py Revocation._revoke */
 inline revoke_subscription(s) {
@@ -260,7 +260,7 @@ inline revoke_subscription(s) {
     fi
 }
 
-/* = appliance/master/graph/graph.py Graph.granted_again
+/* = appliance/master/graph/graph.py RosGraph.granted_again
    = appliance/master/graph/revocation.py Revocation.returned */
 inline give_publication(p) {
     may_publish[p] = true;
@@ -271,7 +271,7 @@ inline give_publication(p) {
     fi
 }
 
-/* = appliance/master/graph/graph.py Graph.remind */
+/* = appliance/master/graph/graph.py RosGraph.remind */
 inline give_subscription(s) {
     may_subscribe[s] = true;
     for (j : 0 .. PUBLISHERS - 1) { barred[PAIR(j, s)] = barred[PAIR(j, s)] && !may_publish[j] }
@@ -284,14 +284,14 @@ inline give_subscription(s) {
 
 /* --- the relay: monitors ---------------------------------------------------------------------------------- */
 
-/* = appliance/relay/relay.py Engine._let_monitor */
+/* = appliance/relay/data_plane.py DataPlane._attach_monitors */
 inline let_monitor(p) {
     through[p] = blocked || monitored[has];
     decided[p] = has
 }
 
-/* = appliance/relay/relay.py Engine._monitors_changed
-   = appliance/relay/monitors/interceptor.py Middle.look_again */
+/* = appliance/relay/data_plane.py DataPlane._monitors_changed
+   = appliance/relay/monitors/interceptor.py Interceptor.invalidate_prepared */
 inline monitors_changed() {
     for (i : 0 .. PUBLISHERS - 1) {
 #ifndef MUTANT_STALE_LANE
@@ -308,7 +308,7 @@ inline monitors_changed() {
 }
 
 /* A set of monitors takes the place of the one before, between two messages.
-   = appliance/relay/monitors/interceptor.py Middle.loaded */
+   = appliance/relay/monitors/interceptor.py Interceptor.loaded */
 inline swap(revision, how) {
     has = revision;
     blocked = false;
@@ -327,7 +327,7 @@ inline swap(revision, how) {
 
 /* --- the relay: connections ------------------------------------------------------------------------------- */
 
-/* = appliance/relay/relay.py Engine._remove_topic
+/* = appliance/relay/data_plane.py DataPlane._remove_topic
    = appliance/relay/connections/relayed_topic.py RelayedTopic.cut_all */
 inline remove_topic(p) {
     placed[p] = false;
@@ -371,11 +371,11 @@ inline pass_on(p, sequence, sent_under, judge) {
 
 #define AS_BEFORE (has && !blocked && len(compiling) == 0 && number == has)
 
-/* = appliance/relay/relay.py Engine._carry_out */
+/* = appliance/relay/data_plane.py DataPlane._carry_out */
 inline carry_out() {
     to_relay?message, number, flags;
     if
-    /* = appliance/relay/monitors/interceptor.py Middle.state
+    /* = appliance/relay/monitors/interceptor.py Interceptor.state
        = appliance/relay/monitors/loader.py Loader.later */
     :: message == spec ->
         if
@@ -393,20 +393,20 @@ inline carry_out() {
             assert(nfull(compiling));
             compiling!number, flags | AHEAD
         fi
-    /* = appliance/relay/relay.py Engine._state
-       = appliance/relay/relay.py Engine._place_topic */
+    /* = appliance/relay/data_plane.py DataPlane._state
+       = appliance/relay/data_plane.py DataPlane._place_topic */
     :: message == place ->
         listening[number] = true;
         if
         :: !placed[number] -> placed[number] = true; let_monitor(number)
         :: else
         fi
-    /* = appliance/relay/relay.py Engine._withdrawn */
+    /* = appliance/relay/data_plane.py DataPlane._withdrawn */
     :: message == withdraw -> remove_topic(number)
-    /* = appliance/relay/granted.py StatedTable.state */
+    /* = appliance/relay/grant_table.py GrantTable.state */
     :: message == grant -> allowed[PAIR(number, flags)] = true
-    /* = appliance/relay/granted.py StatedTable.withdraw
-       = appliance/relay/relay.py Engine._cut_by
+    /* = appliance/relay/grant_table.py GrantTable.withdraw
+       = appliance/relay/data_plane.py DataPlane._cut_by
        = appliance/relay/connections/subscriber.py Subscriber.cut */
     :: message == revoke ->
         allowed[PAIR(number, flags)] = false;
@@ -417,9 +417,9 @@ inline carry_out() {
         :: else
         fi
 #endif
-    /* = appliance/relay/relay.py Engine._upstream_answered
-       = appliance/relay/connections/upstream.py Publisher.found
-       = appliance/relay/connections/upstream.py Publisher._flow */
+    /* = appliance/relay/data_plane.py DataPlane._upstream_answered
+       = appliance/relay/connections/upstream.py PublisherConnection.found
+       = appliance/relay/connections/upstream.py PublisherConnection._flow */
     :: message == found ->
         if
         :: asked[number] == ANSWERED ->
@@ -427,7 +427,7 @@ inline carry_out() {
             for (j : 0 .. SUBSCRIBERS - 1) { last[PAIR(number, j)] = UNKNOWN }
         :: else
         fi
-    /* = appliance/relay/connections/upstream.py Publisher.refused */
+    /* = appliance/relay/connections/upstream.py PublisherConnection.refused */
     :: message == gone -> asked[number] = NOT
     :: message == orders -> orders_done = true
     fi;
@@ -441,7 +441,7 @@ end:
     do
     /* It registers, once: a turn of control.
        = appliance/master/calls/registration.py RegistrationCalls.register_publisher
-       = appliance/master/graph/graph.py Graph.registered
+       = appliance/master/graph/graph.py RosGraph.registered
        = appliance/master/endpoints/relay_control.py RelayControl.place */
     :: atomic {
         !came_p[me] -> came_p[me] = true;
@@ -464,7 +464,7 @@ end:
     do
     /* It registers, once: a turn of control; the answer has its list.
        = appliance/master/calls/registration.py RegistrationCalls.register_subscriber
-       = appliance/master/graph/graph.py Graph.list_for */
+       = appliance/master/graph/graph.py RosGraph.list_for */
     :: atomic {
         !came_s[me] -> came_s[me] = true;
         if
@@ -508,7 +508,7 @@ end:
     /* The grant is on the link before the subscriber has its answer. What a policy took back that came into force
        since it was decided is taken back now.
        = appliance/master/calls/node_calls.py NodeCalls.request_topic
-       = appliance/master/graph/graph.py Graph.topic_granted
+       = appliance/master/graph/graph.py RosGraph.topic_granted
        = appliance/master/calls/call_execution.py Execution._carry_out
        = appliance/master/graph/revocation.py Revocation.redecide_for */
     :: atomic {
@@ -533,10 +533,10 @@ end:
        }
     /* The relay takes the connection, when it has carried out what control has told it. Who lacks something that is
        held back waits.
-       = appliance/relay/relay.py Engine._introduced
-       = appliance/relay/connections/loop_channel.py Link.catch_up
+       = appliance/relay/data_plane.py DataPlane._introduced
+       = appliance/relay/transport/loop_channel.py LoopLink.catch_up
        = appliance/relay/connections/admission.py missing
-       = appliance/relay/relay.py Engine._subscribe */
+       = appliance/relay/data_plane.py DataPlane._subscribe */
     :: atomic {
         up && (awaited || len(to_relay) == 0) && listening[p] && connection[PAIR(p, s)] == KNOCKED ->
         if
@@ -583,8 +583,8 @@ end:
         fi
        }
 #ifdef TRACE
-    /* = appliance/master/endpoints/traffic.py Carried.opened
-       = appliance/master/endpoints/traffic.py Carried.closed */
+    /* = appliance/master/endpoints/traffic.py RelayTraffic.opened
+       = appliance/master/endpoints/traffic.py RelayTraffic.closed */
     :: atomic { reports?[opened] && NEXT_IS(opened, 0, 0) -> reports?opened; at++ }
     :: atomic { reports?[closed] && NEXT_IS(closed, 0, 0) -> reports?closed; at++ }
     /* = appliance/master/reconcile/reminders.py Reminders._remind */
@@ -597,7 +597,7 @@ end:
 }
 
 /* Monitors are loaded, replaced and removed, one change after the other.
-   = appliance/specifications/specifications.py Monitors._change
+   = appliance/specifications/specification_manager.py SpecificationManager._change
    = appliance/specifications/rollout.py Rollout._try */
 proctype Specifications() POSSIBLE {
 end:
@@ -674,7 +674,7 @@ end:
 #define HOLDS_NOTHING_BACK !awaited
 #endif
 
-/* = appliance/relay/relay.py Engine.take */
+/* = appliance/relay/data_plane.py DataPlane.take */
 proctype Relay() POSSIBLE {
     mtype message;
 end:
@@ -687,7 +687,7 @@ end:
         up && len(compiling) > 0 -> compiling?number, flags;
         if
         :: taken_by_relay[number] -> swap(number, flags)
-        /* = appliance/relay/monitors/interceptor.py Middle._refuse */
+        /* = appliance/relay/monitors/interceptor.py Interceptor._refuse */
         :: else ->
             awaited = awaited && !(flags & AHEAD);
             if
@@ -706,15 +706,15 @@ proctype Topic(byte p) POSSIBLE {
     byte sequence, sent_under, judge;
 end:
     do
-    /* = appliance/relay/connections/upstream.py Publisher.want
-       = appliance/relay/connections/upstream.py Publisher.ask */
+    /* = appliance/relay/connections/upstream.py PublisherConnection.connect
+       = appliance/relay/connections/upstream.py PublisherConnection.ask */
     :: atomic {
         up && placed[p] && !flowing[p] && asked[p] == NOT && (through[p] || connected_to(p)) ->
         asked[p] = ASKING
        }
     /* = appliance/relay/connections/relayed_topic.py RelayedTopic.received
-       = appliance/relay/monitors/topic_pipeline.py Lane.through
-       = appliance/relay/monitors/topic_pipeline.py Lane._prepare */
+       = appliance/relay/monitors/topic_pipeline.py TopicPipeline.through
+       = appliance/relay/monitors/topic_pipeline.py TopicPipeline._prepare */
     :: atomic {
         up && flowing[p] && len(upstream[p]) > 0 ->
 #ifdef MUTANT_GIVEN_AGAIN
@@ -764,7 +764,7 @@ end:
 }
 
 /* The relay dies, and is started again; control states everything afresh.
-   = appliance/supervisor/process_handle.py Life */
+   = appliance/supervisor/process_handle.py ProcessHandle */
 proctype Supervisor() POSSIBLE {
 #ifdef MUTANT_STATED_LATER
     bool later;
@@ -806,8 +806,8 @@ end:
     /* = appliance/master/endpoints/relay_control.py RelayControl.attach
        = appliance/specifications/rollout.py Rollout.statement
        = appliance/master/endpoints/relay_control.py RelayControl._place
-       = appliance/control/process.py _Control._relay_link
-       = appliance/master/graph/graph.py Graph.tell_everybody */
+       = appliance/control/supervisor_messages.py SupervisorMessages._relay_link
+       = appliance/master/graph/graph.py RosGraph.tell_everybody */
     :: atomic {
         !up -> up = true; linked = true; lost = false;
 #ifdef MUTANT_STATED_LATER

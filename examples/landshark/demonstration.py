@@ -1,10 +1,9 @@
-"""What `rosrv demo` shows: the product at work, in about a minute.
+"""`rosrv demo`: the appliance at work, in about a minute.
 
-A lab of four hosts on this machine: the appliance, a simulated LandShark of real ROS nodes, its operator,
-and an attacker. The operator drives and fires; the attacker tries what ROS 1 lets anybody do; for each
-the rule that decided is read from the audit log. At last the operator himself makes mistakes that no policy can
-forbid, and monitors keep them from the robot. The exit status says whether the robot did what its
-operator wanted and nothing else: scripts can rely on it.
+A lab of four hosts on this machine: the appliance, a simulated LandShark of real ROS nodes, its operator, and an
+attacker. The operator drives and fires. The attacker tries what ROS 1 allows everyone. For each attempt, the demo reads
+the deciding rule from the audit log. Finally the operator makes mistakes that no policy can forbid, and monitors
+prevent them. Scripts can rely on the exit status: 0 if the robot obeyed only its operator.
 """
 
 import shutil
@@ -39,8 +38,8 @@ from examples.landshark.stage import (
     Stage,
 )
 
-RIGHTFUL = "watch the battery"  # what the policy lets the attacker's host do
-AROUND = "go past the master"  # does not come to the appliance at all
+PERMITTED = "watch the battery"  # the policy allows this to the attacker's host
+BYPASS = "go past the master"  # does not use the appliance at all
 ATTACKS = (
     "look around",
     "take over the operator",
@@ -59,7 +58,7 @@ GRANTED = (
     ("/ocu", "/landshark_control/base_velocity"),
     ("/ocu", "/landshark_control/trigger"),
 )
-# What the demonstration's nodes import, and its ROS Master.
+# Packages that the demonstration's nodes and its ROS master import.
 _NODE_PACKAGES = (
     "rosmaster", "rospy", "genpy", "rosnode", "rosservice", "rostopic",
     "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs",
@@ -68,7 +67,7 @@ Record = dict[str, Any]
 
 
 class Show:
-    """The demonstration, act by act; `results` is what the summary tells."""
+    """The demonstration, act by act; `results` is the basis of the summary."""
 
     def __init__(self, stage: Stage, door: Doorway, console: Console) -> None:
         self.stage, self.door, self.console = stage, door, console
@@ -78,7 +77,7 @@ class Show:
         self.robot: list[Actor] = []
 
     def run(self) -> bool:
-        """All acts; whether everything was as it should be."""
+        """Run all acts; return whether every result was as expected."""
         self.introduce()
         self.open()
         operator = self.mission()
@@ -87,10 +86,10 @@ class Show:
         self.headline(
             f"An attacker has taken over the visitors' tablet ({ATTACKER}), which may watch the battery"
         )
-        self.permit(self.stage.attack(RIGHTFUL))
+        self.expect_allowed(self.stage.attack(PERMITTED))
         for name in ATTACKS:
-            self.refuse(self.stage.attack(name))
-        self.shut_out(self.stage.attack(AROUND))
+            self.expect_denied(self.stage.attack(name))
+        self.expect_blocked(self.stage.attack(BYPASS))
         self.aftermath(operator, before)
         operator.stop()
         self.ways = Mistakes(self.stage, self).run()
@@ -98,35 +97,35 @@ class Show:
         return all(result.good for result in self.results)
 
     def introduce(self) -> None:
-        """What is about to be seen, for who has never heard of it."""
+        """Print what the demonstration shows."""
         self.console.print(
-            "ROS 1 trusts everyone who reaches its master. Here a robot stands behind the appliance, which decides\n"
-            "every call by a policy. Four hosts are made on this machine, as network namespaces: the appliance, the\n"
-            "robot, its operator, and an attacker. What each tries, what becomes of it, and the rule that decided:",
+            "ROS 1 trusts everyone who reaches its master. Here the appliance protects a robot and decides every call\n"
+            "by a policy. The demo creates four hosts as network namespaces here: the appliance, the robot,\n"
+            "its operator, and an attacker. Each line shows an attempt, its outcome, and the deciding rule:",
             highlight=False,
             soft_wrap=True,
         )
 
     def open(self) -> None:
-        """The appliance, then the robot."""
-        self.headline("The appliance takes the place of the ROS Master")
+        """Start the appliance, then the robot."""
+        self.headline("The appliance takes the place of the ROS master")
         ready = self.stage.start_appliance()
         self.say(f"nodes may connect: ROS_MASTER_URI={ready['master']}  (the real one is hidden)")
         self.say(f"policy:            {self.stage.policy}")
         self.say(
-            f"console:           https://127.0.0.1:{self.door.port}/   (of this machine; its certificate is its own)"
+            f"console:           https://127.0.0.1:{self.door.port}/   (on this machine; self-signed certificate)"
         )
-        self.say(f"token for it:      {ready['token']}")
+        self.say(f"its token:         {ready['token']}")
         self.headline(f"A LandShark of unmodified ROS nodes starts ({ROBOT})")
         if not self.stage.make_radar():
-            self.say("without its radar: the one roscpp node is compiled, with g++ and libroscpp-dev")
+            self.say("without its radar, a roscpp node that needs g++ and libroscpp-dev to compile")
         self.robot = self.stage.start_robot()
         self.say(", ".join(actor.name for actor in self.robot))
         self.stage.protect_robot()
-        self.say("its own ports answer the appliance only: rosrv protect --apply")
+        self.say("its own ports answer only the appliance: rosrv protect --apply")
 
     def mission(self) -> Actor:
-        """The operator drives, aims and fires."""
+        """Have the operator drive, aim and fire."""
         self.headline(f"Its operator takes the controls ({OPERATOR})")
         operator = self.stage.start_operator()
         operator.expect("connected")
@@ -141,7 +140,7 @@ class Show:
         return operator
 
     def explain_grants(self) -> None:
-        """Why that was possible: four decisions out of the audit log."""
+        """Print four decisions from the audit log that allowed the mission."""
         granted = self.stage.audit("--allow", "--limit", "10000")
         for caller, topic in GRANTED:
             for record in granted:
@@ -151,32 +150,33 @@ class Show:
             else:
                 self.results.append(Result(f"audit record: {caller} {topic}", good=False, remark="missing"))
 
-    def permit(self, deed: Attack) -> None:
-        """What the policy grants works, whoever it is that does it."""
-        self.decided("allowed" if deed.succeeded else "REFUSED", f"{deed.name}: {deed.tried}", deed.answer)
-        self.results.append(Result(deed.name, deed.succeeded, "granted by the policy"))
+    def expect_allowed(self, attempt: Attack) -> None:
+        """Report an attempt that the policy allows."""
+        outcome = "allowed" if attempt.succeeded else "DENIED"
+        self.decided(outcome, f"{attempt.name}: {attempt.tried}", attempt.answer)
+        self.results.append(Result(attempt.name, attempt.succeeded, "granted by the policy"))
 
-    def refuse(self, attack: Attack) -> None:
-        """One attack and what became of it, with the rule from the audit log."""
+    def expect_denied(self, attack: Attack) -> None:
+        """Report an attack that the policy denies, with the rule from the audit log."""
         if attack.succeeded:
             self.decided("SUCCEEDED", f"{attack.name}: {attack.tried}", attack.answer)
             self.results.append(Result(f"attack: {attack.name}", good=False, remark=attack.answer))
             return
         record = self.record_of(attack)
         why = rule_of(record) if record else f"not in the audit log: {attack.answer}"
-        self.decided("refused", f"{attack.name}: {attack.tried}", why)
+        self.decided("denied", f"{attack.name}: {attack.tried}", why)
         self.results.append(Result(f"attack: {attack.name}", good=record is not None, remark=why))
 
-    def shut_out(self, attack: Attack) -> None:
-        """The attack that goes around the appliance: the robot's own packet filter is to stop it."""
-        outcome = "SUCCEEDED" if attack.succeeded else "refused"
+    def expect_blocked(self, attack: Attack) -> None:
+        """Report an attack that bypasses the appliance; the robot's own packet filter must block it."""
+        outcome = "SUCCEEDED" if attack.succeeded else "blocked"
         self.decided(outcome, f"{attack.name}: {attack.tried}", f"rosrv protect: {attack.answer}")
         self.results.append(Result(f"attack: {attack.name}", not attack.succeeded, attack.answer))
 
     def record_of(self, attack: Attack) -> Record | None:
-        """The denial of this attack: a new record of what was tried, or the one that its answer repeats.
+        """Return the denial of an attack: a new record of its resource, or the record whose reason its answer repeats.
 
-        The same denial, a moment later, is counted and not recorded a second time.
+        The log counts a repeated denial instead of recording it again.
         """
         found = self.stage.audit("--deny", "--host", ATTACKER, "--limit", "1000")  # newest first
         denials = [one for one in found if one["event"] != "denials folded"]
@@ -190,27 +190,27 @@ class Show:
         return next((one for one in matching if one.get("rule")), matching[0] if matching else None)
 
     def aftermath(self, operator: Actor, before: dict[str, Any]) -> None:
-        """The robot is as it was: every node lives, it still drives, and nobody else fired."""
-        self.headline("The robot did not notice")
+        """Check that every node is alive, the robot still drives, and only the operator fired."""
+        self.headline("The robot is unaffected")
         after = operator.newest("position")
         dead = [actor.name for actor in [*self.robot, operator] if not actor.running]
         moved = after["x"] != before["x"]
         place = f"now at {after['latitude']:.6f} {after['longitude']:.6f}"
         results = [
-            Result("every node lives", not dead, ", ".join(dead) or f"{len(self.robot) + 1} nodes"),
+            Result("every node is alive", not dead, ", ".join(dead) or f"{len(self.robot) + 1} nodes"),
             Result("the robot still drives", moved, place),
-            Result("nobody else fired", after["shots"] == 1, f"{after['shots']} shot in all"),
+            Result("only the operator fired", after["shots"] == 1, f"{after['shots']} shot in total"),
         ]
         for result in results:
             self.say(f"{'' if result.good else 'NOT: '}{result.what}: {result.remark}")
         self.results += results
 
     def summary(self) -> None:
-        """How much of it was as it should be, and what was not."""
+        """Print the number of expected results, and each unexpected one."""
         bad = [result for result in self.results if not result.good]
         self.headline(
-            f"{len(self.results) - len(bad)} of {len(self.results)} as it should be"
-            + ("" if bad else ": the robot obeyed its operator, and nobody else")
+            f"{len(self.results) - len(bad)} of {len(self.results)} results as expected"
+            + ("" if bad else ": the robot obeyed only its operator")
         )
         for result in bad:
             self.console.print(f"  [bold red]NOT OK[/] {escape(result.what)}: {escape(result.remark)}")
@@ -220,18 +220,18 @@ class Show:
         self.console.print(f"\n[bold]{escape(text)}[/]", soft_wrap=True)
 
     def say(self, text: str) -> None:
-        """One line of an act."""
+        """Print a line of an act."""
         self.console.print(f"  {escape(text)}", highlight=False, soft_wrap=True)
 
     def decided(self, outcome: str, what: str, why: str) -> None:
-        """One decision: the outcome, what was asked, and the rule."""
-        colour = {"allowed": "green", "refused": "yellow"}.get(outcome, "bold red")
+        """Print a decision: the outcome, the request and the rule."""
+        colour = {"allowed": "green", "denied": "yellow", "blocked": "yellow"}.get(outcome, "bold red")
         line = f"  [{colour}]{outcome:9}[/] {escape(what)}\n            [dim]{escape(why)}[/]"
         self.console.print(line, highlight=False, soft_wrap=True)
 
 
 def rule_of(record: Record) -> str:
-    """The rule that decided, as the policy file has it; else the reason."""
+    """Return the deciding rule with its place in the policy file, else the reason."""
     rule = record.get("rule")
     if not rule:
         return str(record.get("reason", ""))
@@ -239,11 +239,11 @@ def rule_of(record: Record) -> str:
 
 
 def require_everything() -> None:
-    """Say what this machine lacks before anything is started."""
+    """Raise `DemoError` if this machine lacks something that the demonstration needs."""
     if not has_privileges():
         raise DemoError(
-            "the demonstration makes four hosts as network namespaces, which needs root: "
-            "run it as root or with sudo, in a container with --cap-add SYS_ADMIN --cap-add NET_ADMIN"
+            "the demonstration creates four hosts as network namespaces, which needs root: "
+            "run it with sudo, or in a container with --cap-add SYS_ADMIN --cap-add NET_ADMIN"
         )
     imports = f"import {', '.join(_NODE_PACKAGES)}"
     if subprocess.run([NODE_PYTHON, "-c", imports], capture_output=True, check=False).returncode:
@@ -252,7 +252,7 @@ def require_everything() -> None:
 
 
 def demonstrate(*, hold: bool, picture: Path | None, as_json: bool) -> int:
-    """Run the demonstration and tell it; `picture` is where the robot's ways are drawn. Returns the exit status."""
+    """Run the demonstration and return the exit status; draw the robot's paths into the file `picture`."""
     console, errors = Console(stderr=as_json), Console(stderr=True)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
@@ -268,18 +268,18 @@ def demonstrate(*, hold: bool, picture: Path | None, as_json: bool) -> int:
                 sys.stdout.flush()
             if picture is not None:
                 stage.draw(show.ways, picture)
-                console.print(f"  {picture}: the robot's ways from above", soft_wrap=True)
+                console.print(f"  {picture}: the robot's paths from above", soft_wrap=True)
             command = shutil.which("rosrv") or Path(sys.executable).with_name("rosrv")
             if not hold:
                 console.print(
-                    f"  {command} demo --hold    keeps it running, to look around in", soft_wrap=True
+                    f"  {command} demo --hold    keeps everything running for you to explore", soft_wrap=True
                 )
-                console.print("  docs/operating.md    how to put the appliance next to a robot of yours")
+                console.print("  docs/next-to-your-robot.md    how to put the appliance next to your robot")
             else:
                 console.print(
                     f"\nEverything keeps running until Ctrl-C: the master is {MASTER_URI} on these hosts.\n"
                     f"Console:          https://127.0.0.1:{show.door.port}/  (the token is above)\n"
-                    f"Look at it:       {command} status --state {stage.state}\n"
+                    f"Explore:          {command} status --state {stage.state}\n"
                     f"                  {command} audit tail --deny --state {stage.state}\n"
                     f"Be the attacker:  ip netns exec {stage.attacker_host.namespace.name} "
                     f"env ROS_MASTER_URI={MASTER_URI} ROS_IP={ATTACKER} rostopic list",
@@ -288,7 +288,7 @@ def demonstrate(*, hold: bool, picture: Path | None, as_json: bool) -> int:
                 )
                 signal.pause()
     except KeyboardInterrupt:
-        errors.print("\nEnded; everything is cleared away.")
+        errors.print("\nInterrupted; everything is removed.")
         return 130
     except (DemoError, NetworkError) as error:
         errors.print(f"[red]rosrv demo:[/] {escape(str(error))}", soft_wrap=True)

@@ -1,7 +1,7 @@
-"""A door from this machine to a host of a lab, which has no link to it: connections to a loopback port come out there.
+"""Forward a loopback port of this machine to a host of a lab, which has no network link to this machine.
 
-The demonstration's console is behind it. Bytes are carried as they are, both ways; who comes is not asked, since the
-port is on loopback and what is behind it asks for a token.
+It leads to the demonstration's console. Bytes are copied unchanged in both directions. Clients are not authenticated,
+because the port is on loopback and the console requires a token.
 
     with Doorway(host, ("127.0.0.1", 8443)) as door:
         print(door.port)
@@ -15,13 +15,13 @@ from typing import Self
 
 from examples.landshark.lab import Host
 
-CONNECTIONS = 64  # a browser has a handful; further ones wait in the kernel's queue
+CONNECTIONS = 64  # a browser needs a few; further connections wait in the kernel's queue
 CONNECT_SECONDS = 5.0
 _PIECE = 65536
 
 
 class Doorway:
-    """A listening port of this machine, 127.0.0.1 only; a context manager. `target` is an address on `host`."""
+    """A listening port on 127.0.0.1 of this machine; a context manager. `target` is an address on `host`."""
 
     def __init__(self, host: Host, target: tuple[str, int]) -> None:
         self._host, self._target = host, target
@@ -34,7 +34,7 @@ class Doorway:
         self._thread.start()
 
     def close(self) -> None:
-        """Shut the door and every connection through it."""
+        """Close the port and all its connections."""
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)  # wakes `accept`
         self._listener.close()
@@ -61,7 +61,7 @@ class Doorway:
                     far.settimeout(None)
                     self._both_ways(near, far)
         except OSError:
-            pass  # the far side is not there, or one of them went: the other sees its connection end
+            pass  # the target does not answer, or one side closed: both connections end
         finally:
             self._free.release()
 
@@ -87,7 +87,7 @@ class Doorway:
 
 
 def _pass_on(source: socket.socket, sink: socket.socket) -> None:
-    """Carry bytes until the source ends, then tell the sink so."""
+    """Copy bytes until the source ends, then close the sink for writing."""
     with contextlib.suppress(OSError):
         while piece := source.recv(_PIECE):
             sink.sendall(piece)

@@ -4,8 +4,8 @@
     --svg FILE   draw the drive without monitors and the same commands with the monitors of `monitors/`
 
 The operator gives the same commands in both drives: straight at the obstacle, back, around, out of the yard, and three
-shots, one with the gun pointing at the robot itself. A topic's messages go through the monitors before anybody gets
-them, as in the appliance; what the robot then does is what the motors are told. Everything is deterministic.
+shots, one with the gun pointing at the robot itself. As in the appliance, the messages of a topic go through the
+monitors before a subscriber gets them, so the robot moves as the monitors permit. Everything is deterministic.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from roswire.standard import standard_definitions
 SHIPPED = tuple(sorted(MONITORS.glob("*.rv")))
 START = 1_700_000_000 * 10**9
 STEP = 50_000_000  # nanoseconds: the base and the turret work at 20 Hz
-MOMENT = 10_000  # between two messages, which so have an order in the recording, too
+MOMENT = 10_000  # nanoseconds between two messages, so that they have an order in the recording
 BEAMS = 61
 FIELD_OF_VIEW = math.radians(120)
 VELOCITY, TRIGGERED = "/landshark_control/base_velocity", "/landshark_control/trigger"
@@ -45,7 +45,7 @@ TYPES = {
 
 @dataclass(frozen=True)
 class Part:
-    """The operator's commands for some seconds; the gun is aimed at the start, and fired in the middle."""
+    """The operator's commands for some seconds; the gun is aimed at their start, and fired in the middle."""
 
     seconds: float
     forward: float = 0.0
@@ -73,7 +73,7 @@ MISSION = (
 
 @dataclass(frozen=True)
 class Message:
-    """What somebody published, and what became of it: `result` is passed, changed or dropped."""
+    """A published message and its fate: `result` is passed, changed or dropped."""
 
     time: int
     topic: str
@@ -83,7 +83,7 @@ class Message:
 
 @dataclass(frozen=True)
 class Shot:
-    """The operator pulled the trigger at this time with the gun at this angle; `fired` if the driver was told."""
+    """A pull of the trigger: its time, the gun's angle, and whether the driver got the message (`fired`)."""
 
     time: int
     tilt: float
@@ -93,7 +93,7 @@ class Shot:
 
 @dataclass
 class Drive:
-    """What happened: where the robot was, where the gun pointed, what was shot, published and logged."""
+    """The result of a drive: the robot's positions, the gun's angles, the shots, and the messages."""
 
     poses: list[physics.Pose] = field(default_factory=list)
     tilts: list[float] = field(default_factory=list)
@@ -102,13 +102,13 @@ class Drive:
     log: list[tuple[int, str]] = field(default_factory=list)
 
     def nearest(self, obstacle: physics.Obstacle) -> float:
-        """How near the robot came to an obstacle, in metres; negative inside it."""
+        """Return the distance in metres between the robot and an obstacle; negative inside it."""
         return (
             min(math.hypot(pose.x - obstacle.x, pose.y - obstacle.y) for pose in self.poses) - obstacle.radius
         )
 
     def farthest(self) -> float:
-        """How far from its origin the robot was, in metres."""
+        """Return the largest distance in metres between the robot and its origin."""
         return max(math.hypot(pose.x, pose.y) for pose in self.poses)
 
 
@@ -128,7 +128,7 @@ class Simulation:
         self._monitors.start(START)
 
     def run(self, mission: Sequence[Part] = MISSION) -> Drive:
-        """The whole mission."""
+        """Run the whole mission."""
         ticks, began = 0, self._now
         for part in mission:
             count = round(part.seconds * 10**9 / STEP)
@@ -146,7 +146,7 @@ class Simulation:
         return self.drive
 
     def _send(self, topic: str, **fields: object) -> bytes | None:
-        """Publish: the bytes that subscribers get, or nothing."""
+        """Publish a message; return the bytes that subscribers get, or None if it was dropped."""
         data = self._messages.encode(
             TYPES[topic],
             header__stamp__sec=self._now // 10**9,
@@ -189,7 +189,7 @@ class Simulation:
         self.drive.tilts.append(self._turret.tilt)
 
     def _tell(self, ticks: int) -> None:
-        """Odometry and joints always, the laser at 10 Hz, the GPS at 5 Hz, the battery at 1 Hz."""
+        """Publish odometry and joints at every step, the laser at 10 Hz, the GPS at 5 Hz, the battery at 1 Hz."""
         pose, velocity = self._pose, self._velocity
         self._send(
             "/landshark/odom",
@@ -219,7 +219,7 @@ class Simulation:
 
 
 def record(drive: Drive, path: Path) -> None:
-    """Write what was published into a bag. Raises `FileExistsError`."""
+    """Write the published messages into a bag. Raises `FileExistsError`."""
     if path.exists():
         raise FileExistsError(f"{path} is there already")
     store = Messages().store

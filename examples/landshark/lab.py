@@ -6,10 +6,9 @@ with Lab("rosrv-test") as lab:
     process = robot.popen(["rosmaster", "--core"])
 ```
 
-The bridge between the hosts is in a namespace of its own: nothing appears in the machine's own namespace,
-and two labs may use the same addresses at the same time. Leaving the block ends every process that lives in
-one of the lab's namespaces and deletes them. A lab whose process died without doing so is cleared away when
-the next lab with the same prefix starts.
+The bridge between the hosts is in a namespace of its own, so nothing appears in the machine's own namespace, and two
+labs may use the same addresses at the same time. Leaving the block ends every process in the lab's namespaces and
+deletes them. If the lab's process died before that, the next lab with the same prefix does it.
 """
 
 import contextlib
@@ -23,8 +22,13 @@ from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from appliance.network import interfaces
-from appliance.network.endings import end_processes
-from appliance.network.namespaces import Namespace, NetworkError, namespaces, require_privileges
+from appliance.network.namespaces import (
+    Namespace,
+    NetworkError,
+    end_processes,
+    namespaces,
+    require_privileges,
+)
 
 INTERFACE = "eth0"
 _BRIDGE = "br0"
@@ -43,19 +47,19 @@ class Host:
 
     @property
     def address(self) -> str:
-        """The host's first address, without prefix length."""
+        """Return the host's first address, without prefix length."""
         return self.interfaces[0].partition("/")[0]
 
     @property
     def address6(self) -> str:
-        """The host's first IPv6 address, without prefix length."""
+        """Return the host's first IPv6 address, without prefix length."""
         for text in self.interfaces:
             if ":" in text:
                 return text.partition("/")[0]
         raise NetworkError(f"the host {self.name} was given no IPv6 address")
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """Start a program on the host; the lab ends it at the latest when it closes."""
+        """Start a program on the host; it ends with the lab at the latest."""
         return self.namespace.popen(args, **options)
 
     def run(self, function: Callable[[], T]) -> T:
@@ -63,12 +67,12 @@ class Host:
         return self.namespace.run(function)
 
     def entered(self) -> contextlib.AbstractContextManager[None]:
-        """Be on the host with the calling thread for the length of a block (no await inside)."""
+        """Move the calling thread to the host for a block that does not await."""
         return self.namespace.entered()
 
 
 class Lab:
-    """Hosts on a common bridge; a context manager. `prefix` tells its namespaces from all others."""
+    """Hosts on a common bridge; a context manager. The names of its namespaces begin with `prefix`."""
 
     _numbers = itertools.count(1)
 
@@ -116,21 +120,21 @@ class Lab:
         return host
 
     def unplug(self, host: Host) -> None:
-        """Take the host's cable out: packets are lost from now on."""
+        """Unplug the host's cable: its packets are lost from now on."""
         interfaces.set_link(self.switch, host.port, up=False)
 
     def plug(self, host: Host) -> None:
-        """Put the host's cable back in."""
+        """Plug the host's cable in again."""
         interfaces.set_link(self.switch, host.port, up=True)
 
     def close(self) -> None:
-        """End every process in the lab and delete it; closing twice is fine."""
+        """End every process in the lab and delete the lab; a second call does nothing."""
         _clear([*(host.namespace for host in self.hosts.values()), self.switch])
         self.hosts.clear()
 
 
 def clear_leftovers(prefix: str) -> list[str]:
-    """Clear away the labs of this prefix whose process is gone; return the names of their namespaces."""
+    """Delete the labs of this prefix whose process has ended; return the names of their namespaces."""
     pattern = re.compile(re.escape(prefix) + r"\.(\d+)\.\d+\.")
     left = []
     for namespace in namespaces(prefix + "."):
@@ -142,7 +146,7 @@ def clear_leftovers(prefix: str) -> list[str]:
 
 
 def _clear(gone: Sequence[Namespace]) -> None:
-    """End what lives in these namespaces, then delete them."""
+    """End all processes in these namespaces, then delete the namespaces."""
     end_processes([pid for namespace in gone for pid in namespace.processes()])
     for namespace in gone:
         namespace.delete()

@@ -1,4 +1,4 @@
-"""The LandShark's messages as bytes on the wire, without ROS: what is not given is zero; `a__b` is the field `a.b`."""
+"""Encode and decode the LandShark's messages without ROS. Missing fields are zero; `a__b` is the field `a.b`."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +14,7 @@ DEFINITIONS = {f"{TRIGGER}.msg": (MONITORS / "msg" / f"{TRIGGER}.msg").read_text
 
 
 class Messages:
-    """Encodes and decodes; `store` knows the types."""
+    """The encoder and decoder; `store` has the types."""
 
     def __init__(self) -> None:
         self.store: Any = get_typestore(Stores.ROS1_NOETIC)
@@ -23,7 +23,7 @@ class Messages:
         )
 
     def encode(self, kind: str, **fields: object) -> bytes:
-        """A message of type `package/Type`."""
+        """Return the bytes of a message of type `package/Type`."""
         nested: dict[str, Any] = {}
         for path, value in fields.items():
             at = nested
@@ -34,7 +34,7 @@ class Messages:
         return bytes(self.store.serialize_ros1(self._object(long_name(kind), nested), long_name(kind)))
 
     def decode(self, kind: str, data: bytes) -> Any:
-        """The message as an object with its fields."""
+        """Return the message as an object with its fields."""
         return self.store.deserialize_ros1(data, long_name(kind))
 
     def _object(self, kind: str, given: Mapping[str, Any]) -> Any:
@@ -56,6 +56,6 @@ class Messages:
 
 
 def long_name(kind: str) -> str:
-    """`package/msg/Type`, as the library names types."""
+    """Return a type's name in the library's form, `package/msg/Type`."""
     package, _, name = kind.partition("/")
     return f"{package}/msg/{name}"

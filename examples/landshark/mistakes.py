@@ -1,8 +1,8 @@
-"""The last act of `rosrv demo`: what a policy cannot forbid, for it is the operator who does it; monitors can.
+"""Play the last act of `rosrv demo`: mistakes of the operator that no policy can forbid, but monitors prevent.
 
-Each mistake is made twice: without a monitor, and with the one that is meant for it, enabled while the robot runs.
-The limits in which the results are good are those of the simulated robot: it moves through obstacles, and goes on
-for half a second after its last command (`examples/landshark/nodes/physics.py`).
+The operator makes each mistake twice: without a monitor, and with a monitor that is enabled while the robot runs. The
+expected results depend on the simulated robot (`examples/landshark/nodes/physics.py`): it moves through obstacles, and
+continues for half a second after its last command.
 """
 
 from collections.abc import Sequence
@@ -19,11 +19,11 @@ OUTSIDE_ASIDE = ("24", "6")
 FAR_OUT = 23.0
 
 Ways = dict[str, Sequence[Sequence[float]]]
-"""Where the robot was, in metres: `without` and `guarded`."""
+"""The robot's path in metres, `without` monitors and `guarded` by them."""
 
 
-class Teller(Protocol):
-    """Who shows the demonstration, and keeps its results."""
+class Narrator(Protocol):
+    """The printer of the demonstration, which also keeps its results."""
 
     results: list[Result]
 
@@ -31,32 +31,32 @@ class Teller(Protocol):
         """Begin an act."""
 
     def say(self, text: str) -> None:
-        """One line of an act."""
+        """Print a line of an act."""
 
 
 class Mistakes:
     """The operator's mistakes, one after the other."""
 
-    def __init__(self, stage: Stage, teller: Teller) -> None:
-        self._stage, self._teller = stage, teller
+    def __init__(self, stage: Stage, narrator: Narrator) -> None:
+        self._stage, self._narrator = stage, narrator
 
     def run(self) -> Ways:
-        """All of them; the ways of the robot without and with monitors."""
-        self._teller.headline(
-            "The operator makes a mistake: he fires while the gun points at the robot itself"
+        """Make all mistakes; return the robot's paths without and with monitors."""
+        self._narrator.headline(
+            "The operator makes a mistake and fires while the gun points at the robot itself"
         )
         self._shoot_itself()
-        self._teller.headline("He drives at top speed, and does not look where")
+        self._narrator.headline("The operator drives at top speed without looking")
         return {"without": self._unguarded(), "guarded": self._guarded()}
 
     def _shoot_itself(self) -> None:
         self._stage.command("aim", "0", "-0.6")
         self._fires("without a monitor the robot hits itself", hit=True)
         self._enable("safeTrigger", "safe_triggering.rv")
-        self._fires("with the monitor it does not", hit=False)
+        self._fires("with the monitor it does not hit itself", hit=False)
         self._recorded("message dropped", "safeTrigger", "the dropped trigger")
         self._stage.command("aim", "0", "0.2")
-        self._fires("away from the robot it still fires", hit=True)
+        self._fires("it still fires away from itself", hit=True)
 
     def _unguarded(self) -> list[Any]:
         hit, out = self._reach(OBSTACLE), self._reach(OUTSIDE)
@@ -71,12 +71,12 @@ class Mistakes:
         stopped = self._reach(OBSTACLE)
         good = stopped["to_obstacle"] > 0 and not stopped["there"]
         self._result("with the monitor it stops before the obstacle", good, _nearest(stopped))
-        self._recorded("message changed", "obstacleAvoidance", "the speed that became 0")
+        self._recorded("message changed", "obstacleAvoidance", "the speed set to 0")
         around = self._reach(ASIDE)
-        self._result("turning away it goes on", around["there"], _nearest(around))
+        self._result("it drives on after turning away", around["there"], _nearest(around))
         held = self._reach(OUTSIDE_ASIDE)
         self._result("with the monitor it stays in its zone", held["farthest"] < FAR_OUT, _farthest(held))
-        self._recorded("message dropped", "safeZone", "the command that drove on")
+        self._recorded("message dropped", "safeZone", "the dropped command")
         return [*stopped["way"], *around["way"], *held["way"]]
 
     def _reach(self, place: tuple[str, str]) -> Event:
@@ -84,25 +84,25 @@ class Mistakes:
 
     def _enable(self, name: str, file: str) -> None:
         self._stage.enable_monitor(name)
-        self._teller.say(f"rosrv monitor enable {name}  ({self._stage.monitors / file})")
+        self._narrator.say(f"rosrv monitor enable {name}  ({self._stage.monitors / file})")
 
     def _fires(self, what: str, *, hit: bool) -> None:
-        """Pull the trigger; `hit`: a shot is to come."""
+        """Pull the trigger; `hit`: whether a shot is expected."""
         fired = self._stage.command("fire")
         shots = fired["shots"] - fired["before"]
         self._result(what, shots == (1 if hit else 0), "1 shot" if shots == 1 else f"{shots} shots")
 
     def _recorded(self, event: str, monitor: str, what: str) -> None:
-        """The record of what a monitor did."""
+        """Find and print the audit record of a monitor's action."""
         found = self._stage.audit("--event", event, "--limit", "100")
         mine = [one for one in found if one["detail"]["monitor"] == monitor]
-        why = mine[-1]["reason"] if mine else "missing"  # the first: it is in full
-        self._teller.say(f"audit record: {why}")
-        self._teller.results.append(Result(f"audit record: {what}", bool(mine), why))
+        why = mine[-1]["reason"] if mine else "missing"  # the first, which is not folded
+        self._narrator.say(f"audit record: {why}")
+        self._narrator.results.append(Result(f"audit record: {what}", bool(mine), why))
 
     def _result(self, what: str, good: bool, remark: str) -> None:
-        self._teller.results.append(Result(what, good, remark))
-        self._teller.say(f"{'' if good else 'NOT: '}{what}: {remark}")
+        self._narrator.results.append(Result(what, good, remark))
+        self._narrator.say(f"{'' if good else 'NOT: '}{what}: {remark}")
 
 
 def _nearest(drive: Event) -> str:
@@ -111,4 +111,4 @@ def _nearest(drive: Event) -> str:
 
 
 def _farthest(drive: Event) -> str:
-    return f"{drive['farthest']:.1f} m from its start, 20 m are allowed"
+    return f"{drive['farthest']:.1f} m from its start; 20 m are allowed"

@@ -1,7 +1,7 @@
-"""Two drives from above, as an SVG: the yard, the obstacle, where the robot was, and what became of the shots.
+"""Draw two drives from above as an SVG: the yard, the obstacle, the robot's path, and the shots with their results.
 
-Below, the angle of the gun over time, with the same shots. The text stands on its own background, so that the
-picture can be read on a dark page, too.
+Below them is the angle of the gun over time, with the same shots. The text has its own background, so that the picture
+can also be read on a dark page.
 """
 
 import html
@@ -31,7 +31,7 @@ text { font: 14px system-ui, 'DejaVu Sans', sans-serif; fill: #1f2937 }
 
 
 def draw(without: "Drive", guarded: "Drive") -> str:
-    """The picture of the same commands without and with monitors."""
+    """Return the picture of the same commands without and with monitors."""
     parts = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 860" role="img">',
         "<title>The LandShark's drive from above, without and with monitors</title>",
@@ -51,7 +51,7 @@ def draw(without: "Drive", guarded: "Drive") -> str:
 
 
 def draw_ways(without: list[physics.Pose], guarded: list[physics.Pose]) -> str:
-    """The picture of two drives of which only the places are known."""
+    """Return the picture of two drives with only their positions."""
     parts = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 640" role="img">',
         "<title>The LandShark's ways from above, without and with monitors</title>",
@@ -118,7 +118,7 @@ def _end(pose: physics.Pose, colour: str) -> str:
 
 
 def _note(x: float, y: float, row: float, lines: tuple[str, ...]) -> str:
-    """Words at the right, with a line to the place they are about."""
+    """Return a note at the right, with a line to the place that it describes."""
     px, py = _at(x, y)
     left = 705.0
     words = [_text(left + 8, row + 18 * number, line) for number, line in enumerate(lines)]

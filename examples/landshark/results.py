@@ -1,11 +1,11 @@
-"""What the demonstration keeps of each thing that it tried, for its summary and its exit status."""
+"""Define the results of the demonstration's steps, for its summary and its exit status."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Result:
-    """One thing that should happen, or should not, and what became of it."""
+    """A step that should succeed or fail, and its outcome."""
 
     what: str
     good: bool

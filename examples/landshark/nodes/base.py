@@ -1,4 +1,4 @@
-"""/landshark_base: the motors. Velocity commands in, odometry out; stops when commands cease."""
+"""Run /landshark_base, the motors: velocity commands in, odometry out. The robot stops when commands cease."""
 
 import math
 import threading
@@ -23,7 +23,7 @@ class Base:
         rospy.Subscriber("/landshark_control/base_velocity", TwistStamped, self.command)
 
     def command(self, message):
-        """Take over a velocity."""
+        """Store the commanded velocity."""
         with self.lock:
             self.velocity = physics.possible(
                 physics.Velocity(message.twist.linear.x, message.twist.angular.z)
@@ -31,7 +31,7 @@ class Base:
             self.told = rospy.Time.now()
 
     def step(self, seconds):
-        """Move on by so long and tell where the robot is."""
+        """Move for this number of seconds, and publish the robot's position."""
         now = rospy.Time.now()
         with self.lock:
             if (now - self.told).to_sec() > physics.COMMAND_LIFETIME:
@@ -49,7 +49,7 @@ class Base:
 
 
 def main():
-    """Run until told to end."""
+    """Run until a signal ends the program."""
     rospy.init_node("landshark_base")
     base = Base()
     rate = rospy.Rate(HERTZ)

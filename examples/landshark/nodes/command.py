@@ -1,10 +1,10 @@
-"""One command of an operator: `command.py drive FORWARD TURN SECONDS`, `reach X Y`, `aim PAN TILT`, `fire`.
+"""Give one command of an operator: `command.py drive FORWARD TURN SECONDS`, `reach X Y`, `aim PAN TILT`, `fire`.
 
 Places in metres, speeds in metres and radians a second, angles in radians. Waits for the driver; prints one JSON
-object, `drove` (with the position at the end), `reached` (with the way there, whether the robot got there, how near
-it came to the obstacle's edge, negative inside it, and how far from the origin), `aimed` (with the angle reached)
-or `fired` (with the number of shots so far). What is said
-once is latched for a while, as `rostopic pub -1` does: a driver or recorder that connects a moment later hears it, too.
+object, `drove` (with the position at the end), `reached` (with the way there, whether the robot got there, how near it
+came to the obstacle's edge, negative inside it, and how far from the origin), `aimed` (with the angle reached) or
+`fired` (with the number of shots so far). A message that is published once is latched for a while, as with `rostopic
+pub -1`, so that a driver or recorder that connects a little later also receives it.
 """
 
 import math
@@ -21,10 +21,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt32
 
 HERTZ = 10
-SECONDS = 10.0  # a driver that is not there by then is not coming
+SECONDS = 10.0  # a driver that has not connected by then is not coming
 SETTLED = 1.0
 THERE = 0.5  # metres
-STEERED = 0.3  # radians off the way at which it turns only
+STEERED = 0.3  # radians off the way from which on it only turns
 STUCK = 2.0  # seconds without coming nearer
 UNDER_WAY = 60.0  # seconds at most
 LATCHED = 1.5
@@ -44,7 +44,7 @@ class Display:
             self.changed.notify_all()
 
     def wait(self, condition, seconds=SECONDS):
-        """Wait for a message that satisfies `condition`; whether one came."""
+        """Wait for a message that satisfies `condition`; return whether one came."""
         with self.changed:
             return self.changed.wait_for(
                 lambda: self.message is not None and condition(self.message), seconds
@@ -52,7 +52,7 @@ class Display:
 
 
 def connected(publisher):
-    """A publisher with a subscriber; ends the program without one."""
+    """Return the publisher once it has a subscriber; end the program if it gets none."""
     rate = rospy.Rate(HERTZ)
     for _ in range(int(SECONDS * HERTZ)):
         if publisher.get_num_connections():
@@ -62,7 +62,7 @@ def connected(publisher):
 
 
 def drive(forward, turn, seconds):
-    """Give a velocity for so long, and wait until the robot stands."""
+    """Publish a velocity for this number of seconds, then wait until the robot has stopped."""
     display = Display("/landshark/odom", Odometry)
     publisher = connected(rospy.Publisher("/landshark_control/base_velocity", TwistStamped, queue_size=10))
     rate = rospy.Rate(HERTZ)
@@ -120,7 +120,7 @@ def aim(pan, tilt):
 
 
 def fire():
-    """One shot, if it comes through: the count that the driver tells within a second."""
+    """Fire one shot and wait a second for the count that the driver reports."""
     kind = paintball_trigger()
     display = Display("/landshark/shots", UInt32)
     publisher = connected(rospy.Publisher("/landshark_control/trigger", kind, queue_size=10, latch=True))
@@ -134,7 +134,7 @@ def fire():
 
 
 def main():
-    """Do one thing."""
+    """Carry out one command."""
     what, *values = rospy.myargv()[1:] or ["nothing"]
     actions = {"drive": (drive, 3), "reach": (reach, 2), "aim": (aim, 2), "fire": (fire, 0)}
     if what not in actions or len(values) != actions[what][1]:

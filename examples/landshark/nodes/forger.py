@@ -1,7 +1,6 @@
-"""An attacker's node: publishes triggers under a name of its choice. forger.py NAME
+"""Publish triggers under a name of the attacker's choice: forger.py NAME
 
-Prints `forged` with the number of drivers it reached within three seconds: behind a plain master it does
-fire.
+Prints `forged` with the number of drivers it reached within three seconds. Behind a plain master the gun fires.
 """
 
 import sys
@@ -16,18 +15,18 @@ PaintballTrigger = paintball_trigger()
 
 
 class Reached(rospy.SubscribeListener):
-    """Notices the first driver that connects."""
+    """A listener that notices the first driver that connects."""
 
     def __init__(self):
         self.somebody = threading.Event()
 
     def peer_subscribe(self, *_):
-        """Somebody listens."""
+        """Note that a driver has connected."""
         self.somebody.set()
 
 
 def main():
-    """Try, tell, end."""
+    """Publish, report and end."""
     rospy.init_node(sys.argv[1], disable_signals=True)
     reached = Reached()
     gun = rospy.Publisher("/landshark_control/trigger", PaintballTrigger, reached, queue_size=10)

@@ -1,4 +1,4 @@
-"""/ocu: the operator control unit. Drives out, aims, fires once, then patrols until told to end.
+"""Run /ocu, the operator control unit: drive out, aim, fire once, then patrol until a signal.
 
 Prints one JSON object per line: `connected`, `drove` (metres), `aimed` (radians), `fired` (shots so far),
 `position`.
@@ -19,7 +19,7 @@ PaintballTrigger = paintball_trigger()
 
 
 class Operator:
-    """What the operator sees, and the controls."""
+    """The operator's displays and controls."""
 
     def __init__(self):
         self.changed = threading.Condition()
@@ -36,13 +36,13 @@ class Operator:
             rospy.Subscriber(topic, kind, self.look, callback_args=topic)
 
     def look(self, message, topic):
-        """Keep the newest message of a topic."""
+        """Store the newest message of a topic."""
         with self.changed:
             self.seen[topic] = message
             self.changed.notify_all()
 
     def wait(self, condition, seconds=30.0):
-        """Wait until what is seen satisfies `condition`; whether it did."""
+        """Wait until the displays satisfy `condition`; return whether they did."""
         with self.changed:
             return self.changed.wait_for(lambda: rospy.is_shutdown() or condition(self.seen), seconds)
 
@@ -52,7 +52,7 @@ class Operator:
         return len(self.seen) == 4 and all(control.get_num_connections() for control in controls)
 
     def drive(self, forward, turn=0.0):
-        """Tell the base a velocity; it has to be told again within half a second."""
+        """Send the base a velocity; it has to be sent again within half a second."""
         message = TwistStamped()
         message.header.stamp = rospy.Time.now()
         message.twist.linear.x, message.twist.angular.z = forward, turn
@@ -66,18 +66,18 @@ class Operator:
         self.turret.publish(message)
 
     def fire(self):
-        """One shot."""
+        """Fire one shot."""
         message = PaintballTrigger(trigger=PaintballTrigger.SINGLE_SHOT)
         message.header.stamp = rospy.Time.now()
         self.trigger.publish(message)
 
     def x(self):
-        """How far east the robot is, in metres."""
+        """Return how far east the robot is, in metres."""
         return self.seen["/landshark/odom"].pose.pose.position.x
 
 
 def mission(operator, rate):
-    """Drive three metres, aim, fire: each is reported when the robot has done it, not when it was told."""
+    """Drive three metres, aim, fire; report each when the robot has done it, not when the command is sent."""
     start = operator.x()
     while not rospy.is_shutdown() and operator.x() < start + 3:
         operator.drive(1.0)
@@ -95,7 +95,7 @@ def mission(operator, rate):
 
 
 def main():
-    """Run until told to end."""
+    """Run until a signal ends the program."""
     rospy.init_node("ocu")
     operator = Operator()
     rate = rospy.Rate(HERTZ)

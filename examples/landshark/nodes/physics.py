@@ -1,4 +1,4 @@
-"""How the simulated LandShark moves and what its sensors see: plain functions of values, without ROS.
+"""Compute how the simulated LandShark moves, and what its sensors measure, in plain functions without ROS.
 
 Lengths are metres, angles radians (counter-clockwise, 0 is east), times seconds, speeds metres or radians
 a second. The world is a flat yard around ORIGIN with one round obstacle in it.
@@ -22,7 +22,7 @@ DRAIN_MOVING = 0.002  # more, each second at one metre a second
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the robot is and where it looks."""
+    """The position and direction of the robot."""
 
     x: float = 0.0
     y: float = 0.0
@@ -31,7 +31,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Velocity:
-    """What the base is told: forward speed and turn rate."""
+    """The base's commanded forward speed and turn rate."""
 
     forward: float = 0.0
     turn: float = 0.0
@@ -47,7 +47,7 @@ class Turret:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A round thing that stands in the yard."""
+    """A round obstacle in the yard."""
 
     x: float
     y: float
@@ -58,25 +58,25 @@ YARD = (Obstacle(x=8.0, y=0.5, radius=1.0),)
 
 
 def limit(value: float, low: float, high: float) -> float:
-    """The nearest value within the limits; not-a-number is `low` to `high`'s middle, never passed on."""
+    """Return the nearest value within the limits; for not-a-number their middle, so that it is never passed on."""
     if math.isnan(value):
         return (low + high) / 2
     return min(max(value, low), high)
 
 
 def pose_of(odometry: Any) -> Pose:
-    """The pose in a `nav_msgs/Odometry`."""
+    """Return the pose in a `nav_msgs/Odometry`."""
     position, orientation = odometry.pose.pose.position, odometry.pose.pose.orientation
     return Pose(position.x, position.y, 2 * math.atan2(orientation.z, orientation.w))
 
 
 def normal_angle(angle: float) -> float:
-    """The same direction within -pi to pi."""
+    """Return the same direction within -pi to pi."""
     return math.remainder(angle, math.tau)
 
 
 def possible(velocity: Velocity) -> Velocity:
-    """What the motors make of a command."""
+    """Return the velocity that the motors can reach for a command."""
     return Velocity(
         forward=limit(velocity.forward, -TOP_SPEED, TOP_SPEED),
         turn=limit(velocity.turn, -TOP_TURN_RATE, TOP_TURN_RATE),
@@ -84,7 +84,7 @@ def possible(velocity: Velocity) -> Velocity:
 
 
 def drive(pose: Pose, velocity: Velocity, seconds: float) -> Pose:
-    """The pose after driving so long: along a circle, or straight."""
+    """Return the pose after driving for this number of seconds, along a circle or straight."""
     velocity = possible(velocity)
     turned = velocity.turn * seconds
     if abs(turned) < 1e-9:
@@ -104,7 +104,7 @@ def drive(pose: Pose, velocity: Velocity, seconds: float) -> Pose:
 
 
 def aim(turret: Turret, wanted: Turret, seconds: float) -> Turret:
-    """The turret after moving toward the wanted angles for so long, within its limits."""
+    """Return the turret after it moved toward the wanted angles for this number of seconds, within its limits."""
     reach = TURRET_SPEED * seconds
     pan, tilt = limit(wanted.pan, *PAN_LIMITS), limit(wanted.tilt, *TILT_LIMITS)
     return Turret(
@@ -114,14 +114,14 @@ def aim(turret: Turret, wanted: Turret, seconds: float) -> Turret:
 
 
 def position_on_earth(pose: Pose) -> tuple[float, float]:
-    """Latitude and longitude in degrees."""
+    """Return latitude and longitude in degrees."""
     north, east = ORIGIN
     per_degree = math.radians(1) * EARTH_RADIUS
     return north + pose.y / per_degree, east + pose.x / (per_degree * math.cos(math.radians(north)))
 
 
 def distance_along(pose: Pose, direction: float, obstacle: Obstacle) -> float:
-    """How far it is to an obstacle in a direction from the robot's nose; infinite when the ray misses it."""
+    """Return the distance to an obstacle in a direction from the robot; infinite if the ray misses it."""
     ray = pose.heading + direction
     to_x, to_y = obstacle.x - pose.x, obstacle.y - pose.y
     ahead = to_x * math.cos(ray) + to_y * math.sin(ray)
@@ -138,11 +138,11 @@ def distance_along(pose: Pose, direction: float, obstacle: Obstacle) -> float:
 def scan(
     pose: Pose, directions: list[float], obstacles: tuple[Obstacle, ...] = YARD, reach: float = 30.0
 ) -> list[float]:
-    """What a laser on the robot measures in each direction; infinite beyond its reach."""
+    """Return the distances that a laser on the robot measures; infinite beyond its range."""
     nearest = (min(distance_along(pose, direction, thing) for thing in obstacles) for direction in directions)
     return [distance if distance <= reach else math.inf for distance in nearest]
 
 
 def drained(charge: float, speed: float, seconds: float) -> float:
-    """What is left of the battery (1 is full) after driving at this speed for so long."""
+    """Return the charge of the battery (1 is full) after driving at this speed for this number of seconds."""
     return max(0.0, charge - (DRAIN_IDLE + DRAIN_MOVING * abs(speed)) * seconds)

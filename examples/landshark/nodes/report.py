@@ -1,9 +1,9 @@
-"""Tells who started the program what happens: one JSON object per line on standard output."""
+"""Report events to the program's starter: one JSON object per line on standard output."""
 
 import json
 import os
 
 
 def report(event, **fields):
-    """Print one event: one write and no lock, for a signal handler may report in the middle of a report."""
+    """Print one event with one write and no lock, because a signal handler may interrupt another report."""
     os.write(1, (json.dumps({"event": event, **fields}) + "\n").encode())

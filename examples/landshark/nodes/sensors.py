@@ -1,7 +1,7 @@
-"""The LandShark's sensors, one node each: `sensors.py gps`, `sensors.py laser`, `sensors.py battery`.
+"""Run one of the LandShark's sensors as a node: `sensors.py gps`, `sensors.py laser`, `sensors.py battery`.
 
-Each hears the odometry (that is the simulation: a real one would look at the world) and tells what it
-measures: /landshark_gps on /landshark/gps, /landshark_laser on /landshark/scan, /landshark_battery on
+Each simulated sensor subscribes to the odometry, where a real one would measure the world, and publishes its
+measurements: /landshark_gps on /landshark/gps, /landshark_laser on /landshark/scan, /landshark_battery on
 /landshark/battery.
 """
 
@@ -18,12 +18,12 @@ FIELD_OF_VIEW = math.radians(120)
 
 
 class Gps:
-    """Satellite navigation: latitude and longitude."""
+    """The satellite navigation: latitude and longitude."""
 
     topic, kind = "/landshark/gps", NavSatFix
 
     def measure(self, odometry):
-        """One fix."""
+        """Return one fix."""
         message = NavSatFix()
         message.header.stamp, message.header.frame_id = odometry.header.stamp, "gps"
         message.status.status, message.status.service = NavSatStatus.STATUS_FIX, NavSatStatus.SERVICE_GPS
@@ -37,7 +37,7 @@ class Laser:
     topic, kind = "/landshark/scan", LaserScan
 
     def measure(self, odometry):
-        """One sweep."""
+        """Return one sweep."""
         step = FIELD_OF_VIEW / (BEAMS - 1)
         directions = [-FIELD_OF_VIEW / 2 + step * beam for beam in range(BEAMS)]
         message = LaserScan()
@@ -58,7 +58,7 @@ class Battery:
         self.last = None
 
     def measure(self, odometry):
-        """One reading."""
+        """Return one reading."""
         now = odometry.header.stamp
         seconds = (now - self.last).to_sec() if self.last else 0.0
         self.last = now
@@ -74,7 +74,7 @@ SENSORS = {"gps": (Gps, 5.0), "laser": (Laser, 10.0), "battery": (Battery, 1.0)}
 
 
 def main():
-    """Measure until told to end."""
+    """Measure until a signal ends the program."""
     arguments = rospy.myargv()[1:]
     if len(arguments) != 1 or arguments[0] not in SENSORS:
         sys.exit(f"usage: sensors.py {'|'.join(SENSORS)}")

@@ -1,6 +1,7 @@
-"""/landshark_turret: the gun. Joint commands and triggers in; joint states and the count of shots out.
+"""Run /landshark_turret, the gun: joint commands and triggers in, joint states and the count of shots out.
 
-The driver fires whatever way the gun points, at the robot itself, too: that it must not is for a monitor.
+The driver fires in whatever direction the gun points, even at the robot itself: preventing that is the task of a
+monitor.
 """
 
 import threading
@@ -34,7 +35,7 @@ class TurretDriver:
         rospy.Subscriber("/landshark_control/trigger", PaintballTrigger, self.fire)
 
     def command(self, message):
-        """Take over the wanted angles of the joints that are named."""
+        """Store the wanted angles of the named joints."""
         angles = dict(zip(message.name, message.position))  # noqa: B905  a shorter list leaves joints alone
         with self.lock:
             self.wanted = physics.Turret(
@@ -52,7 +53,7 @@ class TurretDriver:
             self.shots.publish(fired)
 
     def step(self, seconds):
-        """Move the joints and tell where they are."""
+        """Move the joints and publish their positions."""
         with self.lock:
             self.turret = physics.aim(self.turret, self.wanted, seconds)
             turret = self.turret
@@ -64,7 +65,7 @@ class TurretDriver:
 
 
 def main():
-    """Run until told to end."""
+    """Run until a signal ends the program."""
     rospy.init_node("landshark_turret")
     driver = TurretDriver()
     rate = rospy.Rate(HERTZ)
