@@ -26,6 +26,7 @@ import tempfile
 import threading
 import time
 import xmlrpc.client
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
@@ -79,6 +80,7 @@ MD5 = {
     "sensor_msgs/JointState": "3066dcd76a6cfaef579bd0f34173e9fd",
 }
 CONTEXT = multiprocessing.get_context("fork")
+PROBES = ("topic", "new calls", "kept calls")
 PATIENCE = 20.0  # seconds until a call counts as unanswered
 _TRIES = 20
 
@@ -87,7 +89,7 @@ _TRIES = 20
 
 
 def header(**fields: str) -> bytes:
-    """A connection header."""
+    """Return a connection header."""
     body = b"".join(
         struct.pack("<I", len(line)) + line for line in (f"{k}={v}".encode() for k, v in fields.items())
     )
@@ -95,7 +97,7 @@ def header(**fields: str) -> bytes:
 
 
 def receive(sock: socket.socket, size: int) -> bytes:
-    """Exactly so many bytes; raises `ConnectionError` at the end of the stream."""
+    """Return exactly this number of bytes. Raises `ConnectionError` at the end of the stream."""
     data = bytearray()
     while len(data) < size:
         piece = sock.recv(size - len(data))
@@ -106,7 +108,7 @@ def receive(sock: socket.socket, size: int) -> bytes:
 
 
 def read_header(sock: socket.socket) -> dict[str, str]:
-    """The peer's connection header."""
+    """Return the peer's connection header."""
     rest, fields = receive(sock, struct.unpack("<I", receive(sock, 4))[0]), {}
     while rest:
         size = struct.unpack_from("<I", rest)[0]
@@ -116,17 +118,17 @@ def read_header(sock: socket.socket) -> dict[str, str]:
 
 
 def frame(body: bytes) -> bytes:
-    """One message on the wire."""
+    """Return one message on the wire."""
     return struct.pack("<I", len(body)) + body
 
 
 def text(value: bytes) -> bytes:
-    """A string field."""
+    """Return a string field."""
     return frame(value)
 
 
 class _NodeApi(socketserver.StreamRequestHandler):
-    """Answers `requestTopic` with the TCPROS port, and everything else with success."""
+    """The API of a node: it answers `requestTopic` with the TCPROS port, and all other calls with success."""
 
     def handle(self) -> None:
         size = 0
@@ -147,7 +149,7 @@ class _NodeServer(socketserver.ThreadingTCPServer):
 
 
 class Nodes:
-    """Nodes that publish and serve at any number of addresses of the namespace that the calling thread is in."""
+    """Nodes that publish and serve at any number of addresses in the calling thread's namespace."""
 
     def __init__(self) -> None:
         self._api = _NodeServer(("", 0), _NodeApi)
@@ -159,7 +161,7 @@ class Nodes:
             threading.Thread(target=serve, daemon=True).start()
 
     def uri(self, address: str) -> str:
-        """The API URI of nodes at an address."""
+        """Return the API URI of nodes at an address."""
         return f"http://{address}:{self._api.server_address[1]}/"
 
     def publish(self, address: str, node: str, topic: str, type_name: str) -> None:
@@ -168,14 +170,14 @@ class Nodes:
         assert answer[0] == 1, answer
 
     def serve(self, address: str, node: str, service: str) -> None:
-        """Register a service; requests on it are read and answered by an empty success."""
+        """Register a service; its requests are answered with an empty success."""
         answer = call(
             address, "registerService", node, service, f"rosrpc://{address}:{self.port}", self.uri(address)
         )
         assert answer[0] == 1, answer
 
     def peers(self, topic: str, count: int) -> list[socket.socket]:
-        """The connections of the relay for a topic, once there are so many."""
+        """Return the connections of the relay for a topic, once there are `count` of them."""
         with self._changed:
 
             def found() -> list[socket.socket]:
@@ -245,7 +247,7 @@ DEFINITIONS = {
 
 
 def call(address: str, method: str, *params: Any, uri: str = MASTER) -> Any:
-    """One call of the Master API from an address, on a new connection; again where an attack is in its way."""
+    """Make one call of the Master API from an address, on a new connection; try again if an attack interferes."""
     place = uri.removeprefix("http://").rstrip("/")
     host, _, port = place.rpartition(":")
     tries = 0
@@ -281,11 +283,11 @@ def subscribe(nodes: Nodes, address: str, node: str, topic: str) -> list[socket.
     return connections
 
 
-# What the robot sees
+# Measurements of the robot
 
 
 def probe_messages(seconds: float, robot: Host, operator: Host, answers: Connection, begin: Event) -> None:
-    """100 messages a second from the robot to its operator, rounds of `seconds` whenever `begin` is set."""
+    """Send 100 messages a second from the robot to its operator, for a round of `seconds` whenever `begin` is set."""
     realtime()
     with robot.entered():
         nodes = Nodes()
@@ -328,33 +330,37 @@ def probe_messages(seconds: float, robot: Host, operator: Host, answers: Connect
                         rest = rest[12:]
                         if (
                             began is not None
-                        ):  # else a message of the round before, which counts as lost there
+                        ):  # else a message of the earlier round, which counts as lost there
                             delays.append(came - began)
             except OSError:
                 missing, sent, rest, lost = missing + len(sent), {}, b"", True
                 source, sink = connect()
                 missing += max(0, int((time.monotonic() - due) * 100))
                 due = time.monotonic()
-        answers.send((delays, missing + len(sent)))
+        answers.send((delays, Counter(lost=missing + len(sent))))
         begin.clear()
 
 
 def probe_calls(seconds: float, robot: Host, keep: bool, answers: Connection, begin: Event) -> None:
-    """20 calls a second of the robot; `keep`: on one connection, else each on a new one."""
+    """Make 20 calls a second from the robot; `keep`: on one connection, else each on a new one.
+
+    Each round has the same number of calls, so that rows can be compared; it ends after three times its length.
+    """
     realtime()
     body = xmlrpc.client.dumps(("/looker", "/rosdistro"), "getParam").encode()
     with robot.entered():
         answers.send("ready")
         while True:
             begin.wait()
-            delays, missing, connection = [], 0, None
+            delays, errors, connection = [], Counter[str](), None
             start = time.monotonic()
-            for turn in itertools.count():
+            for turn in range(round(seconds * 20)):
                 wait = start + turn * 0.05 - time.monotonic()
                 if wait > 0:
                     time.sleep(wait)  # noqa: TID251  the pace of the load
-                if (began := time.monotonic()) > start + seconds:
-                    break
+                if (began := time.monotonic()) > start + 3 * seconds:
+                    errors["not made in time"] += 1
+                    continue
                 try:
                     if connection is None:
                         connection = http.client.HTTPConnection(APPLIANCE, 11311, timeout=PATIENCE)
@@ -362,17 +368,17 @@ def probe_calls(seconds: float, robot: Host, keep: bool, answers: Connection, be
                     answer = connection.getresponse()
                     answer.read()
                     if answer.status != 200:
-                        raise OSError(answer.status)
+                        raise http.client.HTTPException(answer.status)
                     delays.append(time.monotonic() - began)
-                except (OSError, http.client.HTTPException):
-                    missing += 1
+                except (OSError, http.client.HTTPException) as error:
+                    errors[type(error).__name__] += 1
                     keep_open, connection = False, None
                 else:
                     keep_open = keep
                 if not keep_open and connection is not None:
                     connection.close()
                     connection = None
-            answers.send((delays, missing))
+            answers.send((delays, errors))
             begin.clear()
 
 
@@ -381,11 +387,11 @@ def realtime() -> None:
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
 
 
-# Attacks: each is called in the crowd's namespace with its addresses, says `go()` when it is under way, never returns
+# Attacks: each is called in the crowd's namespace with its addresses, calls `go()` when it has begun, and never returns
 
 
 class Pipes:
-    """Sends a message over and over on many connections, as fast as they take it or at a rate (in all)."""
+    """Many connections on which a message is sent repeatedly, as fast as they take it or at a total rate."""
 
     def __init__(self, socks: Sequence[socket.socket]) -> None:
         self._rest: dict[socket.socket, memoryview] = {}
@@ -395,7 +401,7 @@ class Pipes:
         self.sent = 0
 
     def send(self, data: bytes) -> None:
-        """Send it on each connection that has sent what came before."""
+        """Send the data on each connection, or first the rest of the data before."""
         for sock in list(self.socks):
             view = self._rest.pop(sock, None) or memoryview(data)
             try:
@@ -410,7 +416,7 @@ class Pipes:
             self.sent += count
 
     def at(self, rate: float, data: bytes) -> None:
-        """For ever, `rate` times a second."""
+        """Send `rate` times a second, for ever."""
         for turn in itertools.count():
             if turn == 0:
                 start = time.monotonic()
@@ -419,7 +425,7 @@ class Pipes:
 
 
 def published(nodes: Nodes, addresses: Sequence[str], topic: str, *, listen: bool = False) -> Pipes:
-    """A publisher at each address; a subscriber where no monitor wants the topic."""
+    """Register a publisher at each address, and with `listen` a subscriber; return the connections."""
     for number, address in enumerate(addresses):
         nodes.publish(address, f"/guest/n{number}_{topic.rpartition('/')[2]}", topic, TYPES[topic])
     if listen:
@@ -436,14 +442,14 @@ def _drain(sock: socket.socket) -> None:
 
 
 def loop(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """A loop over a string in the guest's own monitored topic, 0.8 MB/s."""
+    """Make a monitor of the guest's own topic loop over a string, at 0.8 MB/s."""
     pipes = published(Nodes(), addresses, "/guest/loop")
     go()
     pipes.at(8 / len(addresses), frame(text(b"y" * 100_000)))
 
 
 def scans(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Scans of 200,000 ranges for the shipped obstacle monitor, two a second."""
+    """Send scans of 200,000 ranges to the shipped obstacle monitor, two a second."""
     pipes = published(Nodes(), addresses, "/landshark/scan")
     head = struct.pack("<III", 1, 0, 0) + text(b"") + struct.pack("<7f", 0, 0, 0, 0, 0, 0, 0)
     go()
@@ -454,7 +460,7 @@ def scans(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """A field behind a million empty strings, 4 MB a message, two a second."""
+    """Send messages with a field behind a million empty strings, 4 MB each, two a second."""
     pipes = published(Nodes(), addresses, "/guest/joints")
     body = struct.pack("<III", 1, 0, 0) + text(b"") + struct.pack("<I", 1_000_000) + bytes(4_000_000)
     go()
@@ -462,7 +468,7 @@ def joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def six_joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """The same by six publishers at once, as fast as they are read."""
+    """Send the messages of `joints` from six publishers at once, as fast as they are read."""
     nodes = Nodes()
     for number in range(6):
         for index, address in enumerate(addresses[: max(1, len(addresses) // 6)]):
@@ -474,20 +480,21 @@ def six_joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def slices(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """20,000 slices, then messages of zero bytes that belong to all of them."""
+    """Make 20,000 slices, then send messages of zero bytes that concern all of them."""
     nodes = Nodes()
     make = published(nodes, addresses, "/guest/make")
     touch = published(nodes, addresses, "/guest/touch")
     for sock in make.socks:
         sock.setblocking(True)
     for number in range(20_000):
-        make.socks[number % len(make.socks)].sendall(frame(struct.pack("<I", number)))
+        with contextlib.suppress(ConnectionError):  # cut for what other attacks do from this host
+            make.socks[number % len(make.socks)].sendall(frame(struct.pack("<I", number)))
     go()
     touch.at(50 / len(addresses), frame(b""))
 
 
 def flood(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """8-byte messages on a topic without a monitor, as fast as they are taken."""
+    """Send 8-byte messages on a topic without a monitor, as fast as they are taken."""
     pipes = published(Nodes(), addresses, "/guest/flood", listen=True)
     go()
     while True:
@@ -496,7 +503,7 @@ def flood(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def kept(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """500 kept connections to RVMaster, each with one small call after the other."""
+    """Keep 500 connections to RVMaster, each with one small call after the other."""
     body = xmlrpc.client.dumps(("/guest/looker", "/rosdistro"), "getParam").encode()
     request = b"POST /RPC2 HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body)
     selector = selectors.DefaultSelector()
@@ -523,7 +530,7 @@ def kept(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def multicalls(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """16 connections of multicalls of 9,000 reads, and 60 new connections a second from an unknown host."""
+    """Send multicalls of 9,000 reads on 16 connections, and open 60 connections a second from an unknown host."""
     part = {"methodName": "getParam", "params": ["/guest/looker", "/rosdistro"]}
     body = xmlrpc.client.dumps(([part] * 9000,), "system.multicall").encode()
 
@@ -549,7 +556,7 @@ def multicalls(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def service(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Requests of 100 kB to a monitored service that loops over them, ten a second."""
+    """Send requests of 100 kB to a service whose monitor loops over them, ten a second."""
     place = call(addresses[0], "lookupService", "/guest/asker", "/guest/service")[2].removeprefix("rosrpc://")
     host, _, port = place.rstrip("/").rpartition(":")
     socks = []
@@ -565,7 +572,7 @@ def service(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def connections(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """New connections to RVMaster and to a port of the relay, as many as there is time for, closed at once."""
+    """Open and close connections to RVMaster and to a port of the relay, as fast as possible."""
     code, _, uri = call(addresses[0], "lookupNode", "/guest/looker", "/probe_source")
     assert code == 1, uri
     place = (APPLIANCE, int(uri.rstrip("/").rpartition(":")[2]))
@@ -596,7 +603,7 @@ ATTACKS: dict[str, tuple[Callable[..., None], ...]] = {
 
 
 def attack(crowd: Host, function: Callable[..., None], addresses: Sequence[str]) -> tuple[Any, Event]:
-    """Start an attack in a process; the event is set when it is under way."""
+    """Start an attack in a process; return it, and an event that is set when the attack has begun."""
     under_way = CONTEXT.Event()
 
     def run() -> None:
@@ -609,7 +616,7 @@ def attack(crowd: Host, function: Callable[..., None], addresses: Sequence[str])
 
 
 def burn() -> None:
-    """Compute for ever."""
+    """Compute without end."""
     while True:
         sum(range(100_000))
 
@@ -656,15 +663,15 @@ class Rig:
                 self._probes.append((ours, begin))
             yield
 
-    def measure(self) -> list[tuple[list[float], int]]:
-        """One round of all probes: delays in seconds and what never came."""
+    def measure(self) -> list[tuple[list[float], Counter[str]]]:
+        """Run one round of all probes; return delays in seconds, and the number of failures by kind."""
         for _, begin in self._probes:
             begin.set()
         return [ours.recv() for ours, _ in self._probes]
 
     def round(self, names: Sequence[Callable[..., None]], addresses: Sequence[str]) -> dict[str, Any]:
-        """Measure while these attacks go on."""
-        before = self.appliance.pids("relay")
+        """Measure during these attacks."""
+        before = {role: {*self.appliance.pids(role)} for role in ("relay", "control")}
         started: list[tuple[Any, Event]] = []
         try:
             for function in names:  # one after the other: an attack may use up what the next needs to begin
@@ -676,14 +683,16 @@ class Rig:
             for process, _ in started:
                 process.kill()
                 process.join()
-        row: dict[str, Any] = {"restarts": len({*self.appliance.pids("relay")} - {*before})}
-        for name, (delays, missing) in zip(("topic", "new calls", "kept calls"), found, strict=True):
-            row[name] = figures(delays) | {"missing": missing, "of": len(delays) + missing}
+        restarts = {role: len({*self.appliance.pids(role)} - pids) for role, pids in before.items()}
+        row: dict[str, Any] = {"restarts": restarts}
+        for name, (delays, errors) in zip(PROBES, found, strict=True):
+            missing = errors.total()
+            row[name] = figures(delays) | {"missing": missing, "of": len(delays) + missing, "errors": errors}
         return row
 
 
 def figures(delays: Sequence[float]) -> dict[str, float]:
-    """Median, 99th percentile and maximum in milliseconds."""
+    """Return median, 99th percentile and maximum in milliseconds."""
     if len(delays) < 2:
         return {"p50": float("nan"), "p99": float("nan"), "max": float("nan")}
     p99 = statistics.quantiles(delays, n=100, method="inclusive")[98]
@@ -723,16 +732,19 @@ def main() -> None:
 def show(rows: Sequence[tuple[str, str, dict[str, Any]]]) -> None:
     """Print the table, and the figures as JSON."""
     table = Table("attack", "by")
-    for name in ("topic", "new calls", "kept calls"):
+    for name in PROBES:
         table.add_column(f"{name}: p50 p99 max ms", justify="right")
         table.add_column("lost", justify="right")
-    table.add_column("relay restarts", justify="right")
+    for column in ("relay restarts", "control restarts", "errors"):
+        table.add_column(column, justify="right")
     for what, who, row in rows:
-        cells = []
-        for name in ("topic", "new calls", "kept calls"):
+        cells, errors = [], Counter[str]()
+        for name in PROBES:
             one = row[name]
+            errors += one["errors"]
             cells += [f"{one['p50']:.1f} {one['p99']:.1f} {one['max']:.1f}", f"{one['missing']}/{one['of']}"]
-        table.add_row(what, who, *cells, str(row["restarts"]))
+        restarts = map(str, row["restarts"].values())
+        table.add_row(what, who, *cells, *restarts, " ".join(f"{kind} {n}" for kind, n in errors.items()))
     Console(width=160).print(table)
     print(json.dumps(rows))
 

@@ -1,4 +1,4 @@
-"""What the audit log costs a caller of RVMaster: python -m benchmarks.audit_latency [--seconds 2] [--rounds 3]
+"""The cost of the audit log to a caller of RVMaster: python -m benchmarks.audit_latency [--seconds 2] [--rounds 3]
 
 Appliances that differ in one thing run at once and take turns, so that whatever else the machine does falls on all of
 them: `batched` (the default), `strict` (on disk before the answer), and `batched` with forwarding to a syslog receiver
@@ -56,7 +56,7 @@ class Running:
         self._control = next(one["pid"] for one in processes if one["role"] == "control")
 
     def cpu(self) -> float:
-        """Seconds of CPU that control has used."""
+        """Return the seconds of CPU that control has used."""
         fields = Path(f"/proc/{self._control}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / _TICKS
 
@@ -67,7 +67,7 @@ class Running:
 
 
 def calls(port: int, seconds: float, taken: list[float]) -> None:
-    """One caller: the time of each call."""
+    """Make calls as one caller; append the time of each to `taken`."""
     data = request("hasParam", "/bench", "/run_id", keep=True)
     with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -88,7 +88,9 @@ def _length(answer: bytes) -> int:
 
 
 def measure(one: Running, clients: int, seconds: float) -> tuple[float, float, float, float]:
-    """Median and 99th percentile in microseconds, calls a second, CPU of control a call in microseconds."""
+    """Return the median and 99th percentile in microseconds, calls a second, and CPU of control per call in
+    microseconds.
+    """
     taken: list[list[float]] = [[] for _ in range(clients)]
     threads = [threading.Thread(target=calls, args=(one.port, seconds, mine)) for mine in taken]
     before = one.cpu()
@@ -103,7 +105,7 @@ def measure(one: Running, clients: int, seconds: float) -> tuple[float, float, f
 
 @contextlib.contextmanager
 def appliances(folder: Path, sink: Sink) -> Iterator[list[Running]]:
-    """Those that are compared."""
+    """Start the appliances to compare."""
     forwarding = {"syslog": {"to": f"tcp://127.0.0.1:{sink.port}"}}
     wanted: dict[str, dict[str, object]] = {
         "batched": {"durability": "batched"},

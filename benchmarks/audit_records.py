@@ -19,10 +19,10 @@ from pathlib import Path
 from appliance.audit.folding import FoldSettings
 from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
-from appliance.audit.record import Record, RuleReference, Severity
+from appliance.audit.record import AuditRecord, RuleReference, Severity
 from appliance.audit.search import search
 from appliance.audit.verification import verify
-from appliance.forwarding.log_forwarder import Forwarder
+from appliance.forwarding.log_forwarder import LogForwarder
 from appliance.forwarding.receiver import StreamReceiver
 from appliance.forwarding.syslog import Formatter
 from benchmarks.syslog_sink import Sink
@@ -31,15 +31,15 @@ _ROWS: list[tuple[str, str]] = []
 
 
 def row(name: str, value: str) -> None:
-    """A line of the table, printed as soon as it is known."""
+    """Print a line of the table."""
     _ROWS.append((name, value))
     print(f"{name:<66} {value:>16}", flush=True)
 
 
-def record(log: AuditLog, number: int) -> Record:
-    """A decision; one in ten thousand is special, so that selective searches have something to find."""
+def record(log: AuditLog, number: int) -> AuditRecord:
+    """Return a decision; one in ten thousand is special, so that selective searches find something."""
     special = number % 10_000 == 9_999
-    return Record(
+    return AuditRecord(
         id=log.ids.next(),
         time=time.time_ns(),
         event="decision",
@@ -58,7 +58,7 @@ def record(log: AuditLog, number: int) -> Record:
 
 
 def open_log(directory: Path, name: str, durability: str) -> AuditLog:
-    """A log that folds nothing, as what is measured here is writing."""
+    """Open a log that folds nothing, because writing is measured."""
     return AuditLog(
         directory / name / "audit.db",
         durability="strict" if durability == "strict" else "batched",
@@ -68,7 +68,7 @@ def open_log(directory: Path, name: str, durability: str) -> AuditLog:
 
 
 def measure_burst(directory: Path, count: int) -> None:
-    """A burst without pauses: what a record costs its caller, and how fast the writer gets it to the disk."""
+    """Measure a burst without pauses: the cost of a record to its caller, and the writer's rate."""
     log = open_log(directory, "burst", "batched")
     records = [record(log, number) for number in range(count)]
     start = time.perf_counter()
@@ -98,7 +98,7 @@ async def _clients(log: AuditLog, clients: int, each: int) -> float:
 
 
 def measure_strict(directory: Path) -> None:
-    """Clients that each wait for their record before they send the next."""
+    """Measure clients that each wait for their record before they send the next."""
     for clients in (1, 10, 100, 1000):
         log = open_log(directory, f"strict{clients}", "strict")
         rate = asyncio.run(_clients(log, clients, max(20, 10_000 // clients)))
@@ -107,7 +107,7 @@ def measure_strict(directory: Path) -> None:
 
 
 async def _paced(log: AuditLog, rate: int, seconds: float) -> tuple[float, float]:
-    """Record `rate` a second from a loop; the latency that the loop's other work sees (median, 99.9 %), in ms."""
+    """Record `rate` a second from a loop; return the latency of the loop's other work (median, 99.9 %), in ms."""
     late: list[float] = []
 
     async def other_work() -> None:
@@ -132,7 +132,7 @@ async def _paced(log: AuditLog, rate: int, seconds: float) -> tuple[float, float
 
 
 def measure_loop(directory: Path) -> None:
-    """What 10,000 records a second do to the event loop that makes them, and whether the writer keeps up."""
+    """Measure the delay of an event loop that makes 10,000 records a second, and whether the writer keeps up."""
     log = open_log(directory, "paced", "batched")
     median, worst = asyncio.run(_paced(log, 10_000, 5.0))
     row("10,000 records/s from an event loop: its other work waits, median", f"{median:.3f} ms")
@@ -142,7 +142,7 @@ def measure_loop(directory: Path) -> None:
 
 
 def measure_busy(directory: Path) -> None:
-    """The writer next to a thread that never lets the interpreter lock go of its own accord."""
+    """Measure the writer beside a thread that never releases the interpreter lock voluntarily."""
     log = open_log(directory, "busy", "batched")
     records = [record(log, number) for number in range(50_000)]
     stop = threading.Event()
@@ -167,7 +167,7 @@ def measure_busy(directory: Path) -> None:
 
 
 def measure_forwarding(directory: Path, count: int) -> None:
-    """Reading committed records, making messages of them, and sending them to a receiver that takes everything."""
+    """Measure reading committed records, making messages of them, and sending them to a receiver that takes all."""
     log = open_log(directory, "forward", "batched")
     for number in range(count):
         log.record(record(log, number))
@@ -177,7 +177,7 @@ def measure_forwarding(directory: Path, count: int) -> None:
     formatter = Formatter(facility=13, longest=8192, host_name="robot")
     with Sink() as sink:
         kept = path.with_name("position.json")
-        one = Forwarder(path, kept, StreamReceiver("127.0.0.1", sink.port), formatter, chosen="all")
+        one = LogForwarder(path, kept, StreamReceiver("127.0.0.1", sink.port), formatter, chosen="all")
         start, used = time.perf_counter(), time.process_time()
         while one.step() == 0.0:
             pass
@@ -190,7 +190,7 @@ def measure_forwarding(directory: Path, count: int) -> None:
 
 
 def timed(name: str, action: Callable[[], object]) -> None:
-    """A line with the best of three runs."""
+    """Print a line with the best of three runs."""
     best = float("inf")
     for _ in range(3):
         start = time.perf_counter()
@@ -200,7 +200,7 @@ def timed(name: str, action: Callable[[], object]) -> None:
 
 
 def measure_search(directory: Path, count: int) -> None:
-    """Searches over many records, and their verification."""
+    """Measure searches over many records, and their verification."""
     log = open_log(directory, "search", "batched")
     path = directory / "search" / "audit.db"
     start = time.perf_counter()

@@ -48,12 +48,12 @@ READS: dict[str, tuple[Any, ...]] = {
     "getTopicTypes": (),
 }
 OPERATIONS = (*READS, "register/unregister", "setParam/getParam", "20 getParam as one", "20 setParam as one")
-NODES, TOPICS = 20, 5  # what is registered while it is measured: nodes, topics of each
+NODES, TOPICS = 20, 5  # registered during the measurement: nodes, and topics of each
 LOADS = ((1, True), (1, False), (16, True), (16, False))
 
 
 def request(method: str, *params: Any, keep: bool) -> bytes:
-    """One whole HTTP request."""
+    """Return a complete HTTP request."""
     body = xmlrpc.client.dumps(params, method).encode()
     connection = "keep-alive" if keep else "close"
     head = f"POST / HTTP/1.1\r\nHost: x\r\nConnection: {connection}\r\nContent-Type: text/xml\r\n"
@@ -61,7 +61,7 @@ def request(method: str, *params: Any, keep: bool) -> bytes:
 
 
 def requests(operation: str, client: int, keep: bool) -> list[bytes]:
-    """What one client sends, over and over."""
+    """Return the requests that one client repeats."""
     me, api = f"/bench_{client}", f"http://127.0.0.1:{40000 + client}/"
     topic, key = f"/bench/topic_{client}", f"/bench/key_{client}"
     if operation in READS:
@@ -80,7 +80,7 @@ def requests(operation: str, client: int, keep: bool) -> list[bytes]:
 
 
 def furnish(port: int) -> None:
-    """Nodes, topics and parameters, as a small robot has them."""
+    """Register nodes, topics and parameters, as a small robot has them."""
     with xmlrpc.client.ServerProxy(f"http://127.0.0.1:{port}/") as master:
         for node in range(NODES):
             for topic in range(TOPICS):
@@ -119,7 +119,7 @@ class Client:
         return self.sock
 
     def receive(self) -> bool:
-        """Read what is there; whether the answer is whole. Raises ConnectionError for a refusal."""
+        """Read the available data; return whether the answer is complete. Raises ConnectionError for a refusal."""
         assert self.sock is not None
         piece = self.sock.recv(1 << 20)
         self._buffer += piece
@@ -142,8 +142,8 @@ class Client:
 
 
 def load(port: int, operation: str, clients: int, keep: bool, seconds: float) -> tuple[float, float]:
-    """Calls per second and the median delay of a call in microseconds."""
-    # Each is a host of its own: long loads of one host go beyond its share of the audit log, and wait for it.
+    """Return calls per second and the median delay of a call in microseconds."""
+    # Each client is a separate host: a long load of one host exceeds its quota of the audit log, and has to wait.
     group = [
         Client(port, requests(operation, one, keep), keep, f"127.0.0.{one + 1}") for one in range(clients)
     ]
@@ -175,14 +175,14 @@ def load(port: int, operation: str, clients: int, keep: bool, seconds: float) ->
 
 
 def free_port() -> int:
-    """A port that is free now."""
+    """Return a port that is free now."""
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         return int(sock.getsockname()[1])
 
 
 def await_port(port: int) -> None:
-    """Wait until somebody listens, at most 30 seconds."""
+    """Wait until a program listens, at most 30 seconds."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
         with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
@@ -192,7 +192,7 @@ def await_port(port: int) -> None:
 
 
 def processor_seconds(pids: list[int]) -> float:
-    """What these processes have used."""
+    """Return the processor time that these processes have used."""
     ticks = 0
     for pid in pids:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
@@ -201,7 +201,7 @@ def processor_seconds(pids: list[int]) -> float:
 
 
 def await_rest(pids: list[int]) -> None:
-    """Wait until these have started and do nothing any more, at most 30 seconds."""
+    """Wait until these processes have started and are idle, at most 30 seconds."""
     deadline, before = time.monotonic() + 30, -1.0
     while time.monotonic() < deadline and (used := processor_seconds(pids)) != before:
         before = used
@@ -209,7 +209,7 @@ def await_rest(pids: list[int]) -> None:
 
 
 def descendants(pid: int) -> list[int]:
-    """A process and all that it started."""
+    """Return the ids of a process and of all its descendants."""
     found = [pid]
     for task in Path(f"/proc/{pid}/task").iterdir():
         for child in (task / "children").read_text(encoding="utf-8").split():
@@ -218,13 +218,13 @@ def descendants(pid: int) -> list[int]:
 
 
 class Master(NamedTuple):
-    """One of the two: where it listens, and its processes."""
+    """One of the two masters: the port where it listens, and its processes."""
 
     port: int
     pids: list[int]
 
     def under(self, operation: str, clients: int, keep: bool, seconds: float) -> tuple[float, float, float]:
-        """Calls per second, median delay of a call and processor time of a call, both in microseconds."""
+        """Return calls per second, and median delay and processor time of a call in microseconds."""
         before = processor_seconds(self.pids)
         began = time.perf_counter()
         rate, delay = load(self.port, operation, clients, keep, seconds)
@@ -233,7 +233,7 @@ class Master(NamedTuple):
 
 
 def measure(plain: Master, ours: Master, seconds: float, rounds: int, only: str) -> Table:
-    """The table of all operations under all loads."""
+    """Return the table of all operations under all loads."""
     columns = ("call", "clients", "connections", "rosmaster calls/s", "RVMaster calls/s", "ratio", "added µs")
     table = Table(*columns, "processor µs")
     for operation in OPERATIONS:
@@ -266,7 +266,7 @@ def measure(plain: Master, ours: Master, seconds: float, rounds: int, only: str)
 
 @contextmanager
 def masters() -> Iterator[tuple[Master, Master]]:
-    """A plain rosmaster, and an appliance as `rosrv up` runs it for users."""
+    """Run a plain rosmaster, and an appliance as `rosrv up` runs it for users."""
     port = free_port()
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.control_plane import Client, Master, masters, processor_seconds, request
-from roswire.xmlrpc import Limits, parse_call
+from roswire.xmlrpc import XmlRpcLimits, parse_call
 
 PARAMETERS, NODES, TOPICS = (
     4000,
@@ -37,7 +37,7 @@ PATIENCE = 120.0  # seconds without any progress
 
 
 def parameters(port: int) -> float:
-    """Seconds until a roslaunch's multicall is answered."""
+    """Return the seconds until a roslaunch's multicall is answered."""
     names = [f"/start/part_{one // 50}/value_{one % 50}" for one in range(PARAMETERS)]
     calls: list[tuple[str, list[str | int]]] = [("deleteParam", ["/roslaunch", "/start"])]
     calls += [("setParam", ["/roslaunch", name, place]) for place, name in enumerate(names)]
@@ -57,7 +57,7 @@ def parameters(port: int) -> float:
 
 
 class Node:
-    """One node: its calls to the master, one after the other, and its own port, where it is told of publishers."""
+    """One node: its calls to the master, one after the other, and its port, where it receives lists of publishers."""
 
     def __init__(self, master: int, number: int) -> None:
         self.listening = socket.create_server(("127.0.0.1", 0), backlog=64)
@@ -75,14 +75,14 @@ class Node:
         self.client = Client(master, self.calls, keep=True)
 
     def answered(self, answer: bytes) -> None:
-        """The answer to its last call."""
+        """Handle the answer to the node's last call."""
         place = len(self.client.delays) - 1 - TOPICS
         if 0 <= place < TOPICS and b"http://" in answer:
             self.known.add(self._wanted[place])
 
     def told(self, body: bytes) -> None:
-        """A call of the master: a list of publishers, or a look whether the node is there."""
-        call = parse_call(body, Limits())
+        """Handle a call of the master: a list of publishers, or a query whether the node is alive."""
+        call = parse_call(body, XmlRpcLimits())
         if call.method == "publisherUpdate" and call.params[2]:
             self.known.add(str(call.params[1]))
 
@@ -102,7 +102,7 @@ class Told:
         self._buffer = b""
 
     def receive(self) -> bool:
-        """Read what is there and acknowledge what is whole; whether the connection goes on."""
+        """Read the available data and acknowledge complete calls; return whether the connection stays open."""
         piece = self.sock.recv(1 << 16)
         self._buffer += piece
         head, mark, body = self._buffer.partition(b"\r\n\r\n")
@@ -115,7 +115,7 @@ class Told:
 
 
 def nodes(port: int) -> float:
-    """Seconds until all nodes have registered and know their publishers."""
+    """Return the seconds until all nodes have registered and know their publishers."""
     group = [Node(port, number) for number in range(NODES)]
     poll = select.epoll()
     listening = {node.listening.fileno(): node for node in group}
@@ -168,7 +168,7 @@ def nodes(port: int) -> float:
 
 
 def timed(start: Callable[[int], float], master: Master) -> tuple[float, float]:
-    """Seconds that a start takes, and processor seconds that it costs."""
+    """Return the seconds and the processor seconds that a start takes."""
     before = processor_seconds(master.pids)
     return start(master.port), processor_seconds(master.pids) - before
 

@@ -2,8 +2,9 @@
 
 CHECKOUT is DejaVu's repository (github.com/havelund/dejavu): its tests name the events of each trace at which a
 property fails, those of the traces that it was entered with at the CRV benchmark challenge of 2018 among them. For
-each the same events have to be said here; the exit status is 1 where they are not. The time is that of one event, all
-specifications together, in microseconds of processor time. A trace that is not in the checkout is said, and left out.
+each, the specifications here must report the same events; otherwise the exit status is 1. The time is that of one
+event, all specifications together, in microseconds of processor time. A trace that is not in the checkout is reported
+and skipped.
 
 DejaVu quantifies over all values; a slice has one binding. So a formula over two parameters that is the conjunction
 of formulas over one is two specifications here (every user with every file would be a slice each), and `exists` over
@@ -28,7 +29,7 @@ _FIELDS = ("key", "value")
 
 
 def specification(name: str, events: Mapping[str, Sequence[str]], over: Sequence[str], formula: str) -> str:
-    """A parametric `ptltl` property. Each event has the names of its values, in their order; `over` are parameters."""
+    """Return a parametric `ptltl` property; `events` has the names of each event's values, `over` the parameters."""
     lines = [
         f"event {event}({', '.join(f'std::string {one}' for one in values if one in over)}) /{event} "
         f"diagnostic_msgs/KeyValue "
@@ -41,7 +42,7 @@ def specification(name: str, events: Mapping[str, Sequence[str]], over: Sequence
 
 
 def of(events: Mapping[str, Sequence[str]], *properties: tuple[Sequence[str], str]) -> tuple[str, ...]:
-    """A specification for each property: its parameters and its formula."""
+    """Return a specification for each property (its parameters and its formula)."""
     return tuple(
         specification(f"s{number}", events, over, formula)
         for number, (over, formula) in enumerate(properties)
@@ -50,7 +51,7 @@ def of(events: Mapping[str, Sequence[str]], *properties: tuple[Sequence[str], st
 
 @dataclass(frozen=True)
 class Case:
-    """A trace, the specifications, and the events at which DejaVu says that they fail, counted from 1."""
+    """A trace, the specifications, and the events at which DejaVu reports their failure, counted from 1."""
 
     trace: str
     specifications: tuple[str, ...]
@@ -72,7 +73,7 @@ FILE = of({"open": ("f", "m"), "close": ("f",)}, (("f",), "close => (*)(!close S
 LOCKS = of(
     {"acq": ("t", "l"), "rel": ("t", "l"), "sleep": ("t",)},
     (("t", "l"), "(sleep => !(!rel S acq)) and (rel => (*)(!rel S acq))"),
-    # whoever acquired it: the same until the first failure, for before it only who has a lock releases it
+    # any acquirer: equivalent until the first failure, because before it only the lock's owner releases it
     (("l",), "acq => !(*)(!rel S acq)"),
 )
 COMMANDS = of({"dis": ("c", "n"), "suc": ("c", "n"), "err": ("n",)}, (("c", "n"), "suc => (!err S dis)"))
@@ -100,7 +101,7 @@ CASES = (
 
 
 def messages(trace: Path) -> list[tuple[str, bytes]]:
-    """Topics, and `diagnostic_msgs/KeyValue` of the first two values; a third one no property asks for."""
+    """Return the topics, each with a `diagnostic_msgs/KeyValue` of the first two values; no property uses a third."""
     found = []
     with trace.open(newline="") as rows:
         for name, *values in (row for row in csv.reader(rows) if row):
@@ -110,7 +111,7 @@ def messages(trace: Path) -> list[tuple[str, bytes]]:
 
 
 def failing(specifications: Sequence[str], trace: Sequence[tuple[str, bytes]]) -> tuple[list[int], float]:
-    """The events at which one of them is violated, counted from 1, and the microseconds of an event."""
+    """Return the events at which a specification is violated, counted from 1, and the microseconds of an event."""
     sources = {f"{number}.rv": text for number, text in enumerate(specifications)}
     monitors = MonitorSet.of(compiled_from(sources, standard_definitions()), slices=SLICES)
     monitors.start(0)
@@ -126,7 +127,7 @@ def failing(specifications: Sequence[str], trace: Sequence[tuple[str, bytes]]) -
 
 
 def main(checkout: Path) -> int:
-    """Print what is found; whether all is as DejaVu says (0) or not (1)."""
+    """Print the results; return 0 if all are equal to DejaVu's, else 1."""
     wrong = 0
     for case in CASES:
         path = checkout / TESTS / case.trace

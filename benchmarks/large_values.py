@@ -1,7 +1,7 @@
-"""What one host's large parameters cost the others: `python -m benchmarks.large_values [--seconds 4]`.
+"""The delay that one host's large parameters cause for the others: `python -m benchmarks.large_values [--seconds 4]`.
 
 A robot makes one small call after the other while a guest (another address of this machine) sets large parameters,
-behind a plain `rosmaster` and behind the appliance. What is shown is the delay of the robot's calls.
+behind a plain `rosmaster` and behind the appliance. The table shows the delay of the robot's calls.
 """
 
 import argparse
@@ -37,7 +37,7 @@ class Caller:
         self._connection = http.client.HTTPConnection("127.0.0.1", port, 120, source_address=(address, 0))
 
     def send(self, body: bytes) -> None:
-        """Make a call that was written before."""
+        """Make a call that was encoded before."""
         self._connection.request("POST", "/", body, {"Content-Type": "text/xml"})
         answer = self._connection.getresponse()
         answer.read()
@@ -46,7 +46,9 @@ class Caller:
 
 
 def delays(port: int, seconds: float, large: bytes | None) -> tuple[list[float], int]:
-    """The robot's delays in milliseconds, while the guest sends `large` again and again; how often that was."""
+    """Return the robot's delays in milliseconds while the guest sends `large` repeatedly, and the number of these
+    calls.
+    """
     stop, sent = threading.Event(), [0]
 
     def flood() -> None:

@@ -3,10 +3,10 @@
     python -m benchmarks.learning [--drives 240] [--faults 100] [--seed 1]
 
 Every drive is another mission of half a minute: speeds, turns, aims and shots are drawn, receptions are late by some
-milliseconds, GPS, battery and odometry have noise. The first half of the drives is
-learnt from (with a share of them held out, as `rosrv monitor learn` does); an alarm in the second half is a false one.
-A fault is put into a drive of the second half, of each kind equally many, on a topic, field and time that are drawn; it
-is flagged if there is an alarm from its beginning on that the same drive does not have without it.
+milliseconds, GPS, battery and odometry have noise. The first half of the drives is learnt from (with a share of them
+held out, as `rosrv monitor learn` does); an alarm in the second half is a false one. Each fault is put into a drive of
+the second half, on a random topic, field and time; all kinds are equally frequent. A fault is flagged if, from its
+beginning on, there is an alarm that the same drive does not have without it.
 """
 
 import argparse
@@ -24,7 +24,7 @@ import numpy as np
 from examples.landshark.drive import TYPES, VELOCITY, Part, Simulation
 from examples.landshark.messages import DEFINITIONS, Messages, long_name
 from rosmop.check.sources import compiled_from
-from rosmop.learn.learner import Learnt, learn
+from rosmop.learn.learner import LearningResult, learn
 from rosmop.run.engine import MonitorSet
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
@@ -65,7 +65,7 @@ class Drive:
 
 
 def mission(chance: random.Random) -> list[Part]:
-    """Half a minute to a minute and a half of driving, turning, aiming and shooting."""
+    """Return a mission of half a minute to a minute and a half of driving, turning, aiming and shooting."""
     parts = [Part(1.0, tilt=chance.uniform(-0.4, 0.5))]
     for _ in range(chance.randint(8, 16)):
         kind = chance.choice(("ahead", "ahead", "turn", "turn", "back", "aim", "stand"))
@@ -86,7 +86,7 @@ def mission(chance: random.Random) -> list[Part]:
 
 
 def drive(number: int, seed: int) -> Drive:
-    """A drive, received with jitter and measured with noise."""
+    """Return a drive, received with jitter and measured with noise."""
     chance = random.Random(f"{seed} {number}")
     offset = number * 1000  # seconds: each begins at another time
     rows: list[Row] = []
@@ -107,7 +107,7 @@ def drive(number: int, seed: int) -> Drive:
 
 
 def altered(topic: str, data: bytes, change: Callable[[Any], None]) -> bytes:
-    """A message after a change of its fields."""
+    """Return a message after a change of its fields."""
     fields = MESSAGES.decode(TYPES[topic], data)
     for name in ("ranges", "position"):
         if isinstance(getattr(fields, name, None), np.ndarray):
@@ -117,7 +117,7 @@ def altered(topic: str, data: bytes, change: Callable[[Any], None]) -> bytes:
 
 
 def get(fields: Any, path: str) -> Any:
-    """A field; of `a#1` the element, of `a#` the whole array."""
+    """Return a field; for `a#1` the element, for `a#` the whole array."""
     path, _, element = path.partition("#")
     for step in path.split("."):
         fields = getattr(fields, step)
@@ -125,7 +125,7 @@ def get(fields: Any, path: str) -> Any:
 
 
 def put(fields: Any, path: str, value: Any) -> None:
-    """Set such a field."""
+    """Set a field; paths are those of `get`."""
     path, _, element = path.partition("#")
     *above, last = path.split(".")
     for step in above:
@@ -173,7 +173,7 @@ class Seeding:
         return topic, found
 
     def after(self, topic: str, seconds: float = 1000.0) -> list[int]:
-        """The places of the topic's messages in the seconds from the fault's beginning on."""
+        """Return the indexes of the topic's messages in this number of seconds from the fault's beginning."""
         return [
             place
             for place, row in enumerate(self.drive.rows)
@@ -185,7 +185,7 @@ class Seeding:
         return get(MESSAGES.decode(TYPES[topic], data), path)
 
     def span(self, topic: str, path: str) -> float:
-        """How far apart the field's values are in this drive; 1 of a constant."""
+        """Return the range of the field's values in this drive; 1 for a constant."""
         values = [
             float(self.value(place, path)) for place, row in enumerate(self.drive.rows) if row[0] == topic
         ]
@@ -276,7 +276,9 @@ KINDS: Mapping[str, Callable[[Seeding], list[Row]]] = {
 
 
 def seeded(kind: str, drives: Sequence[Drive], chance: random.Random) -> tuple[Drive, int, list[Row], str]:
-    """A drive, the time of its fault, its messages with it, and what it is; drawn again while it changes nothing."""
+    """Return a drive, its fault's time, its messages with the fault, and the fault's description. Retry if it changes
+    nothing.
+    """
     while True:
         drive_ = chance.choice(drives)
         time = drive_.began + int((drive_.ended - drive_.began) * chance.uniform(0.2, 0.6))
@@ -289,8 +291,8 @@ def seeded(kind: str, drives: Sequence[Drive], chance: random.Random) -> tuple[D
             return drive_, time, sorted(rows, key=lambda row: row[1]), f"{kind}: {seeding.what}"
 
 
-def alarms(learnt: Learnt, rows: Sequence[Row]) -> list[tuple[int, str, str]]:
-    """Time, specification and text of every warning."""
+def alarms(learnt: LearningResult, rows: Sequence[Row]) -> list[tuple[int, str, str]]:
+    """Return time, specification and text of every warning."""
     monitors = MonitorSet.of(compiled_from({"learnt.rv": learnt.text}, KNOWN))
     monitors.start(rows[0][1], frozenset(TYPES))
     found = []
@@ -303,9 +305,9 @@ def alarms(learnt: Learnt, rows: Sequence[Row]) -> list[tuple[int, str, str]]:
 
 @dataclass(frozen=True)
 class Judged:
-    """What the learnt specifications were worth."""
+    """The scores of the learnt specifications."""
 
-    learnt: Learnt
+    learnt: LearningResult
     hours: float
     false_alarms: list[tuple[int, str, str]]
     flagged: Counter[str]
@@ -313,7 +315,7 @@ class Judged:
 
 
 def judge(count: int, faults: int, seed: int) -> Judged:
-    """Drive, learn, and be judged by other drives and by faults."""
+    """Drive, learn, and judge the result by other drives and by faults."""
     drives = [drive(number, seed) for number in range(count)]
     half = count // 2
     learnt = learn(drives[:half], KNOWN, 0.3, lambda _: None)
@@ -335,7 +337,7 @@ def judge(count: int, faults: int, seed: int) -> Judged:
 
 
 def main() -> None:
-    """Print what came of it, as JSON."""
+    """Print the scores as JSON."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--drives", type=int, default=240)
     parser.add_argument("--faults", type=int, default=100)

@@ -1,4 +1,4 @@
-"""What one step of a monitor costs, per logic, on traces of a thousand and a million events.
+"""The cost of one step of a monitor, per logic, on traces of a thousand and a million events.
 
     python -m benchmarks.logic_steps [--long EVENTS] [--beside]
 
@@ -60,7 +60,7 @@ BESIDE = (
 
 
 def trace(kind: str, length: int) -> list[int]:
-    """Event indexes: at random, balanced pairs of depth up to two, or all openings before all closings."""
+    """Return event indexes: random, balanced pairs of depth up to two, or all openings before all closings."""
     if kind == "pairs":
         return [0, 0, 1, 1, 0, 1] * (length // 6)
     if kind == "nested":
@@ -69,7 +69,7 @@ def trace(kind: str, length: int) -> list[int]:
 
 
 def per_step(run: Run, events: Sequence[int]) -> float:
-    """Nanoseconds per step; events come a millisecond apart."""
+    """Return nanoseconds per step; events come a millisecond apart."""
     step = run.step
     times = range(0, len(events) * MS, MS)
     gc.collect()
@@ -84,7 +84,7 @@ def per_step(run: Run, events: Sequence[int]) -> float:
 
 
 def inline_step(compiled: CompiledProperty, events: Sequence[int]) -> float | None:
-    """Nanoseconds per step of code that looks the tables up itself."""
+    """Return nanoseconds per step of code that looks up the tables inline."""
     if not isinstance(compiled, FiniteProperty):
         return None
     table, verdicts, state = compiled.automaton.table, compiled.automaton.verdicts, compiled.automaton.initial
@@ -102,7 +102,7 @@ def inline_step(compiled: CompiledProperty, events: Sequence[int]) -> float | No
 
 
 def others(for_reelay: str, for_rtamt: str, events: Sequence[int]) -> tuple[Callable[[int], bool], ...]:
-    """A step of reelay and one of rtamt: whether the formula holds at this event."""
+    """Return a step of reelay and one of rtamt; each returns whether the formula holds at an event."""
     other: Any = reelay.discrete_timed_monitor(pattern=for_reelay, semantics="boolean", condense=False)
     third = rtamt.StlDiscreteTimeSpecification()
     for name in (*EVENTS, "out"):

@@ -1,11 +1,11 @@
-"""What the monitors cost for one message: `python benchmarks/monitor_messages.py`.
+"""The cost of the monitors for one message: `python benchmarks/monitor_messages.py`.
 
-A message on a topic of no monitor; the reference specification of the design (reads two fields, writes one, steps
-one state machine); the same with ten monitors on other topics; a string that grows; a copy of the whole message;
-the last ten numbers that are kept; a message that is published with each message; the reference in the module, many at
-once and alone; a state machine with a timeout; a handler and a line of output with each message; a string that is kept;
-and loading, with the module and without.
-Times are processor time, the median of the rounds, in microseconds for a message.
+A message on a topic of no monitor; the reference specification of the design (reads two fields, writes one, steps one
+state machine); the same with ten monitors on other topics; a string that grows; a copy of the whole message; the last
+ten numbers that are kept; a message that is published with each message; the reference in the module, many at once and
+alone; a state machine with a timeout; a handler and a line of output with each message; a string that is kept; and
+loading, with the module and without. Times are processor time, the median of the rounds, in microseconds for a
+message.
 """
 
 import statistics
@@ -65,7 +65,7 @@ OTHERS = "".join(
 
 
 def command(frame: bytes = b"base_link") -> bytes:
-    """A `geometry_msgs/TwistStamped` of 80 bytes and its frame's name."""
+    """Return a `geometry_msgs/TwistStamped` of 80 bytes and its frame's name."""
     return struct.pack(f"<IIII{len(frame)}s6d", 1, 2, 3, len(frame), frame, 2.0, 0, 0, 0, 0, 0.5)
 
 
@@ -99,18 +99,18 @@ def with_module(text: str) -> MonitorSet:
 
 
 def batched(messages: int, body: bytes, text: str = REFERENCE, topic: str = "/cmd") -> float:
-    """A message in a batch of so many; what the module writes is there already after the first round."""
+    """Return the time of a message in a batch of `messages`, after a first round has made the buffers."""
     loaded = with_module(text)
     loaded.process(topic, bytearray(body), 1)
-    walker, area = loaded.walker(topic), loaded.area
-    assert walker is not None
+    lane, area = loaded.lane(topic), loaded.area
+    assert lane is not None
     assert area is not None
     frame = struct.pack("<I", len(body)) + body
     view = area[: len(frame) * messages]
     view[:] = frame * messages
-    prepared = walker.prepare(loud=False, told=(), counted=[True] * len(walker.verdicts))
+    prepared = lane.prepare(loud=False, told=(), counted=[True] * len(lane.verdicts))
     times = MESSAGES // messages
-    return microseconds(lambda: walker.walk(view, 0, 0, [], 1, prepared), times) / messages
+    return microseconds(lambda: lane.process_batch(view, 0, 0, [], 1, prepared), times) / messages
 
 
 DEFINITIONS = standard_definitions()

@@ -1,4 +1,4 @@
-"""What a monitor costs: `python -m benchmarks.monitors` (two or three minutes; the long run: `--all`).
+"""The cost of a monitor: `python -m benchmarks.monitors` (two or three minutes; the long run: `--all`).
 
 One publisher, one subscriber, one topic, loopback; the load is `relay_load.cpp`. In the middle, in turns: nothing;
 `copying_relay.c`; this relay without a monitor, with one on the topic (it reads two fields, writes one and steps one
@@ -6,10 +6,9 @@ FSM at every message), with 10 and with 50 more on other topics; `topic_tools re
 the monitor's work. Cells are medians of the rounds; ratios are to the C relay, of one round each.
 
 *window*: 64 messages on their way; *flat*: as fast as it goes, with the loss; *paced*: 1,000 a second, the delay;
-*topics*: 1, 8 and more topics at 1,000 a second each, each with a monitor of its own; *memory*: that of the relay while
-a flat run of `--minutes` lasts. `--relays` leaves out the peers whose runs take longest; `--kinds` has monitors of one
-kind each instead (`KINDS`), and no peers.
-Needs g++, rosmaster, topic_tools and rospy.
+*topics*: 1, 8 and more topics at 1,000 a second each, each with a monitor of its own; *memory*: that of the relay
+while a flat run of `--minutes` lasts. `--relays` leaves out the peers whose runs take longest; `--kinds` has monitors
+of one kind each instead (`KINDS`), and no peers. Needs g++, rosmaster, topic_tools and rospy.
 """
 
 import argparse
@@ -59,7 +58,7 @@ KINDS = {
 }
 TEXT = "uint64 number\nint64 sent\nfloat64 value\nstring data\n"
 TEXT_MD5SUM = Definitions.from_files({f"{TYPE}.msg": TEXT}).md5sum(TYPE)
-"""The message as it is on the wire, but its bytes are a string."""
+"""The type on the wire, with a string in place of its bytes."""
 TOPICS = (1, 8)
 MORE_TOPICS = (1, 8, 20, 50, 100)
 SIZES = (32, 200, 4096, 65536, 1048576, 4194304)
@@ -69,7 +68,9 @@ Results = dict[tuple[str, int, str], list[Result]]
 
 
 class CopyingRelay:
-    """The relay in C, a fresh one each run; `epoll`: it waits for what comes as one with many connections does."""
+    """The relay in C, a new process for each run; with `epoll` it waits for data as a relay with many connections
+    does.
+    """
 
     def __init__(self, *, epoll: bool = False) -> None:
         self.name = "C with epoll" if epoll else "C relay"
@@ -98,12 +99,12 @@ class CopyingRelay:
 
 
 def specification(name: str, topic: str) -> str:
-    """The monitor, on this topic."""
+    """Return the monitor, on this topic."""
     return SPECIFICATION.replace("NAME", name).replace("TOPIC", topic)
 
 
 def monitored(others: int) -> Relay:
-    """The relay with the monitor on the load's topic and as many others elsewhere."""
+    """Return the relay with the monitor on the load's topic, and this number of others elsewhere."""
     name = f"+ {others} elsewhere" if others else "one monitor"
     relay = Relay(name)
     files = [("load.rv", specification("load", "/load"))]
@@ -119,7 +120,7 @@ def monitored(others: int) -> Relay:
 
 
 def of_kind(name: str) -> Relay:
-    """The relay with a monitor of this kind."""
+    """Return the relay with a monitor of this kind."""
     relay = Relay(name)
     definition = TEXT if name == "string" else DEFINITION.read_text()
     try:
@@ -179,13 +180,13 @@ def show_topics(numbers: tuple[int, ...], rounds: int, seconds: float) -> None:
 
 
 def resident(pid: int | None) -> float:
-    """MiB of memory of a process."""
+    """Return the MiB of memory of a process."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def show_memory(minutes: float) -> None:
-    """Print what the relay holds while messages come as fast as it goes, at twelve moments."""
+    """Print the relay's memory at twelve times while messages arrive at full speed."""
     relay = monitored(0)
     print(f"\nas fast as it goes for {minutes:g} minutes, one monitor: MiB that the relay holds", flush=True)
     try:
@@ -215,7 +216,7 @@ def show(results: Results, mode: str, sizes: tuple[int, ...], names: list[str]) 
 
 
 def cell(results: Results, mode: str, size: int, name: str) -> str:
-    """One cell of the table."""
+    """Return one cell of the table."""
     runs, base = results[mode, size, name], results[mode, size, "C relay"]
 
     def value(one: Result) -> float:
@@ -233,7 +234,7 @@ def cell(results: Results, mode: str, size: int, name: str) -> str:
 
 
 def begin(systems: list[System], *, peers: bool, kinds: bool) -> None:
-    """Start what is put in the middle in turns."""
+    """Start the systems that are compared in turns."""
     systems += [Direct(), CopyingRelay(), CopyingRelay(epoll=True), Relay("relay alone")]
     if kinds:
         systems += map(of_kind, KINDS)

@@ -1,16 +1,17 @@
 """The flight recorder beside `rosbag record` and `rosbag_snapshot`: `python -m benchmarks.recorder [--seconds 15]`.
 
-One node talks on fifty topics (20 MB/s in all) or on five (0.1 MB/s), one listens, on loopback, in turns: at a plain
-master, there with `rosbag record -a`, and with the node `snapshot` of rosbag_snapshot (no package of Debian: the one of
-`--snapshot`, in PATH or below /opt/ros), at the appliance without and with the recorder. Of what was recorded:
-messages, and those that are missing between the first and the last of a topic; seconds from the end of what is
-recorded until the whole file is there. Of the machine: processor time of the relay and the recorder until then, or of
-`rosbag record` until it is asked to end, in percent of a core over the seconds that are recorded; the median delay from
-publisher to subscriber.
+One node talks on fifty topics (20 MB/s in all) or on five (0.1 MB/s), one listens, on loopback. The systems take
+turns: a plain master; the same with `rosbag record -a`; the same with the node `snapshot` of rosbag_snapshot (not a
+Debian package: the program given by `--snapshot`, in PATH or below /opt/ros); the appliance without and with the
+recorder.
 
-*killed* is the appliance with the recorder, whose relay, control and recorder get SIGKILL together in the middle of
-what is recorded. What is missing there is what the subscriber heard in the time that the recording says it has, and the
-recording has not.
+Measured of each recording: messages, those missing between the first and the last of a topic, and the seconds from the
+end of the recorded time until the file is complete. Measured of the machine: the median delay from publisher to
+subscriber, and the processor time of the relay and the recorder, or of `rosbag record`, in percent of a core.
+
+*killed* is the appliance with the recorder, whose relay, control and recorder get SIGKILL together during the recorded
+time. There, a message is missing if the subscriber received it in the time that the recording covers, and the
+recording does not have it.
 """
 
 import argparse
@@ -51,12 +52,12 @@ audit: {{reserve_bytes: 1MiB}}
 
 
 class Bag(NamedTuple):
-    """What a bag has of the load."""
+    """The part of the load that a bag has."""
 
     messages: int
     lost: int
     closed: float
-    """Seconds from the end of what is recorded to the whole file."""
+    """Seconds from the end of the recorded time until the file is complete."""
 
 
 @dataclass
@@ -69,7 +70,7 @@ class Result:
 
 
 class Load:
-    """The two nodes at a master, warm. What was heard stands in a file in `folder`."""
+    """The two nodes at a master, warm. The listener writes the messages that it received into a file in `folder`."""
 
     def __init__(self, session: RosSession, folder: Path, topics: int, size: int, hertz: int) -> None:
         self._heard = folder / "heard"
@@ -84,7 +85,7 @@ class Load:
         self.last(_WARM_SECONDS)
 
     def last(self, seconds: float) -> None:
-        """For so long it goes on."""
+        """Let the load run for this number of seconds."""
         try:
             self._listener.popen.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -92,16 +93,16 @@ class Load:
         raise SystemExit(f"the listener ended: {self._listener.story()}")
 
     def end(self) -> float:
-        """The median delay that the listener saw, in microseconds."""
+        """Return the median delay that the listener measured, in microseconds."""
         self._listener.interrupt()
         heard = self._listener.wait_for(event="heard")
         self._talker.stop()
         return float(heard["p50_us"])
 
     def heard(self, began: int, ended: int) -> dict[str, set[int]]:
-        """The numbers of the messages that the listener had from `began` to `ended` (ns since the epoch), by topic.
+        """Return the numbers of the messages that the listener received from `began` to `ended` (ns), by topic.
 
-        Not those of the first second: what is heard then may have been published before.
+        The first second is left out, because its messages may have been published before.
         """
         numbers: dict[str, set[int]] = {}
         for topic, number, when in struct.iter_unpack("=QQQ", self._heard.read_bytes()):
@@ -112,16 +113,16 @@ class Load:
 
 @contextmanager
 def measured(pids: Mapping[str, int], seconds: float, into: dict[str, float]) -> Iterator[None]:
-    """The processor time of these processes within, in percent of a core over so many seconds."""
+    """Store the processor time of these processes inside the block, in percent of a core over `seconds`."""
     before = {name: cpu_seconds(pid) for name, pid in pids.items()}
     yield
     into |= {name: 100 * (cpu_seconds(pid) - before[name]) / seconds for name, pid in pids.items()}
 
 
 def counted(path: Path, closed: float, heard: dict[str, set[int]] | None = None) -> Bag:
-    """How many messages of the load a bag has, and how many are missing between the first and the last of a topic.
+    """Count the messages of the load in a bag, and those missing between the first and the last of a topic.
 
-    Of those that were `heard`, where it is given: all that the bag has not.
+    With `heard`, every message in it that the bag does not have is missing.
     """
     numbers: dict[str, set[int]] = {}
     with Reader(path) as reader:
@@ -136,7 +137,7 @@ def counted(path: Path, closed: float, heard: dict[str, set[int]] | None = None)
 
 
 def snapshot_program() -> Path | None:
-    """The node of rosbag_snapshot, where this machine has it."""
+    """Return the node of rosbag_snapshot if it is installed."""
     installed = Path("/").glob("opt/ros/*/lib/rosbag_snapshot/snapshot")
     found = shutil.which("snapshot")
     return next(installed, None) if found is None else Path(found)
@@ -145,7 +146,7 @@ def snapshot_program() -> Path | None:
 def at_plain_master(
     folder: Path, load: tuple[int, int, int], seconds: float, recorder: str, snapshot: Path | None
 ) -> Result:
-    """With no recorder (""), `rosbag`, or `snapshot`, which is that program."""
+    """Run the load without a recorder (""), with `rosbag`, or with `snapshot`, which is that program."""
     with PlainMaster(folder) as master, RosSession(master.master_uri, folder) as session:
         running = Load(session, folder, *load)
         if not recorder:
@@ -175,7 +176,9 @@ def at_plain_master(
 def at_appliance(
     folder: Path, load: tuple[int, int, int], seconds: float, *, recorder: bool, kills: bool = False
 ) -> Result:
-    """Without and with the recorder, which is asked at the end for the seconds before and some after; with kills."""
+    """Run the load without and with the recorder, which records the seconds before the request and some after; with
+    kills.
+    """
     configuration = folder / "appliance.yaml"
     configuration.write_text(_CONFIGURATION.format(enabled=str(recorder).lower(), seconds=seconds))
     options = ("--config", str(configuration))

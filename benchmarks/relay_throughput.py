@@ -31,7 +31,7 @@ from appliance.channel.messages import (
     UpstreamWanted,
 )
 from appliance.configuration.settings import RecorderRules
-from appliance.supervisor.rings import Rings
+from appliance.supervisor.rings import RecorderRings
 from tests.support.relay_driver import LOOPBACK, ChannelPeer, RelayProcess, call, free_port
 from tests.support.stated import stated
 from tests.support.waiting import eventually
@@ -46,7 +46,7 @@ TYPE = "relay_load/Sample"
 
 @dataclass
 class Result:
-    """One run: messages a second, share lost, delay in microseconds, the relay's CPU microseconds a message."""
+    """One run: messages a second, fraction lost, delay in microseconds, the relay's CPU microseconds a message."""
 
     rate: float
     loss: float
@@ -55,7 +55,7 @@ class Result:
 
 
 def compiled() -> Path:
-    """The load generator, compiled when its source is newer."""
+    """Return the load generator; compile it if its source is newer."""
     source = HERE / "relay_load.cpp"
     if not PROGRAM.exists() or PROGRAM.stat().st_mtime < source.stat().st_mtime:
         PROGRAM.parent.mkdir(parents=True, exist_ok=True)
@@ -65,7 +65,7 @@ def compiled() -> Path:
 
 
 def cpu_seconds(pid: int | None) -> float:
-    """User and system time of a process so far."""
+    """Return the user and system time of a process so far."""
     if pid is None:
         return 0.0
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -73,7 +73,7 @@ def cpu_seconds(pid: int | None) -> float:
 
 
 def run(mode: str, size: int, seconds: float, system: "System", *md5sum: str) -> Result:
-    """One run of the load through a system; `md5sum`: what it says of its messages, if not that of its definition."""
+    """Run the load once through a system; `md5sum` replaces the checksum of the message's definition."""
     with subprocess.Popen(
         [str(compiled()), str(size), str(seconds), mode, *md5sum],
         stdin=subprocess.PIPE,
@@ -97,13 +97,13 @@ def run(mode: str, size: int, seconds: float, system: "System", *md5sum: str) ->
 
 
 class System(Protocol):
-    """What is put in the middle."""
+    """A system between the publisher and the subscriber."""
 
     name: str
     pid: int | None
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Port and topic for the subscriber, given the publisher's port."""
+        """Return port and topic for the subscriber, given the publisher's port."""
 
     def close(self) -> None:
         """End it."""
@@ -116,7 +116,7 @@ class Direct:
     pid: int | None = None
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """The publisher itself."""
+        """Return the publisher's own port and topic."""
         return publisher, "-"
 
     def close(self) -> None:
@@ -131,8 +131,8 @@ class Relay:
         self._publishers: dict[str, int] = {}
         self._relay = RelayProcess()
         if recorded:
-            rings = Rings(RecorderRules(), 1)
-            [(given, memory)] = rings.given_to("relay", 0)
+            rings = RecorderRings(RecorderRules(), 1)
+            [(given, memory)] = rings.messages_for("relay", 0)
             self._relay.lifeline.send(given, (memory,))
             rings.close()
         self._link: ChannelPeer = self._relay.open_link(self._answer)
@@ -146,11 +146,11 @@ class Relay:
             raise SystemExit(f"the relay does not take the specifications: {answer.findings}")
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """A new incarnation, whose publisher is this run's."""
+        """Make a new incarnation, whose publisher is this run's."""
         return self.place(publisher, "/load")
 
     def place(self, publisher: int, topic: str) -> tuple[int, str]:
-        """A new incarnation that publishes this topic; port and topic for its subscriber."""
+        """Make a new incarnation that publishes this topic; return port and topic for its subscriber."""
         key = str(len(self._publishers) + 1)
         self._publishers[key] = publisher
         with socket.create_server((LOOPBACK, 0)) as listening:

@@ -84,7 +84,7 @@ class Client:
 
 
 def load(port: int, path: str, token: str, clients: int, seconds: float) -> float:
-    """Requests a second in a closed loop."""
+    """Return requests a second in a closed loop."""
     head = f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {token}\r\n\r\n".encode()
     everybody = {one.sock.fileno(): one for one in (Client(port, head) for _ in range(clients))}
     poll = select.epoll()
@@ -106,7 +106,7 @@ def load(port: int, path: str, token: str, clients: int, seconds: float) -> floa
 
 
 def cpu(pids: list[int]) -> float:
-    """CPU seconds that processes used so far."""
+    """Return the CPU seconds that processes have used so far."""
     ticks = 0
     for pid in pids:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -144,7 +144,7 @@ class Appliance:
         self.pids = [int(row["pid"]) for row in rows if row["role"] in ("api", "control")]
 
     def status(self) -> dict[str, Any]:
-        """`/v1/status`, once REST is there."""
+        """Return `/v1/status`, once REST answers."""
         client = Client(
             self.port,
             f"GET /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {self.token}\r\n\r\n".encode(),
@@ -157,7 +157,7 @@ class Appliance:
         return found
 
     def delays(self, seconds: float) -> list[float]:
-        """Seconds of calls of getSystemState, one after the other."""
+        """Return the seconds of calls of getSystemState, one after the other."""
         found = []
         with xmlrpc.client.ServerProxy(self.master) as master:
             end = time.perf_counter() + seconds
@@ -176,7 +176,7 @@ def quantile(values: list[float], share: float) -> float:
 
 
 def rates(appliance: Appliance, bare: int, seconds: float, rounds: int) -> list[dict[str, Any]]:
-    """Requests a second, beside the bare route."""
+    """Return requests a second, beside the bare route."""
     rows = []
     for clients in CLIENTS:
         for path in PATHS:
@@ -198,7 +198,7 @@ def rates(appliance: Appliance, bare: int, seconds: float, rounds: int) -> list[
 
 
 def effects(appliance: Appliance, seconds: float, rounds: int) -> list[dict[str, Any]]:
-    """The delay of a call of RVMaster, quiet and with REST at full load."""
+    """Return the delay of a call of RVMaster, in quiet and with REST at full load."""
     rows = []
     for path in ("/healthz", "/v1/status", "/v1/graph", "/v1/audit?limit=50"):
         quiet, loaded = [], []
@@ -220,7 +220,7 @@ def effects(appliance: Appliance, seconds: float, rounds: int) -> list[dict[str,
 
 
 def beside(work: Callable[[], Any], measured: Callable[[], list[float]]) -> list[float]:
-    """What is measured while other work is done."""
+    """Measure while other work is done."""
     thread = threading.Thread(target=work)
     thread.start()
     found = measured()

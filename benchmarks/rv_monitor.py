@@ -1,11 +1,12 @@
 """`ere` and `ltl` beside RV-Monitor: `python -m benchmarks.rv_monitor CHECKOUT JAVACC [FORMULAS] [--seed SEED]`.
 
 CHECKOUT is RV-Monitor's repository (github.com/runtimeverification/rv-monitor), JAVACC the archive of JavaCC (Debian's
-package `javacc`: /usr/share/java/javacc.jar); `javac` and `java` are on the path. Its plugins are compiled as they are,
-without what reads and writes XML, and make automata of random expressions and formulas (with `(*)`, `<*>` and `S` about
-the past, too). On random traces both sides have to say `match` and `violation` at the same events. RV-Monitor may tell
-`fail` and `violation` later: it does not see each time that nothing can follow any more. Where it is later about
-`ltl`, the definition has to say so, too. Exit status 1 where they differ.
+package `javacc`: /usr/share/java/javacc.jar); `javac` and `java` are on the path. Its plugins are compiled as they
+are, without what reads and writes XML, and make automata of random expressions and formulas, some with `(*)`, `<*>`
+and `S` about the past. On random traces both sides must report `match` and `violation` at the same events. RV-Monitor
+may report `fail` and `violation` later, because it does not always detect that no continuation matches. Where it is
+later for an `ltl` formula, the definition must give `violation` at the earlier event. The exit status is 1 if they
+differ.
 """
 
 import argparse
@@ -70,7 +71,7 @@ public class Made { public static String of(String text) {
 
 
 class Formula(NamedTuple):
-    """What both are given: the tree that it was drawn as, and its text, with all parentheses."""
+    """A formula for both sides: its random tree, and its text with all parentheses."""
 
     logic: str
     events: Sequence[str]
@@ -93,7 +94,7 @@ def _shown(tree: Any) -> str:
 
 
 def drawn(random: Random, count: int) -> Iterator[Formula]:
-    """So many of each logic."""
+    """Yield `count` random formulas of each logic."""
     arity = ltl.UNARY | dict.fromkeys(("previously", "once"), 1)
     operators = (*ltl.TEMPORAL, "previously", "once", "since")
     for _ in range(count):
@@ -105,7 +106,7 @@ def drawn(random: Random, count: int) -> Iterator[Formula]:
 
 
 def automata(checkout: Path, javacc: Path, formulas: Sequence[Formula]) -> list[str]:
-    """What RV-Monitor makes of each; empty where it makes nothing of it."""
+    """Return RV-Monitor's automaton of each formula; empty if it cannot make one."""
     with tempfile.TemporaryDirectory() as made:
         sources, classes = Path(made) / "sources", Path(made) / "classes"
         for logic in ("ere", "ltl"):
@@ -130,7 +131,7 @@ def _run(command: list[str], given: str = "") -> str:
 
 
 def theirs(automaton: str, logic: str, trace: Sequence[str]) -> list[tuple[bool, bool]]:
-    """After each event of a trace: whether it matches, and whether nothing can follow, as its automaton has it."""
+    """Return, after each event of a trace, whether the automaton matches, and whether no continuation can match."""
     states: dict[str, dict[str, str]] = {}
     for name, body in re.findall(r"(\w+) ?\[([^\]]*)\]", automaton):
         states[name] = dict(re.findall(r"(\w+) -> (\w+)", body))
@@ -147,7 +148,7 @@ def theirs(automaton: str, logic: str, trace: Sequence[str]) -> list[tuple[bool,
 
 
 def _violated(tree: Any, trace: tuple[str, ...]) -> bool:
-    """By the definition: on no continuation is it true."""
+    """Whether the formula is false on every continuation, by the definition."""
     endless = [
         ltl.unrolled(one, 6) for one in ltl.lassos(ltl.AB, len(trace) + 1, 3) if one[0][: len(trace)] == trace
     ]
@@ -155,7 +156,7 @@ def _violated(tree: Any, trace: tuple[str, ...]) -> bool:
 
 
 def main(arguments: list[str]) -> int:
-    """See the head of this file."""
+    """Compare both sides; see the head of this file."""
     parser = argparse.ArgumentParser(usage=__doc__)
     parser.add_argument("checkout", type=Path)
     parser.add_argument("javacc", type=Path)

@@ -1,9 +1,9 @@
-"""What slices cost: `python -m benchmarks.slices`.
+"""The cost of slices: `python -m benchmarks.slices`.
 
-The same property without parameters and with one, at 10,000 live slices that are visited in turn; the memory of 100,000
-slices; an event that concerns all of them, and one that brings a verdict of each; how fast ids that nobody has seen are
-taken, and refused beyond the bound; the same `fsm` with a condition, and with an action that changes what slices share.
-Microseconds of processor time, the least of the rounds.
+The same property without parameters and with one, at 10,000 live slices that are visited in turn; the memory of
+100,000 slices; an event that concerns all of them, and one that brings a verdict of each; how fast new ids are
+accepted, and rejected beyond the bound; the same `fsm` with a condition, and with an action that changes what slices
+share. Microseconds of processor time, the least of the rounds.
 """
 
 import struct
@@ -44,20 +44,20 @@ WITHIN = SPECIFICATION % (
 
 
 def ids(count: int) -> list[bytes]:
-    """Messages with ids as actionlib makes them."""
+    """Return messages with ids as actionlib makes them."""
     made = (b"/planner-%d-%d.%09d" % (number, 1_700_000_000 + number, number) for number in range(count))
     return [struct.pack("<I", len(one)) + one for one in made]
 
 
 def monitors(text: str) -> MonitorSet:
-    """A set that has begun."""
+    """Return the monitors of a specification after their start."""
     loaded = MonitorSet.of(compiled_from({"slices.rv": text}, standard_definitions()), slices=MANY)
     loaded.start(0)
     return loaded
 
 
 def microseconds(action: Callable[[], object], times: int, rounds: int = ROUNDS) -> float:
-    """Processor time of one of so many."""
+    """Return the processor time of one of `times` repetitions."""
     found = []
     for _ in range(rounds):
         started = time.process_time()
@@ -67,7 +67,7 @@ def microseconds(action: Callable[[], object], times: int, rounds: int = ROUNDS)
 
 
 def visited(text: str, messages: Sequence[bytes]) -> float:
-    """Of a message, when those of all slices come in turn."""
+    """Return the processor time of a message, when those of all slices come in turn."""
     loaded = monitors(text)
 
     def visit() -> None:
@@ -79,7 +79,7 @@ def visited(text: str, messages: Sequence[bytes]) -> float:
 
 
 def resident() -> float:
-    """Megabytes of this process."""
+    """Return the memory of this process in megabytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
 
 

@@ -1,8 +1,8 @@
-"""What the log in front of the state's database wins: python -m benchmarks.state_writes [--rate 500] [--seconds 10]
+"""Time saved by the log in front of the database: python -m benchmarks.state_writes [--rate 500] [--seconds 10]
 
-A robot's nodes register at a rate; each registration must outlast control before it is answered, and is kept by the
-thread that answers everybody. Every second the tree of parameters is kept, too, by another thread. Shown is how long
-the answering thread is held up by one registration, in microseconds:
+A robot's nodes register at a rate. Each registration must survive the death of control before it is answered, and is
+saved by the thread that answers all nodes. Every second another thread saves the tree of parameters. The table shows
+how long one registration blocks the answering thread, in microseconds:
 
 - `ahead`: as the program does it, a line in `state.ahead` and a statement in the queue of the writer's thread.
 - `commit`: the statement is committed to SQLite's own log (WAL, `synchronous=NORMAL`) by the answering thread. It waits
@@ -27,7 +27,7 @@ Keep = Callable[[RegistrationRow], None]
 
 
 def main() -> None:
-    """Show both, with trees of parameters as small robots and large ones have them."""
+    """Print both, with trees of parameters as small and large robots have them."""
     arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     arguments.add_argument("--rate", type=int, default=500, help="registrations a second")
     arguments.add_argument("--seconds", type=float, default=10)
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def ahead(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
-    """As the program does it."""
+    """Register as the program does."""
     store = StateStore(folder, failed=print)
     try:
         return _registering(
@@ -55,7 +55,7 @@ def ahead(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
 
 
 def commit(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
-    """Each statement committed where it is made."""
+    """Commit each statement in the answering thread."""
     StateStore(folder, failed=print).close()
     registrations, parameters = _opened(folder), _opened(folder)
 
@@ -83,7 +83,7 @@ def _opened(folder: Path) -> sqlite3.Connection:
 def _registering(
     keep: Keep, keep_tree: Callable[[], None], tree: bytes, rate: int, seconds: float
 ) -> list[float]:
-    """Seconds that each registration took."""
+    """Return the seconds that each registration took."""
     over = threading.Event()
 
     def keep_trees() -> None:

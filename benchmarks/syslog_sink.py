@@ -1,4 +1,4 @@
-"""A syslog receiver that takes everything and counts it: for measuring who sends."""
+"""Receive and count all syslog messages, to measure the sender."""
 
 import contextlib
 import socket
@@ -7,7 +7,7 @@ from typing import Self
 
 
 class Sink:
-    """Listens on a loopback `port`; `messages` counts octet-counted messages of RFC 5424."""
+    """A receiver on a loopback `port`; `messages` counts octet-counted messages of RFC 5424."""
 
     def __init__(self) -> None:
         self.messages = 0

@@ -1,11 +1,11 @@
 """The thesis's experiments (chapter 5, RQ2), with real nodes: `python -m benchmarks.thesis_experiments`.
 
-Two rospy nodes, ten messages a second, and how many were sent and received: behind a plain ROSMaster, behind the
+Two rospy nodes, ten messages a second, and how many were sent and received: behind a plain `rosmaster`, behind the
 appliance without a monitor, and with one on each topic. Experiment 1 and 2: one topic, 10 s and 10 minutes; 3: both
 nodes publish and subscribe, 10 s and 10 minutes; 4: the monitor publishes a message for each that it sees, 1 minute.
-Durations are multiplied by --scale (default 0.02, no run below 5 s: about two minutes; `--scale 1` is the thesis's own,
-about an hour). The first messages are published before the nodes have found each other, in the thesis as here; `lost`
-are those missing after the first one was received.
+Durations are multiplied by --scale (default 0.02, no run below 5 s: about two minutes; `--scale 1` is the thesis's
+own, about an hour). The first messages are published before the nodes have found each other, in the thesis as here;
+`lost` are those missing after the first one was received.
 """
 
 import argparse
@@ -37,7 +37,7 @@ EXTRA = "copy = MESSAGE; PUBLISH(/extra, std_msgs/String, copy);"
 
 @dataclass(frozen=True)
 class Experiment:
-    """One of the thesis's: its seconds, the roles of its two nodes, and what the monitor does besides."""
+    """One experiment of the thesis: its seconds, the roles of its two nodes, and the monitor's additional action."""
 
     name: str
     seconds: float
@@ -58,14 +58,14 @@ EXPERIMENTS = (
 
 @contextlib.contextmanager
 def plain(home: Path, _experiment: Experiment) -> Iterator[str]:
-    """Where the nodes find the plain ROSMaster."""
+    """Yield the URI of a plain `rosmaster`."""
     with PlainMaster(home) as master:
         yield master.master_uri
 
 
 @contextlib.contextmanager
 def appliance(enable: str, experiment: Experiment) -> Iterator[str]:
-    """Where the nodes find the appliance."""
+    """Yield the URI of the appliance."""
     with tempfile.TemporaryDirectory(prefix="rosrv-monitors-") as name:
         folder = Path(name)
         folder.chmod(0o755)
@@ -78,7 +78,7 @@ def appliance(enable: str, experiment: Experiment) -> Iterator[str]:
 
 
 def measure(master_uri: str, home: Path, experiment: Experiment, seconds: float) -> str:
-    """Run both nodes for so long: what was sent and received, for each topic."""
+    """Run both nodes for this number of seconds; return the messages sent and received for each topic."""
     with RosSession(master_uri, home) as session:
         nodes = [
             session.start(
@@ -94,7 +94,7 @@ def measure(master_uri: str, home: Path, experiment: Experiment, seconds: float)
 
 
 def counted(node: Process, seconds: float) -> dict[str, int]:
-    """What a node says at its end."""
+    """Return the counts that a node prints at its end."""
     event = node.wait_for(event="counted", timeout=seconds + 60)
     return {name: int(event[name]) for name in ("sent", "received", "lost")}
 

@@ -55,7 +55,9 @@ class Robot:
             node.wait_for(event="ready")
 
     def record(self, bag: Path) -> tuple[float, float, float]:
-        """Of the bag: seconds from the first topic's message to the last one's, from the start; topics missing."""
+        """Record a bag; return the seconds from its first topic's message to the last one's, from the start, and
+        missing topics.
+        """
         began = time.time()
         self.session.run(
             "rosbag", "record", "-a", "-O", str(bag), f"--duration={_RECORDED_SECONDS}", timeout=60
@@ -65,7 +67,7 @@ class Robot:
         return max(at) - min(at), max(at) - began, _NODES * _TOPICS - len(at)
 
     def graph(self) -> float:
-        """Seconds for the whole graph."""
+        """Return the seconds for the whole graph."""
         return float(self.session.run(PYTHON, "-c", _GRAPH, timeout=90).stdout)
 
 

@@ -40,7 +40,7 @@ PACED = 200.0  # messages a second
 
 @dataclass(frozen=True)
 class Way:
-    """A way of the host to the appliance."""
+    """A path from the host to the appliance."""
 
     name: str
     master: str
@@ -51,7 +51,7 @@ class Way:
 
 @dataclass(frozen=True)
 class Measure:
-    """What is measured: its unit, and whether more is better."""
+    """A measured quantity: its unit, and whether more is better."""
 
     name: str
     unit: str
@@ -69,7 +69,7 @@ class Bench:
         )
 
     def measures(self) -> list[Measure]:
-        """All that is measured."""
+        """Return all measures."""
         rows = [Measure(f"{size:,} bytes, flat out", "messages/s", self._flat(size)) for size in SIZES]
         rows.append(Measure(f"200 bytes, {PACED:.0f}/s: delay", "µs (median)", self._paced))
         rows.append(Measure("getSystemState, one caller", "calls/s", self._calls))
@@ -82,7 +82,7 @@ class Bench:
         return self._messages(path, 200, PACED)[1]
 
     def _messages(self, path: Way, size: int, hertz: float) -> tuple[float, float]:
-        """Messages a second, and the median of their delays."""
+        """Return messages a second, and the median of their delays."""
         home = self.site.home
         with (
             RosSession(MASTER, home, self.site.robot) as here,
@@ -98,7 +98,7 @@ class Bench:
         return counted["received"] / counted["seconds"], statistics.median(counted["delays"])
 
     def _calls(self, path: Way) -> float:
-        """Calls a second over one kept connection."""
+        """Return calls a second over one kept connection."""
         body = xmlrpc.client.dumps(("/bench",), "getSystemState").encode()
 
         def work() -> float:
@@ -116,7 +116,7 @@ class Bench:
 
 
 def first_message(site: TunnelSite) -> tuple[JoinedHost, list[tuple[str, float]]]:
-    """The host joins; what took how long."""
+    """Let the host join; return the duration of each step."""
     moments = [("", time.monotonic())]
     kit = site.kit()
     moments.append(("`host add`: the kit is there", time.monotonic()))
@@ -129,7 +129,7 @@ def first_message(site: TunnelSite) -> tuple[JoinedHost, list[tuple[str, float]]
 
 
 def measure(bench: Bench, rounds: int) -> Table:
-    """The table of all measures."""
+    """Return the table of all measures."""
     where = bench.site.appliance.status()["ipsec"]["esp"]
     table = Table("", "", *(path.name for path in bench.paths), "tunnel / clear", title=f"ESP in: {where}")
     for one in bench.measures():
@@ -169,7 +169,7 @@ def in_the_machine(seconds: float, rounds: int) -> None:
 
 
 def main() -> None:
-    """Run it."""
+    """Measure here or in the virtual machine."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--rounds", type=int, default=3)

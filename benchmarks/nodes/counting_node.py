@@ -1,8 +1,8 @@
 """The thesis's node: publishes ten times a second, counts what it sent and received (runs under Debian's Python).
 
-`counting_node.py SECONDS [publish:=TOPIC] [subscribe:=TOPIC]`: publishes from its first moment on, as the thesis's did,
-whether anybody listens or not; ends a second after the last message. Prints `{"event": "counted", "sent": …,
-"received": …, "lost": …}`: lost are the messages missing between the first and the last that were received.
+`counting_node.py SECONDS [publish:=TOPIC] [subscribe:=TOPIC]`: publishes from its start on, as the thesis's node did,
+even without a subscriber; ends a second after the last message. Prints `{"event": "counted", "sent": …, "received": …,
+"lost": …}`: lost are the messages missing between the first and the last that were received.
 """
 
 import json

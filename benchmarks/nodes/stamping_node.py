@@ -1,8 +1,8 @@
-"""Publishes messages that bear their moment, or says when they came (runs under Debian's Python, with rospy).
+"""Publish messages with their time, or report when they arrived (runs under Debian's Python, with rospy).
 
-`stamping_node.py publish TOPIC BYTES HZ SECONDS` (HZ 0: as fast as the connection takes them), ends by itself;
-`stamping_node.py subscribe TOPIC`: for each line on its input a line `{"event": "counted", "received": N, "seconds": S,
-"delays": [µs, …]}`, of what came since the last one. The clock is the machine's (CLOCK_MONOTONIC).
+`stamping_node.py publish TOPIC BYTES HZ SECONDS` (HZ 0: as fast as the connection takes them) ends after SECONDS;
+`stamping_node.py subscribe TOPIC` prints for each line on its input a line `{"event": "counted", "received": N,
+"seconds": S, "delays": [µs, …]}` about the messages since the last line. The clock is the machine's (CLOCK_MONOTONIC).
 """
 
 import json
@@ -17,7 +17,7 @@ NANOSECONDS = 1_000_000_000
 
 
 def publish(topic, size, hertz, seconds):
-    """Publish for so many seconds, once somebody listens."""
+    """Publish for this number of seconds, once there is a subscriber."""
     publisher = rospy.Publisher(topic, String, queue_size=None)
     while not publisher.get_num_connections() and not rospy.is_shutdown():
         threading.Event().wait(0.05)
@@ -48,7 +48,7 @@ def subscribe(topic):
 
 
 def main():
-    """What the arguments say."""
+    """Do as the arguments say."""
     words = rospy.myargv()[1:]
     rospy.init_node(f"stamping_{words[0]}", anonymous=True)
     if words[0] == "publish":
