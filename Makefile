@@ -100,7 +100,7 @@ release: ## everything anew, with provenance and checksums that KEY=FILE signs
 bench: setup ## measure: every program in benchmarks/
 	@for program in benchmarks/*.py; do echo "== $$program"; $(BIN)/python -m "benchmarks.$$(basename "$$program" .py)"; done
 
-prove: ## check what is proved: the proofs in Coq, the code of events, the model of the insertion, its mutants and traces (docs/assurance.md)
+prove: ## check what is proved: the proofs in Coq, the code of events, the model of the insertion, its mutants and traces (docs/dev/assurance.md)
 	@scripts/setup --proofs
 	$(PYTEST) tests/proofs -n auto --dist loadfile --quiet --durations=5
 
