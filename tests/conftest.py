@@ -1,4 +1,4 @@
-"""Fixtures that tests with real nodes share, each ends what it started; how many run at once; what is tried again."""
+"""Fixtures of tests with real nodes, each of which ends what it started; the number of workers; the order of tests."""
 
 import contextlib
 import gc
@@ -17,10 +17,9 @@ from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.examples import examples
 from tests.support.nodes import RosSession, has_ros
-from tests.support.outside import outside
+from tests.support.processes import ThisMachine
 from tests.support.requirements import need_root, needs
-from tests.support.rosmaster import PlainMaster
-from tests.support.site import Site
+from tests.support.site import Masters, Site
 
 _LONGEST_STORY = 40_000  # characters; of a flood there are many more
 
@@ -46,8 +45,8 @@ def common_lab() -> Iterator[Lab]:
 
 
 @pytest.fixture(scope="module")
-def appliance(common_lab: Lab) -> Iterator[Appliance]:
-    """An appliance that lets everything pass, on a host of the common lab (10.77.0.2), firewall in force."""
+def own_appliance(common_lab: Lab) -> Iterator[Appliance]:
+    """An appliance for a file that crashes or restarts it, with an open policy, on 10.77.0.2 of the common lab."""
     with Appliance(common_lab.host("appliance", "10.77.0.2/24"), options=("--api", "off")) as running:
         yield running
 
@@ -59,32 +58,40 @@ def common_robot(common_lab: Lab) -> Host:
 
 
 @pytest.fixture
-def plain_master(lab: Lab, tmp_path: Path) -> Iterator[PlainMaster]:
-    """A plain ROSMaster where the appliance would be."""
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with PlainMaster(tmp_path, lab.host("master", "10.77.0.2/24")) as running:
-        yield running
-
-
-@pytest.fixture
 def robot(lab: Lab) -> Host:
     """The host the robot's nodes run on (10.77.0.10)."""
     return lab.host("robot", "10.77.0.10/24")
 
 
-@pytest.fixture(scope="module", params=["plain", "appliance"])
-def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    """A robot behind a plain master, and the same robot behind the appliance: a test of it runs with both."""
-    need_root()
+@pytest.fixture(scope="session")
+def masters(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Masters]:
+    """The masters that the tests of a worker share."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with Lab("rosrv-test") as lab, Site(lab, request.param, tmp_path_factory.mktemp("master")) as site:
+    with contextlib.closing(Masters(tmp_path_factory.mktemp)) as masters:
+        yield masters
+
+
+@pytest.fixture
+def appliance(masters: Masters) -> Iterator[Appliance]:
+    """The worker's appliance on the loopback, with an open policy and REST; the test must leave it as it was."""
+    with masters.lend("appliance", "loopback") as site:
+        site.appliance.ignore_earlier_records()
+        yield site.appliance
+
+
+@pytest.fixture(params=["plain", "appliance"])
+def site(request: pytest.FixtureRequest, masters: Masters) -> Iterator[Site]:
+    """A robot behind a plain master, and the same robot behind the appliance: a test of it runs with both."""
+    with masters.lend(request.param, "lab") as site:
         yield site
 
 
 @pytest.fixture
-def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
-    """The robot's nodes and tools of one test."""
-    with RosSession(site.master_uri, tmp_path, site.robot) as session:
+def ros(request: pytest.FixtureRequest, appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
+    """The nodes and tools of one test behind its appliance: on this machine, or on the robot if that is in a lab."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    robot = None if isinstance(appliance.host, ThisMachine) else request.getfixturevalue("common_robot")
+    with RosSession(appliance.master_uri, tmp_path, robot) as session:
         yield session
 
 
@@ -101,7 +108,6 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     return report
 
 
-@pytest.hookimpl(trylast=True)  # pytest-rerunfailures has called its other half by then
 def pytest_configure(config: pytest.Config) -> None:
     """Have programs listen to SIGINT; give each worker of pytest-xdist a loopback of its own, as root.
 
@@ -133,18 +139,6 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What tests/outside.toml lists is tried a second time when it fails; nothing else is. tests/long.txt is first."""
+    """Run the files of tests/long.txt first."""
     long = set(Path(__file__).with_name("long.txt").read_text(encoding="utf-8").splitlines())
     items.sort(key=lambda item: item.nodeid.partition("::")[0] not in long)
-    listed = outside()
-    for item in items:
-        if item.nodeid.partition("[")[0] in listed:
-            item.add_marker(pytest.mark.flaky(reruns=1))
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Why what was tried again may fail."""
-    listed = outside()
-    for report in terminalreporter.getreports("rerun"):
-        reason = " ".join(listed[report.nodeid.partition("[")[0]].split())
-        terminalreporter.write_line(f"tried again: {report.nodeid}: {reason}")

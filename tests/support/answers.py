@@ -1,4 +1,4 @@
-"""Answers of the appliance for tests: what a test does not say is empty, nought or none."""
+"""Build answers of the appliance for tests: fields that a test does not set are empty, zero or None."""
 
 import types
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
@@ -10,7 +10,7 @@ _EMPTY: dict[Any, Any] = {int: 0, float: 0.0, str: "", bool: False, list: [], di
 
 
 def example(kind: type[A], **given: Any) -> A:
-    """A struct with these fields; those of structs in it are said as dictionaries."""
+    """Return a struct with these fields; nested structs are given as dictionaries."""
     return msgspec.convert(_fields(kind, given), kind)
 
 
@@ -23,7 +23,7 @@ def _fields(kind: Any, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _value(kind: Any, given: Any) -> Any:
-    """What was said, with the rest of the structs in it."""
+    """Return the given value, with its nested structs filled in."""
     if get_origin(kind) is Annotated:
         return _value(get_args(kind)[0], given)
     if get_origin(kind) in (Union, types.UnionType):

@@ -1,4 +1,4 @@
-"""The real appliance in a test: `rosrv up` as a user would start it, its audit log, its processes.
+"""Run the real appliance in a test: start `rosrv up` as a user would, and read its audit log and processes.
 
 with Appliance(host, state, policy=OPEN_POLICY) as appliance:
     ros = RosSession(appliance.master_uri, home, robot)
@@ -13,9 +13,12 @@ import ssl
 import subprocess
 import tempfile
 import urllib.parse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
+from appliance.channel.admin import A, AdminRequest
+from appliance.cli.connection.admin_client import AdminSocket
 from tests.support.command import ROSRV, rosrv
 from tests.support.own_namespace import own_namespace
 from tests.support.processes import LIMIT, Event, Host, Process, ThisMachine
@@ -35,7 +38,7 @@ default = *
 
 
 class Appliance:
-    """One running appliance; a context manager."""
+    """A running appliance; a context manager."""
 
     def __init__(
         self,
@@ -43,39 +46,52 @@ class Appliance:
         *,
         policy: str = OPEN_POLICY,
         isolation: str | None = None,
+        settings: str = "",
+        monitors: Mapping[str, str] | None = None,
         options: tuple[str, ...] = (),
         json: bool = True,
         relays: int = 1,
     ) -> None:
-        """`json` False: as a person starts it; there is no `ready` then, only the lines in `process`.
+        """Prepare the start. With `json=False` it starts as for a person: there is no `ready`, only lines in `process`.
 
-        `relays` relay processes, on every machine the same.
+        `settings` is the text of appliance.yaml. `monitors` are the specifications in its folder, by name.
+        `relays` is the number of relay processes, the same on every machine.
         """
         self.relays = relays
         self.host: Host = host or ThisMachine()
         self.isolation = isolation or ("none" if isinstance(self.host, ThisMachine) else "container")
         self.options = options
         self.json = json
-        # Not pytest's folder: that is closed to the users the appliance's processes run as.
+        # pytest's folder is closed to the users that the appliance's processes run as
         self.directory = Path(tempfile.mkdtemp(prefix="rosrv-test-"))
         self.directory.chmod(0o755)
         self.state = self.directory / "state"
         self.policy_file = self.directory / "policy.ini"
         self.policy_file.write_text(policy)
+        if settings:
+            file = self.directory / "appliance.yaml"
+            file.write_text(settings)
+            self.options = ("--config", str(file), *self.options)
+        if monitors is not None:
+            folder = self.directory / "monitors"
+            folder.mkdir()
+            for name, text in monitors.items():
+                (folder / f"{name}.rv").write_text(text)
+            self.options = ("--monitors", str(folder), *self.options)
         self.process: Process | None = None
         self.ready: Event = {}
-        self.token = ""  # the first one, which is said at the first start
+        self.token = ""  # the first token, printed at the first start
         self._looked_at = 0  # the last record that `audit` leaves out
         self._turn = contextlib.ExitStack()  # with isolation netns: until it is closed
         self._has_turn = False
 
     @property
     def master_uri(self) -> str:
-        """Where nodes find their master."""
+        """The URI of the master for nodes."""
         return str(self.ready["master"])
 
     def start(self) -> Self:
-        """Start (again, on the same state); returns when nodes may connect."""
+        """Start the appliance (again, on the same state) and return when nodes may connect."""
         if self.isolation == "netns" and not self._has_turn:
             self._turn.enter_context(own_namespace())
             self._has_turn = True
@@ -94,7 +110,7 @@ class Appliance:
         command += ["--listen", "127.0.0.1:0" if loopback else f"{inside}:11311"]
         if loopback:
             command += ["--rosmaster-port", "0"]
-        command += self.options  # last, for of a flag given twice the second counts
+        command += self.options  # last: of a repeated flag the second value counts
         environment = _environment() | {"ROSRV_RELAYS": str(self.relays)}
         self.process = Process(self.host, command, env=environment, label="rosrv up")
         if self.json:
@@ -105,13 +121,13 @@ class Appliance:
         return self
 
     def stop(self) -> int:
-        """SIGTERM: the exit status; a clean end takes less than five seconds."""
+        """Send SIGTERM and return the exit status; a clean stop takes less than five seconds."""
         return self.process.stop(with_signal=signal.SIGTERM, timeout=10) if self.process else 0
 
     def rosrv(
         self, *arguments: str, check: bool = True, state: bool = True
     ) -> subprocess.CompletedProcess[str]:
-        """Another verb of the command, told of this appliance by `--state` (unless it does not take that)."""
+        """Run another verb of the command with `--state` of this appliance (unless the verb does not accept it)."""
         done = rosrv(*arguments, *(["--state", str(self.state)] if state else []))
         if check and done.returncode:
             raise AssertionError(
@@ -120,13 +136,19 @@ class Appliance:
             )
         return done
 
+    def ask(self, request: AdminRequest[A]) -> A:
+        """Return the result of a verb of `rosrv`, without starting a process."""
+        answer = AdminSocket(self.state).ask(request)
+        assert answer.ok, answer.error
+        return answer.given()
+
     def status(self) -> dict[str, Any]:
-        """`rosrv status --json`, whose exit status says whether something is wrong."""
+        """Return `rosrv status --json`; its exit status reports problems."""
         status: dict[str, Any] = json.loads(self.rosrv("status", "--json", check=False).stdout)
         return status
 
     def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
-        """`rosrv audit search --json` with these flags; of its records those that have these fields."""
+        """Return the records of `rosrv audit search --json` with these flags that have these fields."""
         lines = self.rosrv("audit", "search", *flags, "--json").stdout.splitlines()
         records: list[dict[str, Any]] = [json.loads(line) for line in lines if line.strip()]
         return [
@@ -136,14 +158,14 @@ class Appliance:
             and all(record.get(key) == value for key, value in fields.items())
         ]
 
-    def leave_out_what_was(self) -> None:
-        """From now on `audit` and `recorded` have only what is recorded later: what another test did is not there."""
+    def ignore_earlier_records(self) -> None:
+        """Make `audit` and `recorded` leave out all earlier records, such as those of another test."""
         self._looked_at = max(
             (record["sequence"] for record in self.audit("--limit", "1")), default=self._looked_at
         )
 
     def recorded(self, *flags: str, count: int = 1, **fields: Any) -> list[dict[str, Any]]:
-        """The same, once there are so many: a record is on disk, and a relay's report at control, a little later."""
+        """Wait for this number of records: writing takes a moment, and reports of a relay a little longer."""
 
         def found() -> list[dict[str, Any]] | None:
             records = self.audit(*flags, **fields)
@@ -152,16 +174,16 @@ class Appliance:
         return eventually(found, lambda: f"{count} records {flags} {fields}\n{self.story()}")
 
     def reload(self, policy: str) -> None:
-        """Write the policy file and have it read again."""
+        """Write the policy file and reload it."""
         self.policy_file.write_text(policy)
         self.rosrv("policy", "reload")
 
     def rest(self, token: str | None = None) -> Rest:
-        """REST, by the token given or the first one; trusts the certificate the appliance made."""
+        """Return a REST client with this token or the first one; it trusts the appliance's certificate."""
         url = str(self.ready["api"])
         certificate = None
         if url.startswith("https:"):
-            # The kernel takes connections before the process is there: one answer says that it is.
+            # The kernel accepts connections before the process is ready: one answer shows that it is.
             place = urllib.parse.urlsplit(url)
             served = ssl.get_server_certificate((str(place.hostname), place.port or 443), timeout=LIMIT)
             certificate = self.state / "api" / "certificate.pem"
@@ -169,28 +191,28 @@ class Appliance:
         return Rest(url, token or self.token, certificate)
 
     def processes(self) -> dict[str, dict[str, Any]]:
-        """The row of each role in `rosrv status`, once every process has said what walls it is in."""
+        """Return the row of each role in `rosrv status`, once every process has reported its sandbox."""
 
         def told() -> dict[str, dict[str, Any]] | None:
             rows = self.status()["processes"]
-            if any(not row["walls"] and row["role"] != "supervisor" for row in rows):
+            if any(not row["sandbox"] and row["role"] != "supervisor" for row in rows):
                 return None
             return {row["role"]: row for row in rows}
 
         return eventually(told, self.story)
 
     def pids(self, role: str) -> list[int]:
-        """The process ids of a role, by `rosrv status`."""
+        """Return the process ids of a role, from `rosrv status`."""
         return [row["pid"] for row in self.status()["processes"] if row["role"] == role]
 
     def kill(self, role: str) -> int:
-        """SIGKILL to the (first) process of a role: its id."""
+        """Send SIGKILL to the (first) process of a role and return its id."""
         pid = self.pids(role)[0]
         os.kill(pid, signal.SIGKILL)
         return pid
 
     def story(self) -> str:
-        """What the appliance said, for the message of a failure."""
+        """Return the appliance's output, for the message of a failure."""
         return self.process.story() if self.process else "rosrv up was not started"
 
     def __enter__(self) -> Self:
@@ -204,7 +226,7 @@ class Appliance:
         self.close()
 
     def close(self) -> None:
-        """Stop and remove the state."""
+        """Stop the appliance and remove its state."""
         with self._turn:
             self.stop()
         subprocess.run(["/bin/rm", "-rf", str(self.directory)], check=True)

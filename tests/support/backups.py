@@ -1,14 +1,14 @@
-"""Archives as a stranger could write them, for tests of what is put back."""
+"""Make archives as an attacker could write them, for tests of restoring a backup."""
 
 import gzip
 import tarfile
 from pathlib import Path
 
-LOG = "control/audit.db"  # what every backup has
+LOG = "control/audit.db"  # part of every backup
 
 
 def header(name: str, size: int = 0, kind: bytes = tarfile.REGTYPE, **fields: object) -> bytes:
-    """The header of one entry, as a foreign program could write it."""
+    """Return the header of one entry, as a foreign program could write it."""
     entry = tarfile.TarInfo(name)
     entry.size, entry.type = size, kind
     for key, value in fields.items():
@@ -17,6 +17,6 @@ def header(name: str, size: int = 0, kind: bytes = tarfile.REGTYPE, **fields: ob
 
 
 def archive(file: Path, *blocks: bytes) -> Path:
-    """A file of these blocks, after the audit log that every backup has."""
+    """Write an archive of these blocks, after the audit log that every backup has."""
     file.write_bytes(gzip.compress(header(LOG) + b"".join(blocks) + bytes(1024)))
     return file

@@ -1,4 +1,4 @@
-"""Certificates for tests: an authority of the test's own, and one certificate of it."""
+"""Make certificates for tests: a certificate authority, and one certificate that it signed."""
 
 import datetime
 import ipaddress
@@ -15,7 +15,7 @@ from cryptography.x509.oid import NameOID
 
 @dataclass(frozen=True)
 class Certificates:
-    """Files in PEM: an authority, and a certificate of it with its key, for an address and logs.example."""
+    """PEM files: an authority, and a certificate of it with its key, for an address and logs.example."""
 
     ca: Path
     certificate: Path
@@ -23,7 +23,7 @@ class Certificates:
 
 
 def make_certificates(folder: Path, address: str = "127.0.0.1") -> Certificates:
-    """An authority, and a certificate for a server or client with this address."""
+    """Make an authority, and a certificate for a server or client with this address."""
     folder.mkdir(parents=True)
     now = datetime.datetime.now(datetime.UTC)
     keys = {name: ec.generate_private_key(ec.SECP256R1()) for name in ("ca", "peer")}

@@ -1,9 +1,9 @@
-"""`rosrv` within the process of a test: the same entry point and the same words, without a new Python for each verb.
+"""Run `rosrv` within the process of a test: the same entry point, without a new Python for each verb.
 
 done = rosrv("audit", "search", "--json", "--state", str(state))
 assert done.returncode == 0
 
-The installed command itself is what tests/integration/supervisor/test_up.py and tests/integration/cli/ start.
+tests/integration/supervisor/test_up.py and tests/integration/cli/ start the installed command.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ _ONE_AT_A_TIME = threading.Lock()  # a process has one standard output
 
 
 def rosrv(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """What the command says, and its exit status; `environment` is set besides what is no variable of ROS or ours."""
+    """Return the output and exit status of the command; `environment` adds other variables."""
     command = [ROSRV, *arguments]
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
     with (
@@ -49,7 +49,7 @@ def rosrv(*arguments: str, **environment: str) -> subprocess.CompletedProcess[st
 
 
 def table() -> Iterator[tuple[str, Verb]]:
-    """Every entry of the table."""
+    """Yield every entry of the command table."""
     for name, one in main.VERBS.items():
         if isinstance(one, Group):
             yield from ((f"{name} {inner}", verb) for inner, verb in one.verbs.items())
@@ -58,6 +58,6 @@ def table() -> Iterator[tuple[str, Verb]]:
 
 
 def commands() -> Iterator[tuple[str, Any]]:
-    """Every verb, loaded."""
+    """Yield every verb, loaded."""
     for name, verb in table():
         yield name, loaded(verb, name.split()[-1])

@@ -1,8 +1,10 @@
-"""Registry, graph, revocation, liveness and reconcile loop of control, connected as control connects them.
+"""Connect registry, graph, revocation, liveness and reconcile loop as control connects them.
 
-Around them stand the relays, ROSMaster, the deliveries to nodes, and the nodes themselves: they remember what they
-were told and answer as a test has them answer. Nothing is sent over a network.
+Around them are models of the relays, of `rosmaster`, of the deliveries to nodes, and of the nodes. The models remember
+their calls and give the answers that a test sets. Nothing is sent over a network.
 """
+
+# ruff: noqa: D102  the models have the methods of the classes that they replace
 
 import asyncio
 import functools
@@ -14,29 +16,29 @@ from typing import Any, Self, cast
 from appliance.configuration import settings
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.endpoints.endpoint_addresses import Places
-from appliance.master.endpoints.node_api import NodeApi
+from appliance.master.endpoints.node_api import NodeApiClient
+from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.endpoints.traffic import Carried
+from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.effects import Effect, NodeCall
 from appliance.master.graph.grants import Grants
-from appliance.master.graph.graph import Graph
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
+from appliance.master.graph.graph import RosGraph
+from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration, Registry, new_key
 from appliance.master.graph.revocation import Revocation, revoked
 from appliance.master.reconcile.enactor import Enactor
-from appliance.master.reconcile.entries import Entries
+from appliance.master.reconcile.entries import MasterRegistrations
 from appliance.master.reconcile.liveness import Liveness, Watchlist
 from appliance.master.reconcile.reconciler import Reconciler
 from appliance.master.rosmaster import RosMaster
 from appliance.policy.model import Address, Decision
 from appliance.policy.policy_compiler import compile_policy
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from appliance.rpc.server import HttpRequest, Peer
 from appliance.rpc.xmlrpc_client import CallFailedError, RefusedError
 from appliance.store.state_file import StateStore
 from appliance.telemetry.metrics import Meter
 from roswire.uris import node_uri, parse_node_uri
-from roswire.xmlrpc import Limits, Value, build_call, parse_response
+from roswire.xmlrpc import Value, XmlRpcLimits, build_call, parse_response
 from tests.support.idle import idle, idle_class
 from tests.support.parameters import mirror
 from tests.support.serving import serving
@@ -49,7 +51,7 @@ _TABLES = {"Publisher": Kind.PUBLICATION, "Subscriber": Kind.SUBSCRIPTION, "Serv
 
 
 class Records:
-    """The trail: what happened, as (event, resource)."""
+    """An audit trail that keeps (event, resource)."""
 
     def __init__(self) -> None:
         self.events: list[tuple[str, str | None]] = []
@@ -61,62 +63,54 @@ class Records:
         self.meter = Meter()
 
     def shut_out(self, _host: str) -> str:
-        """As `AuditTrail`."""
         return ""
 
     def owing(self, _host: str) -> str:
-        """As `AuditTrail`."""
         return self.debt
 
     async def still_owing(self, host: str) -> str:
-        """As `AuditTrail`."""
         return self.owing(host)
 
     def decided(
         self, _caller: Any, _method: str, _category: str, resource: str, decision: Decision, **_more: str
     ) -> str:
-        """As `AuditTrail`."""
         self.events.append(("allow" if decision.allowed else "deny", resource))
         return "id"
 
     def happened(self, event: str, _reason: str, *, resource: str | None = None, **_detail: Any) -> str:
-        """As `AuditTrail`."""
         self.events.append((event, resource))
         return "id"
 
 
 class Deliveries:
-    """What nodes were told: (node's name, method, parameters)."""
+    """Deliveries to nodes: (name of the node, method, parameters)."""
 
     def __init__(self) -> None:
         self.told: list[tuple[str, str, tuple[Value, ...]]] = []
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
-        """As `Delivery`."""
         self.told.append((incarnation.name, call.method, call.parameters))
 
     def drop(self, _incarnation: Incarnation) -> None:
-        """As `Delivery`."""
+        """Do nothing."""
 
 
-class Relays(idle_class(RelayControl)):  # type: ignore[misc]  # it is made
-    """The relays: which nodes they were told of again."""
+class Relays(idle_class(RelayControl)):  # type: ignore[misc]  # a class made at run time
+    """A relay control that remembers the nodes it restated."""
 
     def __init__(self) -> None:
         self.returned: list[str] = []
-        self.carried = idle(Carried)
+        self.carried = idle(RelayTraffic)
 
     def place_node(self, incarnation: Incarnation) -> None:
-        """As `RelayControl`."""
         self.returned.append(incarnation.name)
 
     def port(self, incarnation: Incarnation, _kind: Kind, _resource: str) -> int:
-        """As `RelayControl`."""
         return incarnation.relay_port
 
 
 class HiddenMaster:
-    """ROSMaster: who registered what under which URI, the parameters, and every call it got."""
+    """A model of `rosmaster`: its registrations with their URIs, its parameters, and every call it received."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[Value, ...]] = []
@@ -126,7 +120,7 @@ class HiddenMaster:
         self.pid = 4711
 
     async def call(self, method: str, *params: Value) -> Answer:
-        """One call, which takes a turn of the loop."""
+        """Carry out one call, which takes a turn of the loop."""
         await asyncio.sleep(0)
         self.calls.append((method, *params))
         for beginning in ("register", "unregister"):
@@ -168,18 +162,18 @@ class HiddenMaster:
         return [1, "", int(table.pop(name, None) is not None)]
 
     def restart(self) -> None:
-        """It died, and another is there that knows nothing."""
+        """Replace `rosmaster` by a new one without registrations."""
         self.pid += 1
         self.tables = {kind: {} for kind in _TABLES.values()}
         self.nodes, self.parameters = {}, {}
 
     def has(self, kind: Kind, resource: str) -> list[str]:
-        """Who has registered it."""
+        """Return the nodes that have registered it."""
         return list(self.tables[kind].get(resource, {}))
 
 
 class Inner:
-    """Faces and arrivals: URIs only; an incarnation that is not known yet is made."""
+    """Proxy endpoints and arrivals: URIs only; an unknown incarnation is made."""
 
     def __init__(self, registry: Registry) -> None:
         self._registry = registry
@@ -187,19 +181,15 @@ class Inner:
         self._ports = itertools.count(20_001)
 
     def close(self, incarnation: Incarnation) -> None:
-        """As `Faces`."""
         self.closed.append(incarnation.key)
 
     def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        """As `Arrivals`."""
         return self._registry.find(caller.caller_id, caller.peer.host, api.text)
 
     def nobody(self) -> str:
-        """As `Faces`."""
         return node_uri("127.0.0.1", _INNER_PORT, "/nobody/")
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
-        """As `Arrivals`."""
         known = self.known(caller, api)
         if known is None:
             outer, relay = next(self._ports), next(self._ports)
@@ -211,28 +201,24 @@ class Inner:
         return known
 
     def inner_uri(self, incarnation: Incarnation) -> str:
-        """As `Faces`."""
         return node_uri("127.0.0.1", _INNER_PORT, f"/{incarnation.key}/")
 
     def by_inner_uri(self, text: str) -> Incarnation | None:
-        """As `Faces`."""
         return self._registry.by_key(text.rstrip("/").rpartition("/")[2])
 
 
 class Clients:
-    """Calls to nodes: those in `silent` do not answer, those in `gone` refuse connections."""
+    """Calls to nodes; nodes in `silent` do not answer, nodes in `gone` refuse connections."""
 
     def __init__(self) -> None:
         self.silent: set[str] = set()
         self.gone: set[str] = set()
 
     def client(self, incarnation: Incarnation) -> "Clients":
-        """As `NodeApi.client`."""
         self._asked = incarnation.name
         return self
 
     async def call(self, _method: str, *_params: Value) -> Value:
-        """As `XmlRpcClient`."""
         if self._asked in self.gone:
             raise RefusedError("nobody is there")
         if self._asked in self.silent:
@@ -241,52 +227,47 @@ class Clients:
 
 
 class Modes:
-    """Everything is relayed under stand-ins."""
+    """Relay all topics and services under proxy endpoints."""
 
     stand_ins = True
 
     def hides_publishers(self, _topic: str) -> bool:
-        """As `Mediation`."""
         return True
 
     def carries_topic(self, _topic: str) -> bool:
-        """As `Mediation`."""
         return True
 
     def carries_service(self, _service: str) -> bool:
-        """As `Mediation`."""
         return True
 
 
 class Addresses:
-    """One address that every node is told."""
+    """One address that every node gets."""
 
     async def learn(self, _peer: Peer) -> None:
-        """As `Addresses`."""
+        """Do nothing."""
 
     def told_to(self, _peer: Peer) -> str:
-        """As `Addresses`."""
         return "10.0.0.1"
 
 
 class Noted(Enactor):
-    """Carries effects out, and keeps them."""
+    """An enactor that carries out effects and keeps them."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
         self.noted: list[Effect] = []
 
     def carry_out(self, effects: Iterable[Effect]) -> None:
-        """As `Enactor`."""
         self.noted += (effects := list(effects))
         super().carry_out(effects)
 
 
 class ControlParts:
-    """The parts, with an open policy; `reload(text)` brings another into force, `settle()` waits for what follows."""
+    """The parts, with an open policy; `reload(text)` puts another in force, `settle()` waits for its consequences."""
 
     def __init__(self, *, silent: float = 0.0) -> None:
-        """`silent` is seconds without an answer until a node is lost."""
+        """Make the parts; `silent` is the number of seconds without an answer until a node is lost."""
         self._not_ours = asyncio.all_tasks()  # the test's own
         self.current = compile_policy(OPEN, file="policy")
         self.registry, self.grants = Registry(), Grants(set)
@@ -294,25 +275,21 @@ class ControlParts:
         self.hidden, self.clients = HiddenMaster(), Clients()
         self.deliveries, self.relay, self.store = Deliveries(), Relays(), idle(StateStore)
         self.faces = Inner(self.registry)
-        self.nodes = NodeApi(self.registry, timeout=3.0)
+        self.nodes = NodeApiClient(self.registry, timeout=3.0)
         cast(Any, self.nodes).client = self.clients.client
         self.surround()
-        self.mediation, self.addresses, self.parameters = (
-            Modes(),
-            Addresses(),
-            mirror(),
-        )
+        self.mediation, self.addresses, self.parameters = (Modes(), Addresses(), mirror())
         trail = cast(Any, self.records)
         rights = ParameterRights(lambda: self.current, trail)
-        self.graph = Graph(
+        self.graph = RosGraph(
             self.registry, self.grants, cast(Any, self.mediation), may_be_told=rights.may_be_told
         )
         self.revocation = Revocation(
             self.registry, self.grants, self.graph, lambda: self.current, lambda: self.parameters.tree
         )
-        self.rosmaster = RosMaster(1, limits=Limits(), hold=1.0)
+        self.rosmaster = RosMaster(1, limits=XmlRpcLimits(), hold=1.0)
         self.rosmaster.calls = cast(Any, self.hidden)
-        self.entries = Entries(self.rosmaster, self.faces.inner_uri)
+        self.entries = MasterRegistrations(self.rosmaster, self.faces.inner_uri)
         self.enactor = Noted(
             self.graph,
             self.entries,
@@ -321,7 +298,7 @@ class ControlParts:
             delivery=cast(Any, self.deliveries),
             relay=self.relay,
             faces=cast(Any, self.faces),
-            places=idle(Places),
+            places=idle(NodePorts),
         )
         self.reconciler = Reconciler(
             self.rosmaster,
@@ -342,8 +319,8 @@ class ControlParts:
             self.enactor,
             self.watchlist,
             nodes=self.nodes,
-            settings=settings.Liveness(silent=silent),
-            standing=lambda _host: Standing.REGISTERED,
+            settings=settings.LivenessSection(silent=silent),
+            quota_class=lambda _host: QuotaClass.REGISTERED,
         )
         self._serving = functools.partial(
             serving,
@@ -367,32 +344,32 @@ class ControlParts:
         self._serve = self._serving()
 
     def surround(self) -> None:
-        """Others may stand around control: before it is connected with them."""
+        """Place other parts around control, before it is connected with them."""
 
     def arrivals(self) -> Any:
-        """Who makes incarnations."""
+        """Return the part that makes incarnations."""
         return self.faces
 
     def redecide_for(self, host: Address, caller_id: str) -> int:
-        """What one caller has is decided again; how much was taken back."""
+        """Decide again for one caller; return the number of revocations."""
         effects = self.revocation.redecide_for(host, caller_id)
         self.enactor.carry_out(effects)
         return revoked(effects)
 
     @classmethod
     async def begun(cls) -> Self:
-        """Control after its first round."""
+        """Return control after its first round."""
         world = cls()
         await world.round()
         return world
 
     @property
     def lives(self) -> list[Life]:
-        """Where each incarnation stands."""
+        """Return the state of each incarnation."""
         return [one.life for one in self.registry.all()]
 
     def node(self, name: str, number: int = 1) -> Incarnation:
-        """A node on the robot that has registered nothing yet; `number` tells its lives apart."""
+        """Return a node on the robot that has registered nothing yet; `number` tells its incarnations apart."""
         uri = f"http://10.0.0.5:{4000 + number}/"
         node = Incarnation(new_key(), name, HOST, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
         self.registry.add(node)
@@ -406,36 +383,36 @@ class ControlParts:
         target: Incarnation | None = None,
         own: bool = False,
     ) -> Value:
-        """A call that a node (our `own`) at `host` makes of RVMaster, or of the face of `target`, as it is answered."""
+        """Return the answer to a call that a node (or our `own`) at `host` makes of RVMaster or of `target`."""
         peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
         serve = self._serving(own=own, target=target) if own or target is not None else self._serve
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "t") -> None:
-        """ROSMaster takes a registration, and control writes it down."""
-        await self.entries.make(node, Registration(kind, resource, detail, 0))
+        """Register at `rosmaster`, and in control's registry."""
+        await self.entries.make(node, NodeRegistration(kind, resource, detail, 0))
         self.enactor.carry_out(self.graph.registered(node, kind, resource, detail))
 
     def reload(self, text: str) -> int:
-        """This policy comes into force; how much was taken back."""
+        """Put this policy in force; return the number of revocations."""
         before, self.current = self.current, compile_policy(text, file="policy")
         effects = self.revocation.policy_changed(before, self.current)
         self.enactor.carry_out(effects)
         return revoked(effects)
 
     async def round(self) -> None:
-        """One round of the reconcile loop."""
+        """Run one round of the reconcile loop."""
         await self.reconciler.round()
 
     async def look(self, node: Incarnation) -> None:
-        """Look at a node now, to the end of what follows from it."""
+        """Check a node now, and wait for everything that follows."""
         await self.liveness.look(node)
         await self.settle()
 
     async def settle(self) -> None:
-        """Look at the nodes on the watchlist, and wait until everything that was begun is done."""
+        """Check the nodes on the watchlist, and wait until all started work is done."""
         self.liveness.look_at_watched()
         while others := asyncio.all_tasks() - self._not_ours:
             await asyncio.wait(others, timeout=5.0)
-            assert all(task.done() for task in others), "it does not end"
+            assert all(task.done() for task in others), "tasks are still running"
             self.liveness.look_at_watched()

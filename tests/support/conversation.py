@@ -1,44 +1,56 @@
-"""Conversations with RVMaster as text: a line is what somebody does, and what follows from it are lines, too.
+"""Conversations with RVMaster as text: each line is an action, followed by the lines of its effects.
 
-What is done (`Conversation.say`):
+Actions (`Conversation.say`):
 
     10.0.0.1 /talker registerPublisher /chatter std_msgs/String    a call of the Master API, made at that host
     10.0.0.1 /talker:2 registerPublisher /chatter ...               the same by a second life of the node
     10.0.0.2 /listener requestTopic /chatter of /talker             a call of another node's API
     own /rosout registerPublisher /rosout_agg rosgraph_msgs/Log     a call of the appliance's own node
-    /talker dies | /talker answers                                  and is looked at
-    policy NAME                                                     that policy comes into force
-    ROSMaster starts anew | a relay starts anew
+    /talker dies | /talker is silent | /talker answers              and is checked
+    /talker misses the list of /chatter                             its delivery failed
+    policy NAME | policy NAME, NAME                                 put that policy in force, or several at once
+    host 10.0.0.1 is expelled                                       take back everything of its nodes
+    ROSMaster starts anew | a relay starts anew | a round           of the reconcile loop
+    ROSMaster has /talker publication /chatter of /other            a registration that control has not made
+    ROSMaster sets /speed 3                                         a value that control has not set
+    state                                                           what control and ROSMaster have
+    given LINE                                                      another action, whose effects are not listed
 
-What follows: the effects, one a line, in the order in which they are carried out; a denial is `deny: why`. Nodes are
-written by their names (a second life as `/talker:2`), also where a node is told an URI. What only keeps state for the
-next life of control is left out. No socket is opened, and nothing has a random name, so that the text of a
-conversation is what a formal model of RVMaster can be compared with.
+Effects follow, one per line, in the order in which they are carried out; a denial is `deny: reason`, the answer to a
+question `answer: value`, a withheld update `withhold`. Nodes are written by name (a second incarnation as
+`/talker:2`), also for the URIs of their proxy endpoints; `/talker itself` is the node's own URI.
+Effects that only store state for a restart of control are left out.
+No socket is opened and no name is random, so a formal model of RVMaster can be
+compared with the text.
 """
 
+import ipaddress
+import json
 import shlex
+from collections.abc import Iterable
 from typing import Any, cast
 
 from appliance.channel import messages
-from appliance.master.endpoints.node_api import NodeApi
+from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.endpoints.traffic import Carried
+from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.effects import (
     CloseNode,
     DropCalls,
     Effect,
-    Place,
+    NodeCall,
     PlaceGrant,
     PlaceNode,
+    PlaceResource,
     PutBack,
-    Record,
     RevokeGrant,
     TakeBack,
     TellNode,
-    Withdraw,
     WithdrawNode,
+    WithdrawResource,
+    WriteRecord,
 )
-from appliance.master.graph.registry import Incarnation
+from appliance.master.graph.registry import Incarnation, Kind
 from appliance.specifications.allocation import Allocation
 from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts
@@ -55,13 +67,21 @@ _SHAPES = {
     "subscribeParam": "AR",
     "unsubscribeParam": "AR",
     "setParam": "RV",
+    "deleteParam": "R",
+    "getPublishedTopics": "R",
+    "getSystemState": "",
+    "getTopicTypes": "",
+    "lookupNode": "R",
     "lookupService": "R",
+    "requestTopic": "R",
 }
+_QUESTIONS = {"getPublishedTopics", "getSystemState", "getTopicTypes", "lookupNode", "lookupService"}
+_REGISTER = {Kind.PUBLICATION: "registerPublisher", Kind.SUBSCRIPTION: "registerSubscriber"}
 _WORDS = {
-    Place: "place",
+    PlaceResource: "place",
     PlaceNode: "place",
     PlaceGrant: "grant",
-    Withdraw: "withdraw",
+    WithdrawResource: "withdraw",
     WithdrawNode: "withdraw",
     RevokeGrant: "revoke",
     CloseNode: "close",
@@ -70,7 +90,7 @@ _WORDS = {
 
 
 class Conversation:
-    """RVMaster and all who speak with it; `policies` are texts by the names that `policy NAME` has."""
+    """RVMaster and its clients; `policies` maps the names in `policy NAME` to texts."""
 
     def __init__(self, parts: ControlParts, **policies: str) -> None:
         self.parts = parts
@@ -78,43 +98,111 @@ class Conversation:
         self._names: dict[str, str] = {}  # of incarnations, by their keys
 
     async def say(self, line: str) -> list[str]:
-        """What follows from one line."""
+        """Return the effects of one line."""
+        given = line.removeprefix("given ")
+        effects = await self._effects(given)
+        return effects if line == given else []
+
+    async def _effects(self, line: str) -> list[str]:
         self.parts.enactor.noted.clear()
+        self.parts.records.events.clear()
         said = shlex.split(line)
-        match said:
-            case ["policy", name]:
-                self.parts.reload(self._policies[name])
-                answers: list[str] = []
-            case ["ROSMaster", "starts", "anew"]:
-                self.parts.hidden.restart()
-                await self.parts.round()
-                answers = []
-            case ["a", "relay", "starts", "anew"]:
-                answers = self._relay_starts()
-            case [name, "dies" | "answers" as does]:
-                node, gone = self._node(name), self.parts.clients.gone
-                (gone.add if does == "dies" else gone.discard)(node.name)
-                await self.parts.look(node)
-                answers = []
-            case [host, name, "requestTopic", topic, "of", publisher]:
-                target = self._node(publisher)
-                asked = self.parts.ask("requestTopic", name, topic, [["TCPROS"]], host=host, target=target)
-                answers = _denial(await asked)
-            case [host, name, method, *rest]:
-                call = self._call(host, name, method, rest)
-                own = host == "own"
-                at = "127.0.0.1" if own else host
-                answers = _denial(await self.parts.ask(*call, host=at, own=own))
-                self._names |= {
-                    node.key: name
-                    for node in self.parts.registry.all()
-                    if node.key not in self._names and node.name == call[1]
-                }
-            case _:
-                raise ValueError(f"nobody says {line!r}")
+        answers = (
+            await self._call_by(said) if len(said) > 2 and said[2] in _SHAPES else await self._event(said)
+        )
         await self.parts.settle()
         shown = [self._shown(effect) for effect in self.parts.enactor.noted]
-        return [*answers, *filter(None, shown)]
+        denied = [resource for event, resource in self.parts.records.events if event == "deny"]
+        withheld = denied[1:] if answers and answers[0].startswith("deny: ") else denied
+        return [*answers, *filter(None, shown), *(f"withhold {key}" for key in withheld)]
+
+    async def _call_by(self, said: list[str]) -> list[str]:
+        """Make a call; return its denial, or the answer to a question."""
+        host, name, method, *rest = said
+        own = host == "own"
+        if method == "requestTopic":
+            topic, _of, publisher = rest
+            target = self._node(publisher)
+            return _denial(await self.parts.ask(method, name, topic, [["TCPROS"]], host=host, target=target))
+        call = self._call(host, name, method, rest)
+        answer = await self.parts.ask(*call, host="127.0.0.1" if own else host, own=own)
+        self._names |= {
+            node.key: name
+            for node in self.parts.registry.all()
+            if node.key not in self._names and node.name == call[1]
+        }
+        assert isinstance(answer, list)
+        if method in _QUESTIONS and answer[0] == 1:
+            return [f"answer: {self._value(answer[1])}: {self._value(answer[2])}"]
+        if method in _QUESTIONS and answer[0] == -1:
+            return [f"answer: {answer[1]!s}"]
+        return _denial(answer)
+
+    async def _event(self, said: list[str]) -> list[str]:
+        """Let something else happen; return what there is to show beside its effects."""
+        parts = self.parts
+        match said:
+            case ["state"]:
+                return self._state()
+            case ["a", "relay", "starts", "anew"]:
+                return self._relay_starts()
+            case ["policy", *names]:
+                for name in names:
+                    parts.reload(self._policies[name.rstrip(",")])
+            case ["host", host, "is", "expelled"]:
+                expelled = parts.revocation.expel(ipaddress.ip_address(host), "the host was expelled")
+                parts.enactor.carry_out(expelled)
+            case ["ROSMaster", "starts", "anew"]:
+                parts.hidden.restart()
+                await parts.round()
+            case ["a", "round"]:
+                await parts.round()
+            case ["ROSMaster", "has", name, kind, resource, "of", owner]:
+                uri = parts.faces.inner_uri(self._node(owner))
+                await parts.hidden.call(_REGISTER[Kind(kind)], name, resource, "type", uri)
+            case ["ROSMaster", "sets", key, value]:
+                parts.hidden.parameters[key[1:]] = json.loads(value)
+            case [name, *happening]:
+                await self._node_event(self._node(name), happening)
+        return []
+
+    async def _node_event(self, node: Incarnation, happening: list[str]) -> None:
+        """Let something happen to a node, and check it."""
+        match happening:
+            case ["misses", "the", "list", "of", topic]:
+                missed = NodeCall("publisherUpdate", (topic, []))
+                self.parts.watchlist.could_not_tell(node, missed, "it does not answer")
+            case ["dies"] | ["is", "silent"] | ["answers"]:
+                clients = self.parts.clients
+                for names, word in ((clients.gone, "dies"), (clients.silent, "silent")):
+                    (names.add if happening[-1] == word else names.discard)(node.name)
+                await self.parts.look(node)
+            case _:
+                raise ValueError(f"unknown action: {' '.join(happening)!r}")
+
+    def _state(self) -> list[str]:
+        """Return the registrations and grants of all nodes, and the registrations at `rosmaster`."""
+        nodes, parts = self._names, self.parts
+        found = [
+            f"{nodes[one.key]} is {one.life}: {_listed(one.registrations)}"
+            + (f"; revoked: {_listed(one.shelf)}" if one.shelf else "")
+            for one in parts.registry.all()
+        ]
+        found += [
+            f"{row.caller_id} of {row.host} has {row.kind} {row.resource} of {nodes[row.key]}"
+            for row in parts.grants.all()
+        ]
+        return found + [
+            f"ROSMaster: {kind} {resource} of {', '.join(map(self._owner, uris))}"
+            for kind, table in parts.hidden.tables.items()
+            for resource, uris in table.items()
+            if uris
+        ]
+
+    def _owner(self, name: str) -> str:
+        """Return the node that `rosmaster` has under this name."""
+        node = self.parts.faces.by_inner_uri(self.parts.hidden.nodes[name])
+        return name if node is None else self._names[node.key]
 
     def _call(self, host: str, name: str, method: str, rest: list[str]) -> tuple[Any, ...]:
         name, _, life = name.partition(":")
@@ -126,7 +214,7 @@ class Conversation:
                 case "S":
                     parameters.append(f"rosrpc://{host}:{next(given)}")
                 case "V" if method == "setParam":
-                    parameters.append(int(next(given)))
+                    parameters.append(json.loads(next(given)))
                 case _:
                     parameters.append(next(given))
         return (method, name, *parameters)
@@ -138,14 +226,14 @@ class Conversation:
         return node
 
     def _relay_starts(self) -> list[str]:
-        """As control does when it gets the link of a new relay."""
+        """Restate the nodes, as control does when it gets the link of a new relay."""
         parts, link = self.parts, _Link()
         relay = RelayControl(
             parts.registry,
             parts.grants,
             cast(Any, _Ports()),
-            idle(NodeApi),
-            idle(Carried),
+            idle(NodeApiClient),
+            idle(RelayTraffic),
             allocation=Allocation(1),
             policy=lambda: parts.current,
             monitors=cast(Any, _Monitors),
@@ -172,12 +260,12 @@ class Conversation:
         return f"relay: {type(message).__name__}"
 
     def _shown(self, effect: Effect) -> str:
-        """One line; an empty one for what only the store is told."""
+        """Return one line; empty for changes of the store alone."""
         name = self._names[effect.node.key] if hasattr(effect, "node") else ""
         match effect:
             case TellNode(_, call):
                 text = f"tell {name} {call.method} {' '.join(self._value(one) for one in call.parameters)}"
-            case Place(_, kind, resource) | Withdraw(_, kind, resource):
+            case PlaceResource(_, kind, resource) | WithdrawResource(_, kind, resource):
                 text = f"{_WORDS[type(effect)]} {name} {kind} {resource}"
             case PlaceNode() | WithdrawNode() | CloseNode() | DropCalls():
                 text = f"{_WORDS[type(effect)]} {name}"
@@ -188,7 +276,7 @@ class Conversation:
                 text = f"ROSMaster: {name} has {', '.join(f'{one.kind} {one.resource}' for one in registrations)} again"
             case TakeBack(_, one):
                 text = f"ROSMaster: {name} has {one.kind} {one.resource} no more"
-            case Record():
+            case WriteRecord():
                 text = f"record {effect.event}: {effect.caller_id} {effect.category} {effect.resource}"
             case _:
                 text = ""
@@ -197,49 +285,51 @@ class Conversation:
     def _value(self, value: Value) -> str:
         if isinstance(value, list):
             return f"[{', '.join(self._value(one) for one in value)}]"
-        nodes = self.parts.registry.all()
-        known = {
-            uri: self._names[one.key] for one in nodes for uri in (one.outer_uri(one.told), one.api_text)
-        }
-        return known.get(str(value), str(value))
+        text = str(value)
+        for one in self.parts.registry.all():
+            name = self._names[one.key]
+            for uri in (one.outer_uri(one.told), f"rosrpc://{one.told}:{one.relay_port}"):
+                text = text.replace(uri, name)
+            text = text.replace(one.api_text, f"{name} itself")
+        return text
 
 
 class _Ports:
-    """As `Places`: a socket for each port that is none."""
+    """`Places` without real ports."""
 
     def socket(self, port: int) -> "_Ports":
-        """As `Places`."""
         self._port = port
         return self
 
     def fileno(self) -> int:
-        """As a socket's."""
         return self._port
 
 
 class _Monitors:
-    """No specifications are in force."""
+    """Without specifications in force."""
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
-        """As `Monitors`."""
         return messages.SpecificationsStated(0, b"", {}, restarted=False)
 
 
 class _Link:
-    """As the channel to a relay: what it was told."""
+    """A channel to a relay that keeps its messages."""
 
     def __init__(self) -> None:
         self.told: list[messages.Message] = []
 
     def attach(self, *_given: object) -> None:
-        """As `Channel`."""
+        """Do nothing."""
 
     def send(self, message: messages.Message, _descriptors: tuple[int, ...] = (), **_when: bool) -> None:
-        """As `Channel`."""
         if not isinstance(message, messages.StateBegan | messages.StateEnded | messages.SpecificationsStated):
             self.told.append(message)
 
 
+def _listed(registrations: Iterable[tuple[Kind, str]]) -> str:
+    return ", ".join(f"{kind} {resource}" for kind, resource in registrations) or "nothing"
+
+
 def _denial(answer: Value) -> list[str]:
     assert isinstance(answer, list)
-    return [] if answer[0] == 1 else [f"deny: {answer[1]!s}"]
+    return [f"deny: {answer[1]!s}"] if answer[0] == 0 else []

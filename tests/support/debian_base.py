@@ -1,11 +1,10 @@
-"""A small Debian, made here with debootstrap: what containers and virtual machines of the tests begin with.
+"""Make a small Debian with debootstrap, as the base of the tests' containers and virtual machines.
 
     tree = make_base(directory, packages=["systemd-sysv", "iproute2"])
 
-The first call of a suite and package list takes a minute or two; what it made is kept under `build/debian/` and
-later calls unpack it in seconds. A tree with packages is made from that of its suite without any. The tree can fetch
-more packages: it has this machine's sources of Debian packages, proxy, certificate authorities and pip settings, none
-of which then has to be named by what is built on it.
+The first call for a suite and package list takes a minute or two. Its result is kept under `build/debian/`, and later
+calls unpack it in seconds. A tree with packages is made from the tree of its suite without packages. The tree can fetch
+more packages: it has this machine's sources of Debian packages, proxy, certificate authorities and pip settings.
 """
 
 import fcntl
@@ -24,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 SUITE = "bookworm"
 MINUTES = 15
 _CERTIFICATES = Path("etc/ssl/certs/ca-certificates.crt")
-# What apt must know to fetch here; the rest of its settings is the tree's own.
+# Settings that apt needs to fetch here; all other settings are the tree's own.
 _APT_KEYS = (
     "Acquire::http",
     "Acquire::https",
@@ -50,19 +49,19 @@ rm -f "$root/etc/machine-id" "$root/etc/hostname"
 
 
 class DebianBaseError(RuntimeError):
-    """The tree cannot be made; the text has the last lines of what failed."""
+    """The tree cannot be made; the text ends with the last lines of the failed command."""
 
 
 @dataclass(frozen=True)
 class MachineSettings:
-    """How this machine fetches packages, as files of the tree."""
+    """The settings for fetching packages on this machine, as files of the tree."""
 
     mirror: str
     files: Mapping[str, str]  # path in the tree -> text
 
 
 def make_base(directory: Path, packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
-    """Make `directory` a Debian root file system with these packages, the caller's to change; returns it.
+    """Make `directory` a Debian root file system with these packages, and return it; the caller may change it.
 
     Needs root, debootstrap and the machine's Debian mirror. Raises `DebianBaseError`.
     """
@@ -73,7 +72,7 @@ def make_base(directory: Path, packages: Sequence[str] = (), *, suite: str = SUI
 
 
 def base_archive(packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
-    """The tar archive that `make_base` unpacks, made now if there is none; for `docker import`, too."""
+    """Return the tar archive that `make_base` unpacks, and make it if there is none; also for `docker import`."""
     need_root()
     need_program("debootstrap", "debootstrap")
     settings = machine_settings(suite)
@@ -81,14 +80,14 @@ def base_archive(packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     archive = folder / f"{suite}-{_key(packages, settings)}.tar"
     with archive.with_suffix(".lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # each is made once; the second finds what the first has made
+        fcntl.flock(lock, fcntl.LOCK_EX)  # each is made once; a second process waits and finds it
         if not archive.exists():
             _make(archive, packages, suite, settings)
     return archive
 
 
 def machine_settings(suite: str = SUITE) -> MachineSettings:
-    """This machine's sources of the suite, proxy, certificate authorities and pip settings."""
+    """Return this machine's sources of the suite, proxy, certificate authorities and pip settings."""
     sources = debian_sources(
         _output("apt-get", "indextargets", "--format", _TARGET, "Created-By: Packages"), suite
     )
@@ -115,7 +114,7 @@ _TARGET = "$(REPO_URI) $(RELEASE) $(COMPONENT) $(ORIGIN)"
 
 
 def debian_sources(targets: str, suite: str) -> list[str]:
-    """Lines of sources.list for a suite and its updates, from what `apt-get indextargets` says; the suite first."""
+    """Return sources.list lines for a suite and its updates, from `apt-get indextargets`; the suite first."""
     found: dict[tuple[str, str], set[str]] = {}
     for fields in map(str.split, targets.splitlines()):
         if len(fields) >= 4 and fields[1].split("-")[0] == suite and fields[3] == "Debian":
@@ -125,7 +124,7 @@ def debian_sources(targets: str, suite: str) -> list[str]:
 
 
 def apt_settings(dump: str, proxies: Mapping[str, str]) -> str:
-    """What apt needs to fetch through this machine's network, from `apt-config dump` and the environment's proxies."""
+    """Return apt's network settings, from `apt-config dump` and the proxies of the environment."""
     lines = [line for line in dump.splitlines() if line.startswith(_APT_KEYS)]
     for scheme in ("http", "https"):
         if scheme in proxies and not any(line.startswith(f"Acquire::{scheme}::Proxy ") for line in lines):
@@ -134,9 +133,9 @@ def apt_settings(dump: str, proxies: Mapping[str, str]) -> str:
 
 
 def pip_settings(listed: str) -> str:
-    """A pip.conf from `pip config list`: indexes that are reached over the network, and the authorities to trust.
+    """Return a pip.conf from `pip config list`: indexes that are reached over the network, and trusted authorities.
 
-    Folders of this machine are left out, for the tree does not have them.
+    Folders of this machine are left out, because the tree does not have them.
     """
     kept = {"cert": f"/{_CERTIFICATES}"}
     for name, _, value in (line.partition("=") for line in listed.splitlines()):
@@ -164,7 +163,7 @@ def _make(archive: Path, packages: Sequence[str], suite: str, settings: MachineS
             path = tree / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
-        # Mounts of its own, which end with it whatever happens.
+        # Its own mounts end with it in every case.
         _run(
             "unshare", "--mount", "--propagation", "private", "sh", "-c", _IN_TREE, "sh", str(tree), *packages
         )
@@ -186,7 +185,7 @@ def _make(archive: Path, packages: Sequence[str], suite: str, settings: MachineS
 
 
 def _key(packages: Iterable[str], settings: MachineSettings) -> str:
-    """Names the archive by all that it was made from."""
+    """Return a name for the archive that depends on all its inputs."""
     parts = [_IN_TREE, settings.mirror, *sorted(packages)]
     parts += [text for one in sorted(settings.files.items()) for text in one]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""A Docker engine of the tests' own: started, used and ended here, beside whatever else the machine runs.
+"""Run a Docker engine for the tests only, independent of other engines on the machine.
 
     build_images()
     with Lab("rosrv-engine") as lab, Engine(lab.host("machine", "10.79.0.1/24")) as engine:
@@ -6,10 +6,9 @@
         compose = engine.compose(project_directory, "rosrv")
         compose("up", "--detach")
 
-The engine lives on a host of the lab: that is the machine that the product's containers run on, and the engine's
-bridges and rules are in the namespace of that host, not in this machine's. Images are built before, by an engine in
-this machine's own network that changes nothing of it (no bridge, no rules); both use the same data, kept under
-`build/docker`, so that a second build is quick.
+The engine runs on a host of the lab. Its bridges and rules are in the namespace of that host, not in this machine's.
+Images are built earlier, by an engine in this machine's own network that does not change it (no bridge, no rules).
+Both use the same data under `build/docker`, so that a second build is quick.
 """
 
 import contextlib
@@ -37,8 +36,7 @@ APPLIANCE, DEMO = "rosrv/appliance", "rosrv/demo"
 START_SECONDS = 60.0
 BUILD_SECONDS = 900.0
 HEALTHY_SECONDS = 120.0
-# In the place of runc. The library is put where nothing of a container is kept; what files say of their times is left
-# as it is.
+# Replaces runc. The library is outside the container's files; time stamps of files stay unchanged.
 _RUNTIME = """\
 #!/usr/bin/python3
 import json, os, sys
@@ -58,13 +56,13 @@ Output = subprocess.CompletedProcess[str]
 
 
 class DockerError(AssertionError):
-    """A command of the engine or of compose failed; the text has what it said."""
+    """A command of the engine or of compose failed; the text contains its output."""
 
 
 class Engine:
-    """A running dockerd; a context manager. With `builds`, one that only builds. `data` is where it keeps images.
+    """A running dockerd; a context manager. With `builds`, it only builds images. `data` is its data folder.
 
-    `clock`: the time of its containers can be changed (`go_ahead`).
+    With `clock`, the time of its containers can be changed (`go_ahead`).
     """
 
     def __init__(
@@ -78,7 +76,7 @@ class Engine:
         self._builds = builds
         self._clock = clock
         self._data = data
-        # Short, for the sockets in it.
+        # short, for the sockets in it
         self.directory = Path(tempfile.mkdtemp(prefix="rosrv-engine-"))
         self._log = self.directory / "log"
         self._runtime = self.directory / "runtime"
@@ -87,31 +85,31 @@ class Engine:
 
     @property
     def address(self) -> str:
-        """Where its clients find it."""
+        """The address for its clients."""
         return f"unix://{self.directory}/sock"
 
     def docker(
         self, *arguments: str, check: bool = True, timeout: float = 120, text: str | None = None
     ) -> Output:
-        """`docker …`; `text` is its standard input."""
+        """Run `docker …`; `text` is its standard input."""
         return self._run([self._client, *arguments], check=check, timeout=timeout, text=text)
 
     def inspect(self, name: str) -> dict[str, Any]:
-        """What the engine knows of a container, image, network or volume."""
+        """Return the engine's description of a container, image, network or volume."""
         found: list[dict[str, Any]] = json.loads(self.docker("inspect", name).stdout)
         return found[0]
 
     def compose(self, directory: Path, project: str, *files: str, **environment: str) -> "Compose":
-        """The services of the compose files in `directory`; without files, of the one compose finds itself."""
+        """Return the project of the compose files in `directory`; without `files`, compose finds its own."""
         return Compose(self, directory, project, files, environment)
 
     def build(self, target: str, tag: str, context: Path = ROOT) -> None:
-        """`docker build` of one target of the Dockerfile, on the base made here."""
+        """Run `docker build` for one target of the Dockerfile, on the base image made here."""
         arguments = ("--network", "host", "--build-arg", f"BASE={BASE}", "--target", target, "--tag", tag)
         self.docker("build", *arguments, str(context), timeout=BUILD_SECONDS)
 
     def go_ahead(self, ahead: str) -> None:
-        """Have what is built from now on be built so much later (`+40h`), by the clock of its containers."""
+        """Set the clock of the containers of later builds ahead by a time such as `+40h`."""
         need_program("faketime", "faketime")
         self._runtime.write_text(_RUNTIME.format(ahead=ahead, library=_FAKETIME))
 
@@ -124,14 +122,14 @@ class Engine:
         self.docker("volume", "prune", "--force")
 
     def start(self) -> Self:
-        """Start it; returns when it answers."""
+        """Start the engine and return when it answers."""
         self._data.mkdir(parents=True, exist_ok=True)
         self._lock = os.open(self._data.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._lock, fcntl.LOCK_EX)  # the data is for one engine at a time
         command = [self._program, "--data-root", str(self._data), "--exec-root", str(self.directory / "exec")]
         command += ["--pidfile", str(self.directory / "pid"), "--host", self.address]
         if self._builds:
-            # Should the tests be killed, nobody else would end it (the lab ends what lives on its hosts).
+            # If the tests are killed, nothing else would end it (the lab ends only processes on its hosts).
             command = ["setpriv", "--pdeathsig", "TERM", *command]
             command += ["--bridge=none", "--iptables=false", "--ip-forward=false", "--ip-masq=false"]
         if self._clock:
@@ -148,7 +146,7 @@ class Engine:
         return self
 
     def stop(self) -> None:
-        """End it, by its own process id, and remove what it left; its data stays."""
+        """Stop the engine by its process id, and remove its leftovers; its data stays."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
@@ -164,7 +162,7 @@ class Engine:
             self._lock = None
 
     def story(self) -> str:
-        """The last of what it said."""
+        """Return the end of its output."""
         lines = self._log.read_text(errors="backslashreplace").splitlines() if self._log.exists() else []
         return "\n".join(["--- dockerd", *(line for line in lines[-200:] if "level=info" not in line)][-40:])
 
@@ -181,7 +179,7 @@ class Engine:
         timeout: float,
         text: str | None = None,
     ) -> Output:
-        """A program that speaks to this engine. Raises `DockerError`."""
+        """Run a client program of this engine. Raises `DockerError`."""
         kept = {
             key: value
             for key, value in os.environ.items()
@@ -242,12 +240,12 @@ class Compose:
             self._options += ["--file", file]
 
     def __call__(self, *arguments: str, check: bool = True, timeout: float = 180) -> Output:
-        """`docker-compose …`."""
+        """Run `docker-compose …`."""
         command = [shutil.which("docker-compose") or "docker-compose", *self._options, *arguments]
         return self.engine.run_client(command, self.environment, self.directory, check=check, timeout=timeout)
 
     def container(self, service: str) -> str:
-        """The id of a service's container."""
+        """Return the id of a service's container."""
         labels = (f"com.docker.compose.project={self.project}", f"com.docker.compose.service={service}")
         filters = [part for label in labels for part in ("--filter", f"label={label}")]
         found = self.engine.docker("ps", "--all", "--quiet", "--no-trunc", *filters).stdout.split()
@@ -259,7 +257,7 @@ class Compose:
         return self.engine.docker("exec", self.container(service), *command, check=check, timeout=timeout)
 
     def wait_healthy(self, service: str = "appliance", timeout: float = HEALTHY_SECONDS) -> None:
-        """Until the health check of a service has passed, since its container was started last."""
+        """Wait until the health check of a service has passed since its last start."""
         container = self.container(service)
         since = self.engine.inspect(container)["State"]["StartedAt"]
         command = [
@@ -280,15 +278,15 @@ class Compose:
         raise DockerError(f"{service} is not healthy: {json.dumps(state)[:2000]}\n{self.story()}")
 
     def wait_for_log(self, service: str, text: str, *, timeout: float = 60, since: str = "0s") -> str:
-        """The first line of a service's output that contains `text`; `since` is a moment, as Docker writes it."""
+        """Return the first line of a service's output that contains `text`; `since` is a time in Docker's format."""
         moment = [] if since == "0s" else ["--since", since]
         for line in self._follow(["logs", "--follow", *moment, self.container(service)], timeout):
             if text in line:
                 return line
-        raise DockerError(f"{service} did not say {text!r} within {timeout:.0f} s\n{self.story()}")
+        raise DockerError(f"{service} did not log {text!r} within {timeout:.0f} s\n{self.story()}")
 
     def _follow(self, command: Sequence[str], seconds: float) -> Iterator[str]:
-        """The lines of a docker command that goes on, as they come, for so long."""
+        """Yield the lines of a running docker command as they come, for at most `seconds`."""
         with subprocess.Popen(
             ["timeout", str(seconds), shutil.which("docker") or "docker", *command],
             env=os.environ | {"DOCKER_HOST": self.engine.address},
@@ -305,7 +303,7 @@ class Compose:
                 follow.terminate()
 
     def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
-        """`rosrv audit search --json` in the appliance; of its records those that have these fields."""
+        """Return the records of `rosrv audit search --json` in the appliance that have these fields."""
         lines = self.exec("appliance", "rosrv", "audit", "search", "--json", "--limit", "1000", *flags).stdout
         records: list[dict[str, Any]] = [
             json.loads(line) for line in lines.splitlines() if line.startswith("{")
@@ -313,19 +311,19 @@ class Compose:
         return [one for one in records if all(one.get(key) == value for key, value in fields.items())]
 
     def status(self) -> dict[str, Any]:
-        """`rosrv status --json` in the appliance."""
+        """Return `rosrv status --json` in the appliance."""
         status: dict[str, Any] = json.loads(
             self.exec("appliance", "rosrv", "status", "--json", check=False).stdout
         )
         return status
 
     def story(self) -> str:
-        """What the containers said last."""
+        """Return the end of the containers' output."""
         return self("--profile", "demo", "logs", "--no-color", "--tail", "40", check=False).stdout
 
 
 def build_images() -> None:
-    """Have the images of the appliance and of the demonstration, built from this checkout as it is."""
+    """Build the images of the appliance and of the demonstration from this checkout."""
     with builder() as engine:
         engine.build("appliance", APPLIANCE)
         engine.build("demo", DEMO)
@@ -334,7 +332,7 @@ def build_images() -> None:
 
 @contextlib.contextmanager
 def builder(*, clock: bool = False) -> Iterator[Engine]:
-    """An engine that only builds, and has the base of the images; `clock`: as `Engine` has it."""
+    """Return an engine that only builds, and has the base of the images; for `clock` see `Engine`."""
     archive = base_archive()
     with Engine(builds=True, clock=clock) as engine:
         label = f"base={archive.stem}"
@@ -345,7 +343,7 @@ def builder(*, clock: bool = False) -> Iterator[Engine]:
 
 
 def project(directory: Path) -> Path:
-    """A directory as a user has it: the compose files and the three folders he edits, his to change."""
+    """Make a user's directory: the compose files and the three folders to edit."""
     for name in ("compose.yaml", "compose.host.yaml"):
         shutil.copy(ROOT / name, directory)
     for name in ("policies", "monitors"):
@@ -355,13 +353,13 @@ def project(directory: Path) -> Path:
 
 
 def namespace_of(engine: Engine, container: str) -> Namespace:
-    """The network namespace of a running container, to try connections from."""
+    """Return the network namespace of a running container, to try connections from it."""
     pid = engine.inspect(container)["State"]["Pid"]
     return _ContainerNamespace(int(pid))
 
 
 class _ContainerNamespace(Namespace):
-    """By process id instead of by name."""
+    """A namespace by process id instead of by name."""
 
     def __init__(self, pid: int) -> None:
         self.name = f"container-{pid}"

@@ -1,4 +1,4 @@
-"""How many examples a property is tried on: a sixth in each run, other ones each time; all in `make test-system`.
+"""Set the number of examples of a property: a sixth in each run, with a new seed; all in `make test-system`.
 
 @settings(max_examples=examples(400))
 """
@@ -7,5 +7,5 @@ import os
 
 
 def examples(many: int) -> int:
-    """So many of `many` as this run has time for."""
+    """Return the part of `many` that this run tries."""
     return many if os.environ.get("TESTS_EXAMPLES") == "all" else many // 6

@@ -1,4 +1,4 @@
-"""An appliance under attack: a robot and its operator talk, a rogue host tries everything, somebody watches the log.
+"""Run an appliance under attack: a robot and its operator talk, a rogue host attacks, a test reads the audit log.
 
 with Field(lab, home, POLICY) as field:
     answer = field.rogue("unregisterPublisher", "/voice", "/chatter", field.api)
@@ -19,39 +19,39 @@ from typing import Any, Self
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
-from tests.support.nodes import RosSession
+from tests.support.nodes import RosSession, numbers, without_gap
 from tests.support.processes import LIMIT, Event, Process, ThisMachine
 
-_ADDRESS = re.compile(r"\b(?!127\.)[0-9]{1,3}(?:\.[0-9]{1,3}){3}\b")  # loopback is everybody's own
+_ADDRESS = re.compile(r"\b(?!127\.)[0-9]{1,3}(?:\.[0-9]{1,3}){3}\b")  # every host has its own loopback
 _RECORD_ID = re.compile(r"\[([0-9a-f]{20})\]\Z")
 
 
 class Field:
     """Hosts: `robot` 10.77.0.10 (talker `/voice`), `ocu` 10.77.0.20 (listener `/ear`), `attacker` 10.77.0.66,
-    `stranger` 10.77.0.99, whom no rule names; the appliance is 10.77.0.2.
+    `unknown_host` 10.77.0.99, which no rule names; the appliance is 10.77.0.2.
     """
 
-    api = "http://10.77.0.66:40404/"  # nobody listens there unless a test does
+    api = "http://10.77.0.66:40404/"  # nothing listens there unless a test does
 
-    def __init__(self, lab: Lab, home: Path, policy: str, options: tuple[str, ...] = ()) -> None:
+    def __init__(self, lab: Lab, home: Path, policy: str, settings: str = "") -> None:
         self.middle = lab.host("appliance", "10.77.0.2/24")
         self.robot = lab.host("robot", "10.77.0.10/24")
         self.ocu = lab.host("ocu", "10.77.0.20/24")
         self.attacker = lab.host("attacker", "10.77.0.66/24")
-        self.stranger = lab.host("stranger", "10.77.0.99/24")
+        self.unknown_host = lab.host("unknown", "10.77.0.99/24")
         self.policy = policy
         self.home = home
-        self.appliance = Appliance(self.middle, policy=policy, options=options)
+        self.appliance = Appliance(self.middle, policy=policy, settings=settings)
         self.answers: list[tuple[str, Any]] = []
         self._looked_at = (
-            0  # the first event of the listener that `unharmed` has not compared with the one before
+            0  # the first event of the listener that `unharmed` has not yet compared with its predecessor
         )
         self._closing = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
             stack.enter_context(self.appliance)
-            # What is recorded before it is there to look, it has as well.
+            # It also has the records from before it could be queried.
             tail = ("audit", "tail", "--lines", "1000", "--json")
             command = [ROSRV, *tail, "--state", str(self.appliance.state)]
             self.trail = stack.enter_context(
@@ -69,17 +69,17 @@ class Field:
 
     @property
     def master(self) -> str:
-        """The URI of RVMaster."""
+        """Return the URI of RVMaster."""
         return self.appliance.master_uri
 
-    # --- what the rogue does ---
+    # --- actions of the rogue ---
 
     def rogue(self, method: str, *parameters: Any, uri: str | None = None) -> Any:
-        """One XML-RPC call from the attacker's host: its answer; a fault or an HTTP error as the exception."""
+        """Make one XML-RPC call from the attacker's host; a fault or an HTTP error is raised as an exception."""
         return self.call(self.attacker, method, *parameters, uri=uri)
 
     def call(self, host: Host, method: str, *parameters: Any, uri: str | None = None) -> Any:
-        """One XML-RPC call from a host."""
+        """Make one XML-RPC call from a host."""
 
         def call() -> Any:
             with xmlrpc.client.ServerProxy(uri or self.master, allow_none=True) as server:
@@ -94,7 +94,7 @@ class Field:
         return answer
 
     def raw(self, data: bytes, host: Host | None = None, port: int = 11311) -> bytes:
-        """Send bytes to the appliance and read until it closes, or until an answer is whole and nothing follows."""
+        """Send bytes to the appliance and read until it closes, or until an answer is complete and nothing follows."""
         with self.connect(host, port) as sock:
             sock.sendall(data)
             received = b""
@@ -107,10 +107,10 @@ class Field:
         return received
 
     def connect(self, host: Host | None = None, port: int = 11311) -> socket.socket:
-        """A TCP connection to the appliance."""
+        """Open a TCP connection to the appliance."""
         return (host or self.attacker).run(lambda: socket.create_connection(("10.77.0.2", port), LIMIT))
 
-    # --- what must be true afterwards ---
+    # --- promises that must hold afterwards ---
 
     def denied(
         self,
@@ -122,16 +122,16 @@ class Field:
         code: int = 0,
         **fields: Any,
     ) -> Event:
-        """The answer is a denial of the right shape for this reason, and the log has it, with the rule and its line.
+        """Assert that the answer is a denial for this reason, and that the log has it with the rule and its line.
 
-        It tells no address but the caller's. `in_record` is the reason there, where it says more. `rule` is its section
-        and key, as `[Nodes] default`. Returns the record.
+        The denial contains no address except the caller's. `in_record` is the reason in the record, where it is longer.
+        `rule` is its section and key, such as `[Nodes] default`. Returns the record.
         """
         assert isinstance(answer, list), answer
         assert (len(answer), answer[0]) == (3, code), answer
         assert reason in answer[1], answer
         host = fields.get("host", "10.77.0.66")
-        assert set(_ADDRESS.findall(answer[1])) <= {host}, f"the denied host is told of others: {answer[1]}"
+        assert set(_ADDRESS.findall(answer[1])) <= {host}, f"the denial reveals other addresses: {answer[1]}"
         found = _RECORD_ID.search(answer[1])
         assert found is not None, answer
         record = self.trail.wait_for(id=found[1])
@@ -151,37 +151,34 @@ class Field:
         return record
 
     def recorded(self, reason: str = "", **fields: Any) -> Event:
-        """The first record with these fields, and this in its reason, once it is there."""
+        """Wait for the first record with these fields and with this text in its reason."""
         return self.trail.wait_for(lambda event: reason in (event.get("reason") or ""), **fields)
 
     def unharmed(self, messages: int = 3) -> None:
-        """Talker and listener go on: every message arrives, once, in order, and from the talker."""
+        """Assert that talker and listener continue: every message arrives once, in order, and from the talker."""
         now = self.listener.mark()
         self.listener.wait_for_count(messages, since=now, event="received")
         heard = [
             event for event in self.listener.events[self._looked_at :] if event.get("event") == "received"
         ]
-        numbers = [int(event["data"].rsplit(" ", 1)[1]) for event in heard]
-        assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), (
-            "messages are missing or doubled"
-        )
+        assert without_gap(numbers(heard)), "messages are missing or repeated"
         assert {event["publisher"] for event in heard} == {"/voice"}
-        self._looked_at = now  # what came from here on is looked at again: nothing is missing in between
+        self._looked_at = now  # the next check begins here, without a gap
         assert self.talker.running
         assert self.listener.running
 
     def memory(self, role: str = "control") -> int:
-        """Resident bytes of a process of the appliance."""
+        """Return the resident bytes of a process of the appliance."""
         status = Path(f"/proc/{self.appliance.pids(role)[0]}/status").read_text()
-        return int(re.search(r"VmRSS:\s+(\d+) kB", status)[1]) << 10  # type: ignore[index]  # it is there
+        return int(re.search(r"VmRSS:\s+(\d+) kB", status)[1]) << 10  # type: ignore[index]  # the kernel always writes it
 
     def story(self) -> str:
-        """What everybody said, for the message of a failure."""
+        """Return the output of all processes, for the message of a failure."""
         return "\n".join([self.appliance.story(), self.trail.story(), self.ros.story()])
 
 
 class Impostor:
-    """A TCP server on a host that answers as `behave(connection, request)` says; counts who came."""
+    """A TCP server on a host that answers with `behave(connection, request)`, and counts its clients."""
 
     def __init__(
         self, host: Host, behave: Callable[[socket.socket, bytes], object], address: str | None = None
@@ -234,14 +231,14 @@ class Impostor:
 
 
 def whole(message: bytes) -> bool:
-    """Whether an HTTP message has arrived whole (by its Content-Length)."""
+    """Whether an HTTP message is complete (by its Content-Length)."""
     head, end, body = message.partition(b"\r\n\r\n")
     found = re.search(rb"(?i)content-length: *(\d+)", head)
     return bool(end) and found is not None and len(body) >= int(found[1])
 
 
 def answering(value: Any) -> Callable[[socket.socket, bytes], None]:
-    """The behaviour of a node that answers every call with this value."""
+    """Return the behaviour of a node that answers every call with this value."""
 
     def behave(connection: socket.socket, _request: bytes) -> None:
         connection.sendall(response(value))
@@ -250,6 +247,6 @@ def answering(value: Any) -> Callable[[socket.socket, bytes], None]:
 
 
 def response(value: Any) -> bytes:
-    """An HTTP response with an XML-RPC answer."""
+    """Return an HTTP response with an XML-RPC answer."""
     body = xmlrpc.client.dumps((value,), methodresponse=True).encode()
     return b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: %d\r\n\r\n" % len(body) + body

@@ -1,4 +1,4 @@
-"""First packets of TCP connections with any source, written by hand, and what of them arrives on an interface.
+"""Write the first packets of TCP connections with any source by hand, and read those that arrive.
 
 robot.run(lambda: send_syn("10.77.0.10", "10.77.0.2", 11311))
 process = attacker.popen(flood_command("10.77.0.10", "10.77.0.2", 11311, per_second=3000, seconds=5))
@@ -17,7 +17,7 @@ _PIECES = 100  # a second
 
 
 def syn(source: str, target: str, port: int, from_port: int) -> bytes:
-    """A SYN with its header of IPv4 or IPv6."""
+    """Return a SYN with its header of IPv4 or IPv6."""
     ends = ipaddress.ip_address(source).packed, ipaddress.ip_address(target).packed
     segment = struct.pack("!HHIIBBHHH", from_port, port, 0, 0, 5 << 4, _SYN, 64240, 0, 0)
     pseudo = b"".join(ends) + struct.pack("!IHH", len(segment), 0, _TCP)
@@ -29,13 +29,13 @@ def syn(source: str, target: str, port: int, from_port: int) -> bytes:
 
 
 def send_syn(source: str, target: str, port: int, from_port: int = 40000) -> None:
-    """Send one SYN from where the calling thread is."""
+    """Send one SYN from the calling thread's network namespace."""
     with _raw(target) as out:
         out.sendto(syn(source, target, port, from_port), (target, 0))
 
 
 def syn_sources(wire: socket.socket) -> list[str]:
-    """The sources of all SYNs that have arrived at a packet socket (SOCK_DGRAM) so far."""
+    """Return the sources of all SYNs that have arrived at a packet socket (SOCK_DGRAM) so far."""
     wire.setblocking(False)
     found: list[str] = []
     while True:
@@ -52,9 +52,9 @@ def syn_sources(wire: socket.socket) -> list[str]:
 
 
 def flood_command(source: str, target: str, port: int, *, per_second: int, seconds: float) -> list[str]:
-    """A program that sends SYNs evenly, and prints how many when it ends.
+    """Return a program that sends SYNs evenly, and prints their number when it ends.
 
-    They are of one source; each is from another of the ports that kernels choose from.
+    All have the same source address, and each has another ephemeral port.
     """
     return [
         sys.executable,

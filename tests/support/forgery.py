@@ -1,4 +1,4 @@
-"""What root on the appliance can do to its audit log: he has the signer's key, its memory, and knows the program."""
+"""Forge an audit log as root can on the appliance: with the signer's key, its memory and the program."""
 
 import hashlib
 import sqlite3
@@ -12,14 +12,14 @@ from appliance.audit.chain import genesis, record_hash
 from appliance.audit.log_database import COLUMNS
 from appliance.signing.signed_statements import NO_CHECKPOINT, checkpoint_hash, parse_checkpoint
 
-# ruff: noqa: S608  the attacker's statements are put together from names of columns
+# ruff: noqa: S608  the attacker's statements are built from names of columns
 
 _FIELDS = COLUMNS.split(", ")
 _EVENT, _DETAIL = _FIELDS.index("event"), _FIELDS.index("detail")
 
 
 def write_anew(path: Path, key: Ed25519PrivateKey, signer: Path, change: str) -> None:
-    """As root can: change records, make every hash, checkpoint and signature anew, and the signer's memory."""
+    """Change records as root can, and compute all hashes, checkpoints, signatures and the signer's memory again."""
     with closing(sqlite3.connect(path)) as connection:
         connection.execute(change)
         rows = connection.execute(f"SELECT {COLUMNS} FROM record ORDER BY sequence").fetchall()

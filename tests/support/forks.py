@@ -1,10 +1,9 @@
-"""Nodes and tools of Debian's Python as forks of one process that has loaded rospy, which costs most of a short one.
+"""Fork nodes and tools of Debian's Python from a process with rospy loaded, which is the slow part of a start.
 
     process = Process(Forking(host), ["rostopic", "list"], env=…, label="rostopic")
 
-A fork is a process of its own, in its own session and in the host's network namespace, and rospy is told of arguments
-and environment before it runs: what differs from a new process is that the modules are in memory already. roslaunch
-starts its nodes itself.
+A fork has its own session and the host's network namespace, and rospy gets arguments and environment before it runs.
+It differs from a new process only in that the modules are already in memory. roslaunch starts its nodes itself.
 """
 
 import atexit
@@ -31,18 +30,18 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 class Forking:
-    """A host on which programs of Debian's Python are forks; others, and those of other hosts, start as ever."""
+    """A host on which programs of Debian's Python are forks; all other programs start as usual."""
 
     def __init__(self, host: Host) -> None:
         self.host = host
 
     @property
     def address(self) -> str:
-        """The host's."""
+        """The host's address."""
         return self.host.address
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """A running program."""
+        """Start a program."""
         arguments = _of_python([str(one) for one in args], options["env"]["PATH"])
         if arguments is None or not isinstance(self.host, ThisMachine | lab.Host):
             return self.host.popen(args, **options)
@@ -51,7 +50,7 @@ class Forking:
 
 
 class Fork(subprocess.Popen[Any]):
-    """A fork, as its users know processes; the leader of its own session."""
+    """A fork with the interface of a process; the leader of its own session."""
 
     def __init__(
         self,
@@ -65,7 +64,7 @@ class Fork(subprocess.Popen[Any]):
         start_new_session: bool = True,
         **standard: Any,
     ) -> None:
-        """`standard`: `stdin`, `stdout` and `stderr`, each PIPE or an open file."""
+        """Take `standard`: `stdin`, `stdout` and `stderr`, each PIPE or an open file."""
         assert start_new_session
         self.args, self.returncode = arguments, None
         self.stdin = self.stdout = self.stderr = None
@@ -90,22 +89,22 @@ class Fork(subprocess.Popen[Any]):
         self.pid = int(self._report.recv(16))
 
     def poll(self) -> int | None:
-        """The exit status, minus the signal; None while it runs."""
+        """Return the exit status, minus the signal; None while it runs."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.wait(0)
         return self.returncode
 
     def wait(self, timeout: float | None = None) -> int:
-        """The exit status, once it has ended."""
+        """Return the exit status, once it has ended."""
         with selectors.PollSelector() as selector:
             selector.register(self._report, selectors.EVENT_READ)
             if not selector.select(timeout):
                 raise subprocess.TimeoutExpired(self.args, timeout or 0)
-        self.returncode = int(self._report.recv(16, socket.MSG_PEEK))  # any thread may ask, and again
+        self.returncode = int(self._report.recv(16, socket.MSG_PEEK))  # any thread may ask, and repeatedly
         return self.returncode
 
     def send_signal(self, sig: int) -> None:
-        """A signal, unless it has ended."""
+        """Send a signal, unless the fork has ended."""
         if self.poll() is None:
             os.kill(self.pid, sig)
 
@@ -115,7 +114,7 @@ class Fork(subprocess.Popen[Any]):
 
 @functools.cache
 def _server() -> socket.socket:
-    """The way to this process's server, which ends with it."""
+    """Return the socket to this process's server, which ends with it."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("ROS", "PYTHON"))}
     with theirs:
@@ -139,7 +138,7 @@ def _is_python(program: str) -> bool:
 
 
 def _of_python(args: list[str], path: str) -> list[str] | None:
-    """What the server has to run for this, if it can."""
+    """Return the Python program and arguments for the server, if it can run them."""
     if args[0] == PYTHON:
         return args[1:] if args[1] == "-c" or not args[1].startswith("-") else None
     program = shutil.which(args[0], path=path)

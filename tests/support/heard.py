@@ -1,4 +1,4 @@
-"""One end of a channel in a test: keeps what it hears, and waits for so much of it."""
+"""Keep the messages at one end of a channel in a test, and wait for a number of them."""
 
 import asyncio
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from appliance.channel.channel import Channel
 
 
 class Heard:
-    """What a channel heard, in order; attached to the running loop."""
+    """The messages of a channel, in order; attached to the running loop."""
 
     def __init__(self, channel: Channel, closed: Callable[[], None] = lambda: None) -> None:
         self.messages: list[Any] = []
@@ -20,7 +20,7 @@ class Heard:
         self._changed.set()
 
     async def until(self, count: int) -> list[Any]:
-        """The messages, once there are so many."""
+        """Return the messages, once there are `count` of them."""
         async with asyncio.timeout(20):
             while len(self.messages) < count:
                 self._changed.clear()

@@ -1,19 +1,21 @@
-"""Histories of RVMaster by seed: its parts as control connects them, among nodes, relay and ROSMaster that are models.
+"""Histories of RVMaster by seed: its real parts, with models of nodes, relay and `rosmaster`.
 
-    .venv/bin/python -m tests.support.histories SEED            # one history, with each thing that happens in it
-    .venv/bin/python -m tests.support.histories --many NUMBER   # so many, from 0 on: those that break a promise
+    .venv/bin/python -m tests.support.histories SEED            # one history, with each of its events
+    .venv/bin/python -m tests.support.histories --many NUMBER   # this many seeds; lists those that break a promise
     .venv/bin/python -m tests.support.histories --mutants NUMBER   # faults of the core, and the first that finds each
 
-Time is virtual: it goes on when nothing else is left to do, so that a history of minutes takes milliseconds, and one
-seed is one order of events. Each call, delivery and order to the relay takes its own time. What goes wrong: nodes die,
-hang, come back, are replaced under their name; ROSMaster and the relay begin anew, control dies between two steps and
-comes back with what its store has; calls to ROSMaster break off, before or after they have had their effect; policies
-are reloaded. After the last fault there is time to settle.
+Time is virtual: it advances when nothing else is left to do, so that a history of minutes takes milliseconds, and a
+seed determines the order of events. Each call, delivery and order to the relay takes a random time. Faults: nodes die,
+hang, come back, and are replaced under their name; `rosmaster` and the relay restart; control dies between two steps
+and restarts with its stored state; calls to `rosmaster` break off before or after their effect; policies are
+reloaded. After the last fault there is time to settle.
 
-Nodes are as ROS's: they take a list of publishers, ask each new one, connect where they were told to, try again what
-broke off, and end when they are told to shut down. They are told nothing about a topic while their own registering
-call for it is under way: how the two overtake each other is ROS's own affair, with a plain master, too.
+Nodes behave as in ROS: they take a list of publishers, ask each new one, connect to the given port, retry broken
+connections, and end on a shutdown request. They get no update of a topic while their own registering call for it is
+in progress: this race exists with a plain ROS master as well.
 """
+
+# ruff: noqa: D102  the models have the methods of the classes that they replace
 
 import asyncio
 import contextlib
@@ -35,10 +37,17 @@ from appliance.channel import messages
 from appliance.master.caller import Answer
 from appliance.master.endpoints.delivery import Delivery
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.endpoints.traffic import Carried
+from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph import graph as graph_module
-from appliance.master.graph.effects import Effect, Place, PlaceGrant, PlaceNode, RevokeGrant, SaveGrant
-from appliance.master.graph.graph import Graph
+from appliance.master.graph.effects import (
+    Effect,
+    PlaceGrant,
+    PlaceNode,
+    PlaceResource,
+    RevokeGrant,
+    SaveGrant,
+)
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Registry, SaveRegistration
 from appliance.master.graph.revocation import Revocation
 from appliance.master.reconcile import arrivals as arrivals_module
@@ -48,7 +57,7 @@ from appliance.master.reconcile.enactor import Enactor, restore
 from appliance.master.reconcile.reminders import Reminders
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from appliance.rpc.xmlrpc_client import BrokenOffError, RefusedError, UnansweredError
 from appliance.specifications.allocation import Allocation
 from appliance.store.state_file import IncarnationRow, PermissionRow, RegistrationRow, StateStore
@@ -75,18 +84,18 @@ _NOBODY_KNOWS = "not come back", "does not answer"  # in the answer to a call th
 
 
 class BrokenPromiseError(AssertionError):
-    """What a history must not have."""
+    """A history broke a promise."""
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """A loop whose time goes on only when nothing else is left to do."""
+    """An event loop with virtual time, which advances only when nothing else is left to do."""
 
     def __init__(self) -> None:
         self.now = 1000.0
         super().__init__(_Jumping(self))
 
     def time(self) -> float:
-        """Seconds of this loop."""
+        """Return this loop's time in seconds."""
         return self.now
 
 
@@ -96,16 +105,16 @@ class _Jumping(selectors.SelectSelector):
         self._loop = loop
 
     def select(self, timeout: float | None = None) -> Any:
-        """As a selector's, of files that never have anything."""
+        """Select among files that never have events."""
         if timeout is None:
-            raise BrokenPromiseError("everybody waits for ever")
+            raise BrokenPromiseError("deadlock: every task waits")
         self._loop.now += max(timeout, 0.0)
         return []
 
 
 @dataclass(eq=False)
 class Subscription:
-    """What a node knows of a topic: the list it was told, and by which of those it is connected to which publisher."""
+    """A node's state for a topic: its list of publishers, and its connections to them with the entry used for each."""
 
     known: list[str] = field(default_factory=list)
     ways: dict[str, str] = field(default_factory=dict)  # URI to the key behind the port it was told
@@ -113,7 +122,7 @@ class Subscription:
 
 @dataclass(eq=False)
 class Process:
-    """A node as it runs."""
+    """A running node."""
 
     name: str
     host: str
@@ -127,12 +136,12 @@ class Process:
 
     @property
     def api(self) -> str:
-        """Its URI."""
+        """Return the node's URI."""
         return f"http://{self.host}:{self.port}/"
 
 
 class Relay:
-    """One life of the relay: what it was told, in order, and who is connected."""
+    """One life of the relay: its orders, in sequence, and its connections."""
 
     def __init__(self, world: "World") -> None:
         self._world = world
@@ -145,20 +154,19 @@ class Relay:
         self.stirred = asyncio.Event()
 
     def attach(self, *_given: object) -> None:
-        """As `Channel`."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """As `Channel`."""
+        """Do nothing."""
 
     def send(self, message: messages.Message, _descriptors: tuple[int, ...] = (), **_when: bool) -> None:
-        """As `Channel`."""
         if isinstance(message, messages.GrantInstalled):
             self._world.check_grant(message.topic, message.host, message.caller_id)
         self.orders.append(message)
         self.stirred.set()
 
     def carry_out(self) -> None:
-        """The next order."""
+        """Carry out the next order."""
         match self.orders.popleft():
             case messages.StateBegan():
                 self._restated = False
@@ -187,8 +195,8 @@ class Relay:
         return row in self.grants and row[:2] in self.publications and row[0] in self.nodes
 
 
-class Kept(idle_class(StateStore)):  # type: ignore[misc]  # it is made
-    """The store: what outlasts control."""
+class Kept(idle_class(StateStore)):  # type: ignore[misc]  # a class made at run time
+    """The state store, which outlives control."""
 
     def __init__(self) -> None:
         self.nodes: dict[str, IncarnationRow] = {}
@@ -196,49 +204,40 @@ class Kept(idle_class(StateStore)):  # type: ignore[misc]  # it is made
         self.grants: dict[PermissionRow, None] = {}
 
     def save_incarnation(self, row: IncarnationRow) -> None:
-        """As `StateStore`."""
         self.nodes[row.key] = row
 
     def forget_incarnation(self, key: str) -> None:
-        """As `StateStore`."""
         self.nodes.pop(key, None)
         self.registrations = {at: row for at, row in self.registrations.items() if row.key != key}
         self.grants = {row: None for row in self.grants if row.key != key}
 
     def save_registration(self, row: RegistrationRow) -> None:
-        """As `StateStore`."""
         self.registrations[row.key, row.kind, row.resource] = row
 
     def remove_registration(self, key: str, kind: str, resource: str) -> None:
-        """As `StateStore`."""
         self.registrations.pop((key, kind, resource), None)
 
     def load_registry(self) -> tuple[list[IncarnationRow], list[RegistrationRow]]:
-        """As `StateStore`."""
         return [*self.nodes.values()], sorted(self.registrations.values(), key=lambda row: row.ordinal)
 
     def save_permission(self, row: PermissionRow) -> None:
-        """As `StateStore`."""
         self.grants[row] = None
 
     def remove_permission(self, row: PermissionRow) -> None:
-        """As `StateStore`."""
         self.grants.pop(row, None)
 
     def permissions(self) -> list[PermissionRow]:
-        """As `StateStore`."""
         return [*self.grants]
 
 
 class Master(HiddenMaster):
-    """ROSMaster: each call takes its time, and while there are faults some break off, with or without their effect."""
+    """A model of `rosmaster`: each call takes time, and some calls break off during faults."""
 
     def __init__(self, world: "World") -> None:
         super().__init__()
         self._world = world
 
     async def call(self, method: str, *params: Value) -> Answer:
-        """As `HiddenMaster`."""
         await self._world.some_time()
         breaks = self._world.faulty and self._world.rng.random() < 0.04
         if breaks and self._world.rng.random() < 0.5:
@@ -247,7 +246,7 @@ class Master(HiddenMaster):
             method in ("registerPublisher", "registerSubscriber")
             and self.nodes.get(str(params[0]), params[-1]) != params[-1]
         ):
-            for table in self.tables.values():  # as ROSMaster does with a node that has another URI
+            for table in self.tables.values():  # as `rosmaster` does with a node that has another URI
                 for holders in table.values():
                     holders.pop(str(params[0]), None)
         answer = await super().call(method, *params)
@@ -265,7 +264,6 @@ class Reach:
         self._incarnation = incarnation
 
     async def call(self, method: str, *params: Value) -> Value:
-        """As `XmlRpcClient`."""
         await self._world.some_time()
         uri = self._incarnation.call_uri
         process = next(
@@ -291,10 +289,10 @@ class Reach:
 
 
 class _Faces(Inner):
-    """As `Faces`; they are open at once."""
+    """Proxy endpoints that open at once."""
 
     async def open(self, _incarnation: Incarnation) -> None:
-        """As `Faces`."""
+        """Do nothing."""
 
 
 class Control(ControlParts):
@@ -306,7 +304,6 @@ class Control(ControlParts):
         self.reminders = Reminders(self.registry, self.graph, self.enactor)
 
     def surround(self) -> None:
-        """As `ControlParts`."""
         world = self.world
         self.current = world.policy_in_force
         self.hidden, self.store = world.master, cast(Any, world.kept)
@@ -314,14 +311,15 @@ class Control(ControlParts):
         delivery = Delivery(
             self.nodes,
             troubled=self.watchlist.could_not_tell,
-            standing=lambda _host: Standing.REGISTERED,
+            quota_class=lambda _host: QuotaClass.REGISTERED,
         )
         self.deliveries = cast(Any, delivery)
         self.faces = _Faces(self.registry)
         self.relay = cast(
             Any,
             RelayControl(
-                self.registry, self.grants, cast(Any, _Ports()), self.nodes, idle(Carried), allocation=Allocation(1),
+                self.registry, self.grants, cast(Any, _Ports()), self.nodes, idle(RelayTraffic),
+                allocation=Allocation(1),
                 policy=lambda: self.current,
                 monitors=cast(Any, _Monitors), broken=self.watchlist.look_at, own_header=None, own_call=cast(Any, None),
             ),
@@ -329,14 +327,13 @@ class Control(ControlParts):
         self.grants.used = world.used
 
     def arrivals(self) -> Any:
-        """As `ControlParts`."""
         return Arrivals(
             self.registry, self.graph, self.enactor, self.liveness, places=cast(Any, self.world),
             faces=cast(Any, self.faces), addresses=cast(Any, self.addresses),
         )  # fmt: skip
 
     async def begin(self) -> None:
-        """As the process does: what was kept, then its loops."""
+        """Start as the process does: load the stored state, then start the loops."""
         restore(self.registry, cast(Any, self.world.kept))
         self.enactor.carry_out(self.grants.restore(self.world.kept.permissions()))
         self.enactor.carry_out(self.revocation.policy_changed(self.current, self.current))
@@ -345,14 +342,14 @@ class Control(ControlParts):
         self.world.task(self.liveness.run())
 
     def attach(self) -> None:
-        """The relay is there, as it is now."""
+        """Attach the relay in its present state."""
         cast(Any, self.relay).attach(0, self.world.relay)
         self.enactor.carry_out(self.graph.tell_everybody())
         self.reminders.begin()
 
 
 class World:
-    """Everything in one history."""
+    """The whole state of one history."""
 
     def __init__(
         self, seed: int, loop: VirtualLoop, say: Callable[[str], object] = lambda _line: None
@@ -370,34 +367,34 @@ class World:
         self.errors: list[Exception] = []
         self.control = Control(self)
 
-    # --- what others are made of ---
+    # --- services for the models ---
 
     @property
     def policy_in_force(self) -> Policy:
-        """Of this life of control."""
+        """Return the policy of this life of control."""
         return compile_policy(POLICIES[self.policy][0], file="policy")
 
     def open(self, _host: object) -> tuple[int, int]:
-        """As `Places`: ports for a node."""
+        """Open ports for a node, as `Places` does."""
         return next(self._ports), next(self._ports)
 
     async def some_time(self) -> None:
-        """How long something takes on its way."""
+        """Wait for a random time, as for a message on its way."""
         await asyncio.sleep(self.rng.choice((0.0, 0.0, 0.001, 0.01, 0.1)))
 
     def used(self) -> set[PermissionRow]:
-        """Grants that somebody is connected by."""
+        """Note grants that a connection uses."""
         return {
             PermissionRow(key, "topic", topic, host, name)
             for key, topic, host, name in self.relay.connections
         }
 
     def say(self, line: str) -> None:
-        """Something happens."""
+        """Log an event."""
         self._say(f"{self.loop.now - 1000.0:9.3f}  {line}")
 
     def task(self, work: Awaitable[Any]) -> None:
-        """Something that goes on until control or the history ends."""
+        """Start a task that runs until control or the history ends."""
         task = asyncio.ensure_future(work)
         self._tasks[task] = None
         task.add_done_callback(self._done)
@@ -410,7 +407,7 @@ class World:
     # --- nodes ---
 
     def ends(self, process: Process) -> None:
-        """A process ends, and what it was connected by."""
+        """End a process and its connections."""
         if process.alive:
             self.say(f"{process.name} at {process.host}:{process.port} ends")
         process.alive = False
@@ -418,7 +415,7 @@ class World:
         self.relay.connections = {row: one for row, one in connections.items() if one is not process}
 
     def call(self, process: Process, method: str, topic: str) -> None:
-        """A node begins a registering call; it makes it again where nobody could say what became of it."""
+        """Start a registering call of a node, and repeat it if its outcome is unknown."""
         if (method, topic) not in process.calling:
             process.calling.add((method, topic))
             self.say(f"{process.name} at {process.host}:{process.port} {method} {topic}")
@@ -449,13 +446,13 @@ class World:
             await self.update(process, topic, answer[2])
 
     def _takes_the_name(self, process: Process) -> None:
-        """Who had it is told to end. Where it hangs it goes on, and what it has depends on who calls next."""
+        """Tell the node that had this name to end. If it hangs it goes on, and its state depends on the next caller."""
         for other in self.processes:
             if other.name == process.name and other is not process:
                 other.superseded = True
 
     async def update(self, process: Process, topic: str, uris: list[str]) -> None:
-        """A node is told who publishes a topic."""
+        """Tell a node the publishers of a topic."""
         while process.alive and ("registerSubscriber", topic) in process.calling:
             await asyncio.sleep(0.01)
         self.see(process, uris)
@@ -463,7 +460,7 @@ class World:
         if subscription is None or not process.alive:
             return
         self.say(f"  {process.name} is told {topic} {uris}")
-        uris = [uri for uri in uris if uri != process.api]  # what it publishes itself stays within it
+        uris = [uri for uri in uris if uri != process.api]  # its own publications stay within the process
         new = [uri for uri in uris if uri not in subscription.known]
         for uri in subscription.known:
             if uri not in uris:
@@ -489,11 +486,11 @@ class World:
                 subscription.known.remove(uri)
 
     def disconnect(self, process: Process, topic: str, key: str) -> None:
-        """A node closes a connection."""
+        """Close a connection of a node."""
         self.relay.connections.pop((key, topic, process.host, process.name), None)
 
     async def connecting(self) -> None:
-        """Nodes connect where they were told to, and try again what broke off."""
+        """Connect nodes to their lists of publishers, and retry broken connections."""
         while True:
             await asyncio.sleep(0.5)
             for process in self.processes:
@@ -504,7 +501,7 @@ class World:
                             self.relay.connections[row] = process
 
     async def carrying(self, relay: Relay) -> None:
-        """The relay carries out what it is told."""
+        """Carry out the orders of the relay."""
         while relay is self.relay:
             await relay.stirred.wait()
             relay.stirred.clear()
@@ -513,14 +510,14 @@ class World:
                 for _ in range(min(len(relay.orders), self.rng.randrange(1, 9))):
                     relay.carry_out()
 
-    # --- what happens ---
+    # --- events ---
 
     def _living(self) -> Process | None:
         there = [one for one in self.processes if one.alive]
         return self.rng.choice(there) if there else None
 
     def starts(self) -> None:
-        """A node starts; with the name of another it takes its place."""
+        """Start a node; with the name of another node it replaces that one."""
         name, host = self.rng.choice(NAMES), self.rng.choice(HOSTS)
         process = Process(name, host, next(self._node_ports))
         self.processes.append(process)
@@ -531,17 +528,17 @@ class World:
                 self.subscribes(process, topic)
 
     def publishes(self, process: Process, topic: str) -> None:
-        """A node publishes a topic."""
+        """Make a node publish a topic."""
         process.publishes.add(topic)
         self.call(process, "registerPublisher", topic)
 
     def subscribes(self, process: Process, topic: str) -> None:
-        """A node subscribes to a topic."""
+        """Make a node subscribe to a topic."""
         process.subscribes.setdefault(topic, Subscription())
         self.call(process, "registerSubscriber", topic)
 
     def changes_its_mind(self) -> None:
-        """A node registers something, or gives it up."""
+        """Make a node register or unregister something."""
         process, topic = self._living(), self.rng.choice(TOPICS)
         if process is None or any(one[1] == topic for one in process.calling):
             return
@@ -559,13 +556,13 @@ class World:
             self.subscribes(process, topic)
 
     def dies(self) -> None:
-        """A node dies without a word."""
+        """Kill a node, without an unregistration."""
         process = self._living()
         if process is not None:
             self.ends(process)
 
     def hangs(self) -> None:
-        """A node answers nothing, or does again."""
+        """Make a node hang, or continue."""
         process = self._living()
         if process is not None:
             process.answers = not process.answers
@@ -574,26 +571,26 @@ class World:
             )
 
     def reloads(self) -> None:
-        """Another policy comes into force."""
+        """Put another policy in force."""
         self.policy = self.rng.choice(list(POLICIES))
         self.say(f"policy: {self.policy}")
         self.control.reload(POLICIES[self.policy][0])
 
     def master_dies(self) -> None:
-        """ROSMaster is another, and knows nothing."""
+        """Replace `rosmaster` by a new one without state."""
         self.say("ROSMaster begins anew")
         self.master.restart()
         self.control.reconciler.wake()
 
     def relay_dies(self) -> None:
-        """The relay is another, and knows nothing."""
+        """Replace the relay by a new one without state."""
         self.say("the relay begins anew")
         self.relay = Relay(self)
         self.task(self.carrying(self.relay))
         self.control.attach()
 
     async def control_dies(self) -> None:
-        """Control dies between two steps; what is under way ends with it, and nodes make their calls again."""
+        """Kill control between two steps; its running tasks end with it, and nodes repeat their calls."""
         self.say("control begins anew")
         calls = [(one, what) for one in self.processes if one.alive for what in one.calling]
         await self.stop()
@@ -608,13 +605,13 @@ class World:
             self.call(process, method, topic)
 
     async def go_on(self) -> None:
-        """All that goes on by itself."""
+        """Start all background tasks."""
         await self.control.begin()
         self.task(self.carrying(self.relay))
         self.task(self.connecting())
 
     async def stop(self) -> None:
-        """End what goes on."""
+        """Stop all background tasks."""
         mine = asyncio.current_task()
         tasks = sorted(asyncio.all_tasks() - {mine}, key=lambda one: int(one.get_name().rpartition("-")[2]))
         for task in tasks:
@@ -629,30 +626,30 @@ class World:
         return process.host in (publishers if publish else subscribers).get(topic, HOSTS)
 
     def see(self, process: Process, uris: list[str]) -> None:
-        """Nobody is told another way than the relay's: the messages of a node go past the monitors there."""
+        """Assert that nodes get relay ports only: messages to other ports would bypass the monitors."""
         for uri in uris:
             if not uri.startswith("http://10.0.0.1:2") and uri != process.api:
                 self.errors.append(
-                    BrokenPromiseError(f"{process.name} is told {uri}, which is past the relay")
+                    BrokenPromiseError(f"{process.name} was told {uri}, which bypasses the relay")
                 )
 
     def check_granted(self) -> None:
-        """Nobody has what the policy in force does not grant, once the relay has carried out what it was told."""
+        """Assert that no node has anything that the policy denies, once the relay has carried out its orders."""
         for _key, topic, host, name in self.relay.grants:
             self.check_grant(topic, host, name)
         for key, topic in self.relay.publications:
             publisher = self.control.registry.by_key(key)
             if publisher is None or str(publisher.host) not in POLICIES[self.policy][1].get(topic, HOSTS):
-                raise BrokenPromiseError(f"{key} publishes {topic}, which the policy does not grant")
+                raise BrokenPromiseError(f"{key} publishes {topic}, which the policy denies")
 
     def check_grant(self, topic: str, host: str, name: str) -> None:
-        """The policy in force grants this to a subscriber: when the relay is told, and at the end."""
+        """Assert that the policy grants a topic to a subscriber: when the relay gets the grant, and at the end."""
         if host not in POLICIES[self.policy][2].get(topic, HOSTS):
             text = f"{name} of {host} has {topic}, which the policy does not grant"
             self.errors.append(BrokenPromiseError(text))
 
     def check_connected(self) -> None:
-        """Every live subscriber hears every live publisher, as far as the policy lets them, and nobody else."""
+        """Assert that live subscribers are connected to exactly the live publishers that the policy allows."""
         holders = {}
         for incarnation in self.control.registry.live():
             for process in self.processes:
@@ -661,7 +658,7 @@ class World:
         for process in self.processes:
             if (
                 process in holders.values() and not process.superseded
-            ):  # else it is dead, or another has its name
+            ):  # else it is dead, or another node has its name
                 for topic, subscription in process.subscribes.items():
                     self._check_heard(process, topic, subscription, holders)
 
@@ -685,29 +682,26 @@ class World:
 
 
 class _Ports:
-    """As `Places`: a socket for each port that is none."""
+    """`Places` without real ports."""
 
     def socket(self, port: int) -> "_Ports":
-        """As `Places`."""
         self._port = port
         return self
 
     def fileno(self) -> int:
-        """As a socket's."""
         return self._port
 
 
 class _Monitors:
-    """No specifications are in force."""
+    """Without specifications in force."""
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
-        """As `Monitors`."""
         return messages.SpecificationsStated(0, b"", {}, restarted=False)
 
 
 @contextlib.contextmanager
 def instead_of(place: Any, name: str, other: object) -> Iterator[None]:
-    """What is there, which must be there, is another for a while."""
+    """Replace an existing attribute during the block."""
     before = getattr(place, name)
     setattr(place, name, other)
     try:
@@ -747,7 +741,7 @@ async def _run(world: World) -> None:
 
 
 def run(seed: int, say: Callable[[str], object] = lambda _line: None) -> None:
-    """One history. Raises `BrokenPromiseError`."""
+    """Run one history. Raises `BrokenPromiseError`."""
     loop = VirtualLoop()
     clock = SimpleNamespace(time=loop.time, monotonic=loop.time)
     keys = count(1)
@@ -760,12 +754,12 @@ def run(seed: int, say: Callable[[str], object] = lambda _line: None) -> None:
 
 
 def _nothing(*_given: Any, **_named: Any) -> list[Effect]:
-    """A part that is forgotten."""
+    """Do nothing, in place of a removed part."""
     return []
 
 
 def _without(kind: type[Any]) -> Callable[[Enactor, Any], None]:
-    """An enactor that leaves out effects of a kind."""
+    """Return an enactor that leaves out effects of a kind."""
     whole = Enactor.carry_out
     return lambda enactor, effects: whole(enactor, [one for one in effects if not isinstance(one, kind)])
 
@@ -777,7 +771,7 @@ def _granted_nowhere(self: RelayControl, post: Any, incarnation: Incarnation) ->
 
 
 MUTANTS: dict[str, tuple[Any, str, Any]] = {
-    "a subscriber is not told of a new publisher": (Graph, "tell", _nothing),
+    "a subscriber is not told of a new publisher": (RosGraph, "tell", _nothing),
     "nodes are told each other's own URIs": (
         Incarnation,
         "uri_for",
@@ -786,21 +780,21 @@ MUTANTS: dict[str, tuple[Any, str, Any]] = {
     "a reload takes back no registration": (Revocation, "_take_back", _nothing),
     "a reload takes back no grant": (Revocation, "_revoke", _nothing),
     "what a policy took is not put back": (Revocation, "returned", _nothing),
-    "an earlier life keeps its name": (Graph, "_take_name", _nothing),
+    "an earlier life keeps its name": (RosGraph, "_take_name", _nothing),
     "a lost node keeps its publications": (Registry, "_unindex", _nothing),
     "a new relay is not told of grants": (RelayControl, "_place", _granted_nowhere),
     "a grant is not kept": (Enactor, "carry_out", _without(SaveGrant)),
     "a registration is not kept": (Enactor, "carry_out", _without(SaveRegistration)),
     "the relay is not told of a grant": (Enactor, "carry_out", _without(PlaceGrant)),
     "the relay is not told what is revoked": (Enactor, "carry_out", _without(RevokeGrant)),
-    "the relay is not told who publishes": (Enactor, "carry_out", _without(Place)),
+    "the relay is not told who publishes": (Enactor, "carry_out", _without(PlaceResource)),
     "a node that comes back is placed nowhere": (Enactor, "carry_out", _without(PlaceNode)),
 }
-"""Faults of the core: where, and what stands there instead."""
+"""Faults of the core: the replaced attribute, and its replacement."""
 
 
 def first_broken(mutant: str, limit: int) -> int | None:
-    """The first seed whose history a faulty core does not keep the promises in."""
+    """Return the first seed whose history breaks a promise with a faulty core."""
     place, name, instead = MUTANTS[mutant]
     with instead_of(place, name, instead):
         for seed in range(limit):
@@ -812,8 +806,8 @@ def first_broken(mutant: str, limit: int) -> int | None:
 
 
 def main(arguments: list[str]) -> None:
-    """See the head of this file."""
-    if os.environ.get("PYTHONHASHSEED") != "0":  # sets of texts have another order in each process
+    """Run the command line that the head of this file describes."""
+    if os.environ.get("PYTHONHASHSEED") != "0":  # sets of strings have another order in each process
         os.environ["PYTHONHASHSEED"] = "0"
         os.execv(sys.executable, [sys.executable, "-m", "tests.support.histories", *arguments])  # noqa: S606  this program again
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))

@@ -1,4 +1,4 @@
-"""Stand-ins for the parts that a test does not look at."""
+"""Make replacements for the parts that a test does not use."""
 
 import functools
 import inspect
@@ -9,14 +9,14 @@ T = TypeVar("T")
 
 
 def idle(part: type[T]) -> T:
-    """An object of the class `part` that does nothing; see `idle_class`."""
+    """Return an object of the class `part` that does nothing; see `idle_class`."""
     return cast(T, idle_class(part)())
 
 
 def idle_class(part: type[object]) -> Any:
-    """A class like `part` whose public methods do nothing but refuse arguments that `part`'s would not take.
+    """Return a class like `part` whose public methods do nothing, and reject arguments that `part`'s reject.
 
-    So what is renamed in the product fails in its tests. Nothing is made of `part`: an object has no attributes.
+    So a renaming in the product fails in its tests. `part` is not instantiated: an object has no attributes.
     """
     methods = {
         name: _idle(method)

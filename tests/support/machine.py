@@ -1,12 +1,11 @@
-"""A virtual machine (QEMU) with Debian's cloud kernel, to run parts of the tests in a kernel of their own.
+"""Run parts of the tests in a virtual machine (QEMU) with Debian's cloud kernel.
 
     with Machine(directory) as machine:
         done = machine.run("ip", "xfrm", "state", seconds=10)
 
-It has no network card: what happens in it stays in it. Its disk is a snapshot that is gone when it ends, unless it is
-given a disk of its own, which it keeps over its next start. KVM is used
-where it really runs a guest, found out by trying; else QEMU computes every instruction itself (TCG), which is five to
-twenty times slower. The machine dies with the process that started it.
+It has no network card. Its disk is a snapshot that is discarded at its end, unless it is given its own disk, which
+persists over restarts. KVM is used where a trial shows that it runs a guest. Otherwise QEMU emulates every instruction
+(TCG), which is five to twenty times slower. The machine ends with the process that started it.
 """
 
 import contextlib
@@ -24,33 +23,33 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
-from appliance.network.patience import Progress
+from appliance.network.hang_detection import ProcessActivity
 from tests.support.machine_disk import ROOT, Kernel, checkout_archive, machine_disk, newest_kernel
 from tests.support.requirements import need_program, need_root
 
-BOOT_SECONDS = 900.0  # of a machine that gets on; one that stands still is not waited for
-_STILL_SECONDS = 60.0  # a kernel that has stopped halts its processors
+BOOT_SECONDS = 900.0  # for a machine that makes progress; a stalled one is not waited for
+_STILL_SECONDS = 60.0  # a halted kernel stops its processors
 KVM = Path("/dev/kvm")
 MEGABYTES = 2048
-# An emulated processor pays for every change of address space: the kernel's defences against its neighbours, of which
-# there are none, cost more than all the rest.
-# On a busy host the ticks of the emulated timer come too late for the kernel's test of it, which ends the boot ("8254
-# timer not connected to IO-APIC"): the timer is there, and is not to be tested.
+# An emulated processor pays for every change of address space. The kernel's defences against other tenants cost more
+# than everything else, and there are no other tenants.
+# On a busy host the ticks of the emulated timer come too late for the kernel's own test, which ends the boot ("8254
+# timer not connected to IO-APIC"). The timer exists, so the test is skipped.
 _KERNEL = "no_timer_check mitigations=off nowatchdog audit=0 systemd.show_status=0"
 _TRY_SECONDS = 8.0
 _OFF_SECONDS = 180.0
-# Programs in an emulated machine have limits of time of their own: it goes before what runs beside it. Where the kernel
-# shares the processors among sessions, the session has this number, too.
+# Programs in an emulated machine have time limits of their own: it gets priority over other processes. Where the kernel
+# divides the processors among sessions, the session gets this number as well.
 _NICE = "-5"
 
 
 class MachineError(AssertionError):
-    """The machine did not do what it was asked to; the text has the end of its console."""
+    """The machine failed; the text contains the end of its console."""
 
 
 @dataclass(frozen=True)
 class Done:
-    """What a program in the machine came to."""
+    """The outcome of a program in the machine."""
 
     status: int
     output: str
@@ -58,10 +57,10 @@ class Done:
 
 
 class Machine:
-    """One machine; a context manager. `directory` keeps its sockets and its console's text.
+    """One machine; a context manager. `directory` keeps its sockets and the text of its console.
 
     `disk` is written to; without it the machine has a snapshot of the tests' disk. `freight` writes the archive that
-    the agent unpacks before it takes orders; it is the checkout unless something else is given.
+    the agent unpacks before it takes orders; the default is the checkout.
     """
 
     def __init__(
@@ -85,7 +84,7 @@ class Machine:
         self._number = 0
 
     def start(self) -> Self:
-        """Boot; returns when the machine takes orders."""
+        """Boot, and return when the machine takes orders."""
         need_root()
         program = need_program("qemu-system-x86_64", "qemu-system-x86")
         kernel = newest_kernel()
@@ -95,7 +94,7 @@ class Machine:
         self._freight(checkout)
         port = self.directory / "agent.sock"
         began = time.monotonic()
-        # The death signal is sent when the *thread* ends that started it: pytest's fixtures run in the main one.
+        # The death signal is sent when the starting *thread* ends: pytest's fixtures run in the main thread.
         assert threading.current_thread() is threading.main_thread()
         with (self.directory / "qemu.log").open("wb") as log:
             self._process = subprocess.Popen(
@@ -119,7 +118,7 @@ class Machine:
 
     def run(self, *argv: str, seconds: float = 600.0, check: bool = True) -> Done:
         """Run a program as root in the checkout's folder; with `check`, a status other than 0 is a failure."""
-        assert self._line is not None, "the machine is not on"
+        assert self._line is not None, "the machine is not running"
         self._number += 1
         order = {"number": self._number, "argv": argv, "seconds": seconds}
         began = time.monotonic()
@@ -132,7 +131,7 @@ class Machine:
         return done
 
     def stop(self) -> bool:
-        """Switch it off as a person would; True if it did so by itself. What does not end is killed."""
+        """Shut down as with the power button; return True if that worked. A machine that does not end is killed."""
         process, self._process = self._process, None
         if process is None:
             return True
@@ -152,13 +151,13 @@ class Machine:
         return orderly
 
     def run_detached(self, *argv: str) -> None:
-        """Have a program run without waiting for what it comes to."""
+        """Start a program without waiting for its outcome."""
         assert self._line is not None
         order = {"number": 0, "argv": ["systemd-run", "--quiet", *argv], "seconds": 20}
         self._line.sendall(json.dumps(order).encode() + b"\n")
 
     def story(self) -> str:
-        """The end of its console, for the message of a failure."""
+        """Return the end of the console, for the message of a failure."""
         words = self.console.read_text(errors="backslashreplace")[-3000:] if self.console.exists() else ""
         log = self.directory / "qemu.log"
         return f"--- the machine's console\n{words}\n--- qemu\n{log.read_text() if log.exists() else ''}"
@@ -180,7 +179,7 @@ class Machine:
         ]
 
     def _connect(self, path: Path) -> socket.socket:
-        """QEMU makes the socket before it starts the machine."""
+        """Connect to the socket that QEMU makes before it starts the machine."""
         assert self._process is not None
         deadline = time.monotonic() + 20
         line = socket.socket(socket.AF_UNIX)
@@ -195,16 +194,16 @@ class Machine:
                 return line
 
     def _hear(self, seconds: float, still: float = math.inf) -> dict[str, Any]:
-        """The next answer; `still`: not waited for while the machine has computed nothing for so long."""
+        """Return the next answer; stop waiting once the machine has computed nothing for `still` seconds."""
         assert self._line is not None
         assert self._process is not None
-        began, progress = time.monotonic(), Progress(self._process.pid)
+        began, progress = time.monotonic(), ProcessActivity(self._process.pid)
         self._line.settimeout(1.0)
         while b"\n" not in self._received:
             try:
                 part = self._line.recv(65536)
             except TimeoutError:
-                waited, halted = time.monotonic() - began, progress.still_seconds()
+                waited, halted = time.monotonic() - began, progress.stalled_seconds()
                 if waited > seconds or halted > still:
                     how = f", and the machine stood still for {halted:.0f} s" if halted > still else ""
                     raise MachineError(f"no answer in {waited:.0f} s{how}\n{self.story()}") from None
@@ -229,7 +228,7 @@ class Machine:
 
 @cache
 def accelerator(program: str, kernel: Kernel) -> str:
-    """`kvm` where a kernel comes to its first line with it, else `tcg`; a device file alone proves nothing."""
+    """Return `kvm` where a kernel prints its first line with it, else `tcg`; a device file alone proves nothing."""
     if not KVM.exists():
         return "tcg"
     arguments = [*_hardware("kvm"), "-m", "256", "-kernel", str(kernel.image), "-serial", "stdio"]
@@ -249,7 +248,7 @@ def accelerator(program: str, kernel: Kernel) -> str:
 
 
 def _hardware(accelerator: str) -> list[str]:
-    """A machine with nothing that the tests do not use."""
+    """Return the options of a machine without hardware that the tests do not use."""
     processor = "host" if accelerator == "kvm" else "max"
     how = "kvm" if accelerator == "kvm" else "tcg,thread=multi"
     return [

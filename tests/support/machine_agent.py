@@ -1,4 +1,4 @@
-"""Runs in the virtual machine of the tests: takes one order per line from a virtio port, answers with its outcome.
+"""Run in the virtual machine of the tests: take one order per line from a virtio port, and answer with its outcome.
 
 An order is `{"number", "argv", "seconds"}`; its answer `{"number", "status", "output"}`, both JSON. The first line
 sent is `{"ready": true}`, once the checkout (a tar archive on the second disk) is unpacked. Standard library only: it
@@ -59,7 +59,7 @@ def _run(argv: list[str], seconds: float, root: str) -> tuple[int, str]:
 
 
 def _line(port: BinaryIO) -> bytes:
-    """One line; a port that nobody holds on the other side gives nothing, and is read again."""
+    """Return one line. Without a reader on the other side the port returns nothing, and is read again."""
     line = b""
     while not line.endswith(b"\n"):
         part = port.read(65536)

@@ -1,7 +1,7 @@
 """The disk of the tests' virtual machine: Debian, its cloud kernel's modules, the project's environment, the agent.
 
-Made under `build/machine/`, named by all that it was made from, and never written to afterwards: a machine works on a
-snapshot. The checkout is not on it, but on a disk of its own that is made for each start (`checkout_archive`).
+The image is under `build/machine/`, named by a key of its inputs, and never changed: a machine works on a snapshot.
+The checkout is on a second disk that is made for each start (`checkout_archive`).
 """
 
 import hashlib
@@ -21,11 +21,11 @@ FOLDER = ROOT / "build" / "machine"
 AGENT = Path(__file__).with_name("machine_agent.py")
 KERNEL = "linux-image-cloud-amd64"
 GIGABYTES = 4  # the file is sparse
-# A machine that is booted needs these beside what the project names in packages.txt; without a network it has what a
-# kit would install (curl), too.
+# Packages that a booted machine needs besides those in packages.txt. It has no network, so it needs curl as well, which
+# a kit would install.
 _MACHINES_OWN = ("systemd-sysv", "udev", "kmod", "procps", "openssl", "tcpdump", "curl")
-_COMPILERS = ("g++", "pkg-config")  # and every -dev package: nodes in the machine are rospy's
-# Of the environment: large, and for other tests.
+_COMPILERS = ("g++", "pkg-config")  # and every -dev package: nodes in the machine use rospy
+# parts of the environment that are large and only for other tests
 _NOT_IN_THE_MACHINE = ("playwright", "mypy", "numpy", "numpy.libs", "networkx", "jsonschema_rs")
 _UNIT = """\
 [Unit]
@@ -42,14 +42,14 @@ LimitNOFILE=65536
 [Install]
 WantedBy=multi-user.target
 """
-# Not started by itself: the tests start what they need.
+# Not started at boot: the tests start the services that they need.
 _QUIET = ("strongswan.service", "nftables.service", "e2scrub_reap.service", "apt-daily.timer")
 _QUIET_TOO = ("apt-daily-upgrade.timer", "dpkg-db-backup.timer", "e2scrub_all.timer", "fstrim.timer")
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """The cloud kernel of this machine, with its first RAM disk."""
+    """The cloud kernel of this machine, with its initial RAM disk."""
 
     release: str
     image: Path
@@ -62,7 +62,7 @@ class Kernel:
 
 
 def newest_kernel() -> Kernel:
-    """The newest cloud kernel that is installed here, as `packages-system.txt` asks for it."""
+    """Return the newest installed cloud kernel, as `packages-system.txt` asks for it."""
     found = [
         Kernel(release, image, initrd)
         for image in sorted(
@@ -77,14 +77,14 @@ def newest_kernel() -> Kernel:
 
 
 def machine_disk(kernel: Kernel) -> Path:
-    """The image of the tests' disk (ext4 without partitions), made now if there is none."""
+    """Return the image of the tests' disk (ext4 without partitions), and make it if there is none."""
     return _disk("disk", kernel, _packages(), environment=True)
 
 
 def clean_disk(kernel: Kernel, packages: tuple[str, ...], *, name: str = "clean") -> Path:
-    """The image of a Debian that knows nothing of the project: these packages, systemd, and the agent.
+    """Return the image of a Debian without the project: these packages, systemd, and the agent.
 
-    The newest of each `name` is kept.
+    For each `name` only the newest image is kept.
     """
     return _disk(name, kernel, (*packages, *_MACHINES_OWN), environment=False)
 
@@ -116,11 +116,11 @@ def _disk(name: str, kernel: Kernel, packages: tuple[str, ...], *, environment: 
 
 
 def checkout_archive(path: Path) -> None:
-    """Write the checkout as it stands, with its Python files compiled, as a tar archive to `path`."""
+    """Write the checkout with its uncommitted changes and compiled Python files as a tar archive to `path`."""
     for folder in ("appliance", "tests"):
         _compile(ROOT / folder, as_if_in=ROOT / folder)
     listed = subprocess.run(
-        # Root may run the tests of somebody else's checkout.
+        # Root may run the tests of another user's checkout.
         [
             "git",
             "-c",
@@ -154,7 +154,7 @@ def _packages() -> tuple[str, ...]:
 
 
 def _furnish(tree: Path, kernel: Kernel) -> None:
-    """Put into a Debian tree what makes it this machine."""
+    """Add the settings of this machine to a Debian tree."""
     shutil.copytree(kernel.modules, tree / "lib" / "modules" / kernel.release, symlinks=True)
     agent = tree / "usr/local/lib/rosrv-agent.py"
     agent.parent.mkdir(parents=True, exist_ok=True)
@@ -167,8 +167,8 @@ def _furnish(tree: Path, kernel: Kernel) -> None:
     for name in (*_QUIET, *_QUIET_TOO):
         for place in units.glob(f"*.wants/{name}"):
             place.unlink()
-    (tree / "etc/machine-id").write_text("")  # one of its own at each start
-    # systemd empties /tmp at its start: the checkout may lie there.
+    (tree / "etc/machine-id").write_text("")  # a new one at each start
+    # systemd empties /tmp at its start, and the checkout may be there
     kept = tree / "etc/tmpfiles.d"
     kept.mkdir(exist_ok=True)
     (kept / "tmp.conf").symlink_to("/dev/null")
@@ -189,17 +189,17 @@ def _too_large(_folder: str, names: list[str]) -> Iterable[str]:
 
 
 def _compile(folder: Path, *, as_if_in: Path) -> None:
-    """Compile what is not compiled yet: the machine would need ten times as long, in every process it starts."""
+    """Compile all Python files in advance: the machine would need ten times as long, in every process."""
     command = [str(ROOT / ".venv/bin/python"), "-m", "compileall", "-q", "-j", "2"]
     done = subprocess.run(
         [*command, "-s", str(folder), "-p", str(as_if_in), str(folder)], capture_output=True, check=False
     )
-    # Some packages carry templates and examples that no interpreter takes; those are imported by nobody.
+    # Some packages contain templates and examples that do not compile; nothing imports them.
     assert done.returncode in (0, 1), done.stderr
 
 
 def _key(base: Path, kernel: Kernel) -> str:
-    """All that the disk is made from. An environment is named by the lock file it was made from."""
+    """Return a key of all inputs of the disk. An environment is identified by its lock file."""
     parts = [base.name, kernel.release, str(ROOT), AGENT.read_text(), Path(__file__).read_text()]
     parts.append((ROOT / "requirements-dev.lock").read_text())
     parts.append((ROOT / "pyproject.toml").read_text())

@@ -4,8 +4,8 @@
         ros.talker("rospy", "/chatter")
         ros.listener("roscpp", "/chatter").wait_for(event="received")
 
-The programs are in `rospy_nodes/` and `roscpp_nodes/`; both kinds print the same events. A process is told of
-the master by ROS_MASTER_URI and of its own address by ROS_IP, nothing else.
+The programs are in `rospy_nodes/` and `roscpp_nodes/`; both kinds print the same events. The only ROS settings of a
+process are ROS_MASTER_URI and, for its own address, ROS_IP.
 """
 
 import fcntl
@@ -15,12 +15,12 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal, Self
 
 from tests.support import forks
-from tests.support.processes import LIMIT, Host, Process, ThisMachine
+from tests.support.processes import LIMIT, Event, Host, Process, ThisMachine
 
 Client = Literal["rospy", "roscpp"]
 PYTHON = forks.PYTHON
@@ -29,13 +29,13 @@ ROOT = HERE.parents[1]
 BUILD = ROOT / "build" / "tests"
 
 
-# rospy ends in its signal handler. One that comes in the middle of `publish` waits for a lock that `publish` holds, or
-# that another thread of rospy has, which waits for that one.
+# rospy ends in its signal handler. A signal in the middle of `publish` waits for a lock that `publish` holds, or for a
+# thread that waits for that lock.
 _IN_ITS_OWN_WAY = re.compile(r"Current thread.*in signal_shutdown.*in _ros_signal.*in publish", re.DOTALL)
 
 
 class RosSession:
-    """The nodes and tools of one test; ends all of them, at once."""
+    """The nodes and tools of one test; all end with it."""
 
     def __init__(self, master_uri: str, home: Path, host: Host | None = None) -> None:
         self.master_uri, self.home = master_uri, home
@@ -43,13 +43,13 @@ class RosSession:
         self.processes: list[Process] = []
 
     def on(self, host: Host) -> "RosSession":
-        """The same session's nodes, started on another host."""
+        """Return the same session for another host."""
         other = RosSession(self.master_uri, self.home, host)
         other.processes = self.processes
         return other
 
     def environment(self, host: Host) -> dict[str, str]:
-        """What a node's process sees: of ROS, only the master and its own address."""
+        """Return the environment of a node: of ROS, only the master and its own address."""
         kept = {
             key: value
             for key, value in os.environ.items()
@@ -61,12 +61,12 @@ class RosSession:
             "ROS_HOME": str(self.home),
             "ROS_LOG_DIR": str(self.home / "log"),
             "PYTHONUNBUFFERED": "1",
-            "PYTHONFAULTHANDLER": "1",  # one that does not end says where it stands
+            "PYTHONFAULTHANDLER": "1",  # on a stuck process, print its stack
             "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
         }
 
     def start(self, command: Sequence[str], *, label: str | None = None, **environment: str) -> Process:
-        """Any program, in the environment of a node."""
+        """Start any program in the environment of a node."""
         process = Process(
             forks.Forking(self.host),
             command,
@@ -78,7 +78,7 @@ class RosSession:
         return process
 
     def node(self, client: Client, program: str, *arguments: str, name: str | None = None) -> Process:
-        """A node of the tests, once it says that it is registered; it runs until the session ends."""
+        """Start a node of the tests and wait until it reports its registration; it runs until the session ends."""
         name = name or f"{program}_{len(self.processes)}"
         if client == "rospy":
             command = [PYTHON, str(HERE / "rospy_nodes" / f"{program}.py")]
@@ -89,29 +89,29 @@ class RosSession:
         return process
 
     def talker(self, client: Client, topic: str, *options: str, name: str | None = None) -> Process:
-        """Publishes std_msgs/String `hello N` ten times a second; `--latch` once, latched; `--text T`."""
+        """Publish std_msgs/String `hello N` ten times a second; `--latch` once, latched; `--text T`."""
         return self.node(client, "talker", topic, *options, name=name)
 
     def listener(self, client: Client, topic: str, *options: str, name: str | None = None) -> Process:
-        """Subscribes to std_msgs/String; event `received` with `data` and `publisher`."""
+        """Subscribe to std_msgs/String; event `received` with `data` and `publisher`."""
         return self.node(client, "listener", topic, *options, name=name)
 
     def service_server(self, client: Client, service: str, name: str | None = None) -> Process:
-        """Offers a std_srvs/SetBool that answers with the negation; event `called`."""
+        """Offer a std_srvs/SetBool that answers with the negation; event `called`."""
         return self.node(client, "service_server", service, name=name)
 
     def service_client(self, client: Client, service: str, *options: str, name: str | None = None) -> Process:
-        """Calls a std_srvs/SetBool for each line `true` or `false` on its input; `answered` or `failed`."""
+        """Call a std_srvs/SetBool for each line `true` or `false` on the input; `answered` or `failed`."""
         return self.node(client, "service_client", service, *options, name=name)
 
     def parameters(self, client: Client, *options: str, name: str | None = None) -> Process:
-        """Gets, sets and watches parameters as told on its input, see the programs."""
+        """Get, set and watch parameters by orders on the input; see the programs."""
         return self.node(client, "parameters", *options, name=name)
 
     def run(
         self, *command: str, timeout: float = LIMIT, check: bool = True, text: str | None = None
     ) -> subprocess.CompletedProcess[str]:
-        """A stock tool that ends by itself: its output. `check`: a failure is the test's failure."""
+        """Run a stock tool to its end and return its output. With `check`, a failure fails the test."""
         with (
             tempfile.TemporaryFile("w+") as given,
             tempfile.TemporaryFile("w+") as out,
@@ -142,7 +142,7 @@ class RosSession:
         return done
 
     def story(self) -> str:
-        """What every process said, for the message of a failure."""
+        """Return the output of every process, for the message of a failure."""
         return "\n".join(process.story() for process in self.processes)
 
     def __enter__(self) -> Self:
@@ -158,17 +158,27 @@ class RosSession:
             for process in self.processes
             if process.deaf and not _IN_ITS_OWN_WAY.search(process.story())
         ]
-        assert not deaf, "did not end when interrupted:\n" + "\n".join(deaf)
+        assert not deaf, "did not end on SIGINT:\n" + "\n".join(deaf)
+
+
+def numbers(events: Iterable[Event]) -> list[int]:
+    """Return the numbers of a talker's messages in these events."""
+    return [int(event["data"].split()[-1]) for event in events]
+
+
+def without_gap(numbers: Sequence[int]) -> bool:
+    """Whether no number is missing between the first and the last, none is repeated, and the order is kept."""
+    return list(numbers) == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
 @functools.cache
 def roscpp_program(name: str) -> Path:
-    """The compiled node; compiled on first use and again when its source changes."""
+    """Return the compiled node; it is compiled on first use and after changes of its source."""
     source, header = HERE / "roscpp_nodes" / f"{name}.cpp", HERE / "roscpp_nodes" / "report.hpp"
     target = BUILD / name
     BUILD.mkdir(parents=True, exist_ok=True)
     with (BUILD / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # one at a time; the second finds what the first has made
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one at a time; a second process waits and finds it
         if target.exists() and header.stat().st_mtime > target.stat().st_mtime:
             target.unlink()
         subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(source), str(target)], check=True)

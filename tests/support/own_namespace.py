@@ -1,4 +1,4 @@
-"""Isolation netns has one namespace and one lock a machine: tests that start it on this machine take turns."""
+"""Isolation netns has one namespace and one lock per machine: tests that use it take turns."""
 
 import contextlib
 import fcntl
@@ -11,7 +11,7 @@ _TURN = Path(tempfile.gettempdir()) / "rosrv-test-netns.lock"
 
 @contextlib.contextmanager
 def own_namespace() -> Iterator[None]:
-    """Wait until no other test has an appliance with isolation netns, which is what `rosrv up` takes by itself."""
+    """Wait until no other test runs an appliance with isolation netns, the default of `rosrv up`."""
     with _TURN.open("w") as turn:
         fcntl.flock(turn, fcntl.LOCK_EX)
         yield

@@ -1,7 +1,7 @@
-"""A process of a test: its events as they are printed, its end by its own id, its output when a test fails.
+"""A process of a test: read its events as they are printed, end it by its own id, show its output on failure.
 
 Programs of the tests print one JSON object per line; a test waits for the line it needs, with a limit, and
-never sleeps. What is not JSON (stock tools, warnings) is kept as `{"text": line}`.
+never sleeps. Other lines (stock tools, warnings) are kept as `{"text": line}`.
 """
 
 import contextlib
@@ -15,16 +15,16 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, Self
 
 Event = dict[str, Any]
-# Seconds; generous, the machine may be busy. A machine that is known to be slow (an emulated one) asks for more.
+# Seconds; generous, as the machine may be busy. A slow machine (an emulated one) asks for more.
 LIMIT = 30.0 * float(os.environ.get("TESTS_PATIENCE", "1"))
 
 
 class Host(Protocol):
-    """Where a process runs: the machine itself, or a host of the lab (`examples.landshark.lab.Host`)."""
+    """A place to run processes: this machine, or a host of the lab (`examples.landshark.lab.Host`)."""
 
     @property
     def address(self) -> str:
-        """The address the host is known by."""
+        """The address of the host."""
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
         """Start a process there."""
@@ -79,12 +79,12 @@ class Process:
 
     @property
     def pid(self) -> int:
-        """The process id, as this machine sees it."""
+        """The process id on this machine."""
         return int(self.popen.pid)
 
     @property
     def running(self) -> bool:
-        """Whether the process has not ended."""
+        """Whether the process is still running."""
         return self.popen.poll() is None
 
     def wait_for(
@@ -95,9 +95,9 @@ class Process:
         since: int = 0,
         **fields: Any,
     ) -> Event:
-        """The first event (from index `since` on) that `wanted` accepts and that has these fields.
+        """Return the first event (from index `since` on) that `wanted` accepts and that has these fields.
 
-        Fails with everything the process said when it does not come within `timeout` seconds.
+        Fails with the whole output of the process if the event does not come within `timeout` seconds.
         """
 
         def accepts(event: Event) -> bool:
@@ -119,7 +119,7 @@ class Process:
                 self._changed.wait(left)
 
     def wait_for_text(self, text: str, *, timeout: float = LIMIT, since: int = 0) -> str:
-        """The first line of plain output that contains `text`."""
+        """Return the first line of plain output that contains `text`."""
         line = self.wait_for(lambda event: text in event.get("text", ""), timeout=timeout, since=since)
         return str(line["text"])
 
@@ -127,12 +127,12 @@ class Process:
         """Wait until a line that contains `text` is on its standard error."""
         with self._changed:
             there = self._changed.wait_for(lambda: any(text in line for line in self.errors), timeout)
-        assert there, f"it did not say {text!r} within {timeout:.0f} s\n{self.story()}"
+        assert there, f"it did not print {text!r} within {timeout:.0f} s\n{self.story()}"
 
     def wait_for_count(
         self, count: int, *, timeout: float = LIMIT, since: int = 0, **fields: Any
     ) -> list[Event]:
-        """The first `count` events (from index `since` on) that have these fields; each within `timeout` seconds."""
+        """Return the first `count` events (from index `since` on) with these fields; each within `timeout` seconds."""
         found: list[Event] = []
         position = since
         deadline = time.monotonic() + timeout
@@ -154,12 +154,12 @@ class Process:
                 self._changed.wait(left)
 
     def mark(self) -> int:
-        """A position in the events: pass it as `since` to look only at what comes after it."""
+        """Return a position in the events: pass it as `since` to see only later events."""
         with self._changed:
             return len(self.events)
 
     def seen(self, **fields: Any) -> list[Event]:
-        """All events so far that have these fields."""
+        """Return all events so far that have these fields."""
         with self._changed:
             return [event for event in self.events if all(event.get(k) == v for k, v in fields.items())]
 
@@ -170,7 +170,7 @@ class Process:
         self.popen.stdin.flush()
 
     def wait(self, *, timeout: float = LIMIT) -> int:
-        """The exit status, once the process has ended by itself and all its output is read."""
+        """Return the exit status, once the process has ended and all its output is read."""
         try:
             status = self.popen.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -180,24 +180,24 @@ class Process:
         return int(status)
 
     def output(self) -> str:
-        """The plain text the program printed so far."""
+        """Return the plain text the program printed so far."""
         with self._changed:
             return "\n".join(
                 event["text"] if set(event) == {"text"} else json.dumps(event) for event in self.events
             )
 
     def interrupt(self, with_signal: int = signal.SIGINT) -> None:
-        """Ask the process to end, and do not wait for it: `stop` does."""
+        """Ask the process to end without waiting for it, as `stop` does."""
         if self.popen.stdin is not None:
             with contextlib.suppress(BrokenPipeError):
-                self.popen.stdin.close()  # a program that waits for its next order ends by this
+                self.popen.stdin.close()  # ends a program that waits for its next order
         if self.running:
             self.popen.send_signal(with_signal)
         self._asked = True
 
     def stop(self, *, with_signal: int = signal.SIGINT, timeout: float = 20) -> int:
-        """End the process: by the signal, and when it does not listen, by SIGABRT (a Python program then says where it
-        stands) and SIGKILL to its own session.
+        """End the process with the signal, then with SIGABRT (a Python program then prints its stack) and
+        SIGKILL to its session if it does not end.
         """
         if not self._asked:
             self.interrupt(with_signal)
@@ -219,13 +219,13 @@ class Process:
         return status
 
     def kill(self) -> None:
-        """End the process and whatever it started, at once and without a word (as a crash does)."""
+        """Kill the process and its children at once, as a crash does."""
         if self.running:
             os.killpg(self.popen.pid, signal.SIGKILL)
         self.popen.wait(LIMIT)
 
     def story(self) -> str:
-        """What the process said, for the message of a failure."""
+        """Return the output of the process, for the message of a failure."""
         with self._changed:
             events = [json.dumps(event) for event in self.events[-40:]]
             errors = self.errors[-40:]

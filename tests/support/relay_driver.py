@@ -1,8 +1,8 @@
-"""Plays control for a real relay process: a master that real ROS nodes use, in front of a real rosmaster.
+"""Play control for a real relay process: a master for real ROS nodes, in front of a real rosmaster.
 
-Every node that registers gets a face (an XML-RPC server that stands for its API) and a relay port. The face
-answers `requestTopic` with the relay port after installing the grant, and hands everything else to the node
-itself. This is the least that puts a relay between unmodified nodes; it decides nothing and protects nothing.
+Every node that registers gets a proxy endpoint (an XML-RPC server in place of its API) and a relay port. The endpoint
+answers `requestTopic` with the relay port after installing the permission, and forwards all other calls to the node.
+This is the minimum that puts a relay between unmodified nodes; it makes no decisions and protects nothing.
 Run as a program it serves until its standard input ends, for measurements:
 
     python3 -m tests.support.relay_driver --master-port 11611 --rosmaster-port 11612
@@ -51,6 +51,7 @@ from appliance.channel.messages import (
     UpstreamRefused,
     UpstreamWanted,
 )
+from tests.support.processes import LIMIT
 from tests.support.waiting import eventually
 
 LOOPBACK = "127.0.0.1"
@@ -69,7 +70,7 @@ class _Handler(SimpleXMLRPCRequestHandler):
 
 
 class ChannelPeer:
-    """One end of a channel, served by a thread; remembers what came and lets tests wait for it."""
+    """One end of a channel, served by a thread; keeps its messages and lets tests wait for them."""
 
     def __init__(
         self, sock: socket.socket, union: Any, received: Callable[[Any], None] | None = None
@@ -92,11 +93,11 @@ class ChannelPeer:
         self._wake.send(b"x")
 
     def send_bytes(self, data: bytes) -> None:
-        """Send what is no message."""
+        """Send bytes that are not a message."""
         os.write(self._channel.fileno(), data)
 
     def wait_for(self, wanted: Callable[[Any], bool], seconds: float = 20.0, after: int = 0) -> Any:
-        """The first message (from index `after` on) that fits; fails loudly when none comes."""
+        """Return the first message (from index `after` on) that fits; fail when none comes."""
         deadline = time.monotonic() + seconds
         with self._changed:
             while True:
@@ -111,7 +112,7 @@ class ChannelPeer:
                 self._changed.wait(left)
 
     def close(self) -> None:
-        """End the channel as the death of a process would."""
+        """Close the channel as the death of a process would."""
         if self._closed:
             return
         self._closed = True
@@ -149,13 +150,13 @@ class ChannelPeer:
 
 
 class RelayProcess:
-    """A real relay process with its lifeline, and the links to the controls a test plays."""
+    """A real relay process with its lifeline, and the links to the controls that a test plays."""
 
     def __init__(self, limits: str = "None") -> None:
         ours, theirs = socket.socketpair()
         code = (
-            "import sys; from appliance.relay.process import main; from appliance.relay.bounds import Limits;"
-            f" main(int(sys.argv[1]), 0, {limits})"
+            "import sys; from appliance.relay.process import main;"
+            f" from appliance.relay.relay_limits import RelayLimits; main(int(sys.argv[1]), 0, {limits})"
         )
         self.process = subprocess.Popen(
             [sys.executable, "-c", code, str(theirs.fileno())],
@@ -167,7 +168,7 @@ class RelayProcess:
         self.ready: Ready = self.lifeline.wait_for(lambda message: isinstance(message, Ready))
 
     def open_link(self, received: Callable[[Any], None] | None = None) -> ChannelPeer:
-        """Be the control from now on."""
+        """Become the control of this relay."""
         ours, theirs = socket.socketpair()
         link = ChannelPeer(ours, RelayLink, received)
         self.lifeline.send(LinkOpened("control", 0), (theirs.fileno(),))
@@ -175,9 +176,9 @@ class RelayProcess:
         return link
 
     def ping(self, number: int) -> None:
-        """Wait for two turns of the relay's main loop: everything sent to it before has been carried out.
+        """Wait for two turns of the relay's main loop: all earlier messages have been carried out.
 
-        The first may be the one in which it is given a link, and has not read what was sent over that.
+        In the first turn the relay may only accept a link, without reading from it.
         """
         for answer in (Pong(number), Pong(number + 1_000_000)):
             after = len(self.lifeline.messages)
@@ -185,22 +186,22 @@ class RelayProcess:
             self.lifeline.wait_for(answer.__eq__, after=after)
 
     def stop(self) -> int:
-        """End it as the supervisor does; its exit status."""
+        """Stop the relay as the supervisor does, and return its exit status."""
         if self.process.poll() is None:
             self.lifeline.send(Stop())
-        status = self.process.wait(10)
+        status = self.process.wait(LIMIT)
         self.lifeline.close()
         return status
 
     def kill(self) -> None:
-        """End it as a crash does."""
+        """Kill the relay as a crash does."""
         self.process.send_signal(signal.SIGKILL)
-        self.process.wait(10)
+        self.process.wait(LIMIT)
         self.lifeline.close()
 
 
 class Face:
-    """What stands for one node: its API, and the relay's port for its topics and services."""
+    """The proxy endpoint of one node: its API, and the relay's port for its topics and services."""
 
     def __init__(self, driver: "RelayDriver", name: str, uri: str) -> None:
         self.driver = driver
@@ -231,7 +232,7 @@ class Face:
         return call(self.real_uri, method, *parameters)
 
     def statements(self) -> list[tuple[Message, tuple[int, ...]]]:
-        """Everything control says about this incarnation."""
+        """Return all statements of control about this incarnation."""
         return [
             (NodePlaced(self.key, self.name, LOOPBACK), (self.listening.fileno(),)),
             *((PublicationPlaced(self.key, topic, kind), ()) for topic, kind in self.publications.items()),
@@ -241,7 +242,7 @@ class Face:
         ]
 
     def close(self) -> None:
-        """End the face."""
+        """Close the endpoint."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join(5)
@@ -287,10 +288,10 @@ class RelayDriver:
         for face in [*self.faces.values(), *self._gone]:
             face.close()
         self.rosmaster.terminate()
-        self.rosmaster.wait(10)
+        self.rosmaster.wait(LIMIT)
 
     def restart_control(self, *, leave_out: Callable[[Message], bool] = lambda _message: False) -> None:
-        """A new control restates everything, except what `leave_out` picks."""
+        """Connect a new control, which restates everything except the statements that `leave_out` accepts."""
         self.link.close()
         self.link = self.relay.open_link(self._received)
         self.link.send(StateBegan(7))
@@ -302,7 +303,7 @@ class RelayDriver:
         self.relay.ping(7)
 
     def environment(self) -> dict[str, str]:
-        """What a node needs to find this master."""
+        """Return the environment in which a node finds this master."""
         return {**os.environ, "ROS_MASTER_URI": self.uri, "ROS_IP": LOOPBACK, "PYTHONWARNINGS": "ignore"}
 
     def _face(self, name: str, uri: str) -> Face:
@@ -318,7 +319,7 @@ class RelayDriver:
             return face
 
     def _dispatch(self, method: str, parameters: tuple[Any, ...]) -> Any:
-        """The Master API: registrations carry the face's URI, services the relay's port."""
+        """Serve the Master API: registrations get the endpoint's URI, services the relay's port."""
         arguments = list(parameters)
         if method in {
             "registerPublisher",
@@ -378,13 +379,13 @@ class RelayDriver:
 
 
 def call(uri: str, method: str, *arguments: Any) -> Any:
-    """One XML-RPC call on a connection of its own."""
+    """Make one XML-RPC call on its own connection."""
     with xmlrpc.client.ServerProxy(uri, allow_none=True) as proxy:
         return getattr(proxy, method)(*arguments)
 
 
 def free_port() -> int:
-    """A port that is free now; only for programs that cannot be given port 0 (rosmaster)."""
+    """Return a port that is free now; only for programs that do not accept port 0 (rosmaster)."""
     with socket.create_server((LOOPBACK, 0)) as sock:
         return int(sock.getsockname()[1])
 

@@ -1,10 +1,10 @@
-"""The memory of a relay for tests of its parts."""
+"""Quotas of the relay's memory for tests of its parts."""
 
-from appliance.quotas.pool import Bounds, Standing
-from appliance.relay.connections.memory import HostShare, HostShares
+from appliance.quotas.pool import Bounds, QuotaClass
+from appliance.relay.transport.memory import HostMemory, MemoryPool
 
 
-def share(limit: int = 1 << 30) -> HostShare:
-    """The share of a host that is alone and may hold so many bytes."""
+def share(limit: int = 1 << 30) -> HostMemory:
+    """Return the quota of the only host, which may hold `limit` bytes."""
     bounds = Bounds(2 * limit, 2 * limit, 0, 0)
-    return HostShares("bytes", bounds, lambda _host: Standing.REGISTERED).of("host")
+    return MemoryPool("bytes", bounds, lambda _host: QuotaClass.REGISTERED).of("host")

@@ -1,4 +1,4 @@
-"""What a test needs of the machine. What is missing skips the test on a laptop and fails it in CI.
+"""Check what a test needs of the machine. A missing requirement skips the test on a laptop and fails it in CI.
 
 `needs(condition, text)` is called at the head of a test or fixture; with `CI=true` in the environment a
 missing thing is a failure, so a test cannot quietly stop running.
@@ -13,7 +13,7 @@ from appliance.network.namespaces import has_privileges
 
 
 def needs(condition: object, text: str) -> None:
-    """Go on if `condition` holds; else skip the test, or fail it in CI, with what is needed."""
+    """Continue if `condition` holds; else skip the test, or fail it in CI, with `text` as the reason."""
     if condition:
         return
     if os.environ.get("CI", "").lower() in ("1", "true", "yes"):
@@ -22,7 +22,7 @@ def needs(condition: object, text: str) -> None:
 
 
 def need_root() -> None:
-    """Network namespaces and the firewall can be changed here."""
+    """Require root, for network namespaces and the firewall."""
     needs(has_privileges(), "root (CAP_SYS_ADMIN and CAP_NET_ADMIN): run the tests with sudo")
 
 

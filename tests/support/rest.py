@@ -1,4 +1,4 @@
-"""A client of the appliance's REST interface, as a script would write it with the standard library.
+"""A client of the appliance's REST interface, written as a user's script would be, with the standard library.
 
 rest = Rest(appliance.ready["api"], appliance.ready["token"], certificate)
 assert rest.get("/v1/policy").status == 200
@@ -34,36 +34,36 @@ class Answer:
 
     @property
     def etag(self) -> str:
-        """Its ETag."""
+        """The ETag of the answer."""
         return self.headers["etag"]
 
 
 class Rest:
-    """Makes requests, each on a connection of its own.
+    """Make requests, each on a connection of its own.
 
-    Told that this host asks too much (429), it asks again when it may, as a good client does: what another test asked
-    of an appliance that they share is not this test's failure. A test of that answer takes `impatient()`.
+    After a 429 the request is repeated when the server allows it, as a good client does: requests of other tests to a
+    shared appliance must not fail this test. A test of the 429 uses `impatient()`.
     """
 
     def __init__(
         self, url: str, token: str | None = None, certificate: Path | None = None, *, patient: bool = True
     ) -> None:
-        """`certificate` is what an https server is trusted by."""
+        """Take the address and token; `certificate` verifies an https server."""
         self.url = urllib.parse.urlsplit(url)
         self.token = token
         self.certificate = certificate
         self.patient = patient
 
     def with_token(self, token: str | None) -> "Rest":
-        """The same place, asked by somebody else."""
+        """Return a client of the same server with another token."""
         return Rest(self.url.geturl(), token, self.certificate, patient=self.patient)
 
     def impatient(self) -> "Rest":
-        """The same, which takes the first answer."""
+        """Return a client of the same server that does not repeat requests."""
         return Rest(self.url.geturl(), self.token, self.certificate, patient=False)
 
     def connect(self, timeout: float = 30, source: str = "") -> http.client.HTTPConnection:
-        """A connection, from the address `source` of this machine if it is given."""
+        """Open a connection, from the address `source` of this machine if given."""
         assert self.url.hostname is not None
         local = (source, 0) if source else None
         if self.url.scheme == "http":
@@ -76,14 +76,14 @@ class Rest:
         )
 
     def headers(self, given: dict[str, str] | None = None) -> dict[str, str]:
-        """What is sent with every request."""
+        """Return the headers of every request."""
         known = {"Authorization": f"Bearer {self.token}"} if self.token is not None else {}
         return known | (given or {})
 
     def request(
         self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
     ) -> Answer:
-        """One request; the last answer of several to a patient one."""
+        """Make one request and return its last answer."""
         with self._asked(method, path, body, headers) as response:
             names = {name.lower(): value for name, value in response.getheaders()}
             return Answer(response.status, names, response.read())
@@ -112,7 +112,7 @@ class Rest:
         )
 
     def post(self, path: str, body: Any = None, *, match: str | None = None) -> Answer:
-        """POST: a text as text/plain, anything else as JSON; `match` is If-Match."""
+        """POST: a string as text/plain, anything else as JSON; `match` is If-Match."""
         headers = {} if match is None else {"If-Match": match}
         if isinstance(body, str):
             return self.request("POST", path, body.encode(), headers | {"Content-Type": "text/plain"})
@@ -120,9 +120,9 @@ class Rest:
         return self.request("POST", path, None if body is None else json.dumps(body).encode(), headers)
 
     def events(self, path: str, timeout: float = 30, **headers: str) -> Generator[dict[str, str], None, None]:
-        """Server-sent events, one dict of its fields each; the first, `{}`, says that the stream is open.
+        """Yield server-sent events as dicts of their fields; the first, `{}`, reports that the stream is open.
 
-        Each is waited for at most `timeout` seconds: the appliance's pings keep a stream alive, not a test.
+        Each is waited for at most `timeout` seconds: the appliance's pings keep a stream open, but not a test.
         """
         given = {name.replace("_", "-"): text for name, text in headers.items()}
         with self._asked("GET", path, None, given, timeout) as response:

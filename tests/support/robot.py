@@ -1,8 +1,8 @@
-"""A robot of a hundred nodes and two hundred topics: its nodes register, and the topics with a rate flow.
+"""Run a robot of a hundred nodes and two hundred topics; the nodes register, and topics with a rate have messages.
 
 The nodes of one machine share one API and one listener, on addresses of the loopback (127.0.0.11 and on), so that the
-appliance sees as many hosts as the robot has machines. What flows is published and read over TCPROS, as ROS's own
-nodes would.
+appliance sees as many hosts as the robot has machines. Messages are published and read over TCPROS, as by ROS's own
+nodes.
 
     with Robot(appliance.master_uri) as robot:
         robot.call("/base/planner", "registerPublisher", "/guarded", "std_msgs/String", robot.api("/base/planner"))
@@ -48,14 +48,14 @@ _LENGTH = struct.Struct("<I")
 
 
 def nodes() -> Iterator[tuple[str, str]]:
-    """The robot's nodes, with the address of the machine each runs on."""
+    """Return the robot's nodes, with the address of each node's machine."""
     for machine, spaces in MACHINES.items():
         for space, part in itertools.product(spaces, PARTS):
             yield f"/{space}/{part}", machine
 
 
 def publications() -> Iterator[tuple[str, str]]:
-    """Who publishes what: two topics each; those that flow have their own names."""
+    """Return the publications: two topics for each node; those with messages have names of their own."""
     own = {("/arm/planner", 0): "/arm/command", ("/arm/driver", 0): "/arm/joint", ("/base/planner", 0): "/base/cmd_vel",
            ("/lidar/driver", 0): "/lidar/range", ("/camera/driver", 0): "/camera/exposure"}  # fmt: skip
     for node, _machine in nodes():
@@ -64,7 +64,7 @@ def publications() -> Iterator[tuple[str, str]]:
 
 
 def subscriptions() -> Iterator[tuple[str, str]]:
-    """Who hears what: each node the one before it in its namespace; a few hear other parts of the robot."""
+    """Return the subscriptions: each node to the one before it in its namespace; a few to other parts of the robot."""
     outputs: dict[str, str] = {}
     for node, topic in publications():
         outputs.setdefault(node, topic)
@@ -82,7 +82,7 @@ def subscriptions() -> Iterator[tuple[str, str]]:
 
 
 class Robot:
-    """Registers all of it on entering; on leaving its nodes stop, without a word to the master."""
+    """Register the whole robot on entering; on leaving its nodes stop without unregistering."""
 
     def __init__(self, master_uri: str) -> None:
         self._master_uri = master_uri
@@ -91,11 +91,11 @@ class Robot:
         self._stack = contextlib.ExitStack()
 
     def api(self, node: str) -> str:
-        """The URI of a node."""
+        """Return the URI of a node."""
         return self._machines[self._machine[node]].uri
 
     def call(self, node: str, method: str, *arguments: Any) -> Any:
-        """A call of the Master API as this node, from its machine."""
+        """Make a call of the Master API as this node, from its machine."""
         with _proxy(self._master_uri, self._machine[node]) as master:
             return getattr(master, method)(node, *arguments)
 
@@ -122,7 +122,7 @@ class Robot:
 
 
 class _Machine:
-    """One machine of the robot: an API that agrees to everything, a listener, and subscribers."""
+    """One machine of the robot: an API that accepts everything, a listener, and subscribers."""
 
     def __init__(self, address: str) -> None:
         self._address = address
@@ -157,7 +157,7 @@ class _Machine:
         return [1, "", 4711 if method == "getPid" else 0]
 
     def hear(self, node: str, topic: str, publisher: str) -> None:
-        """Subscribe: ask the publisher where, and read until one of the two ends."""
+        """Subscribe: ask the publisher for its port, and read until either end closes."""
         with _proxy(publisher, self._address) as api:
             _code, _text, (_protocol, host, port) = api.requestTopic(node, topic, [["TCPROS"]])
         connection = socket.create_connection((host, port), source_address=(self._address, 0))
@@ -179,7 +179,7 @@ class _Listener(ThreadingTCPServer):
 
 
 class _From(xmlrpc.client.Transport):
-    """Calls from an address of this machine."""
+    """Make calls from an address of this machine."""
 
     def __init__(self, address: str) -> None:
         super().__init__()
@@ -187,7 +187,7 @@ class _From(xmlrpc.client.Transport):
 
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
         connection = http.client.HTTPConnection(str(host), timeout=30, source_address=(self._address, 0))
-        self._connection = host, connection  # what the proxy closes
+        self._connection = host, connection  # closed by the proxy
         return connection
 
 
@@ -203,8 +203,8 @@ _DEFINITIONS = standard_definitions()
 
 
 def _publish(connection: socket.socket, over: threading.Event) -> None:
-    """Answer one subscriber, and send it the topic at its rate; without a rate there is silence until it ends."""
-    with contextlib.suppress(ConnectionError):  # it may go at any moment
+    """Answer one subscriber, and send it the topic at its rate, or nothing without a rate, until it ends."""
+    with contextlib.suppress(ConnectionError):  # it may end at any time
         _serve(connection, over)
 
 
@@ -231,18 +231,18 @@ def _exactly(connection: socket.socket, size: int) -> bytes:
     while len(data) < size:
         more = connection.recv(size - len(data))
         if not more:
-            raise ConnectionError("the subscriber went before its header was there")
+            raise ConnectionError("the subscriber closed before its header arrived")
         data += more
     return data
 
 
 def _read(connection: socket.socket) -> None:
-    """To its end: the appliance may be gone before the robot, and reset what was on its way."""
+    """Read to the end: the appliance may end before the robot, and reset connections."""
     with contextlib.suppress(ConnectionError):
         while connection.recv(65536):
             pass
 
 
 def _end(connection: socket.socket) -> None:
-    with contextlib.suppress(OSError):  # the other side has ended it
+    with contextlib.suppress(OSError):  # the other side has closed it
         connection.shutdown(socket.SHUT_RDWR)

@@ -1,7 +1,6 @@
-"""This whole machine as a host of a lab: its own network namespace on the lab's Ethernet.
+"""Make this whole machine a host of a lab: its own network namespace on the lab's Ethernet.
 
-Only for a machine that belongs to the test (tests/support/machine.py): what runs there changes the network of the
-machine itself.
+Only for a virtual machine of the tests (tests/support/machine.py): the tests change the machine's own network.
 """
 
 import contextlib
@@ -16,7 +15,7 @@ _PORT = "port-root"
 
 @contextlib.contextmanager
 def root_host(lab: Lab, address: str) -> Iterator[Host]:
-    """The machine, connected to the lab under an address such as `10.77.0.2/24`, until the block ends."""
+    """Connect the machine to the lab under an address such as `10.77.0.2/24`, until the block ends."""
     own = Namespace.own()
     switch = lab.switch
     interfaces.create_veth(own, INTERFACE, switch, _PORT)

@@ -1,4 +1,4 @@
-"""The plain ROSMaster, as `roscore` would start it: what the appliance is compared with."""
+"""Run the plain ROS master, as `roscore` starts it, to compare the appliance with it."""
 
 import socket
 import threading
@@ -24,7 +24,7 @@ class PlainMaster:
         self.master_uri = ""
 
     def start(self) -> Self:
-        """Start; returns when the master answers and `/rosout` is there, as after `roscore`."""
+        """Start both; return when the master answers and `/rosout` is registered, as after `roscore`."""
         port = free_port() if isinstance(self.host, ThisMachine) else PORT
         self.master_uri = f"http://{self.host.address}:{port}"
         session = RosSession(self.master_uri, self.home, self.host)
@@ -37,12 +37,12 @@ class PlainMaster:
         return self
 
     def stop(self) -> None:
-        """End both programs."""
+        """Stop both programs."""
         for process in reversed(self.processes):
             process.stop()
 
     def story(self) -> str:
-        """What both said, for the message of a failure."""
+        """Return the output of both programs, for the message of a failure."""
         return "\n".join(process.story() for process in self.processes)
 
     def __enter__(self) -> Self:
@@ -53,12 +53,12 @@ class PlainMaster:
 
 
 def master_at(uri: str) -> Any:
-    """The API of a master, for a `with` (the stubs of `xmlrpc.client` know no answers that are lists)."""
+    """Return the API of a master, for a `with` (the type stubs of `xmlrpc.client` lack answers that are lists)."""
     return xmlrpc.client.ServerProxy(uri, allow_none=True)
 
 
 def call_on(host: Host, uri: str, method: str, *parameters: Any) -> Any:
-    """One XML-RPC call, made from that host: the answer as it came."""
+    """Make one XML-RPC call from that host and return the answer unchanged."""
     run = getattr(host, "run", None)
 
     def call() -> Any:
@@ -69,7 +69,7 @@ def call_on(host: Host, uri: str, method: str, *parameters: Any) -> Any:
 
 
 def await_master(uri: str, host: Host, process: Process) -> None:
-    """Return once the master takes connections."""
+    """Return once the master accepts connections."""
     _await(lambda: call_on(host, uri, "getPid", "/test"), f"no master answers at {uri}", process)
 
 
@@ -85,7 +85,7 @@ def await_node(uri: str, host: Host, name: str) -> None:
 
 
 def _await(attempt: Callable[[], object], complaint: str, process: Process | None) -> None:
-    """Try until it works: nobody tells when a foreign program is ready, so it is asked again and again."""
+    """Retry until it works: a foreign program sends no event when it is ready."""
     deadline = time.monotonic() + LIMIT
     pause = threading.Event()
     while True:
@@ -101,7 +101,7 @@ def _await(attempt: Callable[[], object], complaint: str, process: Process | Non
 
 
 def free_port() -> int:
-    """A port nobody listens on at this moment (the kernel does not give it out again soon)."""
+    """Return a port that is free now (the kernel does not hand it out again soon)."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

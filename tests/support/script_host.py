@@ -1,8 +1,7 @@
-"""A host of the lab on which a kit's own scripts run, as root on a Debian machine without systemd would run them.
+"""A host of the lab that runs a kit's own scripts, as root on a Debian machine without systemd would.
 
-It has its own network (the lab's namespace) and, in a mount namespace, its own `/etc` (what is written there is seen
-there alone) and `/run`; with a root of its own, that system's programs. Nothing of the machine that runs the test is
-changed.
+It has its own network (the lab's namespace) and, in a mount namespace, its own `/etc` and `/run`; changes there are
+invisible elsewhere. With `root` it also has that system's programs. The machine that runs the test is not changed.
 """
 
 import contextlib
@@ -34,9 +33,9 @@ _PATIENT_LOOKS = 20  # some seconds
 
 
 class ScriptHost:
-    """A context manager; `address` is what ROS nodes on it are told to be (set once it has joined).
+    """A context manager; `address` is the address for ROS nodes on the host (set once it has joined).
 
-    `root` is the root of its file system, where that is not this machine's.
+    `root` is the root of its file system, where it differs from this machine's.
     """
 
     def __init__(self, host: Host, directory: Path, root: Path | None = None) -> None:
@@ -63,7 +62,7 @@ class ScriptHost:
         eventually(self._left, lambda: f"programs of {self.outer.name} have ended: {self._programs()}")
 
     def _programs(self) -> dict[int, str]:
-        """Of the kit, by process, those that live in this network; they may have lost their files of process ids."""
+        """Return the kit's processes in this network, by id; their pid files may be lost."""
         found = {}
         for pid in self.outer.namespace.processes():
             with contextlib.suppress(OSError):
@@ -73,7 +72,7 @@ class ScriptHost:
         return found
 
     def _left(self) -> bool:
-        """Whether the next host of this network finds the ports free; what does not end by itself is ended."""
+        """Whether the ports are free for the next host of this network; a remaining process is terminated."""
         programs = self._programs()
         self._looks += 1
         if self._looks == _PATIENT_LOOKS:
@@ -83,7 +82,7 @@ class ScriptHost:
         return not programs
 
     def command(self, args: Sequence[str]) -> list[str]:
-        """A command line that runs this on the host."""
+        """Return the command line that runs this command on the host."""
         return ["nsenter", "-t", str(self._holder.pid), "-m", "-n", "-r", "--", *args]
 
     def popen(self, args: Sequence[Any], **options: Any) -> "subprocess.Popen[Any]":
@@ -103,10 +102,10 @@ class ScriptHost:
         return done
 
     def log(self) -> str:
-        """What charon said here."""
+        """Return charon's log on this host."""
         return self.run("sh", "-c", "tail -n 40 /run/rosrv/charon.log 2>/dev/null; true").stdout
 
     def files(self) -> list[str]:
-        """Everything that was written below /etc, as this host sees it."""
+        """Return all files written below /etc, as seen on this host."""
         upper = self._upper / "upper"
         return self.run("find", str(upper), "-type", "f").stdout.replace(str(upper), "/etc").split()

@@ -1,4 +1,4 @@
-"""RVMaster's pipeline over parts that a test has made, or stand-ins for them."""
+"""Build RVMaster's pipeline from parts of a test, with substitutes for the others."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,22 +6,22 @@ from typing import Any
 from appliance.master.calls.call import served
 from appliance.master.calls.call_execution import Execution
 from appliance.master.calls.call_table import master_table
-from appliance.master.calls.gate import Gate, HostLimits
+from appliance.master.calls.gate import CallGate, HostLimits
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.monitor_calls import MonitorCalls
 from appliance.master.calls.multicall import Multicall
 from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
-from appliance.master.calls.parameter_calls import ParameterCalls, ParameterSearch
+from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.policy import Policy
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from appliance.rpc.bulk import LargeWrites, bulk_turns
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler
-from roswire.xmlrpc import Limits
+from roswire.xmlrpc import XmlRpcLimits
 
 
 def serving(
@@ -46,8 +46,8 @@ def serving(
     own: bool = False,
     target: Incarnation | None = None,
 ) -> Handler:
-    """The handler of RVMaster's listener, where every host has a node; for our `own`, or of the face of `target`."""
-    gate = Gate(policy, registry, HostLimits())
+    """Return the handler of RVMaster's listener; `own`: of our own listener; `target`: of its endpoint."""
+    gate = CallGate(policy, registry, HostLimits())
     parameters = ParameterCalls(rosmaster, mirror, graph, enactor, rights, offload)
     execution = Execution(
         gate=gate,
@@ -59,16 +59,16 @@ def serving(
         parameters=parameters,
         redecide_for=redecide_for,
         large=offload,
-        large_writes=LargeWrites(offload, lambda _host: Standing.REGISTERED),
+        large_writes=LargeWrites(offload, lambda _host: QuotaClass.REGISTERED),
     )
     pipeline = Pipeline(
         execution,
         Multicall(execution, parameters, trail, offload=offload),
         addresses=addresses,
         trail=trail,
-        limits=Limits(),
+        limits=XmlRpcLimits(),
         offload=offload,
-        bulk=bulk_turns(lambda _host: Standing.REGISTERED),
+        bulk=bulk_turns(lambda _host: QuotaClass.REGISTERED),
         processor=ProcessorTime(lambda host: host),
     )
     monitors: Any = None
@@ -93,7 +93,6 @@ def serving(
                 stop=lambda _reason: None,
             ),
             parameters,
-            ParameterSearch(rosmaster, mirror, rights),
             MonitorCalls(monitors, registry, relay, real_port=11312, port=11311),
         ),
         own=own,

@@ -1,11 +1,11 @@
-"""A robot at work while two hundred addresses try to use up what there is.
+"""Run a robot at work while two hundred addresses try to exhaust every resource.
 
 with Siege(lab, home, "relay: {connections: 3000}\\n") as siege:
     siege.crowd.hold(siege.crowd.guests, 11311, each=500)
     siege.works()
 
 The appliance is 10.77.0.2, the robot 10.77.0.10, its operator 10.77.0.20. A crowd on one machine has a hundred
-addresses of guests, who may do anything below `/guest`, and a hundred of strangers, whom no rule names.
+guest addresses, which may do anything below `/guest`, and a hundred unknown hosts, which no rule names.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from examples.landshark.lab import Host, Lab
 from roswire.xmlrpc import FaultReceived, parse_response
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
-from tests.support.nodes import RosSession
+from tests.support.nodes import RosSession, numbers, without_gap
 from tests.support.processes import LIMIT, Process, ThisMachine
 from tests.support.waiting import allowed
 
@@ -54,16 +54,16 @@ write /guest/** = team guests
 default = team guests
 """
 APPLIANCE = "10.77.0.2"
-_BURST = 256  # connections that are under way at once
+_BURST = 256  # simultaneous connections in progress
 
 
 class Crowd:
-    """Many addresses on one machine, and the connections that they hold."""
+    """Many addresses on one machine, and their open connections."""
 
     def __init__(self, lab: Lab) -> None:
         self.guests = [f"10.77.1.{number}" for number in range(1, 101)]
-        self.strangers = [f"10.77.2.{number}" for number in range(1, 101)]
-        everybody = [f"{address}/16" for address in (*self.guests, *self.strangers)]
+        self.unknown_hosts = [f"10.77.2.{number}" for number in range(1, 101)]
+        everybody = [f"{address}/16" for address in (*self.guests, *self.unknown_hosts)]
         self.host: Host = lab.host("crowd", *everybody)
         self.held: list[socket.socket] = []
 
@@ -75,7 +75,7 @@ class Crowd:
         each: int,
         data: bytes = b"",
     ) -> int:
-        """Connect so many times from each address, send this, and stay; how many connections there are."""
+        """Open `each` connections from each address, send `data`, and keep them open; return their number."""
         before = len(self.held)
         self.host.run(lambda: self._connect([one for _ in range(each) for one in addresses], port, data))
         return len(self.held) - before
@@ -86,13 +86,13 @@ class Crowd:
             for address in addresses[start : start + _BURST]:
                 sock = socket.socket()
                 sock.setblocking(False)
-                # The kernel looks for a free port when it knows the other end, so that each address has them all.
+                # The kernel chooses a free port once it knows the other end, so that each address can use all ports.
                 sock.setsockopt(socket.IPPROTO_IP, 24, 1)  # IP_BIND_ADDRESS_NO_PORT
                 sock.bind((address, 0))
                 sock.connect_ex((APPLIANCE, port))
                 coming.append(sock)
             waiting = set(coming)
-            deadline = time.monotonic() + allowed(1.0)  # what the firewall drops answers nothing
+            deadline = time.monotonic() + allowed(1.0)  # packets that the firewall drops are not answered
             while waiting and time.monotonic() < deadline:
                 poll = select.poll()
                 by_number = {sock.fileno(): sock for sock in waiting}
@@ -108,7 +108,7 @@ class Crowd:
             self.held += [sock for sock in coming if sock not in waiting]
 
     def subscribe(self, address: str, caller_id: str, publisher: str, topic: str) -> int:
-        """Ask for a topic as a node does: there is a grant then for the port of the relay that is returned."""
+        """Request a topic as a node does, and return the relay's port, for which a permission now exists."""
         face = self.call(address, "lookupNode", caller_id, publisher)
         assert face[0] == 1, face
         port = int(face[2].rstrip("/").rpartition(":")[2])
@@ -123,7 +123,7 @@ class Crowd:
         self.held.clear()
 
     def call(self, address: str, method: str, *parameters: Any, port: int = 11311) -> Any:
-        """One call of the Master API (or of a node's face) from this address: the answer, or the fault."""
+        """Make one call of the Master API (or of an endpoint) from this address, and return the answer or the fault."""
         answer = self.ask(address, method, *parameters, port=port)
         try:
             return parse_response(answer.partition(b"\r\n\r\n")[2])
@@ -131,7 +131,7 @@ class Crowd:
             return fault
 
     def ask(self, address: str, method: str, *parameters: Any, port: int = 11311) -> bytes:
-        """The same call: what comes back."""
+        """Make the same call, and return the raw answer."""
         body = xmlrpc.client.dumps(parameters, method).encode()
         data = b"POST / HTTP/1.1\r\nConnection: close\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body)
 
@@ -147,18 +147,15 @@ class Crowd:
 
 
 class Siege:
-    """The appliance, the robot at work, and the crowd; a context manager."""
+    """The appliance, the working robot, and the crowd; a context manager."""
 
-    def __init__(self, lab: Lab, home: Path, configuration: str) -> None:
+    def __init__(self, lab: Lab, home: Path, settings: str) -> None:
         self.middle = lab.host("appliance", f"{APPLIANCE}/16")
         self.robot = lab.host("robot", "10.77.0.10/16")
         self.ocu = lab.host("ocu", "10.77.0.20/16")
         self.crowd = Crowd(lab)
         self.home = home
-        self.appliance = Appliance(
-            self.middle, policy=POLICY, options=("--config", str(home / "appliance.yaml")), relays=2
-        )
-        (home / "appliance.yaml").write_text(configuration)
+        self.appliance = Appliance(self.middle, policy=POLICY, settings=settings, relays=2)
         self._closing = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
@@ -168,7 +165,7 @@ class Siege:
             stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
             stack.enter_context(self.appliance)
             stack.callback(self.crowd.leave)
-            # What is recorded before it is there to look, it has as well.
+            # It also has the records from before it could be queried.
             tail = ("audit", "tail", "--lines", "1000", "--json")
             command = [ROSRV, *tail, "--state", str(self.appliance.state)]
             self.trail = stack.enter_context(
@@ -187,7 +184,7 @@ class Siege:
         self._closing.close()
 
     def calls(self, count: int = 50) -> float:
-        """The slowest of so many calls of the robot, a connection each; every one is answered."""
+        """Make `count` calls from the robot, each on its own connection, and return the longest time."""
 
         def each() -> float:
             begun = time.monotonic()
@@ -199,7 +196,7 @@ class Siege:
         return self.robot.run(lambda: max(each() for _ in range(count)))
 
     def call(self, method: str, *parameters: Any) -> Any:
-        """One call of the robot."""
+        """Make one call from the robot."""
 
         def make() -> Any:
             with xmlrpc.client.ServerProxy(self.appliance.master_uri) as server:
@@ -208,7 +205,7 @@ class Siege:
         return self.robot.run(make)
 
     def parameters(self, large: str) -> None:
-        """The robot loads its parameters as at a start: small and large ones, and some once more."""
+        """Load the robot's parameters as at a start: small and large ones, and some twice."""
         for number in range(50):
             assert self.call("setParam", "/starter", f"/robot/gains/{number}", number)[0] == 1
         for value in (large, large, {"description": large}):
@@ -217,10 +214,10 @@ class Siege:
         assert self.call("deleteParam", "/starter", "/robot")[0] == 1
 
     def works(self, *, slowest: float, messages: int = 25) -> None:
-        """No message is lost, service calls and calls of the Master API are answered in time, a node can start."""
+        """Assert that no message is lost, that all calls are answered in time, and that a node can start."""
         heard = len(self.listener.seen(event="received"))
         took = self.calls()
-        assert took < allowed(slowest), f"a call of the robot took {took:.2f} s"
+        assert took < allowed(slowest), f"the robot's call took {took:.2f} s"
         answered = len(self.client.seen(event="answered"))
         for _ in range(5):
             self.client.send("true")
@@ -232,26 +229,23 @@ class Siege:
         self.unharmed(heard, messages)
 
     def unharmed(self, before: int, messages: int) -> None:
-        """What the listener heard from its message `before` on is without a gap, and so many more come."""
+        """Assert that the listener misses no message from number `before` on, and receives `messages` more."""
         count = max(before, len(self.listener.seen(event="received"))) + messages
         heard = self.listener.wait_for_count(count, event="received")[before:]
-        numbers = [int(event["data"].rsplit(" ", 1)[1]) for event in heard]
-        assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), (
-            "messages are missing or doubled"
-        )
+        assert without_gap(numbers(heard)), "messages are missing or repeated"
 
     def memory(self, role: str) -> int:
-        """The resident bytes of a process."""
+        """Return the resident bytes of a process."""
         pid = self.appliance.pids(role)[0]
         status = Path(f"/proc/{pid}/status").read_text()
         return int(status.partition("VmRSS:")[2].split()[0]) << 10
 
     def reload(self) -> None:
-        """The policy is read again, in the middle of it all."""
+        """Reload the policy during the attack."""
         self.appliance.rosrv("policy", "reload")
 
     def throughout(self, attack: Callable[[], None], *, slowest: float) -> None:
-        """While this goes on, and after it, the robot works, also over a reload."""
+        """Assert that the robot works during this attack and afterwards, including a reload."""
         attack()
         self.works(slowest=slowest)
         self.reload()

@@ -1,4 +1,4 @@
-"""A key of a site, and what `ssh-keygen` made with it."""
+"""A site key, and signatures that `ssh-keygen` made with it."""
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
@@ -12,5 +12,5 @@ NAME = "SHA256:lbmsoA0yIEcEiVDRnMWuzm+nV+3ZEEpVIURqFoeSspg (site 2026)"
 
 
 def signed(text: str, key: Ed25519PrivateKey = KEY) -> str:
-    """The signature of a text."""
+    """Return the signature of a text."""
     return sign(text, key)

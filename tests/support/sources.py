@@ -1,4 +1,4 @@
-"""The Python files that rules of the project apply to, wherever its packages are."""
+"""List the Python files that rules of the project apply to."""
 
 from collections.abc import Iterator
 from pathlib import Path

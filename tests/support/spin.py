@@ -1,4 +1,4 @@
-"""Spin on `proofs/insertion.pml`: bounds, mutants, and what an exhaustive search finds."""
+"""Run Spin on `proofs/insertion.pml`: bounds, mutants, and the result of an exhaustive search."""
 
 import re
 import subprocess
@@ -19,14 +19,14 @@ _PROPERTIES = {
     "published": "connected",
     "1": "accepted",
 }
-"""The first name in an assertion, and what the head of the model calls the property."""
+"""The first name in an assertion, and the property's name in the head of the model."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """How many nodes there are, and how often what happens; `sending`: publishers send, for ever.
+    """The number of nodes and of events; with `sending`, publishers send for ever.
 
-    `refusing`: there are specifications that the relay cannot take.
+    With `refusing`, there are specifications that the relay cannot take.
     """
 
     publishers: int = 1
@@ -45,7 +45,7 @@ class Bounds:
 
     @property
     def defined(self) -> list[str]:
-        """As the model is told."""
+        """Return the definitions for the model."""
         numbers = {
             "PUBLISHERS": self.publishers,
             "SUBSCRIBERS": self.subscribers,
@@ -59,7 +59,7 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a search found: the property that is broken (empty: none is), and how many states there are."""
+    """The result of a search: the broken property (empty if none), and the number of states."""
 
     broken: str
     states: int
@@ -68,9 +68,9 @@ class Found:
 def search(
     folder: Path, bounds: Bounds, mutant: str = "", model: Path = MODEL, *, large: bool = False
 ) -> Found:
-    """Look at every state that the model can reach, in `folder`. Fails when they are more than fit into memory.
+    """Check every reachable state of the model, in `folder`. Fails when the states do not fit into memory.
 
-    `large`: so many that a program that is fast is worth the time that it takes to be made (four seconds).
+    With `large`, the checker is compiled with optimization, which takes four seconds.
     """
     spin, compiler = need_program("spin", "spin"), need_program("gcc", "g++")
     wrong = [f"-DMUTANT_{mutant}"] if mutant else []
@@ -100,11 +100,11 @@ def search(
 
 
 Step = tuple[str, int, int]
-"""Of a trace: what happened, and two numbers that it is about."""
+"""A step of a trace: the event, and the two numbers that it is about."""
 
 
 def accepts(folder: Path, bounds: Bounds, trace: Sequence[Step]) -> bool:
-    """Whether the model has a way that leaves this trace: all are tried."""
+    """Whether an execution of the model leaves this trace; all executions are tried."""
     filled = "".join(
         f"    kind[{place}] = {what}; first[{place}] = {one}; second[{place}] = {other};\n"
         for place, (what, one, other) in enumerate(trace)

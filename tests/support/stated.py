@@ -1,4 +1,4 @@
-"""What control states to a relay, of texts that are compiled here as the compiler does it."""
+"""Make control's statements to a relay, from texts that are compiled here as the compiler does it."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -20,7 +20,7 @@ _standard = cache(standard_definitions)
 
 
 async def parts_here(compiled: bytes, wanted: list[PartNames]) -> list[bytes]:
-    """What relays run, made in this process."""
+    """Return the programs that relays run, made in this process."""
     return parts(compiled, wanted)
 
 
@@ -32,14 +32,14 @@ def stated(
     restarted: bool = False,
     **more: Any,
 ) -> SpecificationsStated:
-    """A statement of these files; monitors that are not in `enabled` are. Of wrong ones it is no set at all."""
+    """Return a statement of these files; only monitors in `enabled` run. Invalid files give an empty one."""
     if not files:
         return SpecificationsStated(revision, b"", {}, restarted, **more)
     known = _standard().extended(Definitions.from_files(definitions))
     try:
-        monitors = MonitorSet.of(compiled_from(dict(files), known, margins=True))
+        monitors = MonitorSet.of(compiled_from(dict(files), known))
     except SpecificationError:
         return SpecificationsStated(revision, NOTHING_LIKE_IT, dict(enabled), restarted, **more)
     switches = {monitor.name: enabled.get(monitor.name, True) for monitor in monitors.monitors}
-    part = part_of(monitors.compiled, list(switches), more.get("trials", ()))
+    part = part_of(monitors.compiled, list(switches), more.get("shadows", ()))
     return SpecificationsStated(revision, encoded_part(part), switches, restarted, **more)

@@ -1,4 +1,4 @@
-"""How much work something is, told without a clock: the lines of Python that are run for it."""
+"""Measure work without a clock: count the executed lines of Python."""
 
 import sys
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def steps(work: Callable[[], object]) -> int:
-    """How many lines are run while `work()` does."""
+    """Return the number of lines that `work()` executes."""
     count = 0
 
     def trace(_frame: FrameType, event: str, _argument: Any) -> Any:

@@ -1,4 +1,4 @@
-"""A syslog receiver for tests: RFC 5424 read strictly by its grammar, over UDP, TCP and TLS.
+"""Receive syslog in tests: RFC 5424 parsed strictly by its grammar, over UDP, TCP and TLS.
 
 with StreamCollector() as collector:
     collector.wait_for(lambda messages: len(messages) >= 3)
@@ -27,7 +27,7 @@ _ELEMENT = re.compile(rb"\[(" + _NAME + rb")((?: " + _NAME + rb'="(?:[^"\\\]]|\\
 
 @dataclass(frozen=True)
 class Message:
-    """One message, taken apart."""
+    """One parsed message."""
 
     facility: int
     severity: int
@@ -46,7 +46,7 @@ class Message:
 
 
 def parse(data: bytes) -> Message:
-    """A message of RFC 5424. Raises `AssertionError` for anything else."""
+    """Parse a message of RFC 5424. Raises `AssertionError` for anything else."""
     header = _HEADER.match(data)
     assert header is not None, data
     priority = int(header[1])
@@ -78,7 +78,7 @@ def parse(data: bytes) -> Message:
 
 
 class _Collector:
-    """What was received; a context manager."""
+    """Received messages; a context manager."""
 
     def __init__(self) -> None:
         self.messages: list[Message] = []
@@ -86,7 +86,7 @@ class _Collector:
         self._changed = threading.Condition()
 
     def wait_for(self, condition: Callable[[list[Message]], object], timeout: float = LIMIT) -> list[Message]:
-        """Wait until what was received is so."""
+        """Wait until the received messages satisfy the condition."""
         with self._changed:
             assert self._changed.wait_for(lambda: condition(self.messages), timeout), (
                 len(self.messages),
@@ -96,7 +96,7 @@ class _Collector:
             return list(self.messages)
 
     def sequences(self) -> list[int]:
-        """The sequences of the records received, in order."""
+        """Return the sequence numbers of the received records, in order."""
         with self._changed:
             return [int(one.fields["sequence"]) for one in self.messages if "rosrv@32473" in one.elements]
 
@@ -112,7 +112,7 @@ class _Collector:
 
 
 class DatagramCollector(_Collector):
-    """Receives datagrams at `port`."""
+    """Receive datagrams at `port`."""
 
     def __init__(self, host: str = "127.0.0.1") -> None:
         super().__init__()
@@ -139,7 +139,7 @@ class DatagramCollector(_Collector):
 
 
 class StreamCollector(_Collector):
-    """Receives octet-counted messages at `port`, with TLS if there is a context; can go away and come back."""
+    """Receive octet-counted messages at `port`, with TLS if there is a context; can close and open again."""
 
     def __init__(self, host: str = "127.0.0.1", context: ssl.SSLContext | None = None, port: int = 0) -> None:
         super().__init__()
@@ -152,7 +152,7 @@ class StreamCollector(_Collector):
 
     @property
     def port(self) -> int:
-        """Where it listens, also while it does not."""
+        """The listening port, also while it is closed."""
         return self._place[1]
 
     def open(self) -> None:
@@ -207,7 +207,7 @@ class StreamCollector(_Collector):
 
 
 def _counted(read: Callable[[int], bytes]) -> bytes | None:
-    """One message with its length before it (RFC 6587, 3.4.1); None at the end."""
+    """Return one message with its length before it (RFC 6587, 3.4.1); None at the end."""
     digits = b""
     while (one := read(1)) != b" ":
         if not one:

@@ -1,7 +1,7 @@
-"""The rules by which other programs translate the addresses of their guests, as these programs write them.
+"""NAT rules of other programs for their guests, exactly as these programs write them.
 
-Each `Translator` is a network behind the machine (containers, virtual machines, clients of a hotspot) and the text that
-its program gives to iptables-restore or nft.
+Each `Translator` is a network behind the machine (containers, virtual machines, clients of a hotspot) with the rules
+that its program passes to iptables-restore or nft.
 """
 
 import subprocess
@@ -14,7 +14,7 @@ from examples.landshark.lab import Host
 
 @dataclass(frozen=True)
 class Translator:
-    """A program that translates the addresses of the hosts on `interface`; `form` is whose restore program reads it."""
+    """A program that translates addresses of hosts on `interface`; `form` is the restore program for its rules."""
 
     program: str
     form: str  # nft, iptables-legacy-restore, iptables-nft-restore, ip6tables-…
@@ -24,7 +24,7 @@ class Translator:
 
     @property
     def chain(self) -> str:
-        """How its chain that translates is named to operators."""
+        """The name of its translating chain, as shown to operators."""
         if self.form == "nft":
             table = self.rules.split(" {")[0].removeprefix("table ")
             chains = self.rules.split("\n    chain ")[1:]
@@ -36,7 +36,7 @@ class Translator:
 
     @property
     def name(self) -> str:
-        """For the name of a test."""
+        """The name in test ids."""
         return f"{self.program}, {self.form.removesuffix('-restore')}"
 
 
@@ -212,7 +212,7 @@ TRANSLATORS = (
 
 
 def load(machine: Namespace, form: str, rules: str) -> None:
-    """Give rules to nft or to the restore program of iptables, which adds them to what is there."""
+    """Pass rules to nft, or to the iptables restore program, which adds them to existing rules."""
     command = ["nft", "-f", "-"] if form == "nft" else [form, "--noflush"]
     process = machine.popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -222,7 +222,7 @@ def load(machine: Namespace, form: str, rules: str) -> None:
 
 
 def guest_behind(machine: Namespace, guest: Namespace, translator: Translator) -> Host:
-    """A guest of `translator`: a bridge on the machine, the guest's end on it, then the program's rules."""
+    """Make a guest of `translator`: a bridge on the machine with the guest's end, then the program's rules."""
     interfaces.create_bridge(machine, translator.interface)
     interfaces.add_address(machine, translator.interface, f"{translator.network}.1/24")
     interfaces.add_address(machine, translator.interface, "fd88::1/64")
@@ -236,7 +236,7 @@ def guest_behind(machine: Namespace, guest: Namespace, translator: Translator) -
 
 
 def plugged(machine: Namespace, guest: Namespace, bridge: str, network: str) -> Host:
-    """A guest at .2 of `network`, with a cable to a bridge that the machine has, whose address is .1."""
+    """Make a guest at .2 of `network`, connected to a bridge of the machine with the address .1."""
     interfaces.create_veth(guest, "eth0", machine, "vguest")
     interfaces.attach(machine, "vguest", bridge)
     interfaces.set_link(guest, "lo", up=True)

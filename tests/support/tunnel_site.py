@@ -1,6 +1,6 @@
-"""An appliance with hosts around it on one Ethernet: some behind tunnels, some in clear text, and an attacker.
+"""An appliance and hosts on one Ethernet: some behind tunnels, some in clear text, and an attacker.
 
-`trail` is the appliance's audit log as it is written: what a test waits for.
+`trail` is the appliance's audit log as it is written, for tests to wait on.
 """
 
 import contextlib
@@ -61,23 +61,23 @@ class TunnelSite:
         self.kits = 0
 
     def kit(self, verb: str = "add", name: str = "ocu-1", *options: str) -> Path:
-        """Enrol a host, or give it a new certificate: its kit."""
+        """Enrol a host, or renew its certificate, and return its kit."""
         self.kits += 1
         path = self.home / f"kit-{self.kits}.tar.gz"
         self.appliance.rosrv("host", verb, name, "--appliance", MIDDLE, "--out", str(path), *options)
         return path
 
     def join(self, kit: Path, host: Host | None = None, *, log: str = "") -> JoinedHost:
-        """A host with a kit, not started."""
+        """Return a host with a kit, not started."""
         return JoinedHost(host or self.ocu, kit, self.home / f"joined-{time.monotonic_ns()}", log=log)
 
     @contextlib.contextmanager
     def joined(
         self, kit: Path, host: Host | None = None, *, log: str = "", settings: str = ""
     ) -> Iterator[JoinedHost]:
-        """A host with its tunnel up, as both sides see it; down again afterwards, as both sides see it.
+        """Yield a host with its tunnel up on both sides; afterwards the tunnel is down on both sides.
 
-        `settings` are added to those of the tunnel in the kit.
+        `settings` are added to the kit's settings of the tunnel.
         """
         mark = self.mark
         joined = self.join(kit, host, log=log)
@@ -94,7 +94,7 @@ class TunnelSite:
 
     @contextlib.contextmanager
     def talking(self, joined: JoinedHost, rate: int = 10) -> Iterator[tuple[Process, Process]]:
-        """A talker on the host behind its tunnel and a listener on the robot that hears it."""
+        """Run a talker on the host behind its tunnel, and a listener on the robot that receives it."""
         with (
             RosSession(joined.master, self.home, joined) as there,
             RosSession(MASTER, self.home, self.robot) as here,
@@ -112,26 +112,26 @@ class TunnelSite:
         return bool(changes) and changes[-1]["event"] == "tunnel up"
 
     def hosts(self) -> list[dict[str, Any]]:
-        """`rosrv host list`."""
+        """Return `rosrv host list`."""
         return list(map(json.loads, self.appliance.rosrv("host", "list", "--json").stdout.splitlines()))
 
     def state(self, name: str = "ocu-1") -> str:
-        """The state of a host by `rosrv host list`."""
+        """Return the state of a host in `rosrv host list`."""
         return next(str(row["state"]) for row in self.hosts() if row["name"] == name)
 
     def is_up(self, name: str = "ocu-1") -> dict[str, Any]:
-        """Wait until a host's tunnel is up as the appliance knows it: the host itself knows it a moment before."""
+        """Wait until a host's tunnel is up for the appliance; the host itself sees it slightly earlier."""
         return eventually(
             lambda: next((one for one in self.hosts() if (one["name"], one["state"]) == (name, "up")), None),
             f"the tunnel of {name} is up",
         )
 
     def recorded(self, since: int, timeout: float = LONG, **fields: Any) -> Event:
-        """The first audit record with these fields that came after `mark` was taken."""
+        """Return the first audit record with these fields after `mark`."""
         return self.trail.wait_for(since=since, timeout=timeout, **fields)
 
     def refused(self, since: int, host: str | None = None) -> Event:
-        """The first refusal of a tunnel after `since`: its record, or the one that counts it among its repetitions."""
+        """Return the first refusal of a tunnel after `since`: its record, or the one that counts its repetitions."""
 
         def is_it(event: Event) -> bool:
             folded = event.get("event") == "denials folded" and event["detail"]["of"] == "tunnel refused"
@@ -141,19 +141,19 @@ class TunnelSite:
         return found | {"reason": " ".join([found["reason"], *found["detail"].get("reasons", ())])}
 
     def story(self) -> str:
-        """What the appliance said, for the message of a failure."""
+        """Return the appliance's output, for the message of a failure."""
         return self.appliance.story()
 
     def rest(self) -> Rest:
-        """REST as the first admin, for the management network (the attacker's machine, which has a token here)."""
-        # The kernel takes connections before the process is there: one answer says that it is.
+        """Return a REST client of the first admin, for the management network (here the attacker's machine)."""
+        # The kernel accepts connections before the process is ready: one answer shows that it is.
         served = self.attacker.run(partial(ssl.get_server_certificate, (MIDDLE, API), timeout=LONG))
         (self.home / "api.pem").write_text(served)
         return Rest(f"https://{MIDDLE}:{API}", self.appliance.token, self.home / "api.pem")
 
     @property
     def mark(self) -> int:
-        """How many records there are."""
+        """Return the number of records."""
         return len(self.trail.events)
 
     def __enter__(self) -> Self:
@@ -178,7 +178,7 @@ class TunnelSite:
 
 
 def left_behind(host: Host) -> dict[str, str]:
-    """What an appliance has left on its host of rules, IPsec's states, routes, interfaces and addresses."""
+    """Return leftovers of an appliance on its host: rules, IPsec states, routes, interfaces and addresses."""
 
     def told(*command: str) -> str:
         process = host.popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
@@ -200,5 +200,5 @@ def left_behind(host: Host) -> dict[str, str]:
 
 
 def numbers(listener: Process) -> list[int]:
-    """The numbers of the messages that a listener has heard from a talker, in the order of their arrival."""
+    """Return the numbers of the messages that a listener received from a talker, in order."""
     return [int(re.split(r"\s", str(event["data"]))[-1]) for event in listener.seen(event="received")]

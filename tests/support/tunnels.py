@@ -1,4 +1,4 @@
-"""A host that joins the appliance by its kit: unpacked, with a charon of its own, in the host's namespace.
+"""A host that joins the appliance with its kit: unpacked, with its own charon, in the host's namespace.
 
 with JoinedHost(lab_host, kit, folder) as host:
     ros = RosSession(host.master, home, host)
@@ -43,7 +43,7 @@ charon-systemd {{
 
 
 def need_strongswan() -> None:
-    """charon and swanctl are installed."""
+    """Require charon and swanctl."""
     need_program("charon-systemd", "charon-systemd libcharon-extra-plugins")
     need_program("swanctl", "strongswan-swanctl")
 
@@ -52,7 +52,7 @@ class JoinedHost:
     """A host of the lab behind its tunnel; `address` is its virtual one, as `RosSession` needs it."""
 
     def __init__(self, host: Host, kit: Path, directory: Path, *, log: str = "") -> None:
-        """Unpack the kit into `directory`, which must be new; `log` is added to what charon logs (`chd = 4`)."""
+        """Unpack the kit into `directory`, which must be new; `log` is added to charon's log settings (`chd = 4`)."""
         self.outer = host
         self.log = log
         self.directory = directory
@@ -70,7 +70,7 @@ class JoinedHost:
         return self.outer.popen(args, **options)
 
     def start(self) -> Self:
-        """Start charon and give it the kit; it begins to ask for the tunnel."""
+        """Start charon with the kit; it begins to ask for the tunnel."""
         conf = self.directory / "strongswan.conf"
         text = _CONFIGURATION.format(
             plugins=plugins(choose_esp(self.outer.namespace)), directory=self.directory, log=self.log
@@ -95,7 +95,7 @@ class JoinedHost:
         return self
 
     def wait_until_up(self, since: int = 0) -> None:
-        """The tunnel stands, as this side sees it."""
+        """Wait until the tunnel is up on this side."""
         assert self.charon is not None
         self.charon.wait_for(
             lambda event: (
@@ -105,12 +105,12 @@ class JoinedHost:
         )
 
     def wait_until_refused(self) -> None:
-        """The appliance said no."""
+        """Wait until the appliance has refused the tunnel."""
         assert self.charon is not None
         self.charon.wait_for(lambda event: "AUTHENTICATION_FAILED" in str(event.get("text")))
 
     def stop(self) -> None:
-        """End charon: the tunnel is closed."""
+        """Stop charon, which closes the tunnel."""
         if self.keeper is not None:
             self.keeper.kill()
             self.keeper.stop()

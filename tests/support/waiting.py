@@ -1,5 +1,4 @@
-"""Waiting for what nobody tells, a number that is reported from time to time, a record that is written a little later;
-and how long a promise may take on a machine that is busy.
+"""Wait for changes without an event, such as a number in a status or a record that is written later.
 
 eventually(lambda: appliance.audit("--event", "node lost"), "the loss is recorded")
 
@@ -21,23 +20,23 @@ T = TypeVar("T")
 def eventually(
     condition: Callable[[], T | None], what: str | Callable[[], str], seconds: float = 2 * LIMIT
 ) -> T:
-    """The first answer of `condition` that counts as true; fails with `what` after `seconds`, which are generous.
+    """Return the first true answer of `condition`; fail with `what` after `seconds`, which are generous.
 
-    `what` says what should have come; as a function it is asked when it did not come.
+    `what` describes the expected event; a function is called only on failure.
     """
     deadline, pause, moment = time.monotonic() + seconds, threading.Event(), 0.02
     while not (found := condition()):
         if time.monotonic() > deadline:
             raise AssertionError(f"not within {seconds:.0f} s: {what if isinstance(what, str) else what()}")
         pause.wait(moment)
-        moment = min(1.5 * moment, 0.25)  # what is slow is not made slower by who asks
+        moment = min(1.5 * moment, 0.25)  # fewer polls do not slow down a slow machine further
     return found
 
 
 def allowed(seconds: float) -> float:
-    """What may take so long on a machine that does nothing else, on this one: longer by what else wants to run now.
+    """Return the time limit on this machine, with its present load, for work that takes `seconds` on an idle one.
 
-    For an upper bound that is a promise of the product; where an event shows the promise, a test waits for the event.
+    Only for an upper bound that the product promises; if an event shows the promise, wait for the event.
     """
     average, _, _, running, _ = Path("/proc/loadavg").read_text(encoding="ascii").split()
     wanting = max(float(average), float(running.partition("/")[0]))

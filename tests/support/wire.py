@@ -1,4 +1,4 @@
-"""What passes on an Ethernet of the lab, seen and sent below every firewall: raw frames, without a program's help."""
+"""Capture and send raw frames on an Ethernet of the lab, below every firewall."""
 
 import socket
 import threading
@@ -24,37 +24,37 @@ class Frame:
 
     @property
     def ipv4(self) -> bool:
-        """Whether there is an IPv4 packet in it."""
+        """Whether the frame has an IPv4 packet."""
         return self.data[12:14] == b"\x08\x00"
 
     @property
     def arp(self) -> bool:
-        """Whether it asks or says who has an address."""
+        """Whether the frame is an ARP request or reply."""
         return self.data[12:14] == b"\x08\x06"
 
     @property
     def source(self) -> str:
-        """The IPv4 source address."""
+        """Return the IPv4 source address."""
         return socket.inet_ntoa(self.data[26:30])
 
     @property
     def destination(self) -> str:
-        """The IPv4 destination address."""
+        """Return the IPv4 destination address."""
         return socket.inet_ntoa(self.data[30:34])
 
     @property
     def protocol(self) -> int:
-        """The protocol in the IPv4 packet."""
+        """Return the protocol number of the IPv4 packet."""
         return self.data[23]
 
     @property
     def header(self) -> int:
-        """Where the payload of the IPv4 packet begins."""
+        """Return the offset of the IPv4 packet's payload."""
         return 14 + (self.data[14] & 15) * 4
 
     @property
     def ports(self) -> tuple[int, int]:
-        """Source and destination port of a TCP or UDP packet."""
+        """Return source and destination port of a TCP or UDP packet."""
         start = self.header
         return (
             int.from_bytes(self.data[start : start + 2]),
@@ -63,22 +63,22 @@ class Frame:
 
     @property
     def returned(self) -> "Frame | None":
-        """The packet that an ICMP error sends back the beginning of, in a frame as it came in."""
+        """Return the beginning of the packet that an ICMP error quotes, as a frame; None for other packets."""
         if self.protocol != socket.IPPROTO_ICMP or self.data[self.header] != _UNREACHABLE:
             return None
         return Frame(self.data[:14] + self.data[self.header + 8 :])
 
     @property
     def udp_payload(self) -> bytes:
-        """What a UDP packet carries."""
+        """Return the payload of a UDP packet."""
         start = self.header
         length = int.from_bytes(self.data[start + 4 : start + 6])
         return self.data[start + 8 : start + length]
 
     def with_payload(self, payload: bytes) -> bytes:
-        """The frame of a UDP packet, with other content of the same length or the same.
+        """Return the frame of a UDP packet with another payload of the same length.
 
-        Without UDP's checksum, which the kernel leaves to the hardware: a frame that was seen here has none yet.
+        It has no UDP checksum: the kernel leaves that to the hardware, so a captured frame has none yet.
         """
         start = self.header
         head = self.data[: start + 6] + bytes(2)
@@ -87,7 +87,7 @@ class Frame:
 
     @property
     def esp(self) -> bool:
-        """Whether it is ESP in UDP (and not IKE, whose packets on port 4500 begin with four zeros)."""
+        """Whether the frame is ESP in UDP (not IKE, whose packets on port 4500 begin with four zeros)."""
         return (
             self.ipv4
             and self.protocol == _UDP
@@ -98,7 +98,7 @@ class Frame:
 
 
 class Capture:
-    """Every frame on an interface while the block lasts, both directions."""
+    """The frames on an interface in both directions during the block; a context manager."""
 
     def __init__(self, namespace: Namespace, interface: str = INTERFACE) -> None:
         self.frames: list[Frame] = []
@@ -111,7 +111,7 @@ class Capture:
         self._thread = threading.Thread(target=self._read, name="capture", daemon=True)
 
     def wait_for(self, wanted: Callable[[Frame], bool], *, since: int = 0, timeout: float = LIMIT) -> Frame:
-        """The first frame from index `since` on that is wanted."""
+        """Return the first frame from index `since` on that is wanted."""
         with self._changed:
             found = self._changed.wait_for(
                 lambda: next((one for one in self.frames[since:] if wanted(one)), None), timeout
@@ -140,7 +140,7 @@ class Capture:
 
 
 def hardware_address(host: Host) -> bytes:
-    """The Ethernet address of a host's interface."""
+    """Return the Ethernet address of a host's interface."""
     with host.entered(), socket.socket(socket.AF_PACKET, socket.SOCK_RAW) as raw:
         raw.bind((INTERFACE, 0))
         return bytes(raw.getsockname()[4])
@@ -156,7 +156,7 @@ def send_frames(host: Host, frames: list[bytes]) -> None:
 
 
 def udp_packet(source: tuple[str, int], destination: tuple[str, int], payload: bytes) -> bytes:
-    """An IPv4 packet with a UDP datagram, without UDP's checksum."""
+    """Return an IPv4 packet with a UDP datagram, without UDP's checksum."""
     udp = (
         source[1].to_bytes(2)
         + destination[1].to_bytes(2)
@@ -177,7 +177,7 @@ def _checksum(header: bytes) -> bytes:
 
 
 def connect(host: Host, source: str, target: str, port: int = 11311) -> str:
-    """What comes of a TCP connection from this source address: `connected`, `refused` or `nothing`."""
+    """Return the result of a TCP connection from this source address: `connected`, `refused` or `nothing`."""
 
     def work() -> str:
         with socket.socket() as client:

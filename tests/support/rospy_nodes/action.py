@@ -1,4 +1,4 @@
-"""Both ends of an action: action.py server|client; events `executed`, `feedback`, `result`."""
+"""Run one end of an action: action.py server|client; events `executed`, `feedback`, `result`."""
 
 import sys
 
@@ -8,16 +8,23 @@ from actionlib.msg import TestAction, TestFeedback, TestGoal, TestResult
 from report import init_node, report
 
 GOAL = 3
+HEARD = "/feedback_heard"  # the client's last feedback; 0 once it knows its goal
 
 
 def serve():
-    """Count up to each goal."""
+    """Count up to each goal. actionlib drops feedback that overtakes the goal or is overtaken by the result."""
+
+    def until(reached):
+        while not reached() and not rospy.is_shutdown():
+            rospy.sleep(0.02)
 
     def execute(goal):
+        until(server.action_server.feedback_pub.get_num_connections)
+        until(server.action_server.result_pub.get_num_connections)
+        until(lambda: rospy.get_param(HEARD, None) == 0)
         for number in range(1, goal.goal + 1):
-            rospy.sleep(0.2)  # the work; the client must know its goal, and feedback overtakes no result
             server.publish_feedback(TestFeedback(feedback=number))
-        rospy.sleep(0.2)
+            until(lambda number=number: rospy.get_param(HEARD, None) == number)
         report("executed", goal=goal.goal)
         server.set_succeeded(TestResult(result=goal.goal))
 
@@ -32,14 +39,21 @@ def ask():
     client = actionlib.SimpleActionClient("/count", TestAction)
     report("ready", name=rospy.get_name())
     client.wait_for_server()
-    client.send_goal(TestGoal(goal=GOAL), feedback_cb=lambda got: report("feedback", number=got.feedback))
+
+    def heard(got):
+        report("feedback", number=got.feedback)
+        rospy.set_param(HEARD, got.feedback)
+
+    client.send_goal(TestGoal(goal=GOAL), feedback_cb=heard)
+    rospy.set_param(HEARD, 0)
     client.wait_for_result()
+    rospy.delete_param(HEARD)
     report("result", result=client.get_result().result, state=client.get_state())
     rospy.spin()
 
 
 def main():
-    """Be one end."""
+    """Run one end."""
     end = rospy.myargv()[1]
     init_node(f"action_{end}")
     {"server": serve, "client": ask}[end]()

@@ -1,8 +1,8 @@
-"""A rospy subscriber of what `flood_talker.py` says: counting_listener.py TOPIC [--slow SECONDS].
+"""Subscribe to a topic of `flood_talker.py`: counting_listener.py TOPIC [--slow SECONDS].
 
-`first` with the first number; for a line on its input `counted`: the first and the last number, how many came, gaps as
-pairs of the numbers around them, whether a number came that was not larger than the one before, and the words that the
-monitors put behind the messages, in the order in which they changed, each with the number it began with.
+`first` has the first number. For each line on the input, `counted` has the first and last number, the number of
+messages, gaps as pairs of the numbers around them, whether a number was not larger than its predecessor, and the
+texts that monitors appended to messages, in the order of changes, each with the number it began with.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from std_msgs.msg import String
 
 
 class Count:
-    """What came so far."""
+    """The messages so far."""
 
     def __init__(self, slow):
         self.slow = slow
@@ -26,7 +26,7 @@ class Count:
         self.words = []
 
     def heard(self, message):
-        """One message."""
+        """Count one message."""
         parts = message.data.split(" ")
         number, word = int(parts[0]), " ".join(parts[2:])
         if not self.came:
@@ -44,7 +44,7 @@ class Count:
             self.never.wait(self.slow)
 
     def tell(self):
-        """Report it for each line of the input."""
+        """Report the count for each line of the input."""
         for _line in sys.stdin:
             report(
                 "counted",
@@ -58,7 +58,7 @@ class Count:
 
 
 def main():
-    """Listen until told to end."""
+    """Listen until terminated."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     arguments.add_argument("--slow", type=float, default=0.0)

@@ -1,6 +1,6 @@
-"""A rospy publisher of numbered std_msgs/String: flood_talker.py TOPIC [--rate HZ] [--bytes N].
+"""Publish numbered std_msgs/String: flood_talker.py TOPIC [--rate HZ] [--bytes N].
 
-A line on its input ends the flood; `flooded` says how many there were.
+A line on the input ends the flood; `flooded` has the number of messages.
 """
 
 import argparse
@@ -13,7 +13,7 @@ from std_msgs.msg import String
 
 
 def main():
-    """Publish until told to end; then stay."""
+    """Publish until a line on the input; then wait."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     arguments.add_argument("--rate", type=float, default=1000)

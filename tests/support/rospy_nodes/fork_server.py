@@ -1,7 +1,7 @@
-"""Debian's Python with rospy loaded: forks for each program that `tests/support/forks.py` orders.
+"""Load rospy in Debian's Python, and fork for each program that `tests/support/forks.py` orders.
 
-An order is a message with the program, its environment and its folder, and with five descriptors: its standard input,
-output and error, its network namespace, and a socket for its process id and, when it has ended, for how it ended.
+An order is a message with the program, its environment and folder, and with five descriptors: its standard input,
+output and error, its network namespace, and a socket for its process id and later for its exit status.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ CLONE_NEWNET = 0x40000000
 
 
 def serve(orders):
-    """Fork for each order; the fork returns with it."""
+    """Fork for each order; the fork returns with the order."""
     with selectors.PollSelector() as selector:
         selector.register(orders, selectors.EVENT_READ)
         while True:
@@ -38,6 +38,10 @@ def serve(orders):
                     pid = os.fork()
                     if not pid:
                         orders.close()
+                        for other in selector.get_map().values():
+                            if other.fileobj is not orders:  # of another fork, which is still running
+                                os.close(other.fileobj)
+                                other.data[1].close()
                         return json.loads(order), descriptors, report
                     for descriptor in descriptors:
                         os.close(descriptor)
@@ -47,13 +51,13 @@ def serve(orders):
                     selector.unregister(key.fileobj)
                     os.close(key.fileobj)
                     _, status = os.waitpid(pid, 0)
-                    with contextlib.suppress(BrokenPipeError):  # if nobody waits for it any more
+                    with contextlib.suppress(BrokenPipeError):  # if nothing waits for it any more
                         report.send(str(os.waitstatus_to_exitcode(status)).encode())
                     report.close()
 
 
 def become(order, descriptors, report):
-    """Be what a new process of Python would be at its first instruction."""
+    """Take the state of a new Python process at its first instruction."""
     *standard, namespace = descriptors
     elsewhere = os.fstat(namespace).st_ino != Path("/proc/self/ns/net").stat().st_ino
     if elsewhere and ctypes.CDLL(None, use_errno=True).setns(namespace, CLONE_NEWNET):
@@ -68,15 +72,15 @@ def become(order, descriptors, report):
     os.chdir(order["folder"])
     os.environ.clear()
     os.environ.update(order["environment"])
-    sys.argv[:] = order["arguments"]  # in its place: rosmaster has taken hold of it
-    importlib.reload(rospy.names)  # what rospy takes of the arguments and of the environment as it is loaded
+    sys.argv[:] = order["arguments"]  # changed in place: rosmaster keeps a reference to it
+    importlib.reload(rospy.names)  # arguments and environment that rospy reads as it is loaded
 
 
 def main():
-    """Serve; in the fork, run what is ordered."""
+    """Serve; in the fork, run the ordered program."""
     for module in LOADED:
         importlib.import_module(module)
-    gc.freeze()  # what is there stays, and its pages need no copies
+    gc.freeze()  # keep loaded objects out of collections, so that their pages are not copied
     become(*serve(socket.socket(fileno=int(sys.argv[1]))))
     if sys.argv[0] == "-c":
         program = sys.argv.pop(1)

@@ -1,4 +1,4 @@
-"""A rospy subscriber of std_msgs/String: listener.py TOPIC."""
+"""Subscribe to std_msgs/String: listener.py TOPIC."""
 
 import argparse
 
@@ -8,12 +8,12 @@ from std_msgs.msg import String
 
 
 def heard(message):
-    """Report one message with the node it says it is from."""
+    """Report one message with the publishing node in its header."""
     report("received", data=message.data, publisher=message._connection_header["callerid"])
 
 
 def main():
-    """Listen until told to end."""
+    """Listen until terminated."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     options = arguments.parse_args(rospy.myargv()[1:])

@@ -1,4 +1,4 @@
-"""A rospy node that works with parameters as told on standard input, one JSON object per line.
+"""Work with parameters by orders on standard input, one JSON object per line.
 
 {"do": "set", "key": K, "value": V}, {"do": "get" | "has" | "delete" | "search", "key": K}, {"do": "names"},
 {"do": "watch", "key": K} (cached: the node subscribes to it); events `done` (with `value`) or `failed`.
@@ -23,7 +23,7 @@ DO = {
 
 
 def main():
-    """Do what each line says."""
+    """Carry out each line."""
     init_node("parameters")
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     watched = get_param_server_cache()

@@ -1,4 +1,4 @@
-"""A rospy publisher that waits for its first subscriber, says one thing and stays: patient_talker.py TOPIC."""
+"""Wait for the first subscriber, publish one message and stay: patient_talker.py TOPIC."""
 
 import argparse
 
@@ -12,7 +12,8 @@ def main():
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     options = arguments.parse_args(rospy.myargv()[1:])
-    # Not `report.init_node`: with rospy's own, slow end the next one finds that listeners have forgotten this one.
+    # Not `report.init_node`: after rospy's own, slower end the next publisher finds that listeners have dropped this
+    # one.
     rospy.init_node("patient_talker")
     publisher = rospy.Publisher(options.topic, String, queue_size=10)
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())

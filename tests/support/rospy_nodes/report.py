@@ -1,4 +1,4 @@
-"""Tells the test what happens: one JSON object per line on standard output."""
+"""Report events to the test: one JSON object per line on standard output."""
 
 import json
 import os
@@ -7,18 +7,18 @@ import rospy
 
 
 def report(event, **fields):
-    """Print one event: one write and no lock, for a signal handler may report in the middle of a report."""
+    """Print one event with one write and no lock, because a signal handler may interrupt another report."""
     os.write(1, (json.dumps({"event": event, **fields}) + "\n").encode())
 
 
 def init_node(name):
-    """A node that is gone as soon as it has unregistered when it is interrupted.
+    """Start a node that ends as soon as it has unregistered when it is interrupted.
 
-    rospy itself would go on for another half a second, in which a thread asks its closed server for calls
-    without a pause: more processor time than all that the node did.
+    rospy itself goes on for another half second. In that time one of its threads polls the closed server without a
+    pause, which takes more processor time than all of the node's work.
     """
     rospy.init_node(name)
-    rospy.core.add_shutdown_hook(_end)  # the last: rospy's own have closed its connections
+    rospy.core.add_shutdown_hook(_end)  # the last hook: rospy's own hooks have closed its connections
 
 
 def _end(reason):

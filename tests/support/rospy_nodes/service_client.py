@@ -1,6 +1,6 @@
-"""A rospy client of std_srvs/SetBool: service_client.py SERVICE [--persistent] [--trigger].
+"""Call std_srvs/SetBool: service_client.py SERVICE [--persistent] [--trigger].
 
-Each line `true` or `false` on standard input is one call; with --trigger of a std_srvs/Trigger, whatever it says.
+Each line `true` or `false` on standard input is one call; with --trigger any line is a call of a std_srvs/Trigger.
 """
 
 import argparse
@@ -12,7 +12,7 @@ from std_srvs.srv import SetBool, Trigger
 
 
 def main():
-    """Call for each line of the input."""
+    """Call once for each line of the input."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("service")
     arguments.add_argument("--persistent", action="store_true")

@@ -1,4 +1,4 @@
-"""A rospy service std_srvs/SetBool that answers with the negation: service_server.py SERVICE."""
+"""Offer a std_srvs/SetBool that answers with the negation: service_server.py SERVICE."""
 
 import argparse
 
@@ -8,13 +8,13 @@ from std_srvs.srv import SetBool, SetBoolResponse
 
 
 def answer(request):
-    """Negate."""
+    """Return the negation."""
     report("called", data=request.data, client=request._connection_header["callerid"])
     return SetBoolResponse(success=not request.data, message="negated")
 
 
 def main():
-    """Serve until told to end."""
+    """Serve until terminated."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("service")
     options = arguments.parse_args(rospy.myargv()[1:])

@@ -1,4 +1,4 @@
-"""A rospy publisher of std_msgs/String: talker.py TOPIC [--latch] [--text T] [--rate HZ] [--count N]."""
+"""Publish std_msgs/String: talker.py TOPIC [--latch] [--text T] [--rate HZ] [--count N]."""
 
 import argparse
 import sys
@@ -9,19 +9,19 @@ from std_msgs.msg import String
 
 
 class Watch(rospy.SubscribeListener):
-    """Reports who connects and who leaves."""
+    """Report subscribers that connect and leave."""
 
     def peer_subscribe(self, topic_name, topic_publish, peer_publish):
-        """A subscriber has connected."""
+        """Report a new subscriber."""
         report("connected", topic=topic_name)
 
     def peer_unsubscribe(self, topic_name, num_peers):
-        """A subscriber has gone."""
+        """Report a subscriber that left."""
         report("disconnected", topic=topic_name, left=num_peers)
 
 
 def main():
-    """Publish until told to end."""
+    """Publish until terminated."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     arguments.add_argument("--latch", action="store_true")

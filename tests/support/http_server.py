@@ -1,0 +1,200 @@
+"""Run an `HttpServer` in a unit test, with clients, and check that it keeps no state of a client at the end."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+
+import pytest
+
+from appliance.policy.model import Address
+from appliance.quotas.pool import Bounds, QuotaClass
+from appliance.quotas.table import (
+    RVMASTER_ARRIVALS,
+    RVMASTER_BYTES,
+    RVMASTER_CONNECTIONS,
+    RVMASTER_FAREWELLS,
+    RVMASTER_REQUESTS,
+)
+from appliance.rpc.connection_table import ConnectionTable
+from appliance.rpc.fair_queue import Turns
+from appliance.rpc.front import HttpLimits
+from appliance.rpc.processor_time import ProcessorTime
+from appliance.rpc.server import AtOnce, Handler, HttpRequest, HttpServer, Peer, listen, not_at_once
+from appliance.rpc.source_queues import Program
+from roswire.xmlrpc import FaultReceived, parse_response
+
+LIMITS = HttpLimits()
+WAIT = 20.0
+LARGE = 24 << 20  # more than the kernel's buffers take
+
+
+def two_hosts(host: int) -> Bounds:
+    """Return a pool with room for the quotas of two hosts."""
+    return Bounds(whole=2 * host, host=host, unknown=0, kept=0)
+
+
+def _named(_host: object) -> QuotaClass:
+    return QuotaClass.NAMED
+
+
+@dataclass(frozen=True)
+class Shares:
+    """The pools of a server of a test."""
+
+    connections: Bounds = RVMASTER_CONNECTIONS.bounds
+    held: Bounds = RVMASTER_BYTES.bounds
+    farewells: Bounds = RVMASTER_FAREWELLS.bounds
+    requests: Bounds = RVMASTER_REQUESTS.bounds
+    arriving: Bounds = RVMASTER_ARRIVALS.bounds
+    clock: Callable[[], float] = time.thread_time
+    first: Program | None = None
+
+
+def post(body: bytes, *headers: str, path: str = "/", length: int | None = None) -> bytes:
+    """Return a request as a ROS client sends it."""
+    lines = [
+        f"POST {path} HTTP/1.1",
+        "Host: master",
+        f"Content-Length: {len(body) if length is None else length}",
+    ]
+    return "\r\n".join([*lines, *headers, "", ""]).encode() + body
+
+
+def fault(body: bytes) -> str:
+    """Return the text of a fault."""
+    with pytest.raises(FaultReceived) as received:
+        parse_response(body)
+    return received.value.text
+
+
+class Client:
+    """One connection, read with limits."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader, self.writer = reader, writer
+
+    async def send(self, data: bytes) -> None:
+        """Send bytes."""
+        self.writer.write(data)
+        await self.writer.drain()
+
+    async def response(self) -> tuple[int, dict[str, str], bytes]:
+        """Return status, headers and body of the next response."""
+        async with asyncio.timeout(WAIT):
+            head = (await self.reader.readuntil(b"\r\n\r\n")).decode()
+            status, *lines = head.strip().split("\r\n")
+            headers = {line.split(": ")[0].lower(): line.split(": ")[1] for line in lines}
+            body = await self.reader.readexactly(int(headers.get("content-length", "0")))
+        return int(status.split()[1]), headers, body
+
+    async def ended(self) -> bytes:
+        """Return the data until the server closes; fail if it does not."""
+        async with asyncio.timeout(WAIT):
+            try:
+                return await self.reader.read()
+            except ConnectionResetError:
+                return b""
+
+    async def close(self) -> None:
+        """Close the connection."""
+        self.writer.close()
+        with contextlib.suppress(ConnectionError):
+            await self.writer.wait_closed()
+
+
+class Server:
+    """A server of a test, its requests, and its complaints."""
+
+    def __init__(
+        self, handler: Handler | None, limits: HttpLimits, refusal: bytes | None, shares: "Shares"
+    ) -> None:
+        self.requests: list[HttpRequest] = []
+        self.at_once: AtOnce = not_at_once
+        self.troubles: list[str] = []
+        self.connection_table: ConnectionTable[Address] = ConnectionTable(
+            _named,
+            connections=shares.connections,
+            held=shares.held,
+            farewells=shares.farewells,
+            arriving=shares.arriving,
+        )
+        self.turns = Turns(shares.requests, _named)
+        self.time = ProcessorTime(lambda host: host, shares.clock)
+        self._handler = handler
+        self.socket = listen("127.0.0.1", 0)
+        self.port: int = self.socket.getsockname()[1]
+        self.clients: list[Client] = []
+        self.http = HttpServer(
+            self.socket,
+            self._handle,
+            at_once=lambda request: self.at_once(request),  # noqa: PLW0108 - the one of that moment
+            limits=limits,
+            connection_table=self.connection_table,
+            turns=self.turns,
+            time=self.time,
+            first=shares.first,
+            refuse=lambda peer: None if refusal is None else self._refuse,
+            troubled=self._complain,
+        )
+        self.complained = asyncio.Event()
+        self._refusal = refusal
+        self.beginnings: list[bytes] = []
+
+    def _refuse(self, beginning: bytes) -> bytes:
+        self.beginnings.append(beginning)
+        assert self._refusal is not None
+        return self._refusal
+
+    def _complain(self, _peer: Peer, reason: str) -> None:
+        self.troubles.append(reason)
+        self.complained.set()
+
+    async def _handle(self, request: HttpRequest) -> bytes:
+        self.requests.append(request)
+        return (
+            await self._handler(request) if self._handler is not None else b"answer to " + request.body[:1000]
+        )
+
+    async def connect(self, host: str = "127.0.0.1") -> Client:
+        """Return a new connection from this address; it is closed at the end of the test."""
+        client = Client(*await asyncio.open_connection("127.0.0.1", self.port, local_addr=(host, 0)))
+        self.clients.append(client)
+        return client
+
+    async def trouble(self) -> str:
+        """Return the first complaint."""
+        async with asyncio.timeout(WAIT):
+            await self.complained.wait()
+        return self.troubles[0]
+
+
+@contextlib.asynccontextmanager
+async def serving(
+    handler: Handler | None = None,
+    limits: HttpLimits = LIMITS,
+    refusal: bytes | None = None,
+    shares: "Shares | None" = None,
+) -> AsyncIterator[Server]:
+    """Run a server; check that it keeps no state of a client at the end."""
+    server = Server(handler, limits, refusal, shares or Shares())
+    await server.http.start()
+    sweep = asyncio.get_running_loop().create_task(server.connection_table.sweep())
+    try:
+        yield server
+    finally:
+        for client in server.clients:
+            await client.close()
+        await until(lambda: not server.connection_table.connections)
+        await until(lambda: not server.connection_table.held.total)
+        assert server.connection_table.connected.total == server.connection_table.farewells.total == 0
+        sweep.cancel()
+        server.http.close()
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Wait until the condition holds; the loop runs meanwhile."""
+    async with asyncio.timeout(WAIT):
+        while not condition():
+            await asyncio.sleep(0.01)
