@@ -1,4 +1,4 @@
-"""The checks of `ptltl`, `ere` and `fsm` automata are proved sound in Coq; the Python at every load says the same."""
+"""The checks of `ptltl`, `ere` and `fsm` automata are proved sound in Coq; the Python check at each load agrees."""
 
 import shutil
 import subprocess
@@ -9,8 +9,8 @@ from random import Random
 import pytest
 
 from rosmop.certify import formula_reader
-from rosmop.certify.check import Tables, Verdicts, certify
-from rosmop.certify.machines import Machine
+from rosmop.certify.check import AutomatonTables, Verdicts, certify
+from rosmop.certify.machines import StateMachineFollower
 from rosmop.tests.certify.test_certify import broken, properties, tables_of
 from tests.support.requirements import need_program
 from tests.support.spin import MODEL
@@ -25,11 +25,11 @@ def _run(folder: Path, *command: str, given: str = "") -> str:
 
 
 def _proved(folder: Path, name: str) -> Path:
-    """The program that asks what Coq has proved and extracted."""
+    """Return the program extracted from what Coq has proved."""
     for file in (f"{name}.v", f"{name}_driver.ml"):
         shutil.copy(PROOFS / file, folder)
     said = _run(folder, need_program("coqc", "coq"), f"{name}.v")
-    # each theorem stands on no axiom, and nothing is left to prove
+    # each theorem is free of axioms, and no proof is open
     assert set(said.splitlines()) == {"Closed under the global context"}
     compiler = need_program("ocamlfind", "ocaml-findlib")
     _run(folder, compiler, "ocamlopt", "-o", name, f"{name}.mli", f"{name}.ml", f"{name}_driver.ml")
@@ -38,13 +38,13 @@ def _proved(folder: Path, name: str) -> Path:
 
 @pytest.fixture(scope="module")
 def past(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The check of `ptltl`."""
+    """Check `ptltl` with the proved program."""
     return _proved(tmp_path_factory.mktemp("past"), "past")
 
 
 @pytest.fixture(scope="module")
 def words(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The checks of `ere` and `fsm`."""
+    """Check `ere` and `fsm` with the proved program."""
     return _proved(tmp_path_factory.mktemp("words"), "words")
 
 
@@ -52,14 +52,14 @@ def _numbers(*numbers: int) -> str:
     return " ".join(map(str, numbers))
 
 
-def _automaton(events: list[str], tables: Tables, verdict: Callable[[Verdicts], int]) -> str:
+def _automaton(events: list[str], tables: AutomatonTables, verdict: Callable[[Verdicts], int]) -> str:
     rows = [target for row in tables.table for target in row]
     verdicts = map(verdict, tables.verdicts)
     return _numbers(len(events), tables.initial, len(tables.table), *rows, *verdicts)
 
 
 def _written(node: formula_reader.Node, events: list[str]) -> str:
-    """Operator first; a power as often as it says."""
+    """Write operators first, and a power as repetitions."""
     kind = str(node[0])
     if kind == "event":
         return f"event {events.index(str(node[1]))}"
@@ -69,39 +69,39 @@ def _written(node: formula_reader.Node, events: list[str]) -> str:
     return " ".join([kind.replace(" ", "-"), *operands])
 
 
-def _past(formula: str, events: list[str], tables: Tables) -> str:
+def _past(formula: str, events: list[str], tables: AutomatonTables) -> str:
     read = formula_reader.formula(formula, events, formula_reader.PTLTL)
     return f"{_automaton(events, tables, (('violation',), ('validation',)).index)} {_written(read, events)}"
 
 
-def _expression(formula: str, events: list[str], tables: Tables) -> str:
+def _expression(formula: str, events: list[str], tables: AutomatonTables) -> str:
     automaton = _automaton(events, tables, ((), ("match",), ("fail",)).index)
     return f"{automaton} ere {_written(formula_reader.expression(formula, events), events)}"
 
 
-def _machine(formula: str, events: list[str], tables: Tables) -> str:
-    machine = Machine(formula, events)
+def _machine(formula: str, events: list[str], tables: AutomatonTables) -> str:
+    machine = StateMachineFollower(formula, events)
     states = [machine.initial]
     for state in states:
         states += dict.fromkeys(
             after for after in (machine.step(state, event) for event in events) if after not in states
         )
-    told: list[Verdicts] = [machine.told(state) for state in states]
-    known = list(dict.fromkeys([*tables.verdicts, *told]))
+    verdicts: list[Verdicts] = [machine.verdicts(state) for state in states]
+    known = list(dict.fromkeys([*tables.verdicts, *verdicts]))
     rows = [states.index(machine.step(state, event)) for state in states for event in events]
-    tells = map(known.index, told)
-    return f"{_automaton(events, tables, known.index)} fsm {_numbers(0, len(states), *rows, *tells)}"
+    numbers = map(known.index, verdicts)
+    return f"{_automaton(events, tables, known.index)} fsm {_numbers(0, len(states), *rows, *numbers)}"
 
 
-def _compare(program: Path, logic: str, line: Callable[[str, list[str], Tables], str]) -> None:
-    """On a thousand random formulas, with the automata of the compiler and with broken ones."""
+def _compare(program: Path, logic: str, line: Callable[[str, list[str], AutomatonTables], str]) -> None:
+    """Compare both on a thousand random formulas, with the automata of the compiler and with broken ones."""
     random = Random(4)  # noqa: S311  no secret
     lines, answers = [], []
     for compiled in properties(logic, 5, 1000):
         events, tables = list(compiled.events), tables_of(compiled)
         for one in (tables, broken(random, tables)):
             if logic == "ptltl" and () in one.verdicts:
-                continue  # a state that tells nothing is none of the logic's, and cannot be written here
+                continue  # a state without a verdict does not exist in the logic, and cannot be written here
             lines.append(line(compiled.formula, events, one))
             answers.append(certify(logic, compiled.formula, events, one).proved)
     said = [
@@ -112,16 +112,16 @@ def _compare(program: Path, logic: str, line: Callable[[str, list[str], Tables],
     assert said.count(False) >= 300
 
 
-def test_the_check_of_the_past_is_the_proved_one(past: Path) -> None:
-    """`ptltl`."""
+def test_the_check_of_ptltl_agrees_with_the_proof(past: Path) -> None:
+    """Compare the checks of `ptltl`."""
     _compare(past, "ptltl", _past)
 
 
-def test_the_check_of_expressions_is_the_proved_one(words: Path) -> None:
-    """`ere`."""
+def test_the_check_of_ere_agrees_with_the_proof(words: Path) -> None:
+    """Compare the checks of `ere`."""
     _compare(words, "ere", _expression)
 
 
-def test_the_check_of_machines_is_the_proved_one(words: Path) -> None:
-    """`fsm`."""
+def test_the_check_of_fsm_agrees_with_the_proof(words: Path) -> None:
+    """Compare the checks of `fsm`."""
     _compare(words, "fsm", _machine)

@@ -1,4 +1,4 @@
-"""The model of the insertion (`proofs/insertion.pml`), each way it can go.
+"""Check the model of the insertion (`proofs/insertion.pml`) exhaustively.
 
 Bounds that take longer are in `test_insertion_at_large.py`, wrong programs in `test_insertion_mutants.py`.
 """
@@ -18,8 +18,8 @@ BOUNDS = [
 
 
 @pytest.mark.parametrize("bounds", BOUNDS, ids=str)
-def test_every_order_keeps_what_is_promised(tmp_path: Path, bounds: Bounds) -> None:
-    """No state that the model can reach breaks a property, and there are states enough for that to mean something."""
+def test_every_order_keeps_the_promises(tmp_path: Path, bounds: Bounds) -> None:
+    """No reachable state of the model breaks a property, and the number of states is large enough to be meaningful."""
     found = search(tmp_path, bounds)
     assert found.broken == ""
     assert found.states > 1000

@@ -1,4 +1,4 @@
-"""The model of the insertion, within bounds that take minutes."""
+"""Check the model of the insertion within bounds that take minutes."""
 
 from pathlib import Path
 
@@ -20,8 +20,8 @@ BOUNDS = [
 
 
 @pytest.mark.parametrize("bounds", BOUNDS, ids=str)
-def test_every_order_keeps_what_is_promised(tmp_path: Path, bounds: Bounds) -> None:
-    """No state that the model can reach breaks a property, and there are many."""
+def test_every_order_keeps_the_promises(tmp_path: Path, bounds: Bounds) -> None:
+    """No reachable state of the model breaks a property, and there are many."""
     found = search(tmp_path, bounds, large=True)
     assert found.broken == ""
     assert found.states > 50_000

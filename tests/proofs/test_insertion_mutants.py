@@ -1,4 +1,4 @@
-"""The model of the insertion (`proofs/insertion.pml`) with one thing wrong each: what it promises can be broken."""
+"""Check that the promises of the model (`proofs/insertion.pml`) can be broken by a single fault."""
 
 from pathlib import Path
 
@@ -27,6 +27,6 @@ MUTANTS = {
 
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_a_wrong_program_would_be_found(tmp_path: Path, mutant: str) -> None:
-    """With one thing done wrong the model breaks the property that is about it."""
+    """With one fault the model breaks the related property."""
     broken, bounds = MUTANTS[mutant]
     assert search(tmp_path, bounds, mutant).broken == broken

@@ -1,8 +1,8 @@
-"""What the running appliance did is a way of the model of the insertion (`proofs/insertion.pml`); tampered, it is none.
+"""A trace of the running appliance is an execution of the model (`proofs/insertion.pml`); a tampered one is not.
 
-With rospy nodes: a monitor that stamps its revision on what it judges is replaced and removed, the relay is killed, the
-policy takes the subscription and gives it again. The trace has what the audit log says of the topic, in its order, and
-after each change a message that was sent when the change had been answered.
+With rospy nodes: a monitor that stamps its revision on its messages is replaced and removed, the relay is killed, the
+policy revokes the subscription and grants it again. The trace contains the audit log's records of the topic in their
+order and, after each change, a message that was sent once the change had been answered.
 """
 
 import re
@@ -37,7 +37,7 @@ Trace = list[Step]
 
 
 def steps(appliance: Appliance) -> Trace:
-    """What the log says of the topic, the oldest first."""
+    """Return the log's records of the topic, the oldest first."""
     found: Trace = []
     for record in appliance.audit("--limit", "10000", "--oldest-first"):
         event, detail = record["event"], record["detail"]
@@ -51,13 +51,13 @@ def steps(appliance: Appliance) -> Trace:
 
 
 def number(event: Event) -> int:
-    """Of a message that was received."""
+    """Return the number of a received message."""
     return int(event["data"].split()[-1]) if event["event"] == "received" else 0
 
 
 @pytest.fixture(scope="module")
 def trace() -> Trace:
-    """Of one run."""
+    """Return the trace of one run."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with tempfile.TemporaryDirectory(prefix="rosrv-stamp-") as name:
         folder = Path(name)
@@ -71,13 +71,13 @@ def trace() -> Trace:
 
 
 def followed(appliance: Appliance, ros: RosSession, folder: Path) -> Trace:
-    """Change one thing after the other, and hear what is sent then."""
+    """Make one change after the other, and receive a message after each."""
     trace: Trace = []
     listener = ros.listener("rospy", "/chatter")
     talker = ros.talker("rospy", "/chatter", "--rate", "20")
 
     def hear(revision: int, opened: int) -> None:
-        """One that is sent from now on, when the log has the revision and so many connections."""
+        """Receive a message sent from now on, once the log has the revision and this number of connections."""
         last = max((one["number"] for one in talker.seen(event="sent")), default=0)
         heard = listener.wait_for(lambda event: number(event) >= last + 2)
 
@@ -108,14 +108,14 @@ def followed(appliance: Appliance, ros: RosSession, folder: Path) -> Trace:
 
 
 def bounds(trace: Trace) -> Bounds:
-    """As many changes as the trace has, and a crash."""
+    """Allow as many changes as the trace has, and a crash."""
     happened = [what for what, _, _ in trace]
     again = max(0, happened.count("subscription") - 1)
     return Bounds(loads=happened.count("loaded"), policies=happened.count("revoked") + again, crashes=1)
 
 
-def test_a_run_is_one_of_the_models(trace: Trace, tmp_path: Path) -> None:
-    """It has all that was done, and the model has a way that leaves it."""
+def test_a_run_is_an_execution_of_the_model(trace: Trace, tmp_path: Path) -> None:
+    """The trace contains all changes, and an execution of the model leaves it."""
     happened = [what for what, _, _ in trace]
     assert [step for step in trace if step[0] in ("loaded", "heard")] == [
         ("heard", 1, 1), ("loaded", 2, 1), ("heard", 2, 2), ("heard", 2, 2), ("heard", 2, 2), ("loaded", 3, 0),
@@ -126,29 +126,31 @@ def test_a_run_is_one_of_the_models(trace: Trace, tmp_path: Path) -> None:
 
 
 def past_its_monitor(trace: Trace) -> Trace:
-    """A message that was sent after the new revision had been answered is judged by the one before."""
+    """Let the previous revision judge a message that was sent after the new one had been answered."""
     place = trace.index(("heard", 2, 2))
     return [*trace[:place], ("heard", 1, 2)]
 
 
 def undecided(trace: Trace) -> Trace:
-    """A connection that nobody asked for."""
+    """Add a connection without a request."""
     place = trace.index(("decided_call", 0, 0))
     return [*trace[:place], *trace[place + 1 : trace.index(("opened", 0, 0)) + 1]]
 
 
 def after_the_end(trace: Trace) -> Trace:
-    """A message after the connection whose grant was taken is closed."""
+    """Add a message after the connection with the revoked permission is closed."""
     return [*trace[: trace.index(("closed", 0, 0)) + 1], ("heard", 2, 2)]
 
 
 def twice(trace: Trace) -> Trace:
-    """Two connections, where one was asked for."""
+    """Make two connections for one request."""
     return [*trace[: trace.index(("opened", 0, 0)) + 1], ("opened", 0, 0)]
 
 
 @pytest.mark.parametrize("tampered", [past_its_monitor, undecided, after_the_end, twice])
-def test_a_tampered_run_is_none(tampered: Callable[[Trace], Trace], trace: Trace, tmp_path: Path) -> None:
-    """All ways of the model are tried, and none leaves this; what is before the last step was left by one."""
+def test_a_tampered_run_is_not_an_execution_of_the_model(
+    tampered: Callable[[Trace], Trace], trace: Trace, tmp_path: Path
+) -> None:
+    """No execution of the model leaves it, though one leaves everything before the last step."""
     wrong = tampered(trace)
     assert not accepts(tmp_path, bounds(wrong), wrong), wrong

@@ -1,4 +1,4 @@
-"""Verdicts of all logics are those of their definitions: a share of what `rosmop/tests/verdicts.py` judges."""
+"""Verdicts of all logics match their definitions: a part of the cases of `rosmop/tests/verdicts.py`."""
 
 import pytest
 
@@ -9,8 +9,8 @@ DEAR = {"parametric": 100, "pattern": 250, "mtl about the future": 500}
 
 
 @pytest.mark.parametrize("logic", LOGICS)
-def test_verdicts_are_those_of_the_definitions(logic: str) -> None:
-    """All short traces and some random ones, of random properties."""
+def test_verdicts_match_the_definitions(logic: str) -> None:
+    """Test all short traces and some random ones, of random properties."""
     judged = [*differing(logic, DEAR.get(logic, 2000), seed=1)]
     assert [difference for _, difference in judged if difference] == []
     assert sum(count for count, _ in judged) >= 100

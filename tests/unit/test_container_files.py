@@ -6,8 +6,8 @@ from pathlib import Path
 import yaml
 
 from appliance.configuration.config_sources import resolve
-from appliance.hosts.rest_place import rest_place
-from appliance.supervisor.privileges import SUPERVISORS
+from appliance.hosts.rest_address import rest_address
+from appliance.supervisor.privileges import SUPERVISOR_CAPABILITIES
 from appliance.supervisor.roles import ROLES
 from appliance.supervisor.users import NUMERIC_IDS
 from distribution.site import BESIDE
@@ -49,7 +49,7 @@ def test_every_process_is_in_the_table_of_rights() -> None:
 
 def test_the_container_is_given_what_the_supervisor_knows() -> None:
     """A right that the supervisor would give up at once is not asked for."""
-    assert granted() <= set(SUPERVISORS)
+    assert granted() <= set(SUPERVISOR_CAPABILITIES)
 
 
 def test_each_right_has_its_reason_beside_it() -> None:
@@ -85,11 +85,11 @@ def test_no_script_is_written_that_cannot_reach_rest() -> None:
     ]
     assert published == ["127.0.0.1:8443:8443"]
     listens = {"ROSRV_API": "0.0.0.0:8443", "ROSRV_ISOLATION": "container"}  # as in the Dockerfile
-    place = rest_place(resolve(None, listens | environment(), {}))
+    place = rest_address(resolve(None, listens | environment(), {}))
     assert place.port is None
     assert "ROSRV_API_PUBLISHED" in place.trouble
     override = {"ROSRV_API_PUBLISHED": "true", "ROSRV_API_NETWORKS": "[172.29.76.1/32, 192.168.1.0/24]"}
-    assert rest_place(resolve(None, listens | environment() | override, {})).port == 8443
+    assert rest_address(resolve(None, listens | environment() | override, {})).port == 8443
 
 
 def test_a_flood_ends_in_the_container() -> None:

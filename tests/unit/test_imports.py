@@ -1,14 +1,93 @@
 """What imports what."""
 
+import ast
 from graphlib import TopologicalSorter
+from pathlib import Path
 
 import grimp
+import pytest
+
+import rosmop
+
+_MOST_IMPORTS = 25
 
 
-def test_no_module_needs_one_that_needs_it() -> None:
-    """There is no circle of modules, those included that are imported for their types only."""
+@pytest.fixture(scope="module")
+def imports() -> dict[str, set[str]]:
+    """The modules of the project that each module imports."""
     graph = grimp.build_graph("appliance", "roswire", "rosmop", cache_dir=None)
-    needs = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
-    assert "rosmop.run.engine" in needs["appliance.api.monitor_judgement"], "a type-only import is seen"
+    return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+
+
+def test_no_module_needs_one_that_needs_it(imports: dict[str, set[str]]) -> None:
+    """There is no circle of modules, those included that are imported for their types only."""
+    assert "rosmop.run.engine" in imports["appliance.api.monitor_judgement"], "a type-only import is seen"
     # A circle is a CycleError that names its modules.
-    assert len(list(TopologicalSorter(needs).static_order())) == len(needs)
+    assert len(list(TopologicalSorter(imports).static_order())) == len(imports)
+
+
+PUBLIC = {
+    "certify.properties": "proofs of properties",
+    "certify.steps": "the steps of a module differ from the automata",
+    "check.sources": "compiling texts",
+    "fast.abi": "what a relay runs of a set",
+    "fast.serialization": "sending it",
+    "fast.wasm_build": "making it",
+    "fast.wasm_instance": "loading the library of WebAssembly",
+    "fast.wasm_runner": "the fast path of `MonitorSet`",
+    "form.connected_groups": "specifications that belong together",
+    "form.positions": "places in a text",
+    "logics.picture": "drawing automata",
+    "run.engine": "`MonitorSet`",
+    "run.explanations": "why something came of a message",
+    "run.fast_path": "lanes of the fast path",
+    "run.margins": "how close comparisons came in a replay",
+    "run.monitor": "a monitor and its state",
+    "run.outcomes": "what came of a message",
+    "run.slice_quota": "who is charged for slices",
+    "run.state": "keeping state",
+    "run.state_of_slices": "keeping the state of slices",
+    "run.why_text": "explanations as text",
+    "runtime.action_context": "what actions print and publish, and their bounds",
+    "text.errors": "what is wrong with a text",
+}
+"""The modules of the language that the appliance imports, besides those of the command (`rosmop.tool`)."""
+
+
+def test_the_appliance_imports_only_public_modules_of_the_language(imports: dict[str, set[str]]) -> None:
+    """Those of the table, and the command's, which only the appliance's own command imports."""
+    found = {
+        (module, imported.removeprefix("rosmop."))
+        for module, all_imported in imports.items()
+        if module.startswith("appliance.")
+        for imported in all_imported
+        if imported.startswith("rosmop.")
+    }
+    assert {imported for _, imported in found if not imported.startswith("tool")} == set(PUBLIC)
+    assert all(
+        module.startswith("appliance.cli.") for module, imported in found if imported.startswith("tool")
+    )
+
+
+def test_the_tests_of_the_language_import_only_the_language() -> None:
+    """They run without the appliance: rosmop, roswire, and libraries."""
+    folder = Path(rosmop.__file__).parent / "tests"
+    files = list(folder.rglob("*.py"))
+    assert files
+    wrong = [
+        f"{file.relative_to(folder)}: {node.module}"
+        for file in files
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in {"appliance", "tests"}
+    ]
+    assert not wrong
+
+
+def test_no_module_of_the_appliance_imports_too_many(imports: dict[str, set[str]]) -> None:
+    """A module that connects more others than a reader can keep in mind is split."""
+    wide = {
+        module
+        for module, imported in imports.items()
+        if module.startswith("appliance") and len(imported) > _MOST_IMPORTS
+    }
+    assert wide == set()

@@ -1,4 +1,4 @@
-"""The kernel that docs/architecture.md lists: the modules behind "no message and no call passes undecided"."""
+"""The kernel that docs/dev/architecture.md lists: the modules behind "no message and no call passes undecided"."""
 
 import re
 from pathlib import Path
@@ -7,10 +7,10 @@ import grimp
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "architecture.md").read_text()
+PAGE = (ROOT / "docs" / "dev" / "architecture.md").read_text()
 SECTION = PAGE.split("\n## The kernel", 1)[1].split("\n## ", 1)[0]
 SIZES = {path: int(lines) for path, lines in re.findall(r"`([\w/]+\.py)` (\d+)", SECTION)}
-BUDGET = 15_550  # the goal is 10,000: lower it with the kernel, and never raise it
+BUDGET = 15_290  # the goal is 10,000: lower it with the kernel, and never raise it
 
 # The modules of the appliance outside the kernel that the kernel imports.
 OUTSIDE = frozenset(
@@ -32,7 +32,7 @@ OUTSIDE = frozenset(
         "master.calls.monitor_calls",
         "master.calls.request_peek",
         "master.endpoints.delivery",
-        "master.endpoints.endpoint_addresses",
+        "master.endpoints.node_ports",
         "master.endpoints.node_api",
         "master.endpoints.topic_taps_control",
         "master.endpoints.traffic",
@@ -47,26 +47,24 @@ OUTSIDE = frozenset(
         "quotas.queue",
         "quotas.table",
         "recorder.ring",
-        "relay.bounds",
-        "relay.connections.delays",
-        "relay.connections.loop_channel",
-        "relay.connections.memory",
         "relay.connections.named_subscribers",
-        "relay.connections.sockets",
         "relay.context",
-        "relay.counts",
         "relay.loop",
-        "relay.monitors.keeper",
-        "relay.monitors.margin_counts",
+        "relay.monitors.fast_path_counts",
         "relay.monitors.monitor_sets",
         "relay.monitors.observation_points",
         "relay.monitors.observations",
         "relay.monitors.observer",
-        "relay.monitors.pace",
         "relay.monitors.shadow",
+        "relay.monitors.state_keeper",
+        "relay.monitors.time_budget",
         "relay.recorder_ring",
+        "relay.relay_limits",
         "relay.report",
         "relay.topic_taps",
+        "relay.transport.loop_channel",
+        "relay.transport.memory",
+        "relay.transport.sockets",
         "rpc.bulk",
         "rpc.connection_table",
         "rpc.fair_queue",
@@ -74,10 +72,11 @@ OUTSIDE = frozenset(
         "rpc.method_name",
         "rpc.processor_time",
         "rpc.server",
+        "rpc.source_queues",
         "rpc.xmlrpc_client",
         "specifications.allocation",
         "specifications.specification_files",
-        "specifications.specifications",
+        "specifications.specification_manager",
         "store.state_file",
         "telemetry.metrics",
     ]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from appliance.configuration.config_sources import resolve
 from appliance.configuration.inventory import RUNS
-from appliance.supervisor.privileges import SUPERVISORS
+from appliance.supervisor.privileges import SUPERVISOR_CAPABILITIES
 from distribution.environment import INTERPRETERS
 
 ROOT = Path(__file__).parents[2]
@@ -34,7 +34,7 @@ def test_the_service_has_the_rights_of_the_supervisor() -> None:
         for line in re.findall(r"^CapabilityBoundingSet=(.*)$", unit, re.MULTILINE)
         for name in line.split()
     }
-    assert given == set(SUPERVISORS)
+    assert given == set(SUPERVISOR_CAPABILITIES)
 
 
 def test_the_installed_configuration_is_right() -> None:

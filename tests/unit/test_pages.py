@@ -1,14 +1,16 @@
-"""The pages for users: each is found from the README, and no link between them leads nowhere."""
+"""The pages: each is listed, their links lead to pages and headings, and generated pages are current."""
 
 import re
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from appliance.channel.admin import OPERATIONS
+from distribution import command_line_page, settings_page
 
 ROOT = Path(__file__).parents[2]
-PAGES = sorted((ROOT / "docs").glob("*.md"))
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
 WITH_LINKS = [
     *PAGES,
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")),
@@ -17,9 +19,10 @@ WITH_LINKS = [
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_page_is_in_the_list_for_readers(page: Path) -> None:
-    """Who begins at the README finds the list of pages, and in it every page."""
+    """The README links to the list of pages, and the list links to every page."""
     assert "(docs/README.md)" in (ROOT / "README.md").read_text()
-    assert page.name == "README.md" or f"({page.name})" in (ROOT / "docs" / "README.md").read_text()
+    link = f"({page.relative_to(ROOT / 'docs')})"
+    assert page.name == "README.md" or link in (ROOT / "docs" / "README.md").read_text()
 
 
 @pytest.mark.parametrize("page", WITH_LINKS, ids=lambda page: page.name)
@@ -28,11 +31,37 @@ def test_links_lead_somewhere(page: Path) -> None:
     text = page.read_text()
     prose = re.sub(r"```.*?```|`[^`\n]*`", "", text, flags=re.DOTALL)
     linked = [page.parent / link for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", prose)]
-    named = [ROOT / name for name in re.findall(r"\bdocs/[\w-]+\.md", text)]
+    named = [ROOT / name for name in re.findall(r"\bdocs/[\w/-]+\.md", text)]
     assert [place for place in linked + named if not place.exists()] == []
 
 
-@pytest.mark.parametrize("page", ["docs/architecture.md", "CONTRIBUTING.md"])
+@pytest.mark.parametrize("page", WITH_LINKS, ids=lambda page: page.name)
+def test_links_lead_to_headings(page: Path) -> None:
+    """The part of a link after `#` is a heading of the page before it."""
+    prose = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(), flags=re.DOTALL)
+    links = re.findall(r"\]\((?!https?:)([^)#]*)#([^)]+)\)", prose)
+    assert [
+        link for link in links if link[1] not in headings(page.parent / link[0] if link[0] else page)
+    ] == []
+
+
+def headings(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub forms them."""
+    prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    titles = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("module", [settings_page, command_line_page], ids=lambda module: module.__name__)
+def test_generated_pages_are_current(module: ModuleType) -> None:
+    """If this fails, run the command that the page's first paragraph names."""
+    name = re.findall(r"docs/[\w/-]+\.md", str(module.__doc__))[0]
+    assert (ROOT / name).read_text() == module.page()
+
+
+@pytest.mark.parametrize(
+    "page", ["docs/dev/architecture.md", "docs/reference/compatibility.md", "CONTRIBUTING.md"]
+)
 def test_modules_that_are_named_are_there(page: str) -> None:
     """A newcomer who follows the page finds the file under the name it gives."""
     names = re.findall(r"\b(?:[a-z_]+/)+[a-z_]+\.(?:py|sh|js|rv|toml|yaml)\b", (ROOT / page).read_text())
@@ -42,6 +71,6 @@ def test_modules_that_are_named_are_there(page: str) -> None:
 
 def test_every_operation_of_rest_is_on_its_page() -> None:
     """Each path that the command line calls, with a name in the place of each parameter."""
-    text = (ROOT / "docs" / "rest.md").read_text()
+    text = (ROOT / "docs" / "reference" / "rest.md").read_text()
     paths = {re.sub(r"{\w+}", r"[^/\\s?\"]+", one.path) for one in OPERATIONS if one.path}
     assert [path for path in paths if not re.search(rf"{path}(?![\w/])", text)] == []

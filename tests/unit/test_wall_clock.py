@@ -13,24 +13,24 @@ READERS = {
         "hosts/checked_ports.py", "hosts/host_table.py",
         "recorder/recorder.py", "recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
         "relay/recorder_ring.py",
-        "specifications/specifications.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
+        "specifications/specification_manager.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
         "supervisor/rings.py", "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
         "api/access.py", "api/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
-        "control/token_orders.py", "hosts/certification.py", "hosts/enrolment_tokens.py", "hosts/revocation_list.py",
+        "control/token_orders.py", "hosts/certification.py", "hosts/enrolment_tokens.py",
         "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
-        "control/switched_off.py", "hosts/self_service.py", "specifications/returns.py", "store/revisions.py",
+        "control/switched_off.py", "hosts/self_service.py", "specifications/timed_disables.py", "store/revisions.py",
     ],
     "whether the wall clock can be believed": [
         "base/age_clock.py", "base/shipped.py", "control/clock_check.py",
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
-        "api/moments.py", "cli/audit/filter.py", "cli/evidence_verbs.py", "cli/monitor/offline.py",
+        "api/alarms.py", "api/moments.py", "cli/audit/filter.py", "cli/evidence_verbs.py", "cli/monitor/offline.py",
         "cli/monitor/recorder_input.py", "cli/policy/learn_verb.py", "cli/protect_verb.py", "cli/record_verbs.py",
-        "cli/status_verb.py", "cli/status_view.py",
+        "cli/status_verb.py",
     ],
 }  # fmt: skip
 """The files that read the wall clock, by what for. A new one is added here by whoever can say the same of it."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from appliance.api.access import Doorkeeper
+from appliance.api.access import TokenAuthenticator
 from appliance.api.problems import ProblemError
 from appliance.channel.messages.api import TokenKept
 from appliance.store import access_tokens
@@ -14,22 +14,22 @@ from appliance.store.access_tokens import TokenRow, make_token
 
 
 def kept(row: TokenRow) -> TokenKept:
-    """What control tells of a token."""
+    """Return a token's record as control sends it."""
     return TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
 
 
-def recognise(door: Doorkeeper, header: str | None, host: str = "10.0.0.1") -> Any:
-    """The bearer, or the status it is refused with."""
+def recognise(door: TokenAuthenticator, header: str | None, host: str = "10.0.0.1") -> Any:
+    """Return the bearer, or the status of the refusal."""
     try:
         return asyncio.run(door.recognise(header, host))
     except ProblemError as problem:
         return problem.status
 
 
-def test_a_token_is_its_holder() -> None:
-    """Name, role and end are those it was made with; the scheme's case does not matter."""
+def test_a_token_has_the_name_role_and_expiry_it_was_made_with() -> None:
+    """Name, role and expiry come back; the case of the scheme is ignored."""
     row, text = make_token("alice", "operator", now=time.time(), seconds=60)
-    door = Doorkeeper(10)
+    door = TokenAuthenticator(10)
     door.state([kept(row)])
     for scheme in ("Bearer", "bearer"):
         bearer = recognise(door, f"{scheme} {text}")
@@ -40,16 +40,16 @@ def test_a_token_is_its_holder() -> None:
     assert recognise(door, f"Bearer {text}") == 401
 
 
-def test_an_expired_token_is_nobody() -> None:
-    """From its end on it is refused, also when it was recognised before."""
+def test_an_expired_token_is_refused() -> None:
+    """A token is refused after its expiry, even if it was recognised before."""
     row, text = make_token("a", "viewer", now=time.time() - 100, seconds=50)
-    door = Doorkeeper(10)
+    door = TokenAuthenticator(10)
     door.state([kept(row)])
     assert recognise(door, f"Bearer {text}") == 401
 
 
 def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second request by the same token is recognised without scrypt."""
+    """The second request with the same token skips scrypt."""
     row, text = make_token("a", "viewer", now=time.time(), seconds=60)
     checks: list[str] = []
 
@@ -59,7 +59,7 @@ def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyP
 
     real = access_tokens.hash_secret
     monkeypatch.setattr(access_tokens, "hash_secret", counted)
-    door = Doorkeeper(10)
+    door = TokenAuthenticator(10)
     door.state([kept(row)])
     for _ in range(3):
         assert recognise(door, f"Bearer {text}").name == "a"
@@ -67,7 +67,7 @@ def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyP
 
 
 def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After so many wrong secrets of a host nothing is computed for it any more; another host is not concerned."""
+    """After too many wrong secrets from one host, no more hashes are computed for it. Other hosts are unaffected."""
     row, text = make_token("a", "viewer", now=time.time(), seconds=60)
     checks: list[str] = []
 
@@ -76,7 +76,7 @@ def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None
         return b"never"
 
     monkeypatch.setattr(access_tokens, "hash_secret", counted)
-    door = Doorkeeper(5)
+    door = TokenAuthenticator(5)
     door.state([kept(row)])
     wrong = f"Bearer rosrv_{row.id}_" + "A" * 43
     assert [recognise(door, wrong) for _ in range(8)] == [401] * 5 + [429] * 3
@@ -87,9 +87,9 @@ def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_unknown_tokens_do_not_lock_out_a_neighbour() -> None:
-    """A host that tries tokens at random is slowed down; a good token from the same address still opens."""
+    """A host that tries random tokens is slowed down; a valid token from the same address still works."""
     row, text = make_token("a", "viewer", now=time.time(), seconds=60)
-    door = Doorkeeper(5)
+    door = TokenAuthenticator(5)
     door.state([kept(row)])
     statuses = [recognise(door, f"Bearer nonsense{number}") for number in range(8)]
     assert statuses == [401] * 5 + [429] * 3

@@ -19,14 +19,14 @@ GOOD: dict[str, Any] = {
 
 
 def changed(path: str, value: object, **more: object) -> Status:
-    """The good status with one field another."""
+    """Return the healthy status with one field replaced."""
     section, _dot, field = path.partition(".")
     said = {section: GOOD.get(section, {}) | {field: value}} if field else {section: value}
     return example(Status, **{**GOOD, **said, **more})
 
 
 def test_a_healthy_appliance_has_none() -> None:
-    """Nothing is open where nothing is wrong; nor before the probe has run."""
+    """A healthy appliance has no alarms, nor has one before the first probe."""
     assert open_alarms(example(Status, **GOOD)) == []
     assert open_alarms(changed("probe", "")) == []
 
@@ -49,23 +49,31 @@ def test_a_healthy_appliance_has_none() -> None:
         ("monitors.refused", ["a.rv:1:1: no"], "monitors-refused", "warning", "monitors"),
         ("monitors.differs_from_folder", True, "monitors-differ", "notice", "monitors"),
         ("ipsec.troubles", ["a certificate ends"], "ipsec", "warning", "hosts"),
+        ("recorder", {"running": False}, "recorder", "warning", "system"),
+        (
+            "processes",
+            [{"role": "charon", "failing": "no /dev/net/tun"}],
+            "process-failing",
+            "alarm",
+            "system",
+        ),
     ],
 )
 def test_each_condition_is_an_alarm(path: str, value: object, kind: str, severity: str, about: str) -> None:
-    """A condition opens one alarm, with its severity, what it is about, and words for a person."""
+    """Each condition raises one alarm with its severity, subject and a readable text."""
     (alarm,) = open_alarms(changed(path, value))
     assert (alarm.kind, alarm.severity, alarm.about) == (kind, severity, about)
     assert len(alarm.text) > 5
 
 
-def test_one_relay_away_is_not_told_as_all_away() -> None:
-    """With several relay processes the alarm says how many are away, and that the others go on."""
+def test_one_missing_relay_is_not_reported_as_all() -> None:
+    """With several relay processes, the alarm names how many are down and says that the others work."""
     (alarm,) = open_alarms(changed("relay", "1 of 2 are away"))
     assert "1 of 2 are away: their topics" in alarm.text
     assert open_alarms(changed("audit.forwarding", FORWARDING)) == []
 
 
 def test_the_gravest_come_first() -> None:
-    """Alarms stand before warnings, warnings before notices."""
+    """Alarms come before warnings, and warnings before notices."""
     status = changed("policy.differs_from_file", True, relay="away", rosmaster="being rebuilt")
     assert [one.severity for one in open_alarms(status)] == ["alarm", "warning", "notice"]

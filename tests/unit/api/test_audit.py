@@ -10,8 +10,8 @@ from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
 __all__ = ["key", "make_log", "notary", "path"]
 
 
-def test_a_viewers_page_tells_nothing_of_what_is_withheld(make_log: MakeLog) -> None:
-    """Neither its records nor its cursor say whether a text stands in a message: a guess is answered as any other."""
+def test_a_viewers_page_reveals_nothing_that_is_withheld(make_log: MakeLog) -> None:
+    """Neither records nor the cursor reveal whether a message contains a text."""
     log = make_log()
     said = {"monitor": "m", "before_fields": {"data": "password"}}
     for number in range(40):
@@ -38,8 +38,8 @@ def test_a_viewers_page_tells_nothing_of_what_is_withheld(make_log: MakeLog) -> 
     assert len(page_of(log.path, hidden_only, None, 1, reader, newest_first=True)["records"]) == 1
 
 
-def test_a_search_for_what_is_never_recorded_says_so(make_log: MakeLog) -> None:
-    """Beside the records, which an older version may have written; a search that has nothing to tell is as before."""
+def test_a_search_for_messages_says_that_they_are_never_recorded(make_log: MakeLog) -> None:
+    """The note comes with the records, which an older version may have written. Other searches have no note."""
     log = make_log()
     settle(log)
     slips = Filter(event="message droped", category="publsh")
@@ -52,10 +52,8 @@ def test_a_search_for_what_is_never_recorded_says_so(make_log: MakeLog) -> None:
         assert "notes" not in page_of(log.path, known, None, 1, bearer("v"), newest_first=True)
 
 
-def test_a_monitors_history_tells_nothing_of_records_that_have_its_name_in_a_message(
-    make_log: MakeLog,
-) -> None:
-    """The name is whatever somebody writes there: that there is no such monitor is all that he learns."""
+def test_a_viewer_learns_nothing_of_monitor_names_inside_messages(make_log: MakeLog) -> None:
+    """A name that occurs only in a message is answered like the name of an unknown monitor."""
     log = make_log()
     for number in range(600):
         detail = {"monitor": "m" if number % 300 else "gun", "before_fields": {"data": "gun password"}}

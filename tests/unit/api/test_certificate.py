@@ -16,7 +16,7 @@ NOW = datetime.datetime.now(datetime.UTC)
 
 
 def shake_hands(context: ssl.SSLContext, certificate: Path, name: str) -> str | None:
-    """The TLS version a client agrees on that trusts only this certificate; the reason when it does not."""
+    """Return the TLS version agreed with a client that trusts only this certificate, or the reason of the failure."""
     here, there = socket.socketpair()
 
     def serve() -> None:
@@ -40,21 +40,21 @@ def shake_hands(context: ssl.SSLContext, certificate: Path, name: str) -> str | 
 
 
 @pytest.mark.parametrize("name", ["10.1.2.3", "127.0.0.1", "::1", "localhost", "robot.example"])
-def test_it_is_trusted_for_the_names_it_was_made_for(tmp_path: Path, name: str) -> None:
+def test_it_is_trusted_for_its_names(tmp_path: Path, name: str) -> None:
     """A client that has the certificate connects by each of its names, with TLS 1.2 or newer."""
     context = tls_context(tmp_path, ["10.1.2.3", "robot.example"], NOW)
     assert shake_hands(context, tmp_path / CERTIFICATE, name) in ("TLSv1.2", "TLSv1.3")
 
 
 def test_it_is_not_for_other_names(tmp_path: Path) -> None:
-    """For an address it was not made for the client refuses."""
+    """A client rejects the certificate for any other address."""
     said = shake_hands(tls_context(tmp_path, [], NOW), tmp_path / CERTIFICATE, "10.9.9.9")
     assert said is not None
     assert "mismatch" in said
 
 
-def test_it_is_kept_and_its_key_is_its_owners(tmp_path: Path) -> None:
-    """The next start uses the same; nobody else may read the key."""
+def test_it_is_reused_and_only_its_owner_reads_the_key(tmp_path: Path) -> None:
+    """The next start uses the same certificate; only the owner may read the key."""
     tls_context(tmp_path, ["10.1.2.3"], NOW)
     first = (tmp_path / CERTIFICATE).read_bytes()
     tls_context(tmp_path, ["10.1.2.3"], NOW + datetime.timedelta(days=100))
@@ -63,10 +63,10 @@ def test_it_is_kept_and_its_key_is_its_owners(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("names", "days"), [(["10.1.2.4"], 0), (["10.1.2.3"], 800)])
-def test_a_new_one_is_made_for_a_new_name_or_before_it_ends(
+def test_it_is_renewed_for_a_new_name_or_before_it_expires(
     tmp_path: Path, names: list[str], days: int
 ) -> None:
-    """A new address, or an end that is near, gives a new one; hosts that pinned its key still know it."""
+    """A new address or a near expiry makes a new certificate with the same key, so that pins stay valid."""
     tls_context(tmp_path, ["10.1.2.3"], NOW)
     first, pin = (tmp_path / CERTIFICATE).read_bytes(), pin_of(tmp_path)
     tls_context(tmp_path, names, NOW + datetime.timedelta(days=days))
@@ -75,20 +75,23 @@ def test_a_new_one_is_made_for_a_new_name_or_before_it_ends(
 
 
 @pytest.mark.parametrize("wrong", [datetime.timedelta(days=-20_000), datetime.timedelta(days=3650)])
-def test_a_clock_that_is_put_right_is_followed(tmp_path: Path, wrong: datetime.timedelta) -> None:
-    """It was made in 1970, or in ten years: once the clock is right there is a good one, of the same key."""
+def test_it_follows_a_corrected_clock(tmp_path: Path, wrong: datetime.timedelta) -> None:
+    """A certificate made in 1970 or in ten years is replaced once the clock is right; the key stays."""
     context = tls_context(tmp_path, ["10.1.2.3"], NOW + wrong)
     pin = pin_of(tmp_path)
     assert shake_hands(context, tmp_path / CERTIFICATE, "10.1.2.3") not in ("TLSv1.2", "TLSv1.3")
     assert renew(context, tmp_path, ["10.1.2.3"], NOW)
     assert shake_hands(context, tmp_path / CERTIFICATE, "10.1.2.3") in ("TLSv1.2", "TLSv1.3")
-    for now in (NOW, datetime.datetime.fromtimestamp(0, datetime.UTC)):  # at the next start it is 1970 again
+    for now in (
+        NOW,
+        datetime.datetime.fromtimestamp(0, datetime.UTC),
+    ):  # the clock is back in 1970 at the next start
         assert not renew(context, tmp_path, ["10.1.2.3"], now)
     assert pin_of(tmp_path) == pin
 
 
-def test_a_pin_is_that_of_the_key(tmp_path: Path) -> None:
-    """As curl takes it, and as openssl makes it from the certificate; another key has another."""
+def test_a_pin_is_the_hash_of_the_key(tmp_path: Path) -> None:
+    """The pin has curl's format and equals openssl's output for the certificate; another key has another pin."""
     tls_context(tmp_path, [], NOW)
     pipe = "openssl x509 -pubkey -noout | openssl pkey -pubin -outform der"
     pipe += " | openssl dgst -sha256 -binary | openssl base64"
@@ -101,8 +104,8 @@ def test_a_pin_is_that_of_the_key(tmp_path: Path) -> None:
     assert pin_of(tmp_path / "other") != pin_of(tmp_path)
 
 
-def test_what_cannot_be_used_is_an_error(tmp_path: Path) -> None:
-    """A damaged certificate is not silently replaced: somebody may have pinned it."""
+def test_an_unusable_certificate_is_an_error(tmp_path: Path) -> None:
+    """A damaged certificate is not silently replaced, because a host may have pinned it."""
     tls_context(tmp_path, [], NOW)
     (tmp_path / CERTIFICATE).write_text("-----BEGIN CERTIFICATE-----\nnonsense\n-----END CERTIFICATE-----\n")
     with pytest.raises(

@@ -1,6 +1,5 @@
 """Tests of `appliance.api.console`, and of the files it serves."""
 
-import asyncio
 import hashlib
 import json
 import re
@@ -16,43 +15,39 @@ from appliance.api.problems import ProblemError
 from appliance.api.request_gate import is_console
 from appliance.configuration.settings import Settings
 from appliance.policy.model import Category
+from tests.support.asgi import requested
 
 FILES = Path(appliance.api.__file__).parent / "console"
 VENDOR = FILES / "vendor"
 SOURCES = sorted(path for path in (FILES / "js").rglob("*.js"))
 IMPORT = re.compile(r"""(?:from|import)\s+"([^"]+)"|import\("([^"]+)"\)""")
-# Names of XML's vocabularies, not places that anything is fetched from.
+# Names of XML vocabularies; nothing is fetched from them.
 NAMESPACES = re.compile(
     r"http://www\.w3\.org/(2000/svg|1999/xhtml|1998/Math/MathML|1999/xlink|2000/xmlns/|XML/1998/namespace)"
 )
 
 
 class Client:
-    """Asks the console's routes alone."""
+    """Sends requests to the console's routes only."""
 
     def __init__(self, settings: Settings) -> None:
         app = FastAPI(exception_handlers={ProblemError: lambda _request, error: error.response()})
         app.include_router(routes(settings))
-        self._transport = httpx.ASGITransport(app)
+        self._app = app
 
     def get(self, path: str, headers: dict[str, str] | None = None) -> httpx.Response:
-        """One request."""
-
-        async def ask() -> httpx.Response:
-            async with httpx.AsyncClient(transport=self._transport, base_url="http://console") as client:
-                return await client.get(path, headers=headers)
-
-        return asyncio.run(ask())
+        """Send one GET request."""
+        return requested(self._app, "GET", path, headers=headers)
 
 
 @pytest.fixture
 def client() -> Client:
-    """A client."""
+    """Return a client."""
     return Client(Settings())
 
 
 def test_the_page_is_served_at_every_view(client: Client) -> None:
-    """`/`, `/console` and each view, deeper addresses too, are the page; what is no view is nothing."""
+    """`/`, `/console` and each view, also with deeper addresses, serve the page; an unknown view is 404."""
     paths = ["/", "/console", "/console/", *(f"/console/{view}" for view in VIEWS), "/console/audit/813"]
     page = (
         (FILES / "index.html").read_text().replace('lock-seconds" content=""', 'lock-seconds" content="900"')
@@ -61,8 +56,8 @@ def test_the_page_is_served_at_every_view(client: Client) -> None:
     assert client.get("/console/elsewhere").status_code == 404
 
 
-def test_the_page_says_what_the_site_configured() -> None:
-    """The notice is text, whatever stands in it; another notice is another page for a browser that knows one."""
+def test_the_page_shows_the_configured_notice() -> None:
+    """The notice is escaped; a changed notice changes the ETag."""
     told = Client(Settings(api_notice='<b>"Staff" only</b>\n&', api_lock_seconds=60)).get("/console")
     assert 'name="rosrv:lock-seconds" content="60"' in told.text
     assert 'name="rosrv:notice" content="&lt;b&gt;&quot;Staff&quot; only&lt;/b&gt;\n&amp;"' in told.text
@@ -70,7 +65,7 @@ def test_the_page_says_what_the_site_configured() -> None:
 
 
 def test_the_headers_close_the_page(client: Client) -> None:
-    """It may load, run and connect to nothing but this origin, is framed by nobody, and no text becomes script."""
+    """The page may load, run and connect only to this origin, cannot be framed, and runs no script from text."""
     for path in ("/", "/console/static/js/main.js"):
         headers = client.get(path).headers
         policy = dict(
@@ -93,8 +88,8 @@ def test_the_headers_close_the_page(client: Client) -> None:
         assert headers["x-frame-options"] == "DENY"
 
 
-def test_a_file_that_is_known_is_not_sent_again(client: Client) -> None:
-    """A file has an ETag by its content, is asked for again each time, and then answered with 304 and no body."""
+def test_a_cached_file_is_not_sent_again(client: Client) -> None:
+    """A file has an ETag of its content; the browser revalidates it and gets 304 without a body."""
     first = client.get("/console/static/js/main.js")
     assert first.headers["content-type"].startswith("text/javascript")
     assert first.headers["cache-control"] == "no-cache"
@@ -116,19 +111,19 @@ def test_a_file_that_is_known_is_not_sent_again(client: Client) -> None:
         "JS/main.js",
     ],
 )
-def test_no_path_leads_out(client: Client, path: str) -> None:
+def test_only_the_consoles_files_are_served(client: Client, path: str) -> None:
     """Only exact names of the console's files are served."""
     assert client.get(f"/console/static/{path}").status_code == 404
 
 
 @pytest.mark.parametrize("path", ["/consolex", "/v1/console", "/console.py", "//console/now"])
 def test_only_the_console_needs_no_token(path: str) -> None:
-    """What is served without a token begins with the console's own address."""
+    """Every address served without a token is below the console's own."""
     assert not is_console(path)
 
 
-def test_vendored_files_are_those_of_the_manifest() -> None:
-    """Every file of other people is in the manifest, with its hash and its packages, their versions and licences."""
+def test_the_manifest_lists_all_vendored_files() -> None:
+    """Every third-party file is listed with its hash, packages, versions and licences."""
     manifest = json.loads((VENDOR / "manifest.json").read_text())["files"]
     assert set(manifest) == {path.name for path in VENDOR.iterdir()} - {"manifest.json"}
     licences = (VENDOR / "LICENCES.txt").read_text()
@@ -139,8 +134,8 @@ def test_vendored_files_are_those_of_the_manifest() -> None:
             assert f"{package['name']} {package['version']}" in licences, package
 
 
-def test_vendored_versions_are_those_of_the_lock() -> None:
-    """What is vendored is what `console/package-lock.json` names: nothing was put there by hand."""
+def test_vendored_versions_match_the_lock_file() -> None:
+    """The vendored packages are those of `console/package-lock.json`; none was added by hand."""
     lock = json.loads((FILES.parents[2] / "console" / "package-lock.json").read_text())["packages"]
     manifest = json.loads((VENDOR / "manifest.json").read_text())["files"]
     for entry in manifest.values():
@@ -152,14 +147,14 @@ def test_vendored_versions_are_those_of_the_lock() -> None:
     "path", sorted(p for p in FILES.rglob("*") if p.suffix in (".js", ".css", ".html", ".svg")), ids=str
 )
 def test_no_file_names_another_host(path: Path) -> None:
-    """No file has an address of another host in it that could be fetched."""
+    """No file contains the address of another host that could be fetched."""
     text = NAMESPACES.sub("", path.read_text())
     assert re.findall(r"(?:https?:|wss?:)?//[a-z0-9-]+\.[a-z]{2,}[^\s\"'`]*", text) == []
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(FILES)))
-def test_sources_import_what_is_there_and_make_no_markup(path: Path) -> None:
-    """Every import is a file that is served; no source writes markup from text, evaluates text, or sets a cookie."""
+def test_sources_import_served_files_and_make_no_markup(path: Path) -> None:
+    """Every import is a served file; no source writes markup from text, evaluates text, or sets a cookie."""
     text = path.read_text()
     for relative, dynamic in IMPORT.findall(text):
         name = relative or dynamic
@@ -179,7 +174,7 @@ def test_sources_import_what_is_there_and_make_no_markup(path: Path) -> None:
 
 
 def test_the_page_has_nothing_inline() -> None:
-    """No script, style or handler stands in the page itself, and all it names is there."""
+    """The page has no inline script, style or handler, and every file it names exists."""
     page = (FILES / "index.html").read_text()
     assert re.findall(r"<script(?![^>]*\bsrc=)|<style|\son\w+=|\sstyle=", page) == []
     for name in re.findall(r'(?:src|href)="/console/static/([^"]+)"', page):
@@ -187,8 +182,8 @@ def test_the_page_has_nothing_inline() -> None:
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_colours_can_be_read(theme: str) -> None:
-    """Every colour of text has a contrast of 4.5:1 on every surface it stands on, in both themes."""
+def test_text_has_enough_contrast(theme: str) -> None:
+    """Every text colour has a contrast of at least 4.5:1 on every surface, in both themes."""
     css = (FILES / "css" / "tokens.css").read_text()
     blocks = css.split(':root[data-theme="dark"]')
     tokens = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", blocks[0]))
@@ -232,7 +227,7 @@ def _luminance(colour: str) -> float:
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
-def test_the_console_knows_every_category_of_a_decision() -> None:
-    """What the policy decides is offered to explain, and has its button at a record."""
+def test_the_console_explains_every_category_of_decision() -> None:
+    """Each category can be explained and has its button at a record."""
     text = (FILES / "js" / "categories.js").read_text()
     assert set(re.findall(r'\["(\w+)", "', text)) == {*Category}

@@ -1,14 +1,13 @@
-"""What the contract says of itself: units of moments and durations, and of what is not sent again."""
+"""The OpenAPI document: units of times and durations, ETags, examples and descriptions."""
 
-import asyncio
 from typing import Any
 
-import httpx
 import jsonschema_rs
 import pytest
 from fastapi import FastAPI
 
 from appliance.api.contract import EXAMPLES, WORDS, is_described
+from tests.support.asgi import requested
 
 _OF_CHANGES = {"/v1/policy", "/v1/hosts", "/v1/hosts/{name}", "/v1/monitors", "/v1/monitors/{name}"}
 _UNITS = ("seconds", "days")
@@ -26,37 +25,33 @@ _IN_WORDS = (
 
 @pytest.fixture(scope="module")
 def contract(app: FastAPI) -> dict[str, Any]:
-    """The document."""
+    """Return the document."""
     return app.openapi()
 
 
 def _kinds(schema: dict[str, Any]) -> set[str]:
-    """The types that a property can have."""
+    """Return the types that a property can have."""
     kind = schema.get("type", [])
     kinds = {kind} if isinstance(kind, str) else set(kind)
     return kinds.union(*map(_kinds, schema.get("anyOf", ())))
 
 
 def _words(schema: dict[str, Any]) -> str:
-    """All that is said of a property."""
+    """Return all descriptions of a property."""
     return " ".join([schema.get("description", ""), *map(_words, schema.get("anyOf", ()))])
 
 
-def test_a_wrong_method_is_told_the_right_ones(app: FastAPI, contract: dict[str, Any]) -> None:
-    """Those of the contract, at every path that is written out, and at one with a name."""
+def test_a_wrong_method_lists_the_valid_ones(app: FastAPI, contract: dict[str, Any]) -> None:
+    """Every path of the contract lists its methods, also a path with a name in it."""
     paths = [*(path for path in contract["paths"] if "{" not in path), "/v1/tokens/{name}"]
-
-    async def allowed() -> list[tuple[int, str]]:
-        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://a") as client:
-            answers = [await client.request("TRACE", path.format(name="mallory")) for path in paths]
-        return [(answer.status_code, answer.headers["allow"]) for answer in answers]
-
+    answers = [requested(app, "TRACE", path.format(name="mallory")) for path in paths]
     told = [", ".join(sorted(method.upper() for method in contract["paths"][path])) for path in paths]
-    assert asyncio.run(allowed()) == [(405, methods) for methods in told]
+    found = [(answer.status_code, answer.headers["allow"]) for answer in answers]
+    assert found == [(405, methods) for methods in told]
 
 
 def test_times_have_units(contract: dict[str, Any]) -> None:
-    """What is no whole number, and what is called a time, has its unit in its name or in its description."""
+    """Every time that is not a whole number has its unit in its name or its description."""
     without, seen = [], 0
     for kind, schema in contract["components"]["schemas"].items():
         for name, of in schema.get("properties", {}).items():
@@ -71,7 +66,7 @@ def test_times_have_units(contract: dict[str, Any]) -> None:
 
 
 def test_every_field_is_described(contract: dict[str, Any]) -> None:
-    """In words of its own, or in those of what it is of; and no words are left over."""
+    """Each field has a description, its own or its type's; no description is unused."""
     fields = {
         (kind, name): field
         for kind, schema in contract["components"]["schemas"].items()
@@ -87,8 +82,8 @@ def test_every_field_is_described(contract: dict[str, Any]) -> None:
     assert len(fields) > 500
 
 
-def test_what_can_be_asked_for_when_it_changed(contract: dict[str, Any]) -> None:
-    """Each GET that answers with JSON has an ETag; one whose ETag is for changes is sent whole each time."""
+def test_every_json_answer_has_an_etag(contract: dict[str, Any]) -> None:
+    """Each GET that answers with JSON has an ETag; one whose ETag guards changes is always sent whole."""
     for path, operations in contract["paths"].items():
         if "get" not in operations:
             continue
@@ -103,7 +98,7 @@ def test_what_can_be_asked_for_when_it_changed(contract: dict[str, Any]) -> None
 
 
 def _unexemplified(name: str, operation: dict[str, Any], kinds: dict[str, Any]) -> list[str]:
-    """What of an operation has no example: its path, its body, its answer where that is text."""
+    """Return the parts of an operation without an example: path, body and text answer."""
 
     def without(content: dict[str, Any]) -> list[str]:
         return [
@@ -126,8 +121,8 @@ def _unexemplified(name: str, operation: dict[str, Any], kinds: dict[str, Any]) 
     return [f"{name}: {one}" for one in missing]
 
 
-def test_no_operation_is_without_an_example(contract: dict[str, Any]) -> None:
-    """Of what is in its path, of its body, of its answer; and no example is left over."""
+def test_every_operation_has_examples(contract: dict[str, Any]) -> None:
+    """Path, body and answer have examples; no example is unused."""
     kinds = contract["components"]["schemas"]
     operations = {
         f"{method} {path}": one for path, row in contract["paths"].items() for method, one in row.items()
@@ -137,8 +132,8 @@ def test_no_operation_is_without_an_example(contract: dict[str, Any]) -> None:
     assert len(operations) > 60
 
 
-def test_examples_are_what_their_schemas_say(contract: dict[str, Any]) -> None:
-    """Each is valid, and has every field that is not left out where it has its default."""
+def test_examples_match_their_schemas(contract: dict[str, Any]) -> None:
+    """Each example is valid and has every field, except fields omitted at their default."""
     kinds = contract["components"]["schemas"]
     told = [
         ({"$ref": f"#/components/schemas/{kind}"}, one)

@@ -1,4 +1,4 @@
-"""Every denial says what would have allowed it: the smallest change of the policy, or why no change of it would."""
+"""Every denial names the smallest change of the policy that would allow it, or why no change would."""
 
 import ipaddress
 from typing import get_args, get_type_hints
@@ -8,11 +8,11 @@ import pytest
 from appliance.api.denials import DENIALS, asks_policy, is_denial
 from appliance.api.dry_run_policy import explained
 from appliance.audit.events import EVENTS
-from appliance.audit.record import Record, RuleReference
+from appliance.audit.record import AuditRecord, RuleReference
 from appliance.channel.answers.policy_answers import PolicyKnown, Why
 from appliance.channel.messages.relay_link import Violation
 from appliance.master.graph.graph import revocation
-from appliance.policy.live_rights import Live, may_keep
+from appliance.policy.live_rights import LiveRight, may_keep
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_settings import AT_ONCE
 from appliance.telemetry.audit_trail import rule_reference
@@ -23,31 +23,31 @@ CLOSED = "[Nodes]\ndefault = 10.0.0.1\n[Publishers]\n/x = 10.0.0.1\n[Parameters]
 
 
 def known(text: str = CLOSED) -> PolicyKnown:
-    """The policy in force."""
+    """Return the policy in force."""
     unknown = dict.fromkeys(get_type_hints(PolicyKnown))
     given = {"text": text, "file": "p.ini", "revision": 3, "hosts": {}, "robot": [], "site_keys": []}
     return PolicyKnown(**(unknown | given | {"cases_file": ""}))  # type: ignore[arg-type]  # what it is judged by
 
 
-def denied(event: str, reason: str = "because", **fields: object) -> Record:
-    """A denial to a host that asked for the topic /x."""
+def denied(event: str, reason: str = "because", **fields: object) -> AuditRecord:
+    """Return a denial for a host that asked for the topic /x."""
     about = {"host": HOST, "caller_id": "/it", "category": "publish", "resource": "/x", "decision": "deny"}
-    return Record(id="1", time=1, event=event, reason=reason, **(about | fields))  # type: ignore[arg-type]  # fields of it
+    return AuditRecord(id="1", time=1, event=event, reason=reason, **(about | fields))  # type: ignore[arg-type]  # fields of it
 
 
-def why(record: Record, text: str = CLOSED) -> Why:
-    """As the command line and REST have it."""
+def why(record: AuditRecord, text: str = CLOSED) -> Why:
+    """Return the reason as the command line and REST print it."""
     return explained(record, known(text) if asks_policy(record) else None)
 
 
 def allowing(found: Why) -> list[str]:
-    """The lines of the policy that would allow it."""
+    """Return the lines of the policy that would allow it."""
     start = "would be allowed by: "
     return [line.removeprefix(start) for line in found.lines if line.startswith(start)]
 
 
-def test_every_event_that_can_be_a_denial_has_its_row() -> None:
-    """Events that are recorded with a denial, and those that refuse something without one."""
+def test_every_event_of_a_denial_has_its_row() -> None:
+    """Covers events recorded with a denial, and events that refuse without one."""
     refusing = {use.event for use in uses() if use.denies} | {*get_args(Violation)} - {""}
     refusing |= {"decision", "denials folded"}  # their decision is computed
     refusing |= {"specifications refused", "policy refused", "rate limited", "message dropped"}
@@ -56,8 +56,8 @@ def test_every_event_that_can_be_a_denial_has_its_row() -> None:
 
 
 @pytest.mark.parametrize("event", EVENTS)
-def test_every_denial_says_what_would_allow_it(event: str) -> None:
-    """Or that no change of the policy would; and nothing else says either."""
+def test_every_denial_names_the_change_that_allows_it(event: str) -> None:
+    """A denial names the change or says that no change helps; other records say neither."""
     found = why(denied(event))
     assert (bool(allowing(found)) != bool(found.refusal)) is (event in DENIALS)
     assert not is_denial(denied(event, decision="allow"))
@@ -75,18 +75,16 @@ def test_every_denial_says_what_would_allow_it(event: str) -> None:
     ],
 )
 @pytest.mark.parametrize("namespace", [False, True])
-def test_what_was_taken_back_may_be_kept_after_the_change(
-    call: str, category: str, *, namespace: bool
-) -> None:
-    """Everything that a call gives: registrations, connections, a parameter that holds others."""
-    live = Live(ipaddress.ip_address(HOST), "/it", call, "/x", namespace)
+def test_the_change_lets_a_revoked_grant_be_kept(call: str, category: str, *, namespace: bool) -> None:
+    """Covers everything that a call grants: registrations, connections, parameters that contain others."""
+    live = LiveRight(ipaddress.ip_address(HOST), "/it", call, "/x", namespace)
     decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
     made = revocation(decision, HOST, "/it", category, "/x", call=call)
     record = denied(
         made.event, made.reason, category=category, rule=rule_reference(made.rule), detail=dict(made.more)
     )
     text = CLOSED
-    for _ in range(3):  # of a namespace, what is below it may be refused next
+    for _ in range(3):  # a parameter below a namespace may be denied next
         found = why(record, text)
         assert allowing(found)
         assert found.grant is not None
@@ -98,9 +96,9 @@ def test_what_was_taken_back_may_be_kept_after_the_change(
     assert "has every right" in why(record, text).refusal
 
 
-def test_what_no_policy_decided_is_not_put_down_to_it() -> None:
-    """A host that is expelled, and the appliance's own: `call` is not told."""
-    live = Live(ipaddress.ip_address(HOST), "/it", "registerPublisher", "/x")
+def test_denials_without_a_policy_are_not_blamed_on_it() -> None:
+    """Covers an expelled host and the appliance's own calls; `call` is not asked."""
+    live = LiveRight(ipaddress.ip_address(HOST), "/it", "registerPublisher", "/x")
     decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
     assert not revocation(decision, HOST, "/it", "publication", "/x", call="").more
     found = why(denied("revoked", category="publication"))
@@ -108,7 +106,7 @@ def test_what_no_policy_decided_is_not_put_down_to_it() -> None:
 
 
 def test_a_connection_without_a_grant() -> None:
-    """The right to ask for one; where the policy gives that, or something else is wrong with it, that is said."""
+    """The change gives the right to request the grant; if the policy already gives it, no change helps."""
     reason = f"no grant for [/it] at {HOST} to subscribe to [/x]; requestTopic comes first"
     found = why(denied("connection refused", reason, category="topic"))
     assert allowing(found) == ["[Subscribers] /x = 10.0.0.9", "/it = 10.0.0.1 10.0.0.9"]
@@ -127,7 +125,7 @@ def test_a_connection_without_a_grant() -> None:
 
 
 def test_a_name_that_another_host_has() -> None:
-    """The option that gives it at once, in a section that is there or not, for another value that is there."""
+    """The answer is the option that allows it at once, whether or not its section or another value exists."""
     held = f"/it is held by a running node on 10.0.0.1 (or at once with {AT_ONCE})"
     all_may = "[Nodes]\ndefault = *\n[Publishers]\n/x = *\n"
     for options, line in {
@@ -143,7 +141,7 @@ def test_a_name_that_another_host_has() -> None:
 
 
 def test_repetitions_and_limits() -> None:
-    """What stands for repetitions of one denial has its answer; of many kinds, the first; a limit, its line."""
+    """A record of repetitions is explained like one denial; several kinds by the first; a limit by its line."""
     one = {"scope": "kind", "of": "decision", "recorded_id": "7"}
     assert allowing(why(denied("denials folded", detail=one))) == [
         "/x = 10.0.0.1 10.0.0.9",

@@ -1,4 +1,4 @@
-"""Tests of how enrolment by one-time tokens bears wrong ones."""
+"""Tests of how enrolment by one-time tokens handles wrong tokens."""
 
 import pytest
 
@@ -6,8 +6,8 @@ from appliance.api.enrol import _Patience
 from appliance.api.problems import ProblemError
 
 
-def test_who_brings_wrong_tokens_has_to_wait() -> None:
-    """One host after so many; and any host that brought one already, while all together bring too many."""
+def test_hosts_that_send_wrong_tokens_have_to_wait() -> None:
+    """One host waits after its limit. Beyond the common limit, every host that sent a wrong token waits."""
     patience = _Patience(per_minute=10)
     for _ in range(10):
         patience.require("10.0.0.1")
@@ -21,8 +21,8 @@ def test_who_brings_wrong_tokens_has_to_wait() -> None:
         patience.require("10.0.1.7")
 
 
-def test_a_stranger_with_many_addresses_keeps_nobody_out() -> None:
-    """However many wrong tokens others brought, a host that brought none is looked at."""
+def test_wrong_tokens_from_many_addresses_lock_nothing_out() -> None:
+    """However many wrong tokens others sent, a host that sent none is served."""
     patience = _Patience(per_minute=10)
     for number in range(1000):
         patience.failed(f"10.0.{number // 250}.{number % 250}")

@@ -1,6 +1,5 @@
-"""Tests of `appliance.api.etags`: what a client has already is not sent to it again."""
+"""Tests of `appliance.api.etags`: a client does not get an unchanged body again."""
 
-import asyncio
 from collections.abc import AsyncIterator
 
 import httpx
@@ -9,11 +8,12 @@ from starlette.applications import Starlette
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from appliance.api.etags import Unchanged
+from appliance.api.etags import ConditionalGet
+from tests.support.asgi import requested
 
 
-def _app() -> Unchanged:
-    """JSON that changes when it is told to, and what gets no hash."""
+def _app() -> ConditionalGet:
+    """Routes with JSON that the test changes, and routes without an ETag of the body."""
     count = 0
 
     async def counted(request: object) -> Response:
@@ -42,29 +42,23 @@ def _app() -> Unchanged:
 
     handlers = {"counted": counted, "tagged": tagged, "refused": refused, "text": text, "streamed": streamed}
     routes = [Route(f"/{name}", handler) for name, handler in handlers.items()]
-    return Unchanged(Starlette(routes=[*routes, Route("/counted", raised, methods=["POST"])]))
+    return ConditionalGet(Starlette(routes=[*routes, Route("/counted", raised, methods=["POST"])]))
 
 
-def asked(app: Unchanged, path: str, method: str = "GET", **headers: str) -> httpx.Response:
-    """An answer."""
-
-    async def ask() -> httpx.Response:
-        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://x") as client:
-            return await client.request(
-                method, path, headers={name.replace("_", "-"): value for name, value in headers.items()}
-            )
-
-    return asyncio.run(ask())
+def asked(app: ConditionalGet, path: str, method: str = "GET", **headers: str) -> httpx.Response:
+    """Return an answer."""
+    given = {name.replace("_", "-"): value for name, value in headers.items()}
+    return requested(app, method, path, headers=given)
 
 
 @pytest.fixture
-def app() -> Unchanged:
-    """The application."""
+def app() -> ConditionalGet:
+    """Return the application."""
     return _app()
 
 
-def test_a_body_that_is_known_is_not_sent_again(app: Unchanged) -> None:
-    """The same body has the same ETag; who names it, alone or among others, gets 304 without a body."""
+def test_an_unchanged_body_is_not_sent_again(app: ConditionalGet) -> None:
+    """The same body has the same ETag; a client that sends it, alone or in a list, gets 304 without a body."""
     first = asked(app, "/counted")
     tag = first.headers["etag"]
     assert (first.status_code, first.json()) == (200, {"count": 0})
@@ -77,8 +71,8 @@ def test_a_body_that_is_known_is_not_sent_again(app: Unchanged) -> None:
         assert asked(app, "/counted", if_none_match=other).json() == {"count": 0}
 
 
-def test_a_body_that_changed_is_sent(app: Unchanged) -> None:
-    """Whatever the client had before."""
+def test_a_changed_body_is_sent(app: ConditionalGet) -> None:
+    """Any other ETag gets the body."""
     tag = asked(app, "/counted").headers["etag"]
     assert "etag" not in asked(app, "/counted", "POST").headers
     again = asked(app, "/counted", if_none_match=tag)
@@ -90,8 +84,10 @@ def test_a_body_that_changed_is_sent(app: Unchanged) -> None:
     ("path", "status", "tag"),
     [("/tagged", 200, '"7"'), ("/refused", 404, None), ("/text", 200, None), ("/streamed", 200, None)],
 )
-def test_what_gets_no_hash(app: Unchanged, path: str, status: int, tag: str | None) -> None:
-    """A revision's ETag is left alone and sends all; so are errors, texts, and streams, which do not wait."""
+def test_these_answers_get_no_etag_of_the_body(
+    app: ConditionalGet, path: str, status: int, tag: str | None
+) -> None:
+    """A revision keeps its own ETag; errors, texts and streams get none, and streams are not buffered."""
     answer = asked(app, path, if_none_match=f"{tag or '*'}")
     assert (answer.status_code, answer.headers.get("etag")) == (status, tag)
     assert answer.content

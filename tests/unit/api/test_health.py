@@ -1,6 +1,8 @@
 """Tests of `appliance.api.health`."""
 
 import asyncio
+import contextlib
+from collections.abc import AsyncIterator
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -9,26 +11,23 @@ import pytest
 
 from appliance.api.control import ControlAwayError
 from appliance.api.health import Health, routes
-from appliance.api.history import History
+from appliance.api.history import SampleHistory
 from appliance.api.problems import ProblemError
 from appliance.api.services import Services
 from appliance.channel.answers.measures import Measures
 from tests.support.answers import example
 
-SERVING: dict[str, Any] = {
-    "probe": "passed",
-    "relay": "connected",
-    "rosmaster": "reachable",
-}
+pytestmark = pytest.mark.anyio
+SERVING: dict[str, Any] = {"probe": "passed", "relay": "connected", "rosmaster": "reachable"}
 
 
 class Probed:
-    """REST in front of a control that says how it stands; `looks` counts how often it was asked."""
+    """REST before a control in a given state; `looks` counts the probes of control."""
 
     def __init__(self, *statuses: dict[str, Any] | None) -> None:
         self._statuses = list(statuses)
         self.looks = 0
-        self.history = History(self._measures)
+        self.history = SampleHistory(self._measures)
         services = SimpleNamespace(control=SimpleNamespace(connected=True), history=self.history)
         (self._ready,) = [
             one.endpoint  # type: ignore[attr-defined]  # it is a route with one
@@ -44,7 +43,7 @@ class Probed:
         return example(Measures, status=status, nodes={"live": 0})
 
     async def ready(self) -> str:
-        """What the probe says: `ready`, or the kind of the problem."""
+        """Return what the probe reports: `ready`, or the kind of the problem."""
         try:
             answer = await self._ready()
         except ProblemError as problem:
@@ -53,16 +52,14 @@ class Probed:
         return str(msgspec.json.decode(answer.body, type=Health).status)
 
 
-def play(probed: Probed, what: Any) -> None:
-    """Sample while `what()` plays."""
-
-    async def whole() -> None:
-        async with asyncio.timeout(30):
-            task = asyncio.create_task(probed.history.run())
-            await what()
-            task.cancel()
-
-    asyncio.run(whole())
+@contextlib.asynccontextmanager
+async def sampled(probed: Probed) -> AsyncIterator[None]:
+    """Sample health meanwhile, from before the first sample."""
+    async with asyncio.timeout(30):
+        task = asyncio.create_task(probed.history.run())
+        await probed.history.after(0)
+        yield
+        task.cancel()
 
 
 @pytest.mark.parametrize(
@@ -72,38 +69,26 @@ def play(probed: Probed, what: Any) -> None:
         {"rosmaster": "being rebuilt"}, {"audit": {"failed": "disk full", "on_failure": "deny"}}, None,
     ],
 )  # fmt: skip
-def test_it_is_not_ready_while_nodes_are_not_served(wrong: dict[str, Any] | None) -> None:
-    """Each reason makes it 503; the moment that it goes, 200."""
+async def test_it_is_not_ready_while_nodes_are_not_served(wrong: dict[str, Any] | None) -> None:
+    """Each reason answers 503, and 200 as soon as it is gone."""
     unready = None if wrong is None else SERVING | wrong
     probed = Probed(unready, unready, SERVING)
-
-    async def what() -> None:
-        await probed.history.after(0)
+    async with sampled(probed):
         assert await probed.ready() == "not-served"
         assert await probed.ready() == "ready"
 
-    play(probed, what)
 
-
-def test_a_log_that_may_fail_does_not_make_it_unready() -> None:
-    """With `on_audit_failure: allow` nodes are served all the while."""
+async def test_a_log_that_may_fail_does_not_make_it_unready() -> None:
+    """With `on_audit_failure: allow`, nodes are served without a working log."""
     probed = Probed(SERVING | {"audit": {"failed": "disk full", "on_failure": "allow"}})
-
-    async def what() -> None:
-        await probed.history.after(0)
+    async with sampled(probed):
         assert await probed.ready() == "ready"
         assert probed.looks == 1
 
-    play(probed, what)
 
-
-def test_however_many_ask_control_is_not_flooded() -> None:
-    """Many probes of an appliance that is not ready are one look at control."""
+async def test_many_probes_ask_control_once() -> None:
+    """Many probes of an appliance that is not ready cause one question to control."""
     probed = Probed(SERVING | {"relay": "away"})
-
-    async def what() -> None:
-        await probed.history.after(0)
+    async with sampled(probed):
         assert set(await asyncio.gather(*(probed.ready() for _ in range(200)))) == {"not-served"}
         assert probed.looks <= 3
-
-    play(probed, what)

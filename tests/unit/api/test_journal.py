@@ -9,7 +9,7 @@ from appliance.channel.messages.api import RestCalled
 
 
 def answered(journal: Journal, **changes: Any) -> None:
-    """One answer."""
+    """Return one answer."""
     fields: dict[str, Any] = {
         "host": "h",
         "who": "w",
@@ -22,8 +22,8 @@ def answered(journal: Journal, **changes: Any) -> None:
     journal.answered(**fields | changes)
 
 
-def test_equal_reads_are_told_once_and_counted() -> None:
-    """The first at once, the others as a number; after a flush it begins again."""
+def test_equal_reads_are_reported_once_and_counted() -> None:
+    """The first read is reported at once, the others as a number; a flush starts over."""
     told: list[RestCalled] = []
     journal = Journal(told.append)
     for _ in range(4):
@@ -37,7 +37,7 @@ def test_equal_reads_are_told_once_and_counted() -> None:
 
 
 def test_changes_are_never_folded() -> None:
-    """What a recognised token changes is told each time; what strangers try to change is folded."""
+    """Calls with a valid token that change something are reported each time; attempts without one are folded."""
     told: list[RestCalled] = []
     journal = Journal(told.append)
     for _ in range(3):
@@ -49,7 +49,7 @@ def test_changes_are_never_folded() -> None:
 
 
 def test_a_flood_of_kinds_is_bounded() -> None:
-    """Beyond so many kinds in one time the rest is counted by status, and nothing is lost from the sum."""
+    """Beyond the limit of kinds, the rest is counted by status; the sum is complete."""
     told: list[RestCalled] = []
     journal = Journal(told.append, kinds=10)
     for number in range(1000):
@@ -60,8 +60,8 @@ def test_a_flood_of_kinds_is_bounded() -> None:
     assert len(told) == 11
 
 
-def test_strange_methods_are_one_number() -> None:
-    """The metric's labels stay few whatever method a stranger makes up."""
+def test_unknown_methods_share_one_label() -> None:
+    """The metric has few labels whatever methods a client makes up."""
     journal = Journal(lambda call: None)
     for number in range(50):
         answered(journal, method=f"M{number}", status=405)
@@ -69,8 +69,8 @@ def test_strange_methods_are_one_number() -> None:
     assert journal.calls == {("other", "405"): 50, ("GET", "200"): 1}
 
 
-def test_what_is_no_text_is_told_escaped() -> None:
-    """What a client wrote that no message can hold is told by its code points."""
+def test_invalid_text_is_escaped() -> None:
+    """Text from a client that no message can hold is reported by its code points."""
     told: list[RestCalled] = []
     journal = Journal(told.append)
     answered(journal, reason="names: \ud800 é", path="/\udcff", method="POST")

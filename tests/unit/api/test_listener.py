@@ -5,53 +5,58 @@ import contextlib
 import datetime
 import socket
 import ssl
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-import uvloop
+import pytest
 from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 
 from appliance.api.certificate import tls_context
 from appliance.api.listener import Listener
 from appliance.configuration.settings import ApiLimits
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
+
+pytestmark = pytest.mark.anyio
 
 REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 Connect = Callable[[], Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]
 
 
+@pytest.fixture
+def anyio_backend() -> tuple[str, dict[str, Any]]:
+    """Return the loop that the api runs on."""
+    return "asyncio", {"use_uvloop": True}
+
+
 async def application(scope: Scope, receive: Receive, send: Send) -> None:
-    """Says what it was asked for."""
+    """Answer with what was requested."""
     await PlainTextResponse(scope["path"])(scope, receive, send)
 
 
-def run(limits: ApiLimits, play: Callable[[Connect], Awaitable[None]]) -> None:
-    """Serve on a free port and play; `play` gets a way to connect."""
+@contextlib.asynccontextmanager
+async def listening(limits: ApiLimits) -> AsyncIterator[Connect]:
+    """Serve on a free port; yield a function that connects."""
+    sock = socket.create_server(("127.0.0.1", 0))
+    listener = Listener(application, limits, lambda _peer: QuotaClass.REGISTERED)
+    await listener.start(sock, None)
+    writers: list[asyncio.StreamWriter] = []
 
-    async def whole() -> None:
-        sock = socket.create_server(("127.0.0.1", 0))
-        listener = Listener(application, limits, lambda _peer: Standing.REGISTERED)
-        await listener.start(sock, None)
-        writers: list[asyncio.StreamWriter] = []
+    async def connect() -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        reader, writer = await asyncio.open_connection(*sock.getsockname())
+        writers.append(writer)
+        return reader, writer
 
-        async def connect() -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-            reader, writer = await asyncio.open_connection(*sock.getsockname())
-            writers.append(writer)
-            return reader, writer
-
-        try:
-            async with asyncio.timeout(30):
-                await play(connect)
-        finally:
-            for writer in writers:
-                writer.close()
-                with contextlib.suppress(ConnectionError):
-                    await writer.wait_closed()
-            await listener.stop()
-
-    asyncio.run(whole())
+    try:
+        async with asyncio.timeout(30):
+            yield connect
+    finally:
+        for writer in writers:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+        await listener.stop()
 
 
 async def served(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
@@ -66,17 +71,16 @@ async def served(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> 
 
 
 async def cut_off(reader: asyncio.StreamReader) -> bool:
-    """Whether the server closes without a word."""
+    """Whether the server closes without an answer."""
     try:
         return await reader.read(1) == b""
     except ConnectionError:
         return True
 
 
-def test_a_host_has_so_many_connections() -> None:
-    """One more is closed at once; when one of them ends there is room again."""
-
-    async def play(connect: Connect) -> None:
+async def test_connections_of_one_host_are_limited() -> None:
+    """One more is closed at once; when one ends, the next is accepted."""
+    async with listening(ApiLimits(connections_per_host=3)) as connect:
         first = [await connect() for _ in range(3)]
         assert all([await served(*one) for one in first])
         assert not await served(*await connect())
@@ -84,23 +88,17 @@ def test_a_host_has_so_many_connections() -> None:
         while not await served(*await connect()):
             pass
 
-    run(ApiLimits(connections_per_host=3), play)
 
-
-def test_all_hosts_together_have_so_many() -> None:
-    """The limit for all holds whatever one host may have."""
-
-    async def play(connect: Connect) -> None:
+async def test_connections_of_all_hosts_are_limited() -> None:
+    """The total limit applies even where each host is below its own."""
+    async with listening(ApiLimits(connections=2, connections_per_host=50)) as connect:
         assert all([await served(*await connect()) for _ in range(2)])
         assert not await served(*await connect())
 
-    run(ApiLimits(connections=2, connections_per_host=50), play)
 
-
-def test_who_does_not_finish_his_headers_is_cut_off() -> None:
-    """At the first request and at a later one on the same connection; a new one is served."""
-
-    async def play(connect: Connect) -> None:
+async def test_unfinished_headers_are_cut_off() -> None:
+    """This holds for the first and for later requests of a connection; new connections are served."""
+    async with listening(ApiLimits(header_seconds=0.3)) as connect:
         slow, later = await connect(), await connect()
         slow[1].write(REQUEST[:20])
         assert await served(*later)
@@ -111,13 +109,10 @@ def test_who_does_not_finish_his_headers_is_cut_off() -> None:
         assert await cut_off(later[0])
         assert await served(*await connect())
 
-    run(ApiLimits(header_seconds=0.3), play)
 
-
-def test_headers_without_end_are_cut_off() -> None:
-    """A head may have 64 KiB, not more, however quickly it comes; who reads the answer is told so."""
-
-    async def play(connect: Connect) -> None:
+async def test_endless_headers_are_cut_off() -> None:
+    """Headers may have 64 KiB, however fast they arrive; the answer gives the reason."""
+    async with listening(ApiLimits()) as connect:
         reader, writer = await connect()
         writer.write(REQUEST[:16])
         try:
@@ -137,13 +132,10 @@ def test_headers_without_end_are_cut_off() -> None:
         writer.write(REQUEST[:-2] + b"X-B: " + b"y" * 50_000 + b"\r\n\r\n")
         assert (await reader.readline()).startswith(b"HTTP/1.1 200")
 
-    run(ApiLimits(), play)
 
-
-def test_many_requests_on_one_connection_are_served() -> None:
-    """The limits are per request: a client that keeps its connection is never cut off for what it sent before."""
-
-    async def play(connect: Connect) -> None:
+async def test_many_requests_on_one_connection_are_served() -> None:
+    """Limits apply per request: earlier requests never close a connection."""
+    async with listening(ApiLimits()) as connect:
         reader, writer = await connect()
         for _ in range(200):
             writer.write(REQUEST[:-2] + b"X-C: " + b"z" * 2000 + b"\r\n\r\n")
@@ -151,11 +143,9 @@ def test_many_requests_on_one_connection_are_served() -> None:
             await reader.readuntil(b"\r\n\r\n")
             assert await reader.readexactly(1) == b"/"
 
-    run(ApiLimits(), play)
-
 
 async def answered(connect: Connect, request: bytes) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """A connection whose first request was answered."""
+    """Return a connection whose first request was answered."""
     reader, writer = await connect()
     writer.write(request)
     await reader.readuntil(b"\r\n\r\n")
@@ -163,10 +153,9 @@ async def answered(connect: Connect, request: bytes) -> tuple[asyncio.StreamRead
     return reader, writer
 
 
-def test_what_comes_after_an_answer_holds_no_connection() -> None:
-    """Neither an empty line nor a body in drops keeps a connection; who sends a whole request is served."""
-
-    async def play(connect: Connect) -> None:
+async def test_data_after_an_answer_keeps_no_connection_open() -> None:
+    """Neither an empty line nor a slow body keeps a connection; a whole request is served."""
+    async with listening(ApiLimits(header_seconds=1.0)) as connect:
         empty = await answered(connect, REQUEST)
         body = await answered(connect, REQUEST[:-2] + b"Content-Length: 1000000\r\n\r\n")
         begun = await answered(connect, REQUEST)
@@ -178,26 +167,20 @@ def test_what_comes_after_an_answer_holds_no_connection() -> None:
         assert await cut_off(empty[0])
         assert await cut_off(body[0])
 
-    run(ApiLimits(header_seconds=1.0), play)
 
-
-def test_the_rest_of_a_body_costs_nobody_the_connection() -> None:
-    """A body that goes on after its answer is passed over, however long, and the next request is served."""
-
-    async def play(connect: Connect) -> None:
+async def test_the_rest_of_a_body_does_not_close_the_connection() -> None:
+    """A body that continues after its answer is skipped, however long, and the next request is served."""
+    async with listening(ApiLimits()) as connect:
         reader, writer = await answered(connect, REQUEST[:-2] + b"Content-Length: 300000\r\n\r\n")
         for _ in range(3):
             writer.write(b"x" * 100_000)
             await writer.drain()
         assert await served(reader, writer)
 
-    run(ApiLimits(), play)
 
-
-def test_so_many_requests_wait_on_a_connection() -> None:
-    """A few that are sent together are answered in order; thousands are refused."""
-
-    async def play(connect: Connect) -> None:
+async def test_pipelined_requests_are_limited() -> None:
+    """A few requests sent together are answered in order; thousands are refused."""
+    async with listening(ApiLimits()) as connect:
         reader, writer = await connect()
         writer.write(REQUEST * 10)
         for _ in range(10):
@@ -208,63 +191,38 @@ def test_so_many_requests_wait_on_a_connection() -> None:
         assert b"HTTP/1.1 400" in text
         assert text.count(b"HTTP/1.1 200") < 100
 
-    run(ApiLimits(), play)
+
+@pytest.mark.timeout(30)
+async def test_unknown_hosts_in_the_handshake_make_room(tmp_path: Path) -> None:
+    """Silent connections count once accepted; a known peer is served at once and keeps its connections."""
+    context = tls_context(tmp_path, [], datetime.datetime.now(datetime.UTC))
+    known = {"127.0.0.1"}
+    listener = Listener(
+        application,
+        ApiLimits(connections=16, connections_per_host=12),
+        lambda peer: QuotaClass.REGISTERED if peer in known else QuotaClass.UNKNOWN,
+    )
+    sock = socket.create_server(("127.0.0.1", 0))
+    where = sock.getsockname()
+    await listener.start(sock, context)
+    silent = [socket.create_connection(where, source_address=(f"127.0.1.{n}", 0)) for n in range(1, 61)]
+    trust = ssl.create_default_context(cafile=tmp_path / "certificate.pem")
+    trust.check_hostname = False
+    pool = listener.connection_table.connected
+    for _ in range(12):
+        reader, writer = await asyncio.open_connection(*where, ssl=trust)
+        assert await served(reader, writer)
+        assert pool.held_by(QuotaClass.UNKNOWN) <= 6
+        assert pool.total <= 16
+    assert pool.held("127.0.0.1") == 12
+    for one in silent:
+        one.close()
+    await listener.stop()
 
 
-def test_strangers_in_the_handshake_make_room(tmp_path: Path) -> None:
-    """Silent connections count from the moment they are accepted: a known peer is served at once, and its own stay."""
-
-    async def play() -> None:
-        context = tls_context(tmp_path, [], datetime.datetime.now(datetime.UTC))
-        known = {"127.0.0.1"}
-        listener = Listener(
-            application,
-            ApiLimits(connections=16, connections_per_host=12),
-            lambda peer: Standing.REGISTERED if peer in known else Standing.STRANGER,
-        )
-        sock = socket.create_server(("127.0.0.1", 0))
-        where = sock.getsockname()
-        await listener.start(sock, context)
-        silent = [socket.create_connection(where, source_address=(f"127.0.1.{n}", 0)) for n in range(1, 61)]
-        trust = ssl.create_default_context(cafile=tmp_path / "certificate.pem")
-        trust.check_hostname = False
-        pool = listener.visitors.connected
-        for _ in range(12):
-            reader, writer = await asyncio.open_connection(*where, ssl=trust)
-            assert await served(reader, writer)
-            assert pool.held_by(Standing.STRANGER) <= 6
-            assert pool.total <= 16
-        assert pool.held("127.0.0.1") == 12
-        for one in silent:
-            one.close()
-        await listener.stop()
-
-    async def bounded() -> None:
-        async with asyncio.timeout(30):
-            await play()
-
-    uvloop.run(bounded())
-
-
-def test_a_handshake_that_fails_leaves_nothing(tmp_path: Path) -> None:
-    """Nonsense, an end in the middle, and silence beyond the time: the place is free again."""
-
-    async def play() -> None:
-        context = tls_context(tmp_path, [], datetime.datetime.now(datetime.UTC))
-        listener = Listener(application, ApiLimits(header_seconds=0.3), lambda _peer: Standing.STRANGER)
-        sock = socket.create_server(("127.0.0.1", 0))
-        where = sock.getsockname()
-        await listener.start(sock, context)
-        peers = [socket.create_connection(where) for _ in range(3)]
-        peers[0].sendall(b"GET / HTTP/1.1\r\n\r\n")
-        peers[1].sendall(b"\x16\x03\x01")
-        peers[1].close()
-        await asyncio.sleep(0)
-        while listener.visitors.connected.total or not await at_end(peers[2]):
-            await asyncio.sleep(0.01)
-        for peer in peers:
-            peer.close()
-        await listener.stop()
+@pytest.mark.timeout(30)
+async def test_a_failed_handshake_frees_its_slot(tmp_path: Path) -> None:
+    """Garbage, an early end, and a timeout each free the slot."""
 
     async def at_end(peer: socket.socket) -> bool:
         peer.setblocking(False)
@@ -273,15 +231,25 @@ def test_a_handshake_that_fails_leaves_nothing(tmp_path: Path) -> None:
         except ConnectionError:
             return True
 
-    async def bounded() -> None:
-        async with asyncio.timeout(30):
-            await play()
+    context = tls_context(tmp_path, [], datetime.datetime.now(datetime.UTC))
+    listener = Listener(application, ApiLimits(header_seconds=0.3), lambda _peer: QuotaClass.UNKNOWN)
+    sock = socket.create_server(("127.0.0.1", 0))
+    where = sock.getsockname()
+    await listener.start(sock, context)
+    peers = [socket.create_connection(where) for _ in range(3)]
+    peers[0].sendall(b"GET / HTTP/1.1\r\n\r\n")
+    peers[1].sendall(b"\x16\x03\x01")
+    peers[1].close()
+    await asyncio.sleep(0)
+    while listener.connection_table.connected.total or not await at_end(peers[2]):
+        await asyncio.sleep(0.01)
+    for peer in peers:
+        peer.close()
+    await listener.stop()
 
-    uvloop.run(bounded())
 
-
-def test_a_known_peer_is_opened_before_strangers_that_came_first() -> None:
-    """50 strangers connect, then a peer with a good token: the loop opens at most two more of theirs before its."""
+async def test_a_known_peer_is_opened_before_waiting_unknown_hosts() -> None:
+    """After 50 unknown hosts a peer with a valid token connects: at most two of the 50 are opened before it."""
     opened: list[str] = []
 
     class Noting(Listener):
@@ -289,19 +257,16 @@ def test_a_known_peer_is_opened_before_strangers_that_came_first() -> None:
             opened.append(connection.transport.get_extra_info("peername")[0])
             return super().protocol_of(connection)
 
-    async def whole() -> None:
-        sock = socket.create_server(("127.0.0.1", 0), backlog=128)
-        known = {"127.0.0.99": Standing.NAMED}
-        listener = Noting(application, ApiLimits(), lambda peer: known.get(peer, Standing.STRANGER))
-        addresses = [*(f"127.0.0.{number}" for number in range(10, 60)), "127.0.0.99"]
-        clients = [socket.create_connection(sock.getsockname(), source_address=(one, 0)) for one in addresses]
-        await listener.start(sock, None)
-        async with asyncio.timeout(30):
-            while len(opened) < len(addresses):
-                await asyncio.sleep(0)
-        assert opened.index("127.0.0.99") <= 3
-        for client in clients:
-            client.close()
-        await listener.stop()
-
-    uvloop.run(whole())
+    sock = socket.create_server(("127.0.0.1", 0), backlog=128)
+    known = {"127.0.0.99": QuotaClass.NAMED}
+    listener = Noting(application, ApiLimits(), lambda peer: known.get(peer, QuotaClass.UNKNOWN))
+    addresses = [*(f"127.0.0.{number}" for number in range(10, 60)), "127.0.0.99"]
+    clients = [socket.create_connection(sock.getsockname(), source_address=(one, 0)) for one in addresses]
+    await listener.start(sock, None)
+    async with asyncio.timeout(30):
+        while len(opened) < len(addresses):
+            await asyncio.sleep(0)
+    assert opened.index("127.0.0.99") <= 3
+    for client in clients:
+        client.close()
+    await listener.stop()

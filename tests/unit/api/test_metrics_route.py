@@ -15,7 +15,7 @@ from appliance.channel.answers.status import RecorderState
 from appliance.telemetry.metrics import BOUNDS, METRICS, Meter, markdown
 from tests.support.answers import example
 
-PAGE = Path(__file__).parents[3] / "docs" / "metrics.md"
+PAGE = Path(__file__).parents[3] / "docs" / "reference" / "metrics.md"
 
 
 CALLS = {("GET", "200"): 8}
@@ -26,7 +26,7 @@ def body(
     processes: Sequence[dict[str, Any]] = ({"role": "control", "pid": 1, "restarts": 4},),
     forwarding: dict[str, Any] | None = FORWARDING,
 ) -> Measures:
-    """Control's answer, small."""
+    """Return a small answer of control."""
     meter = Meter()
     meter.decided("publish", "deny", 0.0003)
     meter.decided("publish", "deny", 99.0)
@@ -48,7 +48,6 @@ def body(
         nodes={"live": 2, "lost": 1},
         registrations={"publication": 3},
         monitors=[("drop", "safeTrigger", 4)],
-        margins=[("safeTrigger", "8:35", False, 0.025)],
         slices={"goals": (12, 100)},
         relayed={"/a\"\\\n": [1, 2, 3]},
         delayed={"/a": [5, 4, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0.25]},
@@ -65,12 +64,12 @@ def body(
 
 
 def host(name: str, state: str, **more: Any) -> dict[str, Any]:
-    """A row of the hosts."""
+    """Return a row of the hosts."""
     return {"name": name, "state": state, "serial": "1f", "expires": 9.0, "ports": {"state": "closed"}} | more
 
 
-def test_every_metric_is_given_as_it_is_listed() -> None:
-    """Names, kinds, labels and helps are those of the list, and a Prometheus parser reads all of it."""
+def test_every_metric_is_exported_as_listed() -> None:
+    """Names, kinds, labels and helps are those of the list, and a Prometheus parser reads the page."""
     families = {one.name: one for one in text_string_to_metric_families(rendered(body(), CALLS).decode())}
     for metric in METRICS:
         family = families[metric.name.removesuffix("_total")]
@@ -80,8 +79,8 @@ def test_every_metric_is_given_as_it_is_listed() -> None:
             assert set(sample.labels) - {"le"} == set(metric.labels), sample
 
 
-def test_values_are_what_was_counted() -> None:
-    """Counters, gauges, histogram buckets (cumulative); a topic's name is escaped and comes back whole."""
+def test_values_are_exported() -> None:
+    """Covers counters, gauges and cumulative histogram buckets; the parser restores the escaped name of a topic."""
     samples = {
         (one.name, tuple(sorted(one.labels.items()))): one.value
         for family in text_string_to_metric_families(rendered(body(), CALLS).decode())
@@ -90,8 +89,6 @@ def test_values_are_what_was_counted() -> None:
     assert samples["rosrv_decisions_total", (("category", "publish"), ("outcome", "deny"))] == 2
     assert samples["rosrv_decision_seconds_count", ()] == 2
     assert samples["rosrv_monitor_events_total", (("kind", "drop"), ("monitor", "safeTrigger"))] == 4
-    place = (("holds", "false"), ("monitor", "safeTrigger"), ("place", "8:35"))
-    assert samples["rosrv_monitor_margin", place] == 0.025
     goals = (("monitor", "goals"),)
     assert samples["rosrv_monitor_slices", goals] == 12
     assert samples["rosrv_monitor_slice_limit", goals] == 100
@@ -119,7 +116,7 @@ def test_values_are_what_was_counted() -> None:
 
 
 def test_tunnels_are_measured() -> None:
-    """Of an enrolled host: up, age, bytes, when its certificate ends, ports; of a revoked one nothing but its count."""
+    """An enrolled host has state, age, bytes, certificate expiry and ports; a revoked host is only counted."""
     samples = {
         (one.name, tuple(sorted(one.labels.items()))): one.value
         for family in text_string_to_metric_families(rendered(body(), CALLS).decode())
@@ -136,8 +133,8 @@ def test_tunnels_are_measured() -> None:
     assert ("rosrv_tunnel_up", (("host", "b"),)) not in samples
 
 
-def test_recordings_are_counted_while_there_is_a_recorder() -> None:
-    """With it, whether it runs and what it has; without it nothing is said."""
+def test_recordings_are_measured_only_with_a_recorder() -> None:
+    """With a recorder its state and contents are exported; without one nothing is."""
 
     def samples(recorder: RecorderState | None) -> dict[str, float]:
         given = body()
@@ -160,21 +157,21 @@ def test_recordings_are_counted_while_there_is_a_recorder() -> None:
     }
 
 
-def test_nothing_is_said_of_a_forwarding_that_nobody_wants() -> None:
-    """Without a syslog receiver there are no samples of it, so that no alert takes absence for a fault."""
+def test_forwarding_has_no_samples_unless_configured() -> None:
+    """Without a syslog receiver there are no samples, so that no alert fires."""
     answer = body(forwarding=None)
     families = {one.name: one for one in text_string_to_metric_families(rendered(answer, CALLS).decode())}
     assert not any(family.samples for name, family in families.items() if name.startswith("rosrv_syslog_"))
 
 
-def test_the_page_is_what_the_code_says() -> None:
-    """docs/metrics.md lists what is measured (python -m appliance.telemetry.metrics)."""
+def test_the_page_matches_the_code() -> None:
+    """docs/reference/metrics.md lists all metrics (python -m appliance.telemetry.metrics)."""
     generated = PAGE.read_text().split("<!-- generated: python -m appliance.telemetry.metrics -->\n")[1]
     assert generated.startswith(markdown())
 
 
-def test_processes_of_one_role_are_series_of_their_own() -> None:
-    """Of several relay processes each has its restarts and its memory: no series is given twice."""
+def test_processes_of_one_role_have_separate_series() -> None:
+    """Each relay process has its own restarts and memory; no series appears twice."""
     answer = body(
         [
             {"role": "relay", "pid": os.getpid(), "restarts": 1},

@@ -1,4 +1,4 @@
-"""Tests of `appliance.api.moments`: each moment of an answer as RFC 3339, too, and the rest as it was."""
+"""Tests of `appliance.api.moments`: times in answers get RFC 3339 texts; other fields are unchanged."""
 
 from typing import Annotated, Any
 
@@ -27,11 +27,7 @@ class _Outer(msgspec.Struct):
     text: str = "since"
 
 
-_INNER = {
-    "at": None,
-    "exact": 1_795_155_646_123_456_789,
-    "exact_utc": "2026-11-20T06:20:46.123456789Z",
-}
+_INNER = {"at": None, "exact": 1_795_155_646_123_456_789, "exact_utc": "2026-11-20T06:20:46.123456789Z"}
 
 
 def _outer() -> _Outer:
@@ -39,8 +35,8 @@ def _outer() -> _Outer:
     return _Outer(1_795_155_646.1, [inner], {"a": inner, "b": None}, (3, inner))
 
 
-def test_each_moment_has_its_text_beside_it() -> None:
-    """Wherever it is, in lists or in tables, if there is a moment; no text has digits that its number had not."""
+def test_each_time_has_its_text_beside_it() -> None:
+    """This holds in lists and tables, unless the time is missing; a text has no more digits than its number."""
     assert in_full(_outer()) == {
         "since": 1_795_155_646.1,
         "since_utc": "2026-11-20T06:20:46.100000000Z",
@@ -51,8 +47,8 @@ def test_each_moment_has_its_text_beside_it() -> None:
     }
 
 
-def test_the_schema_says_it() -> None:
-    """With every field that is required; what is sent fits it."""
+def test_the_schema_describes_the_texts() -> None:
+    """The texts are required fields, and an answer matches the schema."""
     (root,), kinds = msgspec.json.schema_components([_Outer], ref_template="#/components/schemas/{name}")
     for schema in kinds.values():
         describe(schema)
@@ -69,9 +65,9 @@ def _bare(value: Any) -> Any:
     return [_bare(one) for one in value] if isinstance(value, list) else value
 
 
-@pytest.mark.usefixtures("app")  # it tells the contract of its kinds
-def test_nothing_else_of_an_answer_changes() -> None:
-    """Of no kind that has moments: names, defaults and all else are what msgspec makes of it."""
+@pytest.mark.usefixtures("app")  # tells the contract the type
+def test_other_fields_are_unchanged() -> None:
+    """Names, defaults and values equal msgspec's own output."""
     kinds = [kind for kind in CONTRACT.kinds if UNIT in str(msgspec.json.schema(kind))]
     assert len(kinds) > 15
     for kind in kinds:
@@ -80,14 +76,14 @@ def test_nothing_else_of_an_answer_changes() -> None:
         assert _bare(msgspec.json.decode(msgspec.json.encode(in_full(one)))) == plain, kind
 
 
-def test_what_has_no_moment_is_not_walked_through() -> None:
-    """The graph of a robot is encoded as it is."""
+def test_an_answer_without_times_is_not_walked() -> None:
+    """The graph of a robot is encoded directly."""
     graph = example(Graph)
     assert in_full(graph) is graph
 
 
-def test_what_is_given_may_be_wrong() -> None:
-    """A moment as RFC 3339, or a problem that says what would be right."""
+def test_an_invalid_time_is_a_problem_with_a_hint() -> None:
+    """A time in RFC 3339 is accepted; otherwise the problem shows a valid one."""
     assert given("2026-11-20T06:20:46.123456789Z") == 1_795_155_646_123_456_789
     with pytest.raises(ProblemError, match="2026-03-01T12:00:00Z"):
-        given("yesterday")
+        given("tomorrow")

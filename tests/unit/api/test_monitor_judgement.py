@@ -1,4 +1,4 @@
-"""Tests of `appliance.api.monitor_judgement`: what specifications are, without an appliance."""
+"""Tests of `appliance.api.monitor_judgement`: describing specifications without an appliance."""
 
 import pytest
 
@@ -17,8 +17,8 @@ A = "a() { int n; event said() /chatter std_msgs/String '{}' { } ere: said said 
 TICK = "b() { event t() every 500ms { } event asked(bool on) service /set std_srvs/SetBool request '{data:on}' { } }"
 
 
-def test_findings_without_a_place_stay_words() -> None:
-    """What cannot be pointed at is in the detail alone."""
+def test_findings_without_a_position_stay_in_the_detail() -> None:
+    """A finding without a position appears in the detail only."""
     problem = refusal("refused", ["a would go, too: it is in the same file", "a.rv:1:2: error: odd: 1:2"])
     assert problem.findings is not None
     assert [(one.file, one.line, one.text) for one in problem.findings] == [("a.rv", 1, "odd: 1:2")]
@@ -26,13 +26,13 @@ def test_findings_without_a_place_stay_words() -> None:
     assert findings_of(["nonsense", "a:b:c: error: x"]) == []
 
 
-def test_a_monitor_is_told_apart() -> None:
-    """Events of topics, services and clocks; properties with what they handle; a picture of what is finite."""
+def test_a_monitor_is_described() -> None:
+    """Covers events of topics, services and clocks, properties with their handlers, and a picture if finite."""
     compiler = Compiler()
     a = compiler.monitor(example(Monitors, revision=1, files={"a.rv": A, "b.rv": TICK}, definitions={}), "a")
     b = compiler.monitor(
         example(Monitors, revision=1), "b"
-    )  # compiled before: the same revision is not compiled again
+    )  # already compiled: the same revision is not compiled again
     (said,) = events_of(a)
     assert (said.name, said.topic, said.type, said.part, said.every) == (
         "said",

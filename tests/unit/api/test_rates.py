@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from appliance.api.rates import Buckets, peer_key
 
 
-def test_a_burst_and_then_the_rate() -> None:
-    """So many at once, then one for each part of a second; `wait` says what `take` would."""
+def test_a_burst_is_followed_by_the_rate() -> None:
+    """A burst passes at once, then one per interval; `wait` predicts `take`."""
     buckets = Buckets(2.0, 3)
     assert [buckets.take("a", 0.0) for _ in range(4)] == [0, 0, 0, 0.5]
     assert buckets.wait("a", 0.25) == pytest.approx(0.25)
@@ -17,8 +17,8 @@ def test_a_burst_and_then_the_rate() -> None:
     assert buckets.take("b", 0.5) == 0
 
 
-def test_a_clock_that_stands_gives_nothing() -> None:
-    """Without time nothing is added, and time that goes back takes nothing away."""
+def test_a_stopped_clock_adds_nothing() -> None:
+    """Without elapsed time nothing is added; a clock set back removes nothing."""
     buckets = Buckets(1.0, 1)
     assert buckets.take("a", 10.0) == 0
     assert buckets.take("a", 5.0) > 0
@@ -27,7 +27,7 @@ def test_a_clock_that_stands_gives_nothing() -> None:
 
 @given(st.lists(st.integers(0, 10_000), max_size=300))
 def test_memory_is_bounded(peers: list[int]) -> None:
-    """However many addresses come, there are never more buckets than allowed."""
+    """The number of buckets stays within the limit for any number of addresses."""
     buckets = Buckets(1e-6, 5, peers=16)
     hosts = [f"10.0.{peer // 256}.{peer % 256}" for peer in peers]
     for second, host in enumerate(hosts):
@@ -37,7 +37,7 @@ def test_memory_is_bounded(peers: list[int]) -> None:
 
 
 def test_what_counts_as_one_peer() -> None:
-    """An IPv4 address, also when mapped; the /64 of an IPv6 address; a text that is none is itself."""
+    """A peer is an IPv4 address, also when mapped, the /64 of an IPv6 address, or any other text as it is."""
     assert peer_key("10.0.0.1") == "10.0.0.1"
     assert peer_key("::ffff:10.0.0.1") == "10.0.0.1"
     assert peer_key("2001:db8::1") == peer_key("2001:db8::ffff:2") != peer_key("2001:db8:0:1::1")

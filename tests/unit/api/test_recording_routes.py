@@ -1,4 +1,4 @@
-"""A recording that is removed while it is fetched."""
+"""A recording that is removed during its download."""
 
 import asyncio
 import shutil
@@ -15,7 +15,7 @@ from appliance.api.problems import ProblemError
 from appliance.api.services import Services
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.recording_answers import Recording
-from appliance.recorder.bag_writer import BagWriter, Message
+from appliance.recorder.bag_writer import BagMessage, BagWriter
 from appliance.recorder.mcap import as_mcap
 from tests.support.answers import example
 from tests.unit.recorder.test_bag_writer import HEADER, SECOND, body
@@ -24,14 +24,14 @@ _EVE = Bearer("eve", "eve", "investigator", 1e12, "shown")
 
 
 @pytest.mark.parametrize("mcap", [False, True])
-def test_what_is_answered_is_sent_to_its_end(tmp_path: Path, *, mcap: bool) -> None:
-    """It is open when the answer begins, and may go then; what went before is an error, and no answer of 200."""
+def test_a_started_download_is_completed(tmp_path: Path, *, mcap: bool) -> None:
+    """A file removed after the answer began is sent whole; one removed before gives an error, not 200."""
     kept = tmp_path / "recordings" / ("a" * 20)
     kept.mkdir(parents=True)
     bag = BagWriter(kept / "recording.bag", {})
     bag.connect(HEADER)
     for second in range(3):
-        bag.write([Message(0, second * SECOND, body(b"x" * 2_000_000))])
+        bag.write([BagMessage(0, second * SECOND, body(b"x" * 2_000_000))])
     bag.close()
     size = (kept / "recording.bag").stat().st_size
     whole = b"".join(as_mcap(kept / "recording.bag")) if mcap else (kept / "recording.bag").read_bytes()

@@ -1,6 +1,5 @@
-"""Bodies of REST: what is wrong with one is said whole, each field with its place."""
+"""Bodies of REST: an invalid body gets all its errors in one answer, each with its field."""
 
-import asyncio
 import json
 from typing import Annotated, Any
 
@@ -13,10 +12,11 @@ from fastapi.responses import Response
 from appliance.api import routing
 from appliance.api.problems import ProblemError
 from appliance.api.routing import Routes, body
+from tests.support.asgi import requested
 
 
 class Part(msgspec.Struct, forbid_unknown_fields=True):
-    """A part of a body."""
+    """Part of a body."""
 
     port: Annotated[int, msgspec.Meta(ge=1, le=65535)]
 
@@ -31,7 +31,7 @@ class Wanted(msgspec.Struct, forbid_unknown_fields=True):
 
 @pytest.fixture
 def app(monkeypatch: pytest.MonkeyPatch) -> FastAPI:
-    """A route that takes such a body; the contract of REST does not know of it."""
+    """Return an application with a route for such a body, outside the REST contract."""
     monkeypatch.setattr(routing, "CONTRACT", routing.Contract())
     app, routes = FastAPI(), Routes()
 
@@ -49,17 +49,9 @@ def app(monkeypatch: pytest.MonkeyPatch) -> FastAPI:
 
 
 def posted(app: FastAPI, sent: Any) -> httpx.Response:
-    """The answer to a body; text is sent as it is."""
-
-    async def ask() -> httpx.Response:
-        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://x") as client:
-            return await client.post(
-                "/",
-                content=sent if isinstance(sent, str) else json.dumps(sent),
-                headers={"content-type": "application/json"},
-            )
-
-    return asyncio.run(ask())
+    """Return the answer to a body; text is sent unchanged."""
+    content = sent if isinstance(sent, str) else json.dumps(sent)
+    return requested(app, "POST", "/", content=content, headers={"content-type": "application/json"})
 
 
 @pytest.mark.parametrize(
@@ -73,7 +65,7 @@ def posted(app: FastAPI, sent: Any) -> httpx.Response:
     ],
 )
 def test_every_wrong_field_is_named(app: FastAPI, sent: Any, places: list[str]) -> None:
-    """With its place, in one answer; what is missing and what is unknown, too."""
+    """The answer lists the path of each wrong, missing or unknown field."""
     answer = posted(app, sent)
     assert answer.status_code == 422
     assert [one["where"] for one in answer.json()["errors"]] == places
@@ -83,7 +75,7 @@ def test_every_wrong_field_is_named(app: FastAPI, sent: Any, places: list[str]) 
 @pytest.mark.parametrize(
     "rest", ["", "[" * 100_000, "1e" + "9" * 1000, '"\\ud800"', '{"a":' * 50_000, "9" * 300_000]
 )
-def test_what_is_no_json_behind_what_is_wrong_is_told(app: FastAPI, rest: str) -> None:
-    """The reader ends with the first wrong field; what follows may end it in another way."""
+def test_invalid_json_after_a_wrong_field_is_reported(app: FastAPI, rest: str) -> None:
+    """The parser stops at the first wrong field; invalid JSON after it is still an error."""
     answer = posted(app, f'{{"name": 1, "count": {rest}')
     assert (answer.status_code, answer.json()["type"]) == (422, "urn:rosrv:problem:not-json")

@@ -9,18 +9,18 @@ from starlette.responses import Response
 
 from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
-from appliance.api.streams import Held, Streams
+from appliance.api.streams import StreamResponse, Streams
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
 
 def bearer(name: str, role: TokenRole = "viewer") -> Bearer:
-    """The holder of a token."""
+    """Return the holder of a token."""
     return Bearer(name, name, role, 1e12, "shown")
 
 
 def taken(streams: Streams, who: Bearer, peer: str, most: int = 100) -> list[Callable[[], None]]:
-    """As many places as this one gets; how each is given back."""
+    """Take as many slots as possible; return the functions that release them."""
     places: list[Callable[[], None]] = []
     try:
         while len(places) < most:
@@ -30,16 +30,16 @@ def taken(streams: Streams, who: Bearer, peer: str, most: int = 100) -> list[Cal
     return places
 
 
-def test_two_hundred_viewers_leave_places_to_operators() -> None:
-    """From two hundred machines with a token each: together they get what is not kept, and an operator follows."""
+def test_two_hundred_viewers_leave_slots_to_operators() -> None:
+    """200 hosts with a token each get all slots that are not reserved; an operator still gets one."""
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 16)
     viewers = sum(len(taken(streams, bearer(f"v{one}"), f"10.0.{one}.1")) for one in range(200))
     assert viewers == 12
     assert len(taken(streams, bearer("op", "operator"), "10.1.0.1")) == 4
 
 
-def test_one_token_and_one_machine_have_a_share() -> None:
-    """Six for a token from however many machines, eight for a machine with however many tokens."""
+def test_one_token_and_one_host_have_a_quota() -> None:
+    """A token gets six streams from any number of hosts, a host eight with any number of tokens."""
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 16)
     assert len(taken(streams, bearer("a"), "10.0.0.1", 3) + taken(streams, bearer("a"), "10.0.0.2")) == 6
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 16)
@@ -47,16 +47,16 @@ def test_one_token_and_one_machine_have_a_share() -> None:
 
 
 @pytest.mark.parametrize(("whole", "first"), [(1, 1), (2, 1), (64, 24)])
-def test_a_share_is_as_large_in_proportion(whole: int, first: int) -> None:
-    """However many streams are configured, a token gets its part and an operator one where there are two."""
+def test_quotas_scale_with_the_total(whole: int, first: int) -> None:
+    """For any configured total a token gets its fraction, and an operator gets one if there are two."""
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, whole)
     assert len(taken(streams, bearer("a"), "10.0.0.1")) == first
     assert bool(taken(streams, bearer("op", "admin"), "10.0.0.2", 1)) is (whole > 1)
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_place_is_given_back_however_the_response_ends(*, fails: bool) -> None:
-    """Sent to its end or broken off: whoever followed may follow again, and nothing is remembered of the token."""
+def test_a_slot_is_released_when_the_response_ends(*, fails: bool) -> None:
+    """Completed or aborted, the token may follow again, and nothing is stored about it."""
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 1)
 
     async def send(_message: Any) -> None:
@@ -67,7 +67,7 @@ def test_a_place_is_given_back_however_the_response_ends(*, fails: bool) -> None
         return {"type": "http.disconnect"}
 
     for _ in range(3):
-        held = Held(Response("x"), streams.take(bearer("a"), "10.0.0.1", "clients follow"))
+        held = StreamResponse(Response("x"), streams.take(bearer("a"), "10.0.0.1", "clients follow"))
         try:
             asyncio.run(held({"type": "http"}, receive, send))
         except ConnectionResetError:

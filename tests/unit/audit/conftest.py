@@ -1,4 +1,4 @@
-"""What tests of the audit log share: a place, a log with a signer that lives in the test, and records."""
+"""Fixtures of the audit log: a path, a key, a signer in the test's process, and logs."""
 
 import contextlib
 import time
@@ -10,66 +10,66 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log import AuditLog
-from appliance.ipsec.removals import Kept, RemovalRefusedError, Removals
-from appliance.ipsec.signed_checkpoints import CheckpointRefusedError, SignedCheckpoints
+from appliance.ipsec.removals import RemovalApprover, RemovalRefusedError, RetentionLimits
+from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError
 
 MakeLog = Callable[..., AuditLog]
 
 
 class Notary:
-    """The signer's memory, settings and clock, which stands `ago` nanoseconds behind."""
+    """The signer's memory, settings and clock, which runs `ago` nanoseconds behind."""
 
     def __init__(self, directory: Path) -> None:
         directory.mkdir()
         self.directory = directory
         self.ago = 0
-        self.kept = Kept()
-        self.refused: Callable[[bool], object] = bool  # hears whether it was for its age
-        self._signed = SignedCheckpoints(directory, clock=self._now)
+        self.kept = RetentionLimits()
+        self.refused: Callable[[bool], object] = bool  # records whether age was the reason
+        self._signed = CheckpointMemory(directory, clock=self._now)
 
     def _now(self) -> int:
         return time.time_ns() - self.ago
 
     def sign(self, text: bytes) -> None:
-        """Remember a checkpoint, unless it is of another past: some tests make these."""
+        """Remember a checkpoint, unless it is from another history: some tests make these."""
         with contextlib.suppress(CheckpointRefusedError):
             self._signed.approve(text)
 
     def approve(self, checkpoint: bytes, newest: bytes) -> bytes:
-        """The text of a removal. Raises `RemovalRefusedError`."""
-        return Removals(self._signed, self.kept, clock=self._now).approve(checkpoint, newest)
+        """Return the signed text of a removal. Raises `RemovalRefusedError`."""
+        return RemovalApprover(self._signed, self.kept, clock=self._now).approve(checkpoint, newest)
 
 
 @pytest.fixture
 def notary(tmp_path: Path) -> Notary:
-    """What the signer of a test's logs remembers."""
+    """Return the memory of the test's signer."""
     return Notary(tmp_path / "notary")
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Where the log of a test is."""
+    """Return the path of the test's log."""
     return tmp_path / "audit.db"
 
 
 @pytest.fixture
 def key() -> Ed25519PrivateKey:
-    """The key of a test's signer."""
+    """Return the key of the test's signer."""
     return Ed25519PrivateKey.generate()
 
 
 @pytest.fixture
 def make_log(path: Path, key: Ed25519PrivateKey, notary: Notary) -> Iterator[MakeLog]:
-    """Opens logs at `path` that are signed at once, and closes them after the test.
+    """Return a function that opens logs at `path` with signatures and closes them after the test.
 
-    The signer has the retention that the log is opened with.
+    The signer uses the retention that the log is opened with.
     """
-    logs: list[AuditLog] = []  # the one that is open
+    logs: list[AuditLog] = []  # the open log
     made: list[AuditLog] = []
     public = key.public_key().public_bytes_raw()
 
     def sign(number: int, text: bytes) -> None:
-        if logs:  # what a log asks while it is being made is asked again by `request_signatures`
+        if logs:  # requests made by the constructor are repeated by `request_signatures`
             notary.sign(text)
             logs[-1].signed(number, key.sign(text), public)
 
@@ -89,7 +89,7 @@ def make_log(path: Path, key: Ed25519PrivateKey, notary: Notary) -> Iterator[Mak
         settings.setdefault("removals", approve)
         logs.clear()
         if "retention" in settings:
-            notary.kept = Kept(settings["retention"].days, settings["retention"].size)
+            notary.kept = RetentionLimits(settings["retention"].days, settings["retention"].size)
         log = AuditLog(path, **settings)
         logs.append(log)
         made.append(log)

@@ -1,20 +1,20 @@
-"""Tests of storing whatever a stranger can make a record hold."""
+"""Tests of storing any value that an unknown host can put into a record."""
 
 from typing import Any
 
 import pytest
 
 from appliance.audit.columns import LARGEST_DETAIL, LONGEST_TEXT, from_columns, to_columns
-from appliance.audit.record import Record, RuleReference, Severity
+from appliance.audit.record import AuditRecord, RuleReference, Severity
 
 
-def make(**fields: Any) -> Record:
-    """A record with these fields."""
-    return Record(**{"id": "0" * 20, "time": 1, "event": "decision", **fields})
+def make(**fields: Any) -> AuditRecord:
+    """Return a record with these fields."""
+    return AuditRecord(**{"id": "0" * 20, "time": 1, "event": "decision", **fields})
 
 
 def test_round_trip() -> None:
-    """What is stored is what comes back, to the last field and character."""
+    """The stored record equals the original, to the last field and character."""
     record = make(
         severity=Severity.ALARM, decision="deny", host="10.0.0.1", caller_id="/\x1b[2J\u202e\0é",
         category="call", resource="/a", rule=RuleReference("Clients", "/a", "p.ini", 7), revision=2,
@@ -33,8 +33,8 @@ def test_round_trip() -> None:
     ],
     ids=lambda value: type(value).__name__,
 )  # fmt: skip
-def test_nothing_a_record_holds_stops_the_log(value: Any) -> None:
-    """Any value in `detail` is stored, cut or escaped where it must be, and bounded in size."""
+def test_any_detail_can_be_stored(value: Any) -> None:
+    """Any value in `detail` is stored, cut or escaped where necessary, and bounded in size."""
     columns = to_columns(make(detail={"value": value}), 1)
     assert len(columns.detail) <= LARGEST_DETAIL
     assert from_columns(columns).detail
@@ -42,7 +42,7 @@ def test_nothing_a_record_holds_stops_the_log(value: Any) -> None:
 
 @pytest.mark.parametrize("field", ["host", "caller_id", "category", "resource", "reason", "event"])
 def test_texts_are_bounded_and_storable(field: str) -> None:
-    """Texts that cannot be stored are escaped; long ones are cut and say how long they were."""
+    """Texts that cannot be stored are escaped; long ones are cut and state their length."""
     assert getattr(from_columns(to_columns(make(**{field: "a\udcffb"}), 1)), field) == "a\\udcffb"
     cut = getattr(from_columns(to_columns(make(**{field: "z" * 100_000}), 1)), field)
     assert len(cut) <= LONGEST_TEXT
@@ -60,15 +60,15 @@ def test_texts_are_bounded_and_storable(field: str) -> None:
     ids=str,
 )  # fmt: skip
 def test_fields_of_a_wrong_type(fields: dict[str, Any]) -> None:
-    """A record with fields of a wrong type (a defect of ours) is stored as well as it can be."""
+    """A record with fields of a wrong type (our defect) is stored as well as possible."""
     columns = to_columns(make(**fields), 1)
     assert all(type(one) in (str, int, bytes, type(None)) for one in columns)
     assert abs(columns.time) < 1 << 63
     assert from_columns(columns).id == "0" * 20
 
 
-def test_of_details_too_large_the_small_ones_stay() -> None:
-    """A load of many files says its revision and hash though their names do not fit, and names what is left out."""
+def test_small_details_survive_large_ones() -> None:
+    """A load of many files keeps revision and hash though its names do not fit, and names the omitted fields."""
     names = [f"monitor_{number}" * 20 for number in range(1000)]
     detail = {
         "sha256": "a" * 64,

@@ -1,4 +1,4 @@
-"""Tests of checkpoints kept on another machine. The attacker is root: he has the signer's key too."""
+"""Tests of checkpoints copied to another machine. The attacker is root and also has the signer's key."""
 
 import json
 import sqlite3
@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.audit.chain_findings import Kind, Verification
+from appliance.audit.chain_findings import FindingKind, Verification
 from appliance.audit.copies import (
     SYSLOG_ELEMENT,
     CopiesUnreadableError,
@@ -27,7 +27,7 @@ from tests.unit.audit.conftest import MakeLog, Notary
 
 @pytest.fixture
 def log(make_log: MakeLog, path: Path) -> Path:
-    """A closed log of two hundred records with signed checkpoints."""
+    """Return a closed log of two hundred records with signed checkpoints."""
     log = make_log(checkpoint_every=50, checkpoint_seconds=3600)
     for number in range(200):
         log.record(decision(log, number))
@@ -38,14 +38,14 @@ def log(make_log: MakeLog, path: Path) -> Path:
     return path
 
 
-def kinds(result: Verification) -> set[Kind]:
-    """What was found."""
+def kinds(result: Verification) -> set[FindingKind]:
+    """Return the kinds of the findings."""
     assert result.ok == (not result.findings)
     return {one.kind for one in result.findings}
 
 
-def test_untouched(log: Path) -> None:
-    """A log that nobody touched agrees with every checkpoint that was kept elsewhere, and it is said how far."""
+def test_an_unchanged_log_agrees(log: Path) -> None:
+    """An unchanged log agrees with every copied checkpoint, and the result names the last one."""
     copies = signed_checkpoints(log)
     assert len(copies) >= 4
     result = verify(log, copies=copies)
@@ -63,41 +63,43 @@ def test_untouched(log: Path) -> None:
         "UPDATE record SET host = '10.0.0.1' WHERE sequence = 2",
     ],
 )
-def test_history_signed_anew_by_root(log: Path, key: Ed25519PrivateKey, tmp_path: Path, change: str) -> None:
-    """A history written and signed anew with the real key passes every check here, and not the other machine's copy."""
+def test_history_signed_by_root_is_found(
+    log: Path, key: Ed25519PrivateKey, tmp_path: Path, change: str
+) -> None:
+    """A history rewritten and signed with the real key passes every local check, but not the copy."""
     copies = signed_checkpoints(log)
     write_anew(log, key, tmp_path / "signer", change)
     public = key.public_key().public_bytes_raw()
     assert verify(log, public, tmp_path / "signer").ok
     result = verify(log, public, tmp_path / "signer", copies)
-    assert Kind.REWRITTEN in kinds(result)
+    assert FindingKind.REWRITTEN in kinds(result)
 
 
-def test_the_place_is_bounded_by_two_checkpoints(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
-    """The range that is named begins after the last checkpoint that agrees and ends at the first that does not."""
+def test_the_range_is_between_two_checkpoints(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
+    """The reported range begins after the last checkpoint that agrees and ends at the first that does not."""
     copies = signed_checkpoints(log)
     write_anew(log, key, tmp_path / "signer", "UPDATE record SET reason = 'x' WHERE sequence = 110")
     result = verify(log, copies=copies)
-    finding = next(one for one in result.findings if one.kind is Kind.REWRITTEN)
+    finding = next(one for one in result.findings if one.kind is FindingKind.REWRITTEN)
     assert finding.first <= 110 <= finding.last
     assert finding.last in {one.sequence for one in copies}
     assert finding.first - 1 in {one.sequence for one in copies}
 
 
-def test_the_end_cut_off_by_root(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
-    """Records cut off from the end, checkpoints and the signer's memory with them, are found by the copy."""
+def test_an_end_removed_by_root_is_found(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
+    """The copy shows removed last records, even without their checkpoints and the signer's memory."""
     copies = signed_checkpoints(log)
     with closing(sqlite3.connect(log)) as connection:
         connection.execute("DELETE FROM record WHERE sequence > 90")
         connection.execute("DELETE FROM checkpoint WHERE sequence > 90")
         connection.commit()
     result = verify(log, copies=copies)
-    cut = [one for one in result.findings if one.kind is Kind.TRUNCATED]
+    cut = [one for one in result.findings if one.kind is FindingKind.TRUNCATED]
     assert [(one.first, one.last) for one in cut] == [(91, copies[1].sequence)]
 
 
-def test_another_log_in_its_place(log: Path, make_log: MakeLog, path: Path) -> None:
-    """A new log, however well signed, is not the one that the other machine's checkpoints are of."""
+def test_another_log_is_found(log: Path, make_log: MakeLog, path: Path) -> None:
+    """A new log, however well signed, does not match the copied checkpoints."""
     copies = signed_checkpoints(log)
     for one in path.parent.glob("audit.db*"):
         one.unlink()
@@ -105,31 +107,33 @@ def test_another_log_in_its_place(log: Path, make_log: MakeLog, path: Path) -> N
     fresh.record(decision(fresh))
     assert settle(fresh) is None
     fresh.close()
-    assert kinds(verify(path, copies=copies)) == {Kind.LOG_REPLACED}
+    assert kinds(verify(path, copies=copies)) == {FindingKind.LOG_REPLACED}
 
 
 def test_a_forged_copy_proves_nothing(log: Path) -> None:
-    """A copy that the key did not sign is told, and is not held against the log."""
+    """A copy without a valid signature is reported and not compared with the log."""
     copies = signed_checkpoints(log)
     forged = msgspec.structs.replace(copies[0], hash="0" * 64)
     result = verify(log, copies=[forged, *copies[1:]])
-    assert kinds(result) == {Kind.SIGNATURE_WRONG}
+    assert kinds(result) == {FindingKind.SIGNATURE_WRONG}
     assert result.elsewhere is not None
     assert result.elsewhere.checkpoints == len(copies) - 1
 
 
-def test_all_signed_with_a_new_key(log: Path, tmp_path: Path) -> None:
-    """Root who replaces the key, its pin and every signature is found by the key of the copies."""
+def test_a_replaced_key_is_found(log: Path, tmp_path: Path) -> None:
+    """If root replaces the key, its pin and every signature, the key of the copies shows it."""
     copies = signed_checkpoints(log)
     other = Ed25519PrivateKey.generate()
     write_anew(log, other, tmp_path / "signer", "UPDATE record SET reason = 'x' WHERE sequence = 60")
     public = other.public_key().public_bytes_raw()
     assert verify(log, public, tmp_path / "signer").ok
-    assert kinds(verify(log, public, tmp_path / "signer", copies)) == {Kind.WRONG_KEY}
+    assert kinds(verify(log, public, tmp_path / "signer", copies)) == {FindingKind.WRONG_KEY}
 
 
-def test_records_that_retention_removed(make_log: MakeLog, path: Path, notary: Notary) -> None:
-    """Checkpoints of what retention removed since are no contradiction; alone they prove nothing, and that is said."""
+def test_checkpoints_of_removed_records_are_no_contradiction(
+    make_log: MakeLog, path: Path, notary: Notary
+) -> None:
+    """Checkpoints of removed records contradict nothing; alone they prove nothing, as the result says."""
     notary.ago = 2 * 86_400_000_000_000
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     for number in range(60):
@@ -150,11 +154,11 @@ def test_records_that_retention_removed(make_log: MakeLog, path: Path, notary: N
     assert copies[0].sequence <= result.removed
     gone = [one for one in copies if one.sequence < result.removed]
     assert gone
-    assert kinds(verify(path, copies=gone)) == {Kind.PROVES_NOTHING}
+    assert kinds(verify(path, copies=gone)) == {FindingKind.PROVES_NOTHING}
 
 
-def test_what_a_file_may_look_like(log: Path, tmp_path: Path) -> None:
-    """NDJSON and lines of a syslog receiver are read alike; other lines, and one that was cut, are passed over."""
+def test_formats_of_a_copy(log: Path, tmp_path: Path) -> None:
+    """NDJSON and lines of a syslog receiver are read alike; other lines and a cut line are skipped."""
     copies = signed_checkpoints(log)
     fields = json.loads(copies[1].as_json())
     element = " ".join(f'{name}="{value}"' for name, value in fields.items())
@@ -169,8 +173,8 @@ def test_what_a_file_may_look_like(log: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "{}\n", "[" * 100_000, '{"log": 1}\n', "\x00\xff\n"])
-def test_a_file_without_any(tmp_path: Path, text: str) -> None:
-    """A file with no checkpoint in it, or no file, is an error that names it."""
+def test_a_file_without_checkpoints_is_an_error(tmp_path: Path, text: str) -> None:
+    """A file without a checkpoint, or a missing file, is an error that names it."""
     file = tmp_path / "kept"
     file.write_text(text)
     with pytest.raises(CopiesUnreadableError, match="kept: no checkpoint"):
@@ -180,7 +184,7 @@ def test_a_file_without_any(tmp_path: Path, text: str) -> None:
 
 
 def test_json_and_back(log: Path) -> None:
-    """What leaves the machine is what is read again, and its signature is of exactly these fields."""
+    """A checkpoint as JSON is read back unchanged, and its signature covers exactly these fields."""
     one = signed_checkpoints(log, limit=1)[0]
     assert msgspec.json.decode(one.as_json(), type=SignedCheckpoint) == one
     assert signed_checkpoints(log, after=one.number)[0].number == one.number + 1

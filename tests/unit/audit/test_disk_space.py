@@ -1,4 +1,4 @@
-"""Tests of room on the log's disk: what is told before it is full, and that all goes on by itself."""
+"""Tests of free space for the log: alarms before the disk is full, and recovery without a restart."""
 
 import subprocess
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from appliance.audit.budget import Budget
 from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.search import search
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
 from tests.support.waiting import eventually
@@ -22,7 +22,7 @@ _RESERVE = 4 << 20
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 8 MiB."""
+    """Mount a file system of 8 MiB."""
     need_root()
     place = tmp_path / "disk"
     place.mkdir()
@@ -32,13 +32,13 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def await_degraded(log: AuditLog, *, degraded: bool) -> None:
-    """Wait until the log says that room is scarce, or does not any more."""
+    """Wait until the log reports low space, or no longer reports it."""
     eventually(lambda: (log.degraded is not None) is degraded, lambda: f"degraded: {log.degraded}")
 
 
-def test_a_disk_that_fills_is_told_before_it_is_full(disk: Path) -> None:
-    """Below the reserve an alarm says so and who owes much waits, nobody else; with room again all is as before."""
-    budget = Budget(lambda _host: Standing.REGISTERED)
+def test_low_space_raises_an_alarm_before_the_disk_is_full(disk: Path) -> None:
+    """Below the reserve an alarm is raised and hosts in debt wait; with free space again all is as before."""
+    budget = Budget(lambda _host: QuotaClass.REGISTERED)
     with capture_logs() as said:
         log = AuditLog(disk / "audit.db", budget=budget, reserve=_RESERVE)
         log.record(decision(log))

@@ -4,39 +4,41 @@ import itertools
 from typing import Any
 
 import msgspec
+import pytest
 
-from appliance.audit.folding import Folder, FoldSettings
-from appliance.audit.record import Record, RuleReference
+from appliance.audit.folding import FoldSettings, RecordFolder
+from appliance.audit.record import AuditRecord, RuleReference
+from appliance.audit.repetition import ALL_UNKNOWN, HOST, UNKNOWN, new_state
 from appliance.quotas.pool import Bounds
 
 _numbers = itertools.count(1)
 
 
 def make_folder(
-    seconds: float = 10.0, keys: int = 4096, keys_per_host: int = 256, strangers: int = 8
-) -> Folder:
-    """A folder whose summaries are called s1, s2, ..., with room for so many kinds."""
+    seconds: float = 10.0, keys: int = 4096, keys_per_host: int = 256, unknown: int = 8
+) -> RecordFolder:
+    """Return a folder of records with limits of kinds, whose summaries are called s1, s2, ..."""
     ids = itertools.count(1)
-    bounds = Bounds(keys, min(keys_per_host, keys), min(strangers, keys), 0)
+    bounds = Bounds(keys, min(keys_per_host, keys), min(unknown, keys), 0)
     settings = FoldSettings(seconds=seconds, kinds=bounds, read_kinds=bounds)
-    return Folder(settings, lambda: f"s{next(ids)}", lambda: 1)
+    return RecordFolder(settings, lambda: f"s{next(ids)}", lambda: 1)
 
 
-def denial(resource: str = "/a", host: str = "10.0.0.1", **fields: Any) -> Record:
-    """A denial with an id of its own."""
+def denial(resource: str = "/a", host: str = "10.0.0.1", **fields: Any) -> AuditRecord:
+    """Return a denial with its own id."""
     plain: dict[str, Any] = {
         "event": "decision", "decision": "deny", "caller_id": "/n", "category": "call", "reason": "no",
     }  # fmt: skip
-    return Record(id=f"r{next(_numbers)}", time=1, host=host, resource=resource, **(plain | fields))
+    return AuditRecord(id=f"r{next(_numbers)}", time=1, host=host, resource=resource, **(plain | fields))
 
 
-def offer(folder: Folder, *records: Record, now: float = 0) -> list[Record]:
-    """What is written for these records."""
+def offer(folder: RecordFolder, *records: AuditRecord, now: float = 0) -> list[AuditRecord]:
+    """Return the records written for these."""
     return [written for record in records for written in folder.offer(record, now)]
 
 
 def test_first_in_full_then_counted() -> None:
-    """The first denial is recorded as it is; its repetitions are one summary with count, first and last."""
+    """The first denial is recorded in full; its repetitions become one summary with count, first and last time."""
     folder = make_folder(seconds=10)
     same = [denial() for _ in range(100)]
     assert offer(folder, *same) == same[:1]
@@ -50,8 +52,8 @@ def test_first_in_full_then_counted() -> None:
     assert (summary.detail["first_id"], summary.detail["last_id"]) == (same[1].id, same[99].id)
 
 
-def test_summaries_go_on_while_it_repeats() -> None:
-    """A denial that goes on repeating has a summary every period, and is in full again after a quiet one."""
+def test_summaries_continue_with_the_repetitions() -> None:
+    """A repeated denial has a summary every period, and is recorded in full after a quiet period."""
     folder = make_folder(seconds=10)
     offer(folder, denial(), denial(), now=0)
     assert [one.detail["count"] for one in folder.expire(10)] == [1]
@@ -63,7 +65,7 @@ def test_summaries_go_on_while_it_repeats() -> None:
     assert offer(folder, again, now=31) == [again]
 
 
-def test_what_differs_is_not_folded() -> None:
+def test_different_records_are_not_folded() -> None:
     """Another host, caller, resource, reason, rule or policy revision is another kind, recorded in full."""
     folder = make_folder()
     kinds = [
@@ -75,7 +77,7 @@ def test_what_differs_is_not_folded() -> None:
 
 
 def test_an_allow_ends_the_folding_it_contradicts() -> None:
-    """The summary of denials comes before the allow of the same request, and the next denial is in full."""
+    """The summary of denials precedes the allow of the same request, and the next denial is in full."""
     folder = make_folder()
     offer(folder, denial(), denial())
     allowed = denial(decision="allow")
@@ -87,14 +89,14 @@ def test_an_allow_ends_the_folding_it_contradicts() -> None:
 
 
 def test_allows_that_change_something_are_never_folded() -> None:
-    """Every allow that changes something is recorded in full."""
+    """Each such allow is recorded in full."""
     folder = make_folder()
     allows = [denial(decision="allow") for _ in range(50)]
     assert offer(folder, *allows) == allows
 
 
 def test_varied_names_are_folded_per_host() -> None:
-    """Who varies names costs bounded memory and records, every denial is counted, others are not hit."""
+    """Varied names of one host use bounded memory and records; every denial is counted, other hosts are unaffected."""
     folder = make_folder(keys_per_host=16, keys=64)
     flood = offer(folder, *(denial(f"/{number}") for number in range(10_000)))
     assert len(flood) == 17
@@ -113,7 +115,7 @@ def test_varied_names_are_folded_per_host() -> None:
 
 
 def test_varied_addresses_are_folded_together() -> None:
-    """Even with an address for each denial memory is bounded and every denial is counted."""
+    """Memory is bounded even with a new address for each denial, and every denial is counted."""
     folder = make_folder(keys=64)
     written = offer(folder, *(denial(host=f"10.1.{n // 256}.{n % 256}") for n in range(20_000)))
     assert len(folder) <= 2 * 64 + 1
@@ -125,8 +127,8 @@ def test_varied_addresses_are_folded_together() -> None:
     assert sum(everybody.detail["hosts"].values()) == everybody.detail["count"]
 
 
-def test_a_summary_says_who_and_what() -> None:
-    """Which call of which node on what was repeated is in the summary itself, not only in the record it points to."""
+def test_a_summary_names_host_and_call() -> None:
+    """A summary names the call, the node and the resource, not only the first record."""
     folder = make_folder()
     detail = {"call": "getParam", "key": "/secret", "node": "/arm", "unrelated": 1}
     offer(folder, *(denial(resource="getParam", detail=detail) for _ in range(5)))
@@ -138,8 +140,8 @@ def test_a_summary_says_who_and_what() -> None:
     assert "unrelated" not in one.detail
 
 
-def test_who_is_behind_a_flood_of_many_names() -> None:
-    """A host that is folded as a whole is still told by caller and call: the loudest are there with their counts."""
+def test_the_loudest_callers_are_named() -> None:
+    """A summary of a whole host lists its most frequent callers and calls with their counts."""
     folder = make_folder(keys_per_host=4)
     calls = ["setParam", "getParam", "deleteParam"]
     flood = [
@@ -155,7 +157,7 @@ def test_who_is_behind_a_flood_of_many_names() -> None:
 
 
 def test_long_names_are_bounded() -> None:
-    """Names of strangers take bounded room in a summary, however long they are."""
+    """Long names of unknown hosts use bounded space in a summary."""
     folder = make_folder(keys_per_host=1)
     offer(folder, *(denial("/" + "x" * 100_000 + str(number)) for number in range(50)))
     (host,) = [one for one in folder.finish() if one.detail["scope"] == "host"]
@@ -169,17 +171,17 @@ def test_zero_seconds_records_everything() -> None:
     assert offer(folder, *same) == same
 
 
-def test_what_passed_on_trial_is_never_folded() -> None:
-    """Every `would deny` is a record of its own, like every allow: a policy can be learned from them."""
-    folder = Folder(FoldSettings(), lambda: "0" * 20, lambda: 0)
+def test_would_deny_is_never_folded() -> None:
+    """Every `would deny` is recorded in full, like every allow: a policy can be learned from them."""
+    folder = RecordFolder(FoldSettings(), lambda: "0" * 20, lambda: 0)
     record = denial(decision="would deny")
     assert [list(folder.offer(record, 0.0)) for _ in range(3)] == [[record]] * 3
     assert len(folder) == 0
 
 
-def test_denials_of_different_parameters_are_different() -> None:
-    """The same call on another key, or another call, is recorded in full; the same again is counted."""
-    folder = Folder(FoldSettings(), lambda: "0" * 20, lambda: 0)
+def test_denials_of_different_parameters_are_separate() -> None:
+    """The same call on another key, or another call, is recorded in full; a repetition is counted."""
+    folder = RecordFolder(FoldSettings(), lambda: "0" * 20, lambda: 0)
     kinds = [
         denial(resource="getParam", detail={"call": "getParam", "key": "/a"}),
         denial(resource="getParam", detail={"call": "getParam", "key": "/b"}),
@@ -189,8 +191,8 @@ def test_denials_of_different_parameters_are_different() -> None:
     assert [list(folder.offer(one, 0.0)) for one in kinds] == [[], [], []]
 
 
-def test_what_was_counted_before_counts_as_many() -> None:
-    """A denial that stands for many, because its reporter counted them, is as many in the summary and its tallies."""
+def test_a_reported_count_is_added() -> None:
+    """A denial with a count from its reporter adds that count to the summary and its tallies."""
     folder = make_folder(seconds=10)
     flood = [denial(detail={"count": 1000}) for _ in range(10)]
     assert offer(folder, *flood) == flood[:1]
@@ -202,16 +204,16 @@ def test_what_was_counted_before_counts_as_many() -> None:
     assert host.detail["resources"] == {"/c": 50}
 
 
-def test_a_count_that_is_none_counts_once() -> None:
-    """What stands under `count` and is no positive number is one denial."""
+def test_an_invalid_count_is_one() -> None:
+    """A `count` that is not a positive number means one denial."""
     folder = make_folder(seconds=10)
     strange: tuple[object, ...] = (True, 0, -5, "9", 2.5, None)
     offer(folder, denial(), *(denial(detail={"count": one}) for one in strange))
     assert [one.detail["count"] for one in folder.expire(10)] == [len(strange)]
 
 
-def test_what_is_no_text_can_be_kept() -> None:
-    """Names and reasons with what no disk takes are counted like others, and key and state can be written."""
+def test_invalid_text_can_be_stored() -> None:
+    """Names and reasons with invalid characters are counted like others; key and state can be written."""
     folder = make_folder(seconds=10)
     strange: dict[str, Any] = {"caller_id": "/\ud800", "reason": "\udcff", "detail": {"call": "\ud801"}}
     first, second = denial("/\udfff", **strange), denial("/\udfff", **strange)
@@ -224,13 +226,13 @@ def test_what_is_no_text_can_be_kept() -> None:
     assert len(folder) == 0
 
 
-def test_strangers_with_reasons_of_their_own_take_no_kind_of_a_named_host() -> None:
-    """Strangers who put a number of their choice into everything have a few kinds; a named host keeps its own."""
-    folder = make_folder(keys=64, strangers=8)
+def test_unknown_hosts_leave_named_hosts_their_kinds() -> None:
+    """Unknown hosts with a new number in each field use a few kinds; a named host keeps its own."""
+    folder = make_folder(keys=64, unknown=8)
     flood = [
         denial(
             f"/topic{number}", host=f"10.9.0.{number % 24}", caller_id=f"/n{number}", reason=f"no {number}",
-            detail={"call": "registerPublisher"}, stranger=True,
+            detail={"call": "registerPublisher"}, unknown=True,
         )
         for number in range(5000)
     ]  # fmt: skip
@@ -241,15 +243,15 @@ def test_strangers_with_reasons_of_their_own_take_no_kind_of_a_named_host() -> N
     assert offer(folder, *named) == named
     summaries = list(folder.finish())
     assert sum(one.detail["count"] for one in summaries) == 5000 - 9
-    (together,) = [one for one in summaries if one.detail["scope"] == "strangers"]
+    (together,) = [one for one in summaries if one.detail["scope"] == "unknown hosts"]
     assert together.host is None
     assert sum(together.detail["hosts"].values()) == together.detail["count"]
     assert len(together.detail["reasons"]) == 9
     assert all(one.caller_id is None and one.resource is None for one in summaries)
 
 
-def test_what_a_peer_puts_into_a_reason_makes_no_kind() -> None:
-    """Numbers, names and quotations in the reason of a refused request are one kind, counted in its summary."""
+def test_a_reason_with_peer_text_is_one_kind() -> None:
+    """Numbers, names and quotations in the reason of a refused request share a kind, counted in its summary."""
     folder = make_folder(seconds=10)
     flood = [
         denial(reason=f"number {number} of '/x{number}' at /n{number} is too large", event="malformed")
@@ -262,8 +264,8 @@ def test_what_a_peer_puts_into_a_reason_makes_no_kind() -> None:
     assert len(one.detail["reasons"]) == 9
 
 
-def test_many_named_hosts_keep_a_line_each() -> None:
-    """With all kinds taken by others, a named host's denials are still counted under its own address."""
+def test_named_hosts_keep_a_line_each() -> None:
+    """With all kinds in use, a named host's denials are still counted under its own address."""
     folder = make_folder(keys=64, keys_per_host=16)
     offer(folder, *(denial(f"/{n}", host=f"10.1.0.{host}") for host in range(4) for n in range(50)))
     late = [denial(f"/{number}", host="10.2.0.1") for number in range(10)]
@@ -272,14 +274,14 @@ def test_many_named_hosts_keep_a_line_each() -> None:
     assert mine.detail["count"] == 9
 
 
-def read(key: str, **fields: Any) -> Record:
-    """An allowed call that reads a parameter."""
+def read(key: str, **fields: Any) -> AuditRecord:
+    """Return an allowed call that reads a parameter."""
     plain: dict[str, Any] = {"decision": "allow", "folds": True, "detail": {"call": "hasParam", "key": key}}
     return denial("hasParam", **(plain | fields))
 
 
-def test_reads_are_folded_as_denials_are() -> None:
-    """The first read of its kind is in full; the rest is one summary that says who read what, and how often."""
+def test_reads_are_folded_like_denials() -> None:
+    """The first read of a kind is recorded in full; the rest become one summary with caller, key and count."""
     folder = make_folder(seconds=10)
     same = [read("/a") for _ in range(500)]
     assert offer(folder, *same, read("/b"))[:1] == same[:1]
@@ -289,8 +291,8 @@ def test_reads_are_folded_as_denials_are() -> None:
     )  # fmt: skip
 
 
-def test_a_reading_of_other_topics_is_no_repetition() -> None:
-    """Who read which topics of a recording stands in full; the same again is counted."""
+def test_reads_of_other_topics_are_not_folded() -> None:
+    """Fetching other topics of a recording is recorded in full; a repetition is counted."""
     folder = make_folder()
     scan, image, again = (
         denial("", event="recording read", decision=None, folds=True, category=None, caller_id=None,
@@ -300,8 +302,8 @@ def test_a_reading_of_other_topics_is_no_repetition() -> None:
     assert offer(folder, scan, image, again) == [scan, image]
 
 
-def test_reads_beyond_the_share_are_recorded_in_full() -> None:
-    """No read loses its key: past the share of kinds each is a record of its own, and takes no kind of a denial."""
+def test_reads_beyond_the_quota_are_recorded_in_full() -> None:
+    """No read loses its key: beyond the quota of kinds each is a record, and takes no kind of a denial."""
     folder = make_folder(keys=64, keys_per_host=16)
     varied = [read(f"/{number}") for number in range(1000)]
     assert offer(folder, *varied) == varied
@@ -310,8 +312,8 @@ def test_reads_beyond_the_share_are_recorded_in_full() -> None:
     assert offer(folder, *refused) == refused
 
 
-def test_a_denial_ends_the_reads_it_contradicts() -> None:
-    """What was read before a denial is summarised before it; the read after it is in full again."""
+def test_a_denial_ends_the_folding_of_reads() -> None:
+    """Reads before a denial are summarised before it; the next read is in full."""
     folder = make_folder()
     offer(folder, read("/a"), read("/a"))
     refused = read("/a", decision="deny", folds=False)
@@ -320,16 +322,16 @@ def test_a_denial_ends_the_reads_it_contradicts() -> None:
     assert offer(folder, again) == [again]
 
 
-def test_another_key_ends_nothing() -> None:
-    """Denials of one parameter go on being counted while the same call on another one is allowed."""
+def test_another_key_ends_no_folding() -> None:
+    """Denials of one parameter stay folded while the same call on another parameter is allowed."""
     folder = make_folder()
     flood = [one for n in range(100) for one in (read(f"/a/{n}"), read("/b", decision="deny", folds=False))]
     written = offer(folder, *flood)
     assert [one.detail["key"] for one in written].count("/b") == 1
 
 
-def test_events_of_a_host_beyond_its_budget_are_counted() -> None:
-    """What no call waits for is counted once its host is beyond its budget, by kind and past that by host."""
+def test_events_beyond_the_budget_are_counted() -> None:
+    """Events that no call waits for are counted by kind, and beyond the limit by host."""
     folder = make_folder(keys=64, keys_per_host=4)
     opened = [
         denial(f"/t{n % 8}", event="connection opened", decision=None, folds=True, reason="")
@@ -342,17 +344,17 @@ def test_events_of_a_host_beyond_its_budget_are_counted() -> None:
     assert len(written) + sum(one.detail["count"] for one in summaries) == 800
 
 
-def test_who_is_denied_is_told_the_id_of_a_record_or_none() -> None:
-    """Whatever is over, or of a stranger, and whether it is offered one by one or many at once."""
+def test_a_denied_caller_gets_a_recorded_id_or_none() -> None:
+    """This holds beyond every limit, for unknown hosts, and for single and batched records."""
     for gathered in (1, 7, 400):
-        folder = make_folder(keys_per_host=4, strangers=3)
+        folder = make_folder(keys_per_host=4, unknown=3)
         denials = [
-            denial(f"/{number % 6}", f"10.0.0.{host}", stranger=host > 2, caller_id=f"/n{number % 5}")
+            denial(f"/{number % 6}", f"10.0.0.{host}", unknown=host > 2, caller_id=f"/n{number % 5}")
             for number in range(100)
             for host in (1, 2, 3, 4)
         ]
-        told: list[tuple[Record, str]] = []
-        written: dict[str, Record] = {}
+        told: list[tuple[AuditRecord, str]] = []
+        written: dict[str, AuditRecord] = {}
         for begin in range(0, len(denials), gathered):
             together = denials[begin : begin + gathered]
             told += [(one, folder.in_full(one)) for one in together]
@@ -361,3 +363,9 @@ def test_who_is_denied_is_told_the_id_of_a_record_or_none() -> None:
         for one, found in told:
             kept = written.get(found, one)
             assert (kept.host, kept.resource, kept.caller_id) == (one.host, one.resource, one.caller_id)
+
+
+@pytest.mark.parametrize(("old", "new"), [("stranger", UNKNOWN), ("strangers", ALL_UNKNOWN), ("host", HOST)])
+def test_stored_scopes_of_0_1_0_get_their_new_names(old: str, new: str) -> None:
+    """Counts that 0.1.0 stored are summarized under the name of this version."""
+    assert new_state(denial("/node", "10.0.0.1"), old).scope == new

@@ -1,4 +1,4 @@
-"""Tests of who keeps the log from being written: a real process that holds SQLite's locks as a reader may."""
+"""Tests of finding the process that blocks the log: a real process holds SQLite's locks as a reader may."""
 
 import fcntl
 import queue
@@ -27,7 +27,7 @@ sys.stdin.read()
 
 @contextmanager
 def holding(file: Path, byte: int) -> Iterator[int]:
-    """Another process that holds a shared lock on one byte of a file, which reading allows; its process id."""
+    """Start a process that holds a shared lock on one byte of a file, as a reader may; return its id."""
     command = [sys.executable, "-c", _HOLD, str(file), str(byte)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -38,7 +38,7 @@ def holding(file: Path, byte: int) -> Iterator[int]:
 
 @pytest.fixture
 def log(tmp_path: Path) -> Iterator[AuditLog]:
-    """A log with a record in it."""
+    """Return a log with one record."""
     log = AuditLog(tmp_path / "audit.db")
     log.record(decision(log, 1))
     assert settle(log) is None
@@ -47,8 +47,8 @@ def log(tmp_path: Path) -> Iterator[AuditLog]:
 
 
 @pytest.mark.parametrize(("suffix", "byte"), [("-shm", 120), ("-shm", 121), ("-shm", 122), ("", 0x40000000)])
-def test_who_holds_what_only_the_writer_needs(log: AuditLog, suffix: str, byte: int) -> None:
-    """It is found by the kernel's list, and gone from it when it ends."""
+def test_the_holder_of_a_writers_lock_is_found(log: AuditLog, suffix: str, byte: int) -> None:
+    """The kernel's list names the process until it ends."""
     file = log.path.with_name(log.path.name + suffix)
     with holding(file, byte) as pid:
         assert holders(log.path) == [pid]
@@ -56,15 +56,15 @@ def test_who_holds_what_only_the_writer_needs(log: AuditLog, suffix: str, byte: 
 
 
 def test_a_lock_without_a_process_is_found(log: AuditLog) -> None:
-    """A lock of an open file description hides its process, and not that it is there."""
+    """A lock of an open file description is found though it has no process."""
     file = log.path.with_name(log.path.name + "-shm")
     with file.open("rb") as opened:
         fcntl.fcntl(opened, fcntl.F_OFD_SETLK, struct.pack("hhqqi4x", fcntl.F_RDLCK, 0, 120, 1, 0))
         assert holders(log.path) == [-1]
 
 
-def test_a_reader_that_is_in_order_is_not_named(log: AuditLog) -> None:
-    """Reading, with a read that is not finished, holds nothing that the writer needs; nor do locks of other files."""
+def test_an_ordinary_reader_is_not_reported(log: AuditLog) -> None:
+    """An unfinished read holds no lock that the writer needs; locks on other files are ignored."""
     with holding(log.path.with_name(log.path.name + "-shm"), 124), holding(Path(__file__), 120):
         connection = open_for_reading(log.path)
         connection.execute("BEGIN")
@@ -74,8 +74,8 @@ def test_a_reader_that_is_in_order_is_not_named(log: AuditLog) -> None:
     assert holders(log.path.with_name("nowhere.db")) == []
 
 
-def test_the_log_names_who_locks_it(tmp_path: Path) -> None:
-    """The owner is told the process, so that he can end it, and everybody reads it in the reason; then it goes on."""
+def test_the_log_names_the_process_that_locks_it(tmp_path: Path) -> None:
+    """The alarm and the reason of the refusal name the process; after its end the log continues."""
     told: queue.Queue[list[int]] = queue.Queue()
     log = AuditLog(tmp_path / "audit.db", held_by=told.put)
     log.record(decision(log, 1))

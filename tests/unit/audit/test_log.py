@@ -1,4 +1,4 @@
-"""Tests of the log as its owner uses it, on real files; also on a full disk, and with the process killed."""
+"""Tests of the log on real files, also with a full disk and a killed process."""
 
 import asyncio
 import signal
@@ -29,18 +29,18 @@ _LIMIT_SECONDS = 30
 
 
 def events(path: Path) -> Counter[str]:
-    """How many records of each event the log has."""
+    """Return the number of records of each event in the log."""
     return Counter(entry.record.event for entry in export(path, Filter()))
 
 
 def await_state(log: AuditLog, *, failed: bool) -> None:
-    """Wait until the log says that it failed, or that it works."""
+    """Wait until the log reports failure, or that it works."""
     eventually(lambda: (log.failed is not None) == failed, lambda: f"failed is still {log.failed!r}")
 
 
 @pytest.mark.parametrize("durability", ["strict", "batched"])
-def test_what_was_waited_for_is_on_disk(make_log: MakeLog, path: Path, durability: str) -> None:
-    """After `wait_durable` a reader finds the records, in the order they were recorded."""
+def test_durable_records_are_on_disk(make_log: MakeLog, path: Path, durability: str) -> None:
+    """After `wait_durable` a reader finds the records in order."""
     log = make_log(durability=durability)
     sent = [decision(log, number) for number in range(500)]
     for one in sent:
@@ -51,15 +51,15 @@ def test_what_was_waited_for_is_on_disk(make_log: MakeLog, path: Path, durabilit
     assert log.lag.records == 0
 
 
-def test_batched_is_on_disk_soon_without_being_asked(make_log: MakeLog, path: Path) -> None:
-    """A record is on disk soon after it was recorded though nobody waits for it."""
+def test_records_reach_the_disk_without_a_wait(make_log: MakeLog, path: Path) -> None:
+    """A record is on disk soon, even if no caller waits for it."""
     log = make_log()
     log.record(decision(log))
     eventually(lambda: search(path, Filter(event="decision")).entries, "it is on disk")
 
 
 def test_many_waiters_share_commits(make_log: MakeLog, path: Path) -> None:
-    """A hundred concurrent requests in strict mode are each answered after their own record is on disk."""
+    """A hundred concurrent requests in strict mode each get their answer after their own record is on disk."""
     log = make_log(durability="strict")
 
     async def request(number: int) -> None:
@@ -74,8 +74,8 @@ def test_many_waiters_share_commits(make_log: MakeLog, path: Path) -> None:
     assert events(path)["decision"] == 100
 
 
-def test_log_goes_on_after_a_clean_stop(make_log: MakeLog, path: Path) -> None:
-    """A log that is opened again continues its chain, and its ids, though the clock was set back."""
+def test_a_reopened_log_continues(make_log: MakeLog, path: Path) -> None:
+    """A reopened log continues its chain and its ids, even with the clock set back."""
     first = make_log(clock=lambda: 2_000_000_000_000_000_000)
     first.record(decision(first))
     assert first.close() is None
@@ -89,8 +89,8 @@ def test_log_goes_on_after_a_clean_stop(make_log: MakeLog, path: Path) -> None:
     assert events(path)["log begun"] == 1
 
 
-def test_killed_writer(path: Path) -> None:
-    """After SIGKILL in the middle of writing the chain goes on, and all that was confirmed is there."""
+def test_a_killed_writer_loses_nothing_confirmed(path: Path) -> None:
+    """After SIGKILL during a write the chain continues, and all confirmed records are there."""
     script = (
         "import asyncio, sys; from pathlib import Path; from appliance.audit.log import AuditLog;"
         "from tests.support.audit import decision\n"
@@ -125,7 +125,7 @@ def test_killed_writer(path: Path) -> None:
 
 
 def test_counted_denials_survive_a_kill(path: Path) -> None:
-    """Repetitions that were counted but not summarised when the process was killed are not forgotten."""
+    """Repetitions that were counted but not yet summarised survive SIGKILL."""
     script = (
         "import asyncio, os, signal, sys; from pathlib import Path; from appliance.audit.log import AuditLog;"
         "from appliance.audit.folding import FoldSettings; from tests.support.audit import decision\n"
@@ -156,17 +156,17 @@ def test_flood_of_denials(make_log: MakeLog, path: Path) -> None:
     assert verify(path).ok
 
 
-@pytest.mark.parametrize("stranger", [False, True], ids=["named", "stranger"])
+@pytest.mark.parametrize("unknown", [False, True], ids=["named", "unknown"])
 @pytest.mark.parametrize("at_once", [False, True], ids=["later", "at once"])
-def test_whoever_is_denied_again_is_told_an_id_that_is_there(
-    make_log: MakeLog, path: Path, stranger: bool, at_once: bool
+def test_a_repeated_denial_gets_the_id_of_a_stored_record(
+    make_log: MakeLog, path: Path, unknown: bool, at_once: bool
 ) -> None:
-    """The id of a repetition, which is only counted, is that of the record in full; another denial has its own."""
+    """A repetition is only counted and has the id of the record in full; another denial has its own."""
     log = make_log()
 
     def told(**about: Any) -> str:
         record = decision(log, decision="deny", **about)
-        found_by = log.record(msgspec.structs.replace(record, stranger=stranger))
+        found_by = log.record(msgspec.structs.replace(record, unknown=unknown))
         assert at_once or settle(log) is None
         return found_by
 
@@ -189,7 +189,7 @@ def fill(path: Path) -> None:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 2 MiB."""
+    """Mount a file system of 2 MiB."""
     need_root()
     place = tmp_path / "disk"
     place.mkdir()
@@ -199,7 +199,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_full_disk(small_disk: Path) -> None:
-    """With the disk full the log says so, keeps what it is given, and writes it when there is room."""
+    """With a full disk the log reports it, keeps its queue, and writes it once there is space."""
     path = small_disk / "audit.db"
     filler = small_disk / "filler"
     log = AuditLog(path)
@@ -228,8 +228,8 @@ def test_full_disk(small_disk: Path) -> None:
     assert verify(path).ok
 
 
-def test_failure_and_recovery_are_logged_once(small_disk: Path) -> None:
-    """Who reads standard error learns that nothing is recorded, with the file and the reason, and when it is over."""
+def test_failure_and_recovery_are_printed_once(small_disk: Path) -> None:
+    """Standard error names the failure with file and reason, and later the recovery."""
     filler = small_disk / "filler"
     with structlog.testing.capture_logs() as said:
         log = AuditLog(small_disk / "audit.db", reserve=0)
@@ -250,8 +250,8 @@ def test_failure_and_recovery_are_logged_once(small_disk: Path) -> None:
     assert "full" in said[0]["reason"]
 
 
-def test_queue_is_bounded_and_says_what_was_lost(small_disk: Path) -> None:
-    """What does not fit into the queue while the disk is full is counted, and the count is recorded."""
+def test_the_queue_is_bounded_and_losses_are_counted(small_disk: Path) -> None:
+    """Records that do not fit in the queue while the disk is full are counted, and the count is recorded."""
     path = small_disk / "audit.db"
     log = AuditLog(path, queue_limit=100)
     assert settle(log) is None
@@ -276,8 +276,8 @@ def test_queue_is_bounded_and_says_what_was_lost(small_disk: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"not a database" * 1000, b"SQLite format 3\0" + b"\0" * 5000])
-def test_damaged_file_is_an_error_and_stays(path: Path, content: bytes) -> None:
-    """A file that is no log is told with its name, and is left as it is."""
+def test_a_damaged_file_is_an_error_and_stays(path: Path, content: bytes) -> None:
+    """A file that is not a log is named in the error and stays unchanged."""
     path.write_bytes(content)
     log = AuditLog(path)
     assert log.failed is not None
@@ -288,7 +288,7 @@ def test_damaged_file_is_an_error_and_stays(path: Path, content: bytes) -> None:
     assert path.read_bytes() == content
 
 
-def test_another_kind_of_database_is_an_error(path: Path) -> None:
+def test_another_database_is_an_error(path: Path) -> None:
     """A database of another program is not written to."""
     with closing(sqlite3.connect(path)) as other:
         other.execute("CREATE TABLE something (x)")
@@ -298,7 +298,7 @@ def test_another_kind_of_database_is_an_error(path: Path) -> None:
     log.close()
 
 
-def test_changed_end_stops_writing(make_log: MakeLog, path: Path) -> None:
+def test_a_changed_end_stops_writing(make_log: MakeLog, path: Path) -> None:
     """A log whose last records were changed while it was closed is not continued."""
     log = make_log()
     log.record(decision(log))
@@ -313,8 +313,8 @@ def test_changed_end_stops_writing(make_log: MakeLog, path: Path) -> None:
     log.close()
 
 
-def test_removed_file_is_noticed(make_log: MakeLog, path: Path) -> None:
-    """A log file that is removed or replaced while it is written stops the log, and is told."""
+def test_a_removed_file_is_noticed(make_log: MakeLog, path: Path) -> None:
+    """A log file removed or replaced while it is written stops the log with a reason."""
     log = make_log()
     assert settle(log) is None
     path.rename(path.with_name("stolen.db"))
@@ -322,8 +322,8 @@ def test_removed_file_is_noticed(make_log: MakeLog, path: Path) -> None:
     assert "removed or replaced" in (settle(log) or "")
 
 
-def test_second_writer_is_refused(make_log: MakeLog, path: Path) -> None:
-    """Two processes cannot write one log; the second says why and takes over when the first ends."""
+def test_a_second_writer_is_refused(make_log: MakeLog, path: Path) -> None:
+    """The second process reports the reason and takes over when the first ends."""
     first = make_log()
     second = AuditLog(path)
     assert second.failed is not None
@@ -336,8 +336,8 @@ def test_second_writer_is_refused(make_log: MakeLog, path: Path) -> None:
     assert verify(path).ok
 
 
-def test_no_state_directory(tmp_path: Path) -> None:
-    """A directory that does not exist is a failure with its name, and the log works once it is there."""
+def test_a_missing_directory_is_a_failure(tmp_path: Path) -> None:
+    """The failure names the directory, and the log works once it exists."""
     path = tmp_path / "missing" / "audit.db"
     log = AuditLog(path)
     assert str(path) in (log.failed or "")
@@ -349,7 +349,7 @@ def test_no_state_directory(tmp_path: Path) -> None:
 
 
 def test_missing_earlier_log_is_an_alarm(make_log: MakeLog, path: Path) -> None:
-    """If a signed log was here before and is gone, the first record of the new one says so."""
+    """If a signed log existed here before and is gone, the first record of the new one says so."""
     log = make_log(checkpoint_every=1)
     log.record(decision(log))
     assert settle(log) is None
@@ -363,8 +363,8 @@ def test_missing_earlier_log_is_an_alarm(make_log: MakeLog, path: Path) -> None:
     assert begun.record.detail["earlier_log_missing"] is True
 
 
-def test_closed_log_answers(make_log: MakeLog) -> None:
-    """Whoever waits on a closed log is told so instead of waiting for ever."""
+def test_waiting_on_a_closed_log_is_an_error(make_log: MakeLog) -> None:
+    """A caller that waits on a closed log gets an error instead of waiting forever."""
     log = make_log()
     log.close()
     log.record(decision(log))
@@ -372,7 +372,7 @@ def test_closed_log_answers(make_log: MakeLog) -> None:
 
 
 def test_recovery_counts_denials_once(make_log: MakeLog, path: Path) -> None:
-    """Denials that were being counted when the log failed for a while are counted once, not twice."""
+    """Denials being counted when the log failed are counted once, not twice."""
     log = make_log(fold=FoldSettings(seconds=3600))
     for _ in range(50):
         log.record(decision(log, decision="deny"))
@@ -392,18 +392,18 @@ def test_recovery_counts_denials_once(make_log: MakeLog, path: Path) -> None:
 
 
 def signed_now(log: AuditLog) -> str | None:
-    """Wait until what was recorded is sealed and signed; the reason if it is not."""
+    """Wait until all records are sealed and signed; return the reason if not."""
     return asyncio.run(asyncio.wait_for(log.wait_signed(), _LIMIT_SECONDS))
 
 
-def test_who_needs_a_signature_gets_it_now(make_log: MakeLog, path: Path) -> None:
-    """Checkpoints are an hour apart; who waits has one at once, over all that was recorded, and no second."""
+def test_a_signature_can_be_requested_at_once(make_log: MakeLog, path: Path) -> None:
+    """Checkpoints are an hour apart; a caller gets one at once over all records, and no second one."""
     log = make_log(checkpoint_seconds=3600)
     for number in range(5):
         log.record(decision(log, number))
     assert signed_now(log) is None
     sealed = verify(path)
-    assert (sealed.ok, sealed.unsealed) == (True, 1)  # the record of the checkpoint itself
+    assert (sealed.ok, sealed.unsealed) == (True, 1)  # the record of the checkpoint
     before = events(path)["checkpoint"]
     assert signed_now(log) is None
     assert events(path)["checkpoint"] == before
@@ -412,8 +412,8 @@ def test_who_needs_a_signature_gets_it_now(make_log: MakeLog, path: Path) -> Non
     assert events(path)["checkpoint"] == before + 1
 
 
-def test_who_waits_for_a_signature_that_is_refused_is_told(make_log: MakeLog) -> None:
-    """The signer's words are the answer; one that never answers leaves the waiting to who waits."""
+def test_a_refused_signature_is_reported(make_log: MakeLog) -> None:
+    """The caller gets the signer's reason; without an answer the caller decides how long to wait."""
     asked: list[int] = []
     log = make_log(checkpoint_seconds=3600, signer=lambda number, _text: asked.append(number))
     log.record(decision(log))
@@ -427,3 +427,21 @@ def test_who_waits_for_a_signature_that_is_refused_is_told(make_log: MakeLog) ->
         return await waiting
 
     assert asyncio.run(asyncio.wait_for(refused(), _LIMIT_SECONDS)) == "it does not follow"
+
+
+def test_abandoned_waits_leave_no_memory(make_log: MakeLog) -> None:
+    """While the signer is down, orders that stop waiting leave nothing in memory."""
+    asked: list[int] = []
+    log = make_log(checkpoint_seconds=3600, signer=lambda number, _text: asked.append(number))
+
+    async def give_up() -> None:
+        for number in range(1, 6):
+            log.record(decision(log, number))
+            waiting = asyncio.create_task(log.wait_signed())
+            while len(asked) < number:
+                await asyncio.sleep(0.01)
+            waiting.cancel()
+            await asyncio.wait([waiting])
+
+    asyncio.run(asyncio.wait_for(give_up(), _LIMIT_SECONDS))
+    assert len(log.housekeeping.unsigned) <= 1

@@ -1,15 +1,15 @@
-"""Tests of what leaves the log: JSON and text for people."""
+"""Tests of records as JSON and as text."""
 
 import json
 
 import msgspec
 import pytest
 
-from appliance.audit.record import Record, RuleReference, Severity
-from appliance.audit.record_format import Entry, as_json, as_object, printable, rfc3339, without_contents
+from appliance.audit.record import AuditRecord, RuleReference, Severity
+from appliance.audit.record_format import LogEntry, as_json, as_object, printable, rfc3339, without_contents
 from appliance.audit.why import lines_of
 
-_RECORD = Record(
+_RECORD = AuditRecord(
     id="0" * 20, time=1_772_366_400_000_000_007, event="decision", severity=Severity.WARNING, decision="deny",
     host="10.0.0.1", caller_id="/n", category="publish", resource="/\x1b]0;x\x07é", revision=3,
     rule=RuleReference("Publishers", "/**", "a.ini", 4), reason="no", duration_us=5,
@@ -17,9 +17,9 @@ _RECORD = Record(
 )  # fmt: skip
 
 
-def test_object_is_the_documented_one() -> None:
+def test_json_has_the_documented_fields() -> None:
     """A record's JSON has exactly the documented fields with the documented values."""
-    assert as_object(Entry(9, _RECORD)) == {
+    assert as_object(LogEntry(9, _RECORD)) == {
         "schema": 1, "id": "0" * 20, "time": "2026-03-01T12:00:00.000000007Z", "sequence": 9,
         "event": "decision",
         "severity": "warning", "decision": "deny", "host": "10.0.0.1", "caller_id": "/n",
@@ -31,15 +31,15 @@ def test_object_is_the_documented_one() -> None:
 
 
 def test_no_decision_no_rule() -> None:
-    """Where nothing was decided `decision` is absent and `rule` is null."""
-    shown = as_object(Entry(1, Record(id="0" * 20, time=0, event="appliance started")))
+    """Without a decision, `decision` is absent and `rule` is null."""
+    shown = as_object(LogEntry(1, AuditRecord(id="0" * 20, time=0, event="appliance started")))
     assert "decision" not in shown
     assert shown["rule"] is None
 
 
 def test_json_is_one_line_of_ascii() -> None:
-    """NDJSON has no byte that a terminal acts on, and gives the stranger's text back unchanged."""
-    text = as_json(Entry(1, _RECORD))
+    """NDJSON has no byte that a terminal interprets, and a client's text is decoded unchanged."""
+    text = as_json(LogEntry(1, _RECORD))
     assert text.isascii()
     assert text.isprintable()
     assert json.loads(text)["resource"] == _RECORD.resource
@@ -60,7 +60,7 @@ def test_json_is_one_line_of_ascii() -> None:
     ],
 )
 def test_printable(text: str, shown: str) -> None:
-    """Control characters, escape sequences and invisible or bidirectional marks are escaped, letters are not."""
+    """Control characters, escape sequences and invisible or bidirectional marks are escaped; letters are not."""
     assert printable(text) == shown
 
 
@@ -77,13 +77,13 @@ def test_time(time: int, text: str) -> None:
     assert rfc3339(time) == text
 
 
-def test_who_may_not_read_messages_gets_a_monitors_record_without_them() -> None:
-    """It says what is left out; fields of the same name that are no message stay."""
+def test_a_viewer_gets_monitor_records_without_messages() -> None:
+    """The record names the omitted fields; fields of the same name without a message stay."""
     said = {"before": "00", "before_fields": {"data": "x"}, "conditions": {"m.rv:3": {"text": "x"}}}
-    dropped = Record(
+    dropped = AuditRecord(
         id="0" * 20, time=0, event="message dropped", detail={"monitor": "m", "at": ["m.rv:3"], **said}
     )
-    shown = without_contents(Entry(1, dropped)).record
+    shown = without_contents(LogEntry(1, dropped)).record
     assert shown.detail == {"monitor": "m", "at": ["m.rv:3"], "withheld": list(said)}
     assert "message" in " ".join(lines_of(shown))
     texts = {
@@ -97,15 +97,15 @@ def test_who_may_not_read_messages_gets_a_monitors_record_without_them() -> None
     }
     for reason, plain in texts.items():
         detail = {"monitor": "goals", "category": "twice", "binding": {"id": "a: secret"}, "handler": reason}
-        verdict = Record(id="0" * 20, time=0, event="monitor verdict", reason=reason, detail=detail)
-        shown = without_contents(Entry(1, verdict)).record
+        verdict = AuditRecord(id="0" * 20, time=0, event="monitor verdict", reason=reason, detail=detail)
+        shown = without_contents(LogEntry(1, verdict)).record
         assert (shown.reason, shown.detail["handler"]) == (plain, plain)
         assert "secret" not in str(shown)
         shown = without_contents(
-            Entry(1, msgspec.structs.replace(verdict, detail={"monitor": "goals"}))
+            LogEntry(1, msgspec.structs.replace(verdict, detail={"monitor": "goals"}))
         ).record
         assert "secret" not in str(shown)
-    ordered = Entry(
-        2, Record(id="0" * 20, time=0, event="recording ordered", detail={"before": 60.0, "who": "eve"})
+    ordered = LogEntry(
+        2, AuditRecord(id="0" * 20, time=0, event="recording ordered", detail={"before": 60.0, "who": "eve"})
     )
     assert without_contents(ordered) == ordered

@@ -1,4 +1,4 @@
-"""Tests of removing old records: only what may go, never silently, and provable afterwards."""
+"""Tests of removing old records: only records within the rules, always recorded, and provable afterwards."""
 
 import itertools
 import sqlite3
@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from appliance.audit.chain_findings import Kind
+from appliance.audit.chain_findings import FindingKind
 from appliance.audit.query import Filter
-from appliance.audit.record import Record, Severity
+from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.retention import Retention, worth_keeping
 from appliance.audit.search import export, search
 from appliance.audit.verification import verify
@@ -30,7 +30,7 @@ def await_removal(path: Path, through: int = 1) -> None:
 
 
 def make_old(make_log: MakeLog, notary: Notary) -> None:
-    """A log of 2000 records that are a week old, and were signed then."""
+    """Return a log of 2000 records that were made and signed a week ago."""
     notary.ago = 7 * _DAY
     clock = itertools.count(time.time_ns() - 7 * _DAY, 1000)
     log = make_log(checkpoint_every=100, clock=lambda: next(clock))
@@ -43,8 +43,8 @@ def make_old(make_log: MakeLog, notary: Notary) -> None:
     notary.ago = 0
 
 
-def test_old_records_go_and_that_is_recorded(make_log: MakeLog, path: Path, notary: Notary) -> None:
-    """Records past the limit are removed, the log says which, and verification proves the rest."""
+def test_old_records_are_removed_and_that_is_recorded(make_log: MakeLog, path: Path, notary: Notary) -> None:
+    """Records past the limit are removed, the log names them, and verification proves the rest."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     fresh = decision(log, reason="fresh")
@@ -66,8 +66,8 @@ def test_old_records_go_and_that_is_recorded(make_log: MakeLog, path: Path, nota
     assert result.removed == removed
 
 
-def test_nothing_young_goes(make_log: MakeLog, path: Path) -> None:
-    """Records within the limits stay, all of them."""
+def test_young_records_stay(make_log: MakeLog, path: Path) -> None:
+    """No record within the limits is removed."""
     log = make_log(checkpoint_every=10, retention=Retention(days=1, size=1 << 30))
     for number in range(500):
         log.record(decision(log, number))
@@ -77,8 +77,8 @@ def test_nothing_young_goes(make_log: MakeLog, path: Path) -> None:
     assert search(path, Filter()).entries[-1].sequence
 
 
-def test_records_of_a_future_go_with_those_after_them(make_log: MakeLog, path: Path, notary: Notary) -> None:
-    """The clock stood a year ahead for a while: what was recorded then holds up nothing, and goes neither early."""
+def test_records_with_future_times_delay_no_removal(make_log: MakeLog, path: Path, notary: Notary) -> None:
+    """The clock was a year ahead for a while: records from then delay no removal and are not removed early."""
     now = itertools.count(time.time_ns() - 7 * _DAY, 1000)
     notary.ago, ahead = 7 * _DAY, 0
     log = make_log(checkpoint_every=10, clock=lambda: next(now) + ahead)
@@ -96,10 +96,8 @@ def test_records_of_a_future_go_with_those_after_them(make_log: MakeLog, path: P
     assert verify(path).ok
 
 
-def test_what_the_signer_holds_back_for_its_age_is_no_trouble(
-    make_log: MakeLog, path: Path, notary: Notary
-) -> None:
-    """The machine's clock is a year ahead: the signer waits, nothing goes, and nothing is said to be behind."""
+def test_waiting_for_the_signers_clock_is_not_an_alarm(make_log: MakeLog, path: Path, notary: Notary) -> None:
+    """The machine's clock is a year ahead: the signer waits, nothing is removed, and no delay is reported."""
     log = make_log(checkpoint_every=10, retention=Retention(days=30))
     for number in range(100):
         log.record(decision(log, number))
@@ -119,8 +117,8 @@ def test_what_the_signer_holds_back_for_its_age_is_no_trouble(
     assert next(export(path, Filter(), page=1)).sequence == 1
 
 
-def test_size(make_log: MakeLog, path: Path) -> None:
-    """A log that grows past its size loses its oldest records, and stays near the limit."""
+def test_a_log_past_its_size_loses_its_oldest_records(make_log: MakeLog, path: Path) -> None:
+    """The log stays near its limit."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))
     for number in range(12_000):
         log.record(decision(log, number))
@@ -139,8 +137,8 @@ def test_size(make_log: MakeLog, path: Path) -> None:
     assert "larger than" in search(path, Filter(event="records removed")).entries[0].record.reason
 
 
-def test_denials_and_alarms_go_last(make_log: MakeLog, path: Path) -> None:
-    """A flood of what was allowed pushes no denial out: it is written again, with its id, time, and first place."""
+def test_denials_and_alarms_are_removed_last(make_log: MakeLog, path: Path) -> None:
+    """A flood of allows removes no denial: it is copied with its id, time and original position."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))
     early = decision(log, decision="deny", host="10.0.0.66", resource="/cmd_vel", reason="no")
     log.record(early)
@@ -163,18 +161,20 @@ def test_denials_and_alarms_go_last(make_log: MakeLog, path: Path) -> None:
     assert result.removal == "signed"
 
 
-def denial(number: int, host: str, **fields: Any) -> Record:
-    """A denial with an id of its own."""
-    return Record(id=f"{number:020x}", time=number, event="decision", decision="deny", host=host, **fields)
+def denial(number: int, host: str, **fields: Any) -> AuditRecord:
+    """Return a denial with its own id."""
+    return AuditRecord(
+        id=f"{number:020x}", time=number, event="decision", decision="deny", host=host, **fields
+    )
 
 
-def test_a_flood_of_denials_pushes_no_other_hosts_out() -> None:
-    """At most half of what goes is written again, the hosts in turn, all strangers as one, alarms before summaries."""
+def test_a_flood_of_denials_leaves_those_of_other_hosts() -> None:
+    """At most half of the removed records are copied: hosts in turn, unknown hosts as one, alarms first."""
     flood = [denial(number, "10.0.0.66") for number in range(400)]
-    strangers = [denial(1000 + n, f"10.9.0.{n}", detail={"stranger": True}) for n in range(90)]
+    unknown = [denial(1000 + n, f"10.9.0.{n}", detail={"stranger": True}) for n in range(90)]
     few = [denial(2000 + number, "10.0.0.5") for number in range(10)]
     alarm = denial(3000, "10.0.0.66", severity=Severity.ALARM)
-    kept = worth_keeping([*flood, *strangers, *few, alarm], 501)
+    kept = worth_keeping([*flood, *unknown, *few, alarm], 501)
     assert len(kept) == 250
     assert {one.id for one in few} <= {one.id for one in kept}
     assert alarm in kept
@@ -184,7 +184,7 @@ def test_a_flood_of_denials_pushes_no_other_hosts_out() -> None:
 
 
 def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
-    """What the signer has not signed yet is not removed, however old it is."""
+    """Records that the signer has not signed yet stay, however old."""
     clock = itertools.count(time.time_ns() - 7 * _DAY, 1000)
     log = make_log(checkpoint_every=100, clock=lambda: next(clock), signer=lambda number, text: None)
     for number in range(1000):
@@ -198,8 +198,8 @@ def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
     assert next(export(path, Filter())).sequence == 1
 
 
-def test_removal_by_hand_is_not_retention(make_log: MakeLog, path: Path, notary: Notary) -> None:
-    """Removing more than retention said it removed is found."""
+def test_removal_beyond_retention_is_found(make_log: MakeLog, path: Path, notary: Notary) -> None:
+    """Removing more records than the retention record names is found."""
     make_old(make_log, notary)
     log = make_log(retention=Retention(days=1))
     log.record(decision(log))
@@ -209,11 +209,13 @@ def test_removal_by_hand_is_not_retention(make_log: MakeLog, path: Path, notary:
     with closing(sqlite3.connect(path)) as attacker:
         attacker.execute("DELETE FROM record WHERE sequence <= ?", (first,))
         attacker.commit()
-    assert (Kind.MISSING, first, first) in {(one.kind, one.first, one.last) for one in verify(path).findings}
+    assert (FindingKind.MISSING, first, first) in {
+        (one.kind, one.first, one.last) for one in verify(path).findings
+    }
 
 
 @pytest.mark.parametrize("wrong", [{"days": 0}, {"days": -1}, {"size": 100}])
-def test_limits_that_make_no_sense(wrong: dict[str, Any]) -> None:
-    """Limits that would remove everything are refused."""
+def test_invalid_limits_are_rejected(wrong: dict[str, Any]) -> None:
+    """Limits that would remove everything are rejected."""
     with pytest.raises(ValueError, match="retention needs"):
         Retention(**wrong)

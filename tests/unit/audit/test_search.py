@@ -1,4 +1,4 @@
-"""Tests of finding records, while the log is written and when it is not."""
+"""Tests of finding records in a running and in a closed log."""
 
 import itertools
 from pathlib import Path
@@ -20,7 +20,7 @@ _BEGIN = 1_700_000_000 * _SECOND
 
 @pytest.fixture
 def log(make_log: MakeLog) -> AuditLog:
-    """An open log: a hundred ordinary decisions a second apart, and some that differ."""
+    """Return an open log with a hundred ordinary decisions a second apart, and some that differ."""
     log = make_log(checkpoint_seconds=3600)
     for number in range(100):
         log.record(decision(log, number, time=_BEGIN + number * _SECOND))
@@ -43,7 +43,7 @@ def log(make_log: MakeLog) -> AuditLog:
 
 
 def sequences(path: Path, wanted: Filter, **arguments: Any) -> list[int]:
-    """Which records are found, by their sequences less two (the log's own first record is 1)."""
+    """Return the sequences of the records found, less two (the log's own first record is 1)."""
     return [entry.sequence - 2 for entry in search(path, wanted, **arguments).entries]
 
 
@@ -81,14 +81,14 @@ def sequences(path: Path, wanted: Filter, **arguments: Any) -> list[int]:
     ids=str,
 )
 def test_filters(log: AuditLog, path: Path, wanted: Filter, expected: list[int]) -> None:
-    """Each filter finds exactly what it says, newest first, also combined, in a running and a closed log."""
+    """Each filter, alone or combined, finds exactly its records, newest first, in a running and a closed log."""
     assert sequences(path, wanted) == expected
     log.close()
     assert sequences(path, wanted) == expected
 
 
-def test_text_is_found_at_once_and_after_indexing(log: AuditLog, path: Path) -> None:
-    """A text is found as soon as its record is on disk, whether it is in the full-text index yet or not."""
+def test_a_text_is_found_before_and_after_indexing(log: AuditLog, path: Path) -> None:
+    """A text is found as soon as its record is on disk."""
     for number in range(600):
         log.record(decision(log, number, reason=f"needle {number}"))
         if number % 100 == 0:
@@ -100,8 +100,8 @@ def test_text_is_found_at_once_and_after_indexing(log: AuditLog, path: Path) -> 
 
 @pytest.mark.parametrize("newest_first", [True, False])
 @pytest.mark.parametrize("wanted", [Filter(), Filter(resource="/cmd_*"), Filter(text="lets it")])
-def test_paging(log: AuditLog, path: Path, wanted: Filter, newest_first: bool) -> None:
-    """Pages in a row give every record once, in order, though records are added meanwhile."""
+def test_pages_give_every_record_once(log: AuditLog, path: Path, wanted: Filter, newest_first: bool) -> None:
+    """Pages are in order, even while records are added."""
     everything = [entry.record.id for entry in search(path, wanted, limit=1000).entries]
     found: list[str] = []
     cursor = None
@@ -117,15 +117,15 @@ def test_paging(log: AuditLog, path: Path, wanted: Filter, newest_first: bool) -
     assert found == (everything if newest_first else everything[::-1])
 
 
-def test_export_is_everything_oldest_first(log: AuditLog, path: Path) -> None:
-    """The export has every record once, oldest first, whatever the size of its pages."""
+def test_an_export_has_everything_oldest_first(log: AuditLog, path: Path) -> None:
+    """The export has every record once, oldest first, with pages of any size."""
     entries = list(export(path, Filter(), page=9))
     assert [entry.sequence for entry in entries] == list(range(1, len(entries) + 1))
     assert len(entries) >= 105
 
 
-def test_show_with_neighbours(log: AuditLog, path: Path) -> None:
-    """One record by its id or its sequence, with what the same host or caller did before and after."""
+def test_a_record_is_shown_with_its_neighbours(log: AuditLog, path: Path) -> None:
+    """A record is found by its id or its sequence, with earlier and later actions of the same host or caller."""
     entry = search(path, Filter(resource="/cmd_7", host="10.0.0.2")).entries[2]
     shown = show(path, entry.record.id, neighbours=2)
     assert shown is not None
@@ -137,8 +137,8 @@ def test_show_with_neighbours(log: AuditLog, path: Path) -> None:
         assert show(path, unknown) is None
 
 
-def test_follow(log: AuditLog, path: Path) -> None:
-    """A follower gives what is recorded after it began, once, in order, and only what is asked for."""
+def test_a_follower_gets_new_records(log: AuditLog, path: Path) -> None:
+    """A follower gets the matching records made after it began, once and in order."""
     follower = Follower(path, Filter(decision=("deny",)))
     assert follower.poll() == []
     sent = [decision(log, number, decision="deny", resource=f"/n{number}") for number in range(25)]
@@ -160,8 +160,8 @@ def test_follow(log: AuditLog, path: Path) -> None:
         (Filter(text="y" * 300), "text: longer"),
     ],
 )
-def test_filters_that_cannot_be_used(log: AuditLog, path: Path, wanted: Filter, message: str) -> None:
-    """A filter past its limits is an error that says which part and why."""
+def test_invalid_filters_are_errors(log: AuditLog, path: Path, wanted: Filter, message: str) -> None:
+    """A filter past its limits is an error that names the part and the reason."""
     with pytest.raises(FilterError, match=message):
         search(path, wanted)
 
@@ -169,22 +169,22 @@ def test_filters_that_cannot_be_used(log: AuditLog, path: Path, wanted: Filter, 
 @pytest.mark.parametrize(
     "arguments", [{"limit": 0}, {"limit": 10_001}, {"cursor": "x"}, {"cursor": "-1"}, {"cursor": "9" * 30}]
 )
-def test_page_that_cannot_be_asked_for(log: AuditLog, path: Path, arguments: dict[str, Any]) -> None:
+def test_invalid_pages_are_errors(log: AuditLog, path: Path, arguments: dict[str, Any]) -> None:
     """A wrong limit or cursor is an error."""
     with pytest.raises(FilterError):
         search(path, Filter(), **arguments)
 
 
-def test_no_log_and_no_directory(tmp_path: Path) -> None:
-    """Searching where there is no log says what is missing and which option gives the place."""
+def test_a_missing_log_is_an_error(tmp_path: Path) -> None:
+    """The error names the missing file and the option that sets the path."""
     with pytest.raises(LogUnreadableError, match=r"no audit log yet.*--state"):
         search(tmp_path / "audit.db", Filter())
     with pytest.raises(LogUnreadableError, match=r"no such directory.*--state"):
         search(tmp_path / "none" / "audit.db", Filter())
 
 
-def test_damaged_log(path: Path) -> None:
-    """Searching a file that is no log is an error that names it."""
+def test_a_damaged_log_is_an_error(path: Path) -> None:
+    """Searching a file that is not a log is an error that names it."""
     path.write_bytes(b"rubbish" * 1000)
     with pytest.raises(LogUnreadableError, match=r"audit\.db"):
         search(path, Filter())
@@ -198,8 +198,8 @@ def test_reading_leaves_no_trace(log: AuditLog, path: Path) -> None:
     assert path.read_bytes() == before
 
 
-def test_calls_that_only_looked_are_left_out(log: AuditLog, path: Path) -> None:
-    """Allowed GETs of REST go; orders, refused looks, and words that a client made up stay."""
+def test_reads_over_rest_can_be_left_out(log: AuditLog, path: Path) -> None:
+    """Allowed GETs of REST are left out; orders, refused reads, and methods made up by a client stay."""
     calls = [
         ("GET", "allow", "rest call", "rest"), ("HEAD", "allow", "rest call", "rest"),
         ("POST", "allow", "rest call", "rest"),
@@ -218,8 +218,8 @@ def test_calls_that_only_looked_are_left_out(log: AuditLog, path: Path) -> None:
     assert [entry.sequence for entry in followed] == [entry.sequence for entry in shown]
 
 
-def test_who_asked(log: AuditLog, path: Path) -> None:
-    """The name of a token finds what it asked, a glob what anybody did; a node's own words are nobody's name."""
+def test_records_are_found_by_token_name(log: AuditLog, path: Path) -> None:
+    """The name of a token finds its requests, a glob those of several; texts of a node match no name."""
     details: list[dict[str, Any]] = [{"who": "alice"}, {"who": "bob"}, {"text": '"who":"alice"'}, {}]
     for detail in details:
         log.record(decision(log, resource="/v1/x", detail=detail))

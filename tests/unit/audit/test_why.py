@@ -1,11 +1,11 @@
-"""Why what a record tells happened, in lines."""
+"""Explanations of records, in lines."""
 
-from appliance.audit.record import Record, RuleReference, Severity
+from appliance.audit.record import AuditRecord, RuleReference, Severity
 from appliance.audit.why import lines_of
 
 
-def test_a_verdict() -> None:
-    """Who, where, the values, the events, and how far they explain it."""
+def test_a_verdict_is_explained() -> None:
+    """The lines name the message, the place, the values, the events, and how far they explain the verdict."""
     event = {
         "event": "go",
         "time": "12:00",
@@ -17,7 +17,7 @@ def test_a_verdict() -> None:
     }
     why = {"events": [event], "fewest": False, "since": "11:00", "decided": ["a is true"]}
     detail = {"number": 3, "at": ["x.rv:1:2"], "conditions": {"x.rv:3:4": {"x": 2}}, "why": why}
-    record = Record(
+    record = AuditRecord(
         id="1", time=1, event="monitor verdict", reason="bad", host="10.0.0.1", caller_id="/a", detail=detail
     )
     assert list(lines_of(record)) == [
@@ -32,31 +32,35 @@ def test_a_verdict() -> None:
     ]
 
 
-def test_what_is_not_known_is_said() -> None:
-    """A verdict without an explanation, one that needed no event, one whose events are too many to be told."""
-    bare = Record(id="1", time=1, event="monitor verdict", reason="bad")
+def test_missing_explanations_are_reported() -> None:
+    """Covers a verdict without an explanation, one without events, and one with too many events."""
+    bare = AuditRecord(id="1", time=1, event="monitor verdict", reason="bad")
     assert list(lines_of(bare))[-1].startswith("because: which events made it so is not known")
-    silent = Record(id="1", time=1, event="monitor verdict", reason="bad", detail={"why": {"events": []}})
+    silent = AuditRecord(
+        id="1", time=1, event="monitor verdict", reason="bad", detail={"why": {"events": []}}
+    )
     assert list(lines_of(silent)) == ["bad", "because: no event was needed: time has passed"]
     events = [{"event": str(number), "time": "12:00"} for number in range(10)]
-    many = Record(id="1", time=1, event="monitor verdict", detail={"why": {"events": events, "left_out": 4}})
+    many = AuditRecord(
+        id="1", time=1, event="monitor verdict", detail={"why": {"events": events, "left_out": 4}}
+    )
     assert list(lines_of(many))[6] == "because: … 4 more …"
 
 
-def test_a_refusal() -> None:
-    """Its rule; what would allow it is asked of the policy in force."""
+def test_a_denial_names_its_rule() -> None:
+    """The change that would allow it is computed from the policy in force."""
     rule = RuleReference("Publishers", "/t", "robot.ini", 4)
-    record = Record(
+    record = AuditRecord(
         id="1", time=1, event="decision", decision="deny", severity=Severity.WARNING, reason="no", host="10.0.0.1",
         rule=rule,
     )  # fmt: skip
     assert list(lines_of(record)) == ["no", "by: on 10.0.0.1", "rule: [Publishers] /t robot.ini:4"]
-    other = Record(
+    other = AuditRecord(
         id="1", time=1, event="policy loaded", reason="by somebody", detail={"why": "strange", "at": 3}
     )
     assert list(lines_of(other)) == ["by somebody"]
 
 
-def test_an_event_without_a_reason() -> None:
-    """What happened is said all the same, instead of an empty line."""
-    assert list(lines_of(Record(id="1", time=1, event="log begun"))) == ["log begun"]
+def test_an_event_without_a_reason_is_described() -> None:
+    """The line describes the event instead of being empty."""
+    assert list(lines_of(AuditRecord(id="1", time=1, event="log begun"))) == ["log begun"]

@@ -1,4 +1,4 @@
-"""Tests of what is believed of an archive: all of it is checked before anything is written."""
+"""Tests of validating an archive: everything is checked before anything is written."""
 
 import gzip
 import io
@@ -16,7 +16,7 @@ NOTHING = "nothing is put back"
 
 
 def refused(file: Path, state: Path, words: str) -> None:
-    """It is not put back, these words say why, and nothing is left."""
+    """Check that the restore fails with these words and leaves nothing behind."""
     with pytest.raises(BackupError, match=words):
         restore(file, state)
     assert not state.exists()
@@ -31,8 +31,8 @@ def refused(file: Path, state: Path, words: str) -> None:
         "api/\x1b[2J", "api/a\nb", "api/" + "x" * 97,
     ],
 )  # fmt: skip
-def test_a_name_that_no_backup_has(tmp_path: Path, name: str) -> None:
-    """It is refused whole, before anything is written."""
+def test_an_unknown_name_is_rejected(tmp_path: Path, name: str) -> None:
+    """The whole archive is rejected before anything is written."""
     file = tmp_path / "evil.tar.gz"
     with tarfile.open(file, "w:gz", format=tarfile.GNU_FORMAT) as tar:
         for one in (LOG, name):
@@ -41,8 +41,8 @@ def test_a_name_that_no_backup_has(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.DIRTYPE])
-def test_only_files(tmp_path: Path, kind: bytes) -> None:
-    """Links, devices and folders are in no backup."""
+def test_only_files_are_accepted(tmp_path: Path, kind: bytes) -> None:
+    """Links, devices and folders are rejected."""
     refused(
         archive(tmp_path / "evil", header("api/x", kind=kind, linkname="/etc/passwd")),
         tmp_path / "s",
@@ -50,7 +50,7 @@ def test_only_files(tmp_path: Path, kind: bytes) -> None:
     )
 
 
-def test_holes_are_refused(tmp_path: Path) -> None:
+def test_sparse_files_are_rejected(tmp_path: Path) -> None:
     """A header of a hundred bytes cannot unpack to a file of gigabytes."""
     sparse = bytearray(header("api/hole", kind=tarfile.GNUTYPE_SPARSE))
     sparse[483:495] = b"%011o\0" % (4 << 30)
@@ -62,7 +62,7 @@ def test_holes_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "kind", [tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK]
 )
-def test_headers_that_say_more_are_refused(tmp_path: Path, kind: bytes) -> None:
+def test_extended_headers_are_rejected(tmp_path: Path, kind: bytes) -> None:
     """A backup has none; they could hold gigabytes, or name a file twice."""
     text = b"20 path=api/x\0yyyyy\n".ljust(512, b"\0")
     refused(
@@ -71,25 +71,25 @@ def test_headers_that_say_more_are_refused(tmp_path: Path, kind: bytes) -> None:
 
 
 @pytest.mark.parametrize("size", [-1, 1 << 40])
-def test_sizes_that_cannot_be(tmp_path: Path, size: int) -> None:
-    """Less than nothing, or more than a file that is no database ever has."""
+def test_impossible_sizes_are_rejected(tmp_path: Path, size: int) -> None:
+    """A size is not negative and not larger than any file except a database."""
     refused(archive(tmp_path / "evil", header("api/x", size)), tmp_path / "state", NOTHING)
 
 
-def test_a_name_twice(tmp_path: Path) -> None:
-    """Neither as two files, nor as a file and a folder."""
+def test_a_duplicate_name_is_rejected(tmp_path: Path) -> None:
+    """This holds for two files, and for a file and a folder."""
     for name in (LOG, f"{LOG}/x"):
         refused(archive(tmp_path / "evil", header(name)), tmp_path / "state", NOTHING)
 
 
-def test_files_without_number(tmp_path: Path) -> None:
+def test_too_many_files_are_rejected(tmp_path: Path) -> None:
     """A backup has a handful of files; a million of them would fill the disk with names."""
     many = b"".join(header(f"api/{number}") for number in range(10_001))
     refused(archive(tmp_path / "evil", many), tmp_path / "state", "more than 10000 files")
 
 
 def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
-    """The file says by a checksum over all of it whether it is what was written, and it is asked."""
+    """A checksum over the whole file detects each changed bit."""
     content = os.urandom(2000)
     whole = archive(
         tmp_path / "whole", header("api/x", len(content)), content.ljust(2048, b"\0")
@@ -102,10 +102,10 @@ def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
     refused(file, tmp_path / "state", "flipped cannot be put back")
 
 
-def test_what_cannot_be_read(tmp_path: Path) -> None:
-    """No archive, none there, one without an audit log: an error that names it."""
+def test_an_unreadable_archive_is_an_error(tmp_path: Path) -> None:
+    """Another file, a missing file, or an archive without an audit log: the error names it."""
     (tmp_path / "rubbish").write_bytes(b"\x1f\x8b rubbish")
     refused(tmp_path / "rubbish", tmp_path / "state", "rubbish cannot be put back")
     refused(tmp_path / "nowhere", tmp_path / "state", "nowhere cannot be put back")
     (tmp_path / "other").write_bytes(gzip.compress(header("api/x") + bytes(1024)))
-    refused(tmp_path / "other", tmp_path / "state", "no backup of an appliance")
+    refused(tmp_path / "other", tmp_path / "state", "not a backup of an appliance")

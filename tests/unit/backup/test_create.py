@@ -1,4 +1,4 @@
-"""Tests of backups: what is in them, what is refused, and a signer's memory that fits the log."""
+"""Tests of backups: their contents, their refusals, and a signer's memory that matches the log."""
 
 import os
 import shutil
@@ -20,22 +20,21 @@ from appliance.audit.log import AuditLog
 from appliance.audit.verification import verify
 from appliance.backup import create as backup
 from appliance.backup.contents import BackupError
-from appliance.backup.create import back_up
-from appliance.backup.database_copy import copy_database
+from appliance.backup.create import back_up, copy_database
 from appliance.backup.restore import restore
-from appliance.ipsec.signed_checkpoints import SignedCheckpoints
+from appliance.ipsec.signed_checkpoints import CheckpointMemory
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
 
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    """A state directory with a log of some signed checkpoints, whose signer has signed one more since."""
+    """Return a state directory with signed checkpoints, whose signer has signed one more since."""
     state = tmp_path / "state"
     for part in ("control", "signer", "api", "ipsec", "run", "rosmaster/log"):
         (state / part).mkdir(parents=True)
     key = Ed25519PrivateKey.generate()
-    memory = SignedCheckpoints(state / "signer", time.time_ns)
+    memory = CheckpointMemory(state / "signer", time.time_ns)
 
     def sign(number: int, text: bytes) -> None:
         memory.approve(text)
@@ -49,7 +48,7 @@ def state(tmp_path: Path) -> Path:
     logs[0].close()
     (signed,) = (state / "signer").glob("*.signed")
     with signed.open("ab") as file:
-        file.write(b"\x01" * 32)  # signed after the copy of the log was taken
+        file.write(b"\x01" * 32)  # signed after the log was copied
     with closing(sqlite3.connect(state / "control" / "state.db")) as connection:
         connection.execute("CREATE TABLE thing (value TEXT)")
         connection.execute("INSERT INTO thing VALUES ('kept')")
@@ -62,8 +61,8 @@ def state(tmp_path: Path) -> Path:
     return state
 
 
-def test_there_and_back(state: Path, tmp_path: Path) -> None:
-    """What must survive is put back as it was; what belongs to a running appliance is not; the log proves itself."""
+def test_a_backup_is_restored(state: Path, tmp_path: Path) -> None:
+    """Permanent state is restored unchanged; that of a running appliance is not; the log proves itself."""
     file, other = tmp_path / "backup.tar.gz", tmp_path / "other"
     assert not verify(state / "control" / "audit.db", signer=state / "signer").ok
     names = back_up(state, file)
@@ -83,7 +82,7 @@ def test_there_and_back(state: Path, tmp_path: Path) -> None:
     assert [one.name for one in tmp_path.iterdir() if one.name.startswith(".rosrv-backup")] == []
 
 
-def test_the_key_that_is_pinned_meanwhile_is_taken(
+def test_a_key_pinned_during_the_backup_is_included(
     state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first checkpoint may be signed, and its key pinned, while a backup begins: its log proves itself."""
@@ -101,8 +100,8 @@ def test_the_key_that_is_pinned_meanwhile_is_taken(
     assert verify(tmp_path / "other" / "control" / "audit.db", signer=tmp_path / "other" / "signer").ok
 
 
-def test_no_ros_is_needed(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where rosmaster is not installed a backup is taken and put back; recordings of messages are in none."""
+def test_a_backup_needs_no_ros(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without rosmaster a backup is made and restored; no backup contains recordings of messages."""
     monkeypatch.setattr(shutil, "which", lambda _program: None)
     (state / "recordings").mkdir()
     (state / "recordings" / "recording.bag").write_text("what messages said")
@@ -111,8 +110,8 @@ def test_no_ros_is_needed(state: Path, tmp_path: Path, monkeypatch: pytest.Monke
     assert not any(name.startswith("recordings/") for name in names)
 
 
-def test_nothing_is_written_over(state: Path, tmp_path: Path) -> None:
-    """An existing file, and a state directory that has something in it, stay as they are."""
+def test_nothing_is_overwritten(state: Path, tmp_path: Path) -> None:
+    """An existing file, and a state directory that is not empty, stay unchanged."""
     file = tmp_path / "backup.tar.gz"
     file.write_text("mine")
     with pytest.raises(BackupError, match="is there already"):
@@ -125,8 +124,8 @@ def test_nothing_is_written_over(state: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", ["8k", "64k"])
-def test_a_full_disk_is_called_so(state: Path, tmp_path: Path, size: str) -> None:
-    """What is to be done is to make room; rights that are there would not help."""
+def test_a_full_disk_is_reported(state: Path, tmp_path: Path, size: str) -> None:
+    """The error says to free space, not to change permissions."""
     need_root()
     place = tmp_path / "disk"
     place.mkdir()
@@ -141,14 +140,14 @@ def test_a_full_disk_is_called_so(state: Path, tmp_path: Path, size: str) -> Non
         subprocess.run(["umount", "--lazy", place], check=True)
 
 
-def test_what_cannot_be_read(tmp_path: Path) -> None:
-    """No state directory: an error that names it."""
-    with pytest.raises(BackupError, match="no state directory of an appliance"):
+def test_a_missing_state_directory_is_an_error(tmp_path: Path) -> None:
+    """The error names the directory."""
+    with pytest.raises(BackupError, match="not the state directory of an appliance"):
         back_up(tmp_path, tmp_path / "x.tar.gz")
 
 
-def test_a_part_that_cannot_be_read(state: Path, tmp_path: Path) -> None:
-    """A backup without the keys would be none: what cannot be looked into is an error, and no file is left."""
+def test_an_unreadable_part_is_an_error(state: Path, tmp_path: Path) -> None:
+    """A backup without the keys would be useless: an unreadable part is an error, and no file is left."""
     need_root()
     file = Path(tempfile.mkdtemp(prefix="rosrv-backup-test-"))
     file.chmod(0o777)
@@ -175,8 +174,8 @@ def test_a_part_that_cannot_be_read(state: Path, tmp_path: Path) -> None:
     file.rmdir()
 
 
-def test_what_a_process_planted_is_not_taken_for_its_own(state: Path, tmp_path: Path) -> None:
-    """Links, pipes and folders that are links, put into a part by its user, lead a backup that root makes nowhere."""
+def test_planted_links_and_pipes_are_refused(state: Path, tmp_path: Path) -> None:
+    """Links, pipes and linked folders that a part's user plants lead a backup by root nowhere."""
     secret = tmp_path / "shadow"
     secret.write_text("root's")
     (tmp_path / "outside").mkdir()
@@ -192,10 +191,10 @@ def test_what_a_process_planted_is_not_taken_for_its_own(state: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("name", ["api/key.pem", "api/folder/shadow"])
-def test_a_link_that_is_put_there_at_the_last_moment_is_not_followed(
+def test_a_late_link_is_not_followed(
     state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """A file, or a folder on the way to it, that becomes a link after it was seen gives nothing of its target away."""
+    """A file or folder that becomes a link after the check reveals nothing of its target."""
     (tmp_path / "shadow").write_text("root's")
     (state / "api" / "key.pem").symlink_to(tmp_path / "shadow")
     (state / "api" / "folder").symlink_to(tmp_path)
@@ -211,7 +210,7 @@ def test_a_link_that_is_put_there_at_the_last_moment_is_not_followed(
 
 
 def test_a_file_of_another_user_is_refused(state: Path, tmp_path: Path) -> None:
-    """A hard link that a process made to a file of somebody else is told, and no backup is left."""
+    """A hard link to another user's file is reported, and no backup is left."""
     need_root()
     for path in (state / "api", *(state / "api").iterdir()):
         os.chown(path, 61014, 61014)
@@ -222,8 +221,8 @@ def test_a_file_of_another_user_is_refused(state: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "backup.tar.gz").exists()
 
 
-def test_a_file_without_end_is_refused(state: Path, tmp_path: Path) -> None:
-    """A process cannot fill the disk, or the memory, of whoever makes the backup with a file full of holes."""
+def test_a_sparse_file_is_refused(state: Path, tmp_path: Path) -> None:
+    """A process cannot fill the disk or the memory of a backup with a file full of holes."""
     with (state / "api" / "hole").open("wb") as file:
         file.truncate(1 << 40)
     with pytest.raises(BackupError, match="api/hole has 1099511627776 bytes"):
@@ -232,8 +231,8 @@ def test_a_file_without_end_is_refused(state: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["\x1b[2J", "x" * 97])
-def test_a_name_that_could_not_be_put_back(state: Path, tmp_path: Path, name: str) -> None:
-    """A backup that nobody could put back is not made: the file that is in the way is named."""
+def test_a_name_that_cannot_be_restored_is_refused(state: Path, tmp_path: Path, name: str) -> None:
+    """The error names the file that would make the backup impossible to restore."""
     (state / "api" / name).touch()
     with pytest.raises(BackupError, match="see who put it there"):
         back_up(state, tmp_path / "backup.tar.gz")
@@ -241,7 +240,7 @@ def test_a_name_that_could_not_be_put_back(state: Path, tmp_path: Path, name: st
 
 
 def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who writes on while it is read cannot fill the disk with a backup, either."""
+    """A process that writes during the backup cannot fill the disk with it."""
     content = state / "api" / "growing"
     content.write_bytes(bytes(1000))
     opened = backup.opened
@@ -258,10 +257,8 @@ def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: 
     assert not (tmp_path / "backup.tar.gz").exists()
 
 
-def test_more_files_than_could_be_put_back(
-    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A process that makes files without number is found when the backup is made, not when it is needed."""
+def test_too_many_files_are_refused(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that makes too many files is found when the backup is made, not at the restore."""
     monkeypatch.setattr(backup, "MOST_FILES", 5)
     with pytest.raises(BackupError, match=r"more than 5 files, .* in api"):
         for number in range(9):
@@ -273,7 +270,7 @@ def test_more_files_than_could_be_put_back(
 def test_an_interrupted_backup_leaves_no_file(
     state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C in the middle: under the name that was asked for there is a whole backup or none."""
+    """After Ctrl-C in the middle, the target is a whole backup or does not exist."""
 
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
@@ -285,16 +282,16 @@ def test_an_interrupted_backup_leaves_no_file(
 
 
 def test_a_half_restored_state_is_not_backed_up(state: Path, tmp_path: Path) -> None:
-    """What a torn restore left is no appliance's state."""
+    """The state left by an interrupted restore is not a valid state."""
     (state / "restoring").touch()
-    with pytest.raises(BackupError, match="was not put back to its end"):
+    with pytest.raises(BackupError, match="a restore did not finish"):
         back_up(state, tmp_path / "backup.tar.gz")
     assert not (tmp_path / "backup.tar.gz").exists()
 
 
 @pytest.fixture
 def owned(state: Path) -> Iterator[Path]:
-    """The state where its users can reach it, and `control` its user's own; root makes the backup."""
+    """Return the state owned by `control`'s user and reachable for its users; root makes the backup."""
     need_root()
     place = Path(tempfile.mkdtemp(prefix="rosrv-backup-test-"))
     place.chmod(0o711)
@@ -306,8 +303,8 @@ def owned(state: Path) -> Iterator[Path]:
     shutil.rmtree(place)
 
 
-def test_databases_in_use_are_copied_as_their_user(owned: Path, tmp_path: Path) -> None:
-    """What is still in the write-ahead log is in the backup, and no file of root's is left beside the database."""
+def test_open_databases_are_copied_as_their_user(owned: Path, tmp_path: Path) -> None:
+    """The backup includes the write-ahead log, and root leaves no file beside the database."""
     with closing(sqlite3.connect(owned / "control" / "state.db")) as connection:
         connection.execute("PRAGMA journal_mode=WAL")
         connection.execute("INSERT INTO thing VALUES ('fresh')")
@@ -324,10 +321,10 @@ def test_databases_in_use_are_copied_as_their_user(owned: Path, tmp_path: Path) 
         assert connection.execute("SELECT value FROM thing").fetchall() == [("kept",), ("fresh",)]
 
 
-def test_a_database_that_becomes_a_link_gives_nothing_of_roots_away(
+def test_a_database_replaced_by_a_link_reveals_nothing_of_root(
     owned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Put in its place after it was looked at, a link is followed with no more rights than its user has."""
+    """A link planted after the check is followed only with the rights of its user."""
     secret = owned.parent / "secret.db"
     with closing(sqlite3.connect(secret)) as connection:
         connection.execute("CREATE TABLE secret (value TEXT)")

@@ -1,4 +1,4 @@
-"""The end of a state directory: all of it goes, and nothing beside it; not while an appliance uses it."""
+"""Tests of removing a state directory: all of it, nothing else, and not while an appliance uses it."""
 
 import os
 from pathlib import Path
@@ -16,7 +16,7 @@ KEY = b"-----BEGIN PRIVATE KEY-----"
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    """A state directory with a key, a log, a link to a file that is not its own, and a second name of that."""
+    """Return a state directory with a key, a log, a link to another file, and a hard link to that file."""
     place = tmp_path / "state"
     StateDirectory(place).close()
     (place / "signer").mkdir()
@@ -30,20 +30,20 @@ def state(tmp_path: Path) -> Path:
     return place
 
 
-def test_all_of_it_goes_and_nothing_else(state: Path, tmp_path: Path) -> None:
-    """A key that somebody has open already reads as noise; what only has a name here stays as it is elsewhere."""
+def test_all_of_it_is_removed_and_nothing_else(state: Path, tmp_path: Path) -> None:
+    """An open key reads as random bytes; the target of a link stays unchanged."""
     with (state / "signer" / "audit.key").open("rb") as still:
         files, written = purge(state)
         kept = still.read()
     assert kept != KEY
     assert len(kept) == len(KEY)
-    assert (files, written) == (5, 2)  # with the lock
+    assert (files, written) == (5, 2)  # including the lock
     assert not state.exists()
     assert (tmp_path / "mine").read_bytes() == KEY
 
 
 def test_not_while_an_appliance_uses_it(state: Path) -> None:
-    """Nothing is touched then, and its process is named."""
+    """Nothing is touched, and the error names the process."""
     held = StateDirectory(state)
     try:
         with pytest.raises(BackupError, match=f"uses the state directory .* already .process {os.getpid()}"):
@@ -53,23 +53,23 @@ def test_not_while_an_appliance_uses_it(state: Path) -> None:
     assert (state / "signer" / "audit.key").read_bytes() == KEY
 
 
-def test_only_a_state_directory(tmp_path: Path) -> None:
-    """Not a folder with something else in it, not an empty one, not one that is not there."""
+def test_only_a_state_directory_is_removed(tmp_path: Path) -> None:
+    """A folder with other files, an empty folder, and a missing one are refused."""
     (tmp_path / "home").mkdir()
     for place, why in ((tmp_path / "home", "empty"), (tmp_path / "nothing", "there is no state directory")):
         with pytest.raises(BackupError, match=why):
             purge(place)
     (tmp_path / "home" / "letter").write_text("dear")
-    with pytest.raises(BackupError, match="is no state directory of an appliance"):
+    with pytest.raises(BackupError, match="is not the state directory of an appliance"):
         purge(tmp_path / "home")
     assert (tmp_path / "home" / "letter").exists()
 
 
-def test_the_command_wants_the_path_once_more(state: Path) -> None:
-    """From a script by --confirm, else it is asked; another path removes nothing."""
+def test_the_command_asks_for_the_path_again(state: Path) -> None:
+    """A script gives it by --confirm, a person is asked; another path removes nothing."""
     run = CliRunner().invoke
     refused = run(app, ["purge", "--state", str(state), "--confirm", "/var/lib/rosrv"])
     assert (refused.exit_code, "nothing was removed" in refused.output) == (1, True)
     done = run(app, ["purge", "--state", str(state)], input=f"{state}\n")
-    assert (done.exit_code, "is gone: 5 files" in done.output) == (0, True)
+    assert (done.exit_code, "is erased: 5 files" in done.output) == (0, True)
     assert not state.exists()

@@ -1,4 +1,4 @@
-"""Tests of putting a backup back: where to, for whom, and what a torn restore leaves."""
+"""Tests of restoring a backup: target, owner, and an interrupted restore."""
 
 import os
 import stat
@@ -16,8 +16,8 @@ from tests.support.backups import LOG, archive, header
 from tests.support.requirements import need_root
 
 
-def test_more_than_there_is_room_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What unpacks to more than the disk has room for is not begun."""
+def test_a_backup_larger_than_the_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A backup that unpacks to more than the free space is not started."""
     file = archive(tmp_path / "bomb", header("api/x", 1 << 24), bytes(1 << 24))
     assert file.stat().st_size < 1 << 16
     monkeypatch.setattr(backup_restore, "_room_in", lambda _state: 1 << 23)
@@ -26,22 +26,22 @@ def test_more_than_there_is_room_for(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert not (tmp_path / "state").exists()
 
 
-def test_a_place_that_is_no_folder(tmp_path: Path) -> None:
-    """A file in the place of the new state directory, or on the way to it: an error that names it."""
+def test_a_target_that_is_a_file_is_an_error(tmp_path: Path) -> None:
+    """A file at the path of the new state directory, or on the way to it, is named in the error."""
     (tmp_path / "file").touch()
     for state in (tmp_path / "file", tmp_path / "file" / "state"):
         with pytest.raises(BackupError, match=r"file.*: Not a directory"):
             restore(archive(tmp_path / "backup"), state)
 
 
-def test_a_torn_restore_is_not_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed in the middle it leaves a mark, which `rosrv up` refuses; an error or Ctrl-C leaves nothing at all."""
+def test_an_interrupted_restore_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A killed restore leaves a mark that `rosrv up` refuses; an error or Ctrl-C leaves nothing."""
     file, state = archive(tmp_path / "backup", header("api/x")), tmp_path / "state"
     seen: list[str] = []
 
     def torn(*_: object) -> None:
         seen.extend(one.name for one in state.iterdir())
-        with pytest.raises(StartError, match="was not put back to its end: remove it"):
+        with pytest.raises(StartError, match="a restore did not finish: remove this folder"):
             refuse_half_restored(state)
         raise KeyboardInterrupt
 
@@ -61,8 +61,8 @@ def test_a_torn_restore_is_not_started(tmp_path: Path, monkeypatch: pytest.Monke
     assert sorted(one.name for one in state.iterdir()) == ["api", "control", "lock"]
 
 
-def test_what_was_restored_is_an_appliances(tmp_path: Path) -> None:
-    """`rosrv up` takes it, in a container too, where root may not look into the parts: it has the lock."""
+def test_a_restored_state_starts(tmp_path: Path) -> None:
+    """`rosrv up` accepts it and takes its lock, also in a container where root cannot read the parts."""
     state = tmp_path / "state"
     restore(archive(tmp_path / "backup"), state)
     assert stat.S_IMODE((state / "lock").stat().st_mode) == 0o600
@@ -71,8 +71,8 @@ def test_what_was_restored_is_an_appliances(tmp_path: Path) -> None:
     assert foreign(state) is None
 
 
-def test_a_folder_that_was_there_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of an empty folder, such as a volume or a disk, a failed restore takes away only what it put there."""
+def test_an_existing_folder_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A failed restore removes only its own files from an empty folder such as a volume."""
     file, state = archive(tmp_path / "backup"), tmp_path / "state"
     (state / "lost+found").mkdir(parents=True)
 
@@ -85,8 +85,8 @@ def test_a_folder_that_was_there_stays(tmp_path: Path, monkeypatch: pytest.Monke
     assert [one.name for one in state.iterdir()] == ["lost+found"]
 
 
-def test_a_folder_is_given_away_after_what_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While `restore` hands a part over, its user cannot put a link in the place of what is still to be given away."""
+def test_a_folder_changes_owner_after_its_contents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While `restore` hands a part over, its user cannot replace a remaining file by a link."""
     need_root()
     given: list[str] = []
     monkeypatch.setattr(os, "chown", lambda path, *_ids, **_more: given.append(str(path)))

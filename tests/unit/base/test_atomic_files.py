@@ -22,8 +22,8 @@ from appliance.cli.output import write_told
 from tests.support.requirements import need_root
 
 
-def test_a_file_is_replaced_with_the_mode_that_is_said(tmp_path: Path) -> None:
-    """Whatever the mask is; nothing stays beside it."""
+def test_a_file_is_replaced_with_the_given_mode(tmp_path: Path) -> None:
+    """The umask is ignored, and no temporary file is left."""
     path = tmp_path / "key.pem"
     path.write_text("before")
     mask = os.umask(0o077)
@@ -35,8 +35,8 @@ def test_a_file_is_replaced_with_the_mode_that_is_said(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_cannot_be_written_leaves_the_file_before(tmp_path: Path) -> None:
-    """What is there is no file: it is as it was, and nothing stays beside it."""
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
+    """A target that is not a file stays unchanged, and no temporary file is left."""
     path = tmp_path / "position"
     path.mkdir()
     with pytest.raises(IsADirectoryError, match=r"/position'$"):
@@ -44,10 +44,8 @@ def test_what_cannot_be_written_leaves_the_file_before(tmp_path: Path) -> None:
     assert [*tmp_path.rglob("*")] == [path]
 
 
-def test_of_several_who_write_a_file_at_once_it_is_one_s(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each has written its own, whole, before it takes the name: none takes what another has begun."""
+def test_concurrent_writers_do_not_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each writer completes its own temporary file before the rename; none uses that of another."""
     path = tmp_path / "policy.ini"
     rename = Path.rename
 
@@ -63,10 +61,10 @@ def test_of_several_who_write_a_file_at_once_it_is_one_s(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_file_that_is_not_surely_kept_is_not_told_as_not_written(
+def test_a_failed_sync_of_the_folder_is_reported_as_such(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The folder cannot be brought to the disk: the file is replaced, and whoever ordered it reads what that means."""
+    """The file is replaced, and the error says that a power cut may undo it."""
     path = tmp_path / "policy.ini"
     fsync = os.fsync
 
@@ -84,8 +82,8 @@ def test_a_file_that_is_not_surely_kept_is_not_told_as_not_written(
     assert capsys.readouterr() == ("", said)
 
 
-def test_it_outlasts_the_machines_power(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is in the file is on the disk before it has its name, and the name before it is said to be written."""
+def test_a_written_file_survives_a_power_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The contents are synced before the rename, and the rename before the function returns."""
     synced: list[tuple[str, list[str]]] = []
     fsync = os.fsync
 
@@ -101,15 +99,15 @@ def test_it_outlasts_the_machines_power(tmp_path: Path, monkeypatch: pytest.Monk
     assert (there, folder) == ([making], (tmp_path.name, ["key.pem"]))
 
 
-def test_no_writer_is_kept_from_its_file_by_what_another_left() -> None:
-    """A file in the making has a name of its own wherever one is made: no `FILE.part` that was left is in the way."""
+def test_leftovers_of_other_writers_do_not_block() -> None:
+    """Temporary names are unique: an old `FILE.part` is not in the way."""
     sources = {path: path.read_text() for path in Path(appliance.__file__).parent.rglob("*.py")}
     fixed = re.compile(r'with_name\(f"\{\w+\.name\}\.(new|part|tmp)"')
     assert [path.name for path, text in sources.items() if fixed.search(text)] == []
 
 
-def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
-    """In folders below, too: only files, only of names that writers make themselves; nothing behind a link."""
+def test_only_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
+    """Also in subfolders, only files with a writer's temporary name are removed, and links are not followed."""
     there, elsewhere = tmp_path / "state" / "control", tmp_path / "elsewhere"
     for folder in (there, elsewhere):
         folder.mkdir(parents=True)
@@ -135,20 +133,20 @@ def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path: Path) -
     assert sum(path.is_symlink() for path in there.iterdir()) == links
 
 
-def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:
-    """The system says only that there is no space: who reads it learns where to make room."""
+def test_a_full_disk_error_names_the_file(tmp_path: Path) -> None:
+    """The system's error names no file; this one says where to free space."""
     need_root()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4k", "rosrv-files-test", tmp_path], check=True)
     try:
         with pytest.raises(OSError, match=r"No space left.*audit\.pub"):
             write_whole(tmp_path / "audit.pub", bytes(8192), 0o644)
-        assert not list(tmp_path.iterdir())  # what was begun takes no room
+        assert not list(tmp_path.iterdir())  # the unfinished file uses no space
     finally:
         subprocess.run(["umount", "--lazy", tmp_path], check=True)
 
 
-def test_a_file_behind_a_link_keeps_its_mode_and_a_pipe_stays_one(tmp_path: Path) -> None:
-    """What somebody names is written where it is: nothing else takes the place of a link, a pipe or a device."""
+def test_links_and_pipes_are_written_through(tmp_path: Path) -> None:
+    """A link, pipe or device is written to and not replaced; a linked file keeps its mode."""
     file, link, pipe = tmp_path / "file", tmp_path / "link", tmp_path / "pipe"
     file.write_text("before")
     file.chmod(0o640)
@@ -168,8 +166,8 @@ def test_a_file_behind_a_link_keeps_its_mode_and_a_pipe_stays_one(tmp_path: Path
     assert (tmp_path / "new").read_bytes() == b"one"
 
 
-def test_what_goes_to_our_own_output_stands_behind_what_was_said(tmp_path: Path) -> None:
-    """`verb --write /dev/stdout >> file` keeps what the file had, and what the verb says before and after."""
+def test_writing_to_standard_output_keeps_the_order(tmp_path: Path) -> None:
+    """`verb --write /dev/stdout >> file` keeps the file's contents, and the verb's output before and after."""
     file = tmp_path / "file"
     file.write_text("before\n")
     program = (
@@ -181,10 +179,8 @@ def test_what_goes_to_our_own_output_stands_behind_what_was_said(tmp_path: Path)
     assert file.read_text() == "before\nsaid\nwritten\ndone\n"
 
 
-def test_a_file_of_another_user_is_its_owners_before_it_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whoever is killed then, or may not give it away, leaves none that its owner cannot read."""
+def test_a_file_gets_its_owner_before_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A writer that is killed or may not change the owner leaves no file that its owner cannot read."""
     need_root()
     file = tmp_path / "policy.ini"
     file.write_text("before")

@@ -1,4 +1,4 @@
-"""A file that a person names is a regular one, read under a bound; what it cannot be is said in words."""
+"""Tests of files named by a person: only regular files of bounded size are read, others are clear errors."""
 
 import logging
 import os
@@ -12,12 +12,12 @@ import structlog
 
 from appliance.base.input_files import lines_given, read_given, read_given_text
 from appliance.cli import main
-from appliance.cli.rest.session import _context
+from appliance.cli.connection.rest_session import _context
 
 POLICY = "[Nodes]\ndefault = *\n"
 SPECIFICATION = "m() { event e() /t std_msgs/Int32 '{}' {} fsm: s0 [ e -> s0 ] @s0 {} }\n"
 
-# `{}` is the file that is not what it should be; the others are in order.
+# `{}` is the bad file; the other files are valid.
 VERBS = [
     "policy check {}",
     "policy test {}",
@@ -47,13 +47,13 @@ VERBS = [
 
 
 def folder(place: Path) -> None:
-    """Make a folder that has a named pipe where a definition would be."""
+    """Make a folder with a named pipe instead of a definition."""
     (place / "p").mkdir(parents=True)
     os.mkfifo(place / "p" / "T.msg")
 
 
 def huge(place: Path) -> None:
-    """Make a file of a gigabyte that takes no room."""
+    """Make a sparse file of a gigabyte."""
     place.touch()
     os.truncate(place, 1 << 30)
 
@@ -72,7 +72,7 @@ KINDS: dict[str, Callable[[Path], object]] = {
 
 @pytest.fixture
 def logs() -> Iterator[None]:
-    """Log as before, after a verb (`up`) that has set up the logs of its process."""
+    """Restore logging after a verb (`up`) that configured it."""
     root = logging.getLogger()
     handlers, level = [*root.handlers], root.level
     yield
@@ -88,7 +88,7 @@ def logs() -> Iterator[None]:
 def test_no_file_makes_a_verb_hang_or_crash(
     verb: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whatever a verb is given as a file, it ends with 1 or 2 and words, or finds the file in order."""
+    """Each verb with each bad file ends with status 1 or 2 and a message, or accepts the file."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ROSRV_TOKEN", "x" * 43)
     Path("policy.ini").write_text(POLICY)
@@ -110,10 +110,10 @@ def test_no_file_makes_a_verb_hang_or_crash(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_certificate_of_another_kind_is_waited_for(
+def test_a_bad_certificate_file_is_an_error(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What `--api-ca` names is such a file as well; an empty one is not the system's authorities."""
+    """`--api-ca` follows the same rules; an empty file does not mean the system's authorities."""
     monkeypatch.chdir(tmp_path)
     KINDS[kind](Path("given"))
     with pytest.raises(ValueError, match="--api-ca given: "):
@@ -121,7 +121,7 @@ def test_no_certificate_of_another_kind_is_waited_for(
 
 
 def test_a_pipe_of_the_shell_is_read(tmp_path: Path) -> None:
-    """`rosrv policy check <(command)` reads what the command writes: that pipe has a writer."""
+    """`rosrv policy check <(command)` reads the command's output: that pipe has a writer."""
     script = (
         "import sys; from pathlib import Path; from appliance.base import input_files;"
         " print(input_files.read_given(Path(sys.argv[1])))"
@@ -134,8 +134,8 @@ def test_a_pipe_of_the_shell_is_read(tmp_path: Path) -> None:
     assert read_given(Path("/dev/null")) == b""
 
 
-def test_what_is_too_long_is_refused(tmp_path: Path) -> None:
-    """A file, and a line of one, has as many bytes as its reader takes, or is an error that says so."""
+def test_files_and_lines_are_bounded(tmp_path: Path) -> None:
+    """A file or a line longer than the reader's limit is an error that names the limit."""
     file = tmp_path / "file"
     file.write_bytes(b"abc\r\nd\n")
     assert read_given(file, 7) == b"abc\r\nd\n"

@@ -1,4 +1,4 @@
-"""No library's sentence about a wrong value reaches a user: not from the command line, REST or the configuration."""
+"""Users get our own messages for invalid values, never a library's: command line, REST and configuration."""
 
 import asyncio
 import dataclasses
@@ -28,8 +28,8 @@ LIBRARY = re.compile(
 )
 
 
-def test_the_command_line_says_what_a_value_must_be() -> None:
-    """Of every option and argument of every verb that takes a number, or one of a few words."""
+def test_the_command_line_explains_valid_values() -> None:
+    """Covers each option and argument of every verb that is a number or a choice."""
     told = []
     for verb, command in commands():
         for one in command.params:
@@ -47,8 +47,8 @@ def test_the_command_line_says_what_a_value_must_be() -> None:
     assert len(told) > 30
 
 
-def test_rest_says_what_a_parameter_must_be(app: FastAPI) -> None:  # noqa: F811  the fixture
-    """Of each parameter of every path and query, and of each header."""
+def test_rest_explains_valid_parameters(app: FastAPI) -> None:  # noqa: F811  the fixture
+    """Covers each parameter of every path and query, and each header."""
     told = set()
     for dependant in _dependants(app):
         for field in [*dependant.query_params, *dependant.path_params, *dependant.header_params]:
@@ -61,8 +61,8 @@ def test_rest_says_what_a_parameter_must_be(app: FastAPI) -> None:  # noqa: F811
     assert len(told) > 50
 
 
-def test_rest_says_what_a_body_must_be(app: FastAPI) -> None:  # noqa: F811  the fixture
-    """Of each field of every body, and of what is in it."""
+def test_rest_explains_valid_bodies(app: FastAPI) -> None:  # noqa: F811  the fixture
+    """Covers each field of every body, including nested ones."""
     told: set[str] = set()
     for dependant in _dependants(app):
         for reads in [one.call for one in dependant.dependencies if hasattr(one.call, "kind")]:
@@ -78,8 +78,8 @@ def test_rest_says_what_a_body_must_be(app: FastAPI) -> None:  # noqa: F811  the
 
 
 @pytest.mark.filterwarnings("ignore:__int__ returned non-int")  # ipaddress makes a network of `true`
-def test_the_configuration_says_what_a_key_must_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of each key of each section."""
+def test_the_configuration_explains_valid_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Covers each key of each section."""
     monkeypatch.chdir(tmp_path)
     told: set[str] = set()
     for path in _keys(dataclasses.asdict(Settings())):
@@ -96,7 +96,7 @@ def test_the_configuration_says_what_a_key_must_be(tmp_path: Path, monkeypatch: 
 
 
 def _dependants(of: FastAPI) -> Iterator[Any]:
-    """What every route depends on, and what that does."""
+    """Yield the dependencies of every route, recursively."""
     found = [getattr(route.original_route, "dependant", None) for route in iter_route_contexts(of.routes)]
     while found:
         if (dependant := found.pop()) is not None:
@@ -105,7 +105,7 @@ def _dependants(of: FastAPI) -> Iterator[Any]:
 
 
 def _said_of(reads: Any, value: Any) -> set[str]:
-    """What is said of a body."""
+    """Return the messages about a body."""
 
     async def sent() -> dict[str, Any]:
         return {"type": "http.request", "body": json.dumps(value).encode()}
@@ -138,8 +138,8 @@ def _keys(values: dict[str, Any]) -> Iterator[tuple[str, ...]]:
         ("a: *x", "put the text in quotes"),
     ],
 )
-def test_what_is_not_yaml_is_told_with_what_to_do(tmp_path: Path, text: str, do: str) -> None:
-    """Behind the place and what the parser says of it."""
+def test_invalid_yaml_is_reported_with_a_hint(tmp_path: Path, text: str, do: str) -> None:
+    """The hint follows the position and the parser's message."""
     file = tmp_path / "appliance.yaml"
     file.write_text(text)
     with pytest.raises(ConfigError, match=rf"^{re.escape(str(file))}:\d+: is not YAML: .*; {re.escape(do)}$"):

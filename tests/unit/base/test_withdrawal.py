@@ -1,4 +1,4 @@
-"""Orders that are withdrawn before they take effect."""
+"""Tests of withdrawing orders before they take effect."""
 
 import asyncio
 
@@ -7,8 +7,8 @@ import pytest
 from appliance.base.withdrawal import WithdrawnError, awaited, require_awaited, take_effect
 
 
-def test_an_order_whose_client_gave_up_does_not_take_effect() -> None:
-    """It is withdrawn up to the moment at which it takes effect, and not after it."""
+def test_an_order_of_a_disconnected_client_does_not_take_effect() -> None:
+    """It is withdrawn until it takes effect, and not afterwards."""
     gone = False
     with awaited(lambda: gone):
         require_awaited()
@@ -22,8 +22,8 @@ def test_an_order_whose_client_gave_up_does_not_take_effect() -> None:
         take_effect()
 
 
-def test_outside_an_order_nothing_is_withdrawn() -> None:
-    """A start, a signal and a rollback by itself have no client; neither has a task that an order left behind."""
+def test_only_orders_are_withdrawn() -> None:
+    """A start, a signal and an automatic rollback have no client, nor has a task that an order left behind."""
     take_effect()
 
     async def order() -> asyncio.Task[None]:

@@ -12,12 +12,14 @@ import pytest
 from appliance.channel.channel import SOON_SECONDS, Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.messages import Lifeline, Message, Ping, Pong, ProbeFailed, SocketKept, StateBegan
 
+pytestmark = pytest.mark.anyio
+
 Pair = tuple[Channel, Channel]
 
 
 @pytest.fixture
 def pair() -> Iterator[Pair]:
-    """Two ends of a lifeline; the second takes messages of 1,000 bytes at most."""
+    """Return the two ends of a channel; the second accepts messages of at most 1,000 bytes."""
     one, other = socket.socketpair()
     ends = Channel(one, Lifeline, limit=300_000), Channel(other, Lifeline, longest=1000)
     yield ends
@@ -38,7 +40,7 @@ def _open_files() -> int:
 
 
 def test_messages_arrive_in_order_with_their_descriptors(pair: Pair) -> None:
-    """Each descriptor is delivered with the message it was sent with, also between messages without one."""
+    """Each descriptor arrives with its message, also between messages without one."""
     here, there = pair
     with socket.create_server(("127.0.0.1", 0)) as first, socket.create_server(("127.0.0.1", 0)) as second:
         here.send(Ping(1))
@@ -56,37 +58,33 @@ def test_messages_arrive_in_order_with_their_descriptors(pair: Pair) -> None:
                 assert names[sock.getsockname()] == message.name
 
 
-def test_what_is_sent_soon_leaves_together_and_before_what_is_not(pair: Pair) -> None:
-    """It waits some milliseconds, or for the next message that does not; order and descriptors stay."""
+async def test_delayed_messages_are_sent_together(pair: Pair) -> None:
+    """A delayed message waits some milliseconds or for the next immediate one; order and descriptors stay."""
     here, there = pair
+    here.attach(asyncio.get_running_loop(), lambda _message, _descriptors: None, lambda: None)
 
-    async def scene() -> list[list[Message]]:
-        here.attach(asyncio.get_running_loop(), lambda _message, _descriptors: None, lambda: None)
+    def seen() -> list[Message]:
+        return [message for message, _descriptors in there.receive()]
 
-        def seen() -> list[Message]:
-            return [message for message, _descriptors in there.receive()]
-
-        with socket.create_server(("127.0.0.1", 0)) as sock:
-            here.send(Ping(1), soon=True)
-            here.send(SocketKept("first"), (sock.fileno(),), soon=True)
-            here.send(Ping(2), soon=True)
-        await asyncio.sleep(0)
-        before = seen()
-        await asyncio.sleep(SOON_SECONDS)  # a timer that is set later ends later
-        after = seen()
-        here.send(Ping(3), soon=True)
-        here.send(Ping(4))
-        at_once = seen()
-        here.send(Ping(5), soon=True)
-        here.close()
-        await asyncio.sleep(SOON_SECONDS)  # what was not written is given up with the channel
-        return [before, after, at_once]
-
-    assert asyncio.run(scene()) == [[], [Ping(1), SocketKept("first"), Ping(2)], [Ping(3), Ping(4)]]
+    with socket.create_server(("127.0.0.1", 0)) as sock:
+        here.send(Ping(1), soon=True)
+        here.send(SocketKept("first"), (sock.fileno(),), soon=True)
+        here.send(Ping(2), soon=True)
+    await asyncio.sleep(0)
+    before = seen()
+    await asyncio.sleep(SOON_SECONDS)  # a timer that is set later ends later
+    after = seen()
+    here.send(Ping(3), soon=True)
+    here.send(Ping(4))
+    at_once = seen()
+    here.send(Ping(5), soon=True)
+    here.close()
+    await asyncio.sleep(SOON_SECONDS)  # closing the channel drops unsent messages
+    assert [before, after, at_once] == [[], [Ping(1), SocketKept("first"), Ping(2)], [Ping(3), Ping(4)]]
 
 
 def test_a_message_must_come_with_its_descriptors(pair: Pair) -> None:
-    """Who sends too many or too few is told at once; who receives too few refuses the link."""
+    """A sender with too many or too few descriptors gets an error; a receiver with too few closes the link."""
     here, there = pair
     with pytest.raises(ValueError, match="travels with 1"):
         here.send(SocketKept("nothing"))
@@ -96,8 +94,8 @@ def test_a_message_must_come_with_its_descriptors(pair: Pair) -> None:
         there.receive()
 
 
-def test_what_is_not_of_the_link_is_refused(pair: Pair) -> None:
-    """A message of another link, nonsense, and one that is too long (before it is there) are errors."""
+def test_foreign_data_is_rejected(pair: Pair) -> None:
+    """A message of another link, garbage, and a message that is too long (before it is complete) are errors."""
     for frame, reason in (
         (_frame(msgspec.msgpack.encode(StateBegan(1))), "Invalid value"),
         (_frame(b"\xc1"), "malformed"),
@@ -112,7 +110,7 @@ def test_what_is_not_of_the_link_is_refused(pair: Pair) -> None:
 
 
 def test_a_peer_that_does_not_read_is_bounded(pair: Pair) -> None:
-    """Past the limit `send` raises; what was queued before still arrives."""
+    """Past the limit `send` raises; messages queued before still arrive."""
     here, there = pair
     sent = 0
     with pytest.raises(ChannelFullError):
@@ -126,8 +124,8 @@ def test_a_peer_that_does_not_read_is_bounded(pair: Pair) -> None:
     assert received == sent
 
 
-def test_the_end_of_the_peer_is_told_after_its_last_words(pair: Pair) -> None:
-    """What was sent before the other end closed is delivered first."""
+def test_the_end_of_the_peer_follows_its_last_messages(pair: Pair) -> None:
+    """Messages sent before the other end closed are delivered first."""
     here, there = pair
     here.send(Pong(7))
     here.close()
@@ -136,8 +134,8 @@ def test_the_end_of_the_peer_is_told_after_its_last_words(pair: Pair) -> None:
         there.receive()
 
 
-def test_nothing_stays_open_behind_a_closed_end() -> None:
-    """Descriptors that were not sent yet, or that nobody took, are closed with the channel."""
+def test_closing_closes_descriptors() -> None:
+    """Unsent and unread descriptors are closed with the channel."""
     before = _open_files()
     one, other = socket.socketpair()
     here, there = Channel(one, Lifeline), Channel(other, Lifeline)
@@ -150,46 +148,38 @@ def test_nothing_stays_open_behind_a_closed_end() -> None:
     assert _open_files() == before
 
 
-def test_an_attached_end_is_told_once_and_sends_without_raising(pair: Pair) -> None:
-    """In an asyncio process a dead peer is one event, in order; `send` after it is nothing, not an error."""
+async def test_an_attached_end_reports_a_dead_peer_once(pair: Pair) -> None:
+    """In an asyncio process a dead peer is one event, in order; `send` after it does nothing."""
     here, there = pair
     told: list[Message | str] = []
+    ended = asyncio.Event()
 
-    async def scene() -> None:
-        ended = asyncio.Event()
+    def end() -> None:
+        told.append("end")
+        ended.set()
 
-        def end() -> None:
-            told.append("end")
-            ended.set()
-
-        there.attach(asyncio.get_running_loop(), lambda message, _descriptors: told.append(message), end)
-        here.send(Ping(1))
-        here.close()
-        there.send(Pong(1))  # the peer is gone already, its last words are not read yet
-        await asyncio.wait_for(ended.wait(), 10)
-        there.send(Pong(2))
-
-    asyncio.run(scene())
+    there.attach(asyncio.get_running_loop(), lambda message, _descriptors: told.append(message), end)
+    here.send(Ping(1))
+    here.close()
+    there.send(Pong(1))  # the peer is gone, its last messages are not read yet
+    await asyncio.wait_for(ended.wait(), 10)
+    there.send(Pong(2))
     assert told == [Ping(1), "end"]
 
 
-def test_an_attached_end_refuses_what_is_not_of_its_link(pair: Pair) -> None:
-    """The reason is told, the end is closed, and the loop goes on."""
+async def test_an_attached_end_rejects_foreign_data(pair: Pair) -> None:
+    """The end is closed with a reason, and the loop continues."""
     here, there = pair
     told: list[str] = []
+    refused = asyncio.Event()
 
-    async def scene() -> None:
-        refused = asyncio.Event()
+    def refuse(reason: str) -> None:
+        told.append(reason)
+        refused.set()
 
-        def refuse(reason: str) -> None:
-            told.append(reason)
-            refused.set()
-
-        there.attach(asyncio.get_running_loop(), lambda *_message: None, lambda: told.append("end"), refuse)
-        os.write(here.fileno(), _frame(b"\xc1"))
-        await asyncio.wait_for(refused.wait(), 10)
-
-    asyncio.run(scene())
+    there.attach(asyncio.get_running_loop(), lambda *_message: None, lambda: told.append("end"), refuse)
+    os.write(here.fileno(), _frame(b"\xc1"))
+    await asyncio.wait_for(refused.wait(), 10)
     assert len(told) == 1
     assert told != ["end"]
     assert not _is_open(there.fileno())

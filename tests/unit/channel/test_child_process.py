@@ -1,4 +1,4 @@
-"""Tests of what the children of the supervisor have in common, with the supervisor's and control's ends in hand."""
+"""Tests of the base of the supervisor's children; the test holds the ends of supervisor and control."""
 
 import asyncio
 import socket
@@ -8,8 +8,8 @@ from typing import Any
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.channel.messages import (
+    AuthorityRequest,
     AuthorityStated,
-    AuthorityWanted,
     Lifeline,
     LinkOpened,
     Ping,
@@ -21,7 +21,7 @@ from appliance.channel.messages import (
 
 
 class Bench:
-    """A child that answers every question with its number; `heard` is what its supervisor hears."""
+    """A child that answers each question with its number; `heard` collects the supervisor's messages."""
 
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
@@ -43,7 +43,7 @@ class Bench:
         self.links += 1
 
     def link(self, role: str = "control") -> tuple[Channel, asyncio.Queue[Any]]:
-        """Give it a link: control's end, and what comes there (None: it was closed)."""
+        """Give the child a link; return control's end and the list of received messages (None: closed)."""
         ours, theirs = socket.socketpair()
         self.lifeline.send(LinkOpened(role=role, index=0), (theirs.fileno(),))
         theirs.close()
@@ -58,7 +58,7 @@ class Bench:
 
 
 def run(work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
-    """Run a test's work."""
+    """Run the child's loop and a test's steps."""
 
     async def inside() -> None:
         bench = Bench()
@@ -74,8 +74,8 @@ def run(work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
     asyncio.run(inside())
 
 
-def test_it_answers_pings_and_ends_when_told() -> None:
-    """The supervisor sees that it lives; `Stop` ends it."""
+def test_it_answers_pings_and_stops() -> None:
+    """The supervisor gets an answer to its ping; `Stop` ends the child."""
 
     async def work(bench: Bench) -> None:
         bench.lifeline.send(Ping(7))
@@ -87,7 +87,7 @@ def test_it_answers_pings_and_ends_when_told() -> None:
 
 
 def test_it_ends_with_its_supervisor() -> None:
-    """Nobody is left behind when the supervisor dies."""
+    """No child is left when the supervisor dies."""
 
     async def work(bench: Bench) -> None:
         bench.lifeline.close()
@@ -96,17 +96,17 @@ def test_it_ends_with_its_supervisor() -> None:
     run(work)
 
 
-def test_a_new_link_takes_the_place_of_the_one_before() -> None:
-    """A control that was started again is served; the old link is closed; what is told in between is dropped."""
+def test_a_new_link_replaces_the_old_one() -> None:
+    """A restarted control is served; the old link is closed; messages in between are dropped."""
 
     async def work(bench: Bench) -> None:
         bench.child.tell(AuthorityStated(0, b""))
         first, came_first = bench.link()
-        first.send(AuthorityWanted(1))
+        first.send(AuthorityRequest(1))
         assert (await came_first.get()).number == 1
         second, came_second = bench.link()
         assert await came_first.get() is None
-        second.send(AuthorityWanted(2))
+        second.send(AuthorityRequest(2))
         assert (await came_second.get()).number == 2
         assert bench.links == 2
         second.close()
@@ -114,8 +114,8 @@ def test_a_new_link_takes_the_place_of_the_one_before() -> None:
     run(work)
 
 
-def test_descriptors_that_are_not_for_it_are_closed() -> None:
-    """A link to somebody else is not kept open."""
+def test_foreign_descriptors_are_closed() -> None:
+    """A link to another process is not kept open."""
 
     async def work(bench: Bench) -> None:
         _channel, came = bench.link("relay")

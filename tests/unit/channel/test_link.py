@@ -1,4 +1,4 @@
-"""Tests of `appliance.channel.link`: whoever is there, and what it is asked."""
+"""Tests of `appliance.channel.link`: peers and questions."""
 
 import asyncio
 import socket
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.anyio
 
 
 class World:
-    """A link, what it heard and lost, and the lives at its other end."""
+    """A link, its received messages and lost peers, and the processes at its other end."""
 
     def __init__(self) -> None:
         self.heard: list[object] = []
@@ -29,7 +29,7 @@ class World:
             self.link.answered(message.number, message)
 
     def life(self) -> Channel:
-        """Another life at the other end."""
+        """Connect another process at the other end."""
         here, there = socket.socketpair()
         self.link.attach(Channel(here, Ping | Pong))
         self.ends.append(Channel(there, Ping | Pong))
@@ -38,7 +38,7 @@ class World:
 
 @pytest.fixture
 def world() -> Iterator[World]:
-    """One, closed at the end."""
+    """Return a world that is closed after the test."""
     world = World()
     yield world
     world.link.close()
@@ -46,8 +46,8 @@ def world() -> Iterator[World]:
         end.close()
 
 
-async def test_the_answer_to_a_question_is_the_one_with_its_number(world: World) -> None:
-    """Whatever else is said, and in whatever order the answers come."""
+async def test_an_answer_has_the_number_of_its_question(world: World) -> None:
+    """Other messages and the order of the answers do not matter."""
     ear = Heard(other := world.life())
     asked = [asyncio.ensure_future(world.link.ask(Ping, 10)) for _turn in range(2)]
     pings = await ear.until(2)
@@ -58,8 +58,8 @@ async def test_the_answer_to_a_question_is_the_one_with_its_number(world: World)
     assert world.link.unanswered == 0
 
 
-async def test_who_was_there_before_is_heard_no_more_and_owes_no_answer(world: World) -> None:
-    """Not even what it said and nobody has read yet; its end is no loss, for another is there."""
+async def test_a_replaced_peer_is_ignored_and_owes_no_answer(world: World) -> None:
+    """Its unread messages are dropped, and its end is not reported as a loss."""
     before = world.life()
     asked = asyncio.ensure_future(world.link.ask(Ping, 10))
     await asyncio.sleep(0)
@@ -77,8 +77,8 @@ async def test_who_was_there_before_is_heard_no_more_and_owes_no_answer(world: W
     assert world.lost == [""]
 
 
-async def test_nobody_can_be_told_or_asked_when_nobody_is_there(world: World) -> None:
-    """Nor does a question wait for who may come."""
+async def test_without_a_peer_messages_and_questions_fail(world: World) -> None:
+    """A question does not wait for a future peer."""
     assert not world.link.send(Ping(1))
     with pytest.raises(ChannelClosedError):
         await world.link.ask(Ping, 10)

@@ -9,19 +9,19 @@ from appliance.cli.durations import seconds_of
     ("text", "seconds"),
     [("30s", 30), ("5m", 300), ("1.5h", 5400), ("90d", 90 * 86_400), ("52w", 52 * 7 * 86_400)],
 )
-def test_a_span_is_a_number_and_a_unit(text: str, seconds: float) -> None:
-    """Every unit that some verb takes is that many seconds."""
+def test_a_duration_is_a_number_and_a_unit(text: str, seconds: float) -> None:
+    """Each unit is converted to seconds."""
     assert seconds_of(text, "smhdw") == seconds
 
 
 @pytest.mark.parametrize(
     "text", ["", "5", "m", "-1m", "0s", "0.0h", "1y", "1e9d", "1 h", "٣m", "1m\n", "9999999999s"]
 )
-def test_what_is_no_span_is_none(text: str) -> None:
-    """Text that is no span, or no time at all, has no seconds."""
+def test_an_invalid_duration_is_none(text: str) -> None:
+    """Other text, and a duration of zero, have no seconds."""
     assert seconds_of(text, "smhdw") is None
 
 
-def test_only_the_units_asked_for_count() -> None:
-    """A verb that is about minutes does not take weeks."""
+def test_only_the_allowed_units_count() -> None:
+    """A verb that takes minutes does not take weeks."""
     assert seconds_of("1w", "smh") is None

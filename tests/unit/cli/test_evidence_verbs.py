@@ -1,4 +1,4 @@
-"""`rosrv evidence export`: a bundle has its name when it is whole."""
+"""`rosrv evidence export`: a bundle gets its name when it is complete."""
 
 import re
 import stat
@@ -14,10 +14,10 @@ from tests.support.command import rosrv
 
 
 @pytest.mark.parametrize("breaks", [False, True])
-def test_a_bundle_has_its_name_when_it_is_whole(
+def test_a_bundle_gets_its_name_when_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, breaks: bool
 ) -> None:
-    """Who is killed meanwhile leaves nothing that looks like one; what breaks off leaves nothing."""
+    """A killed or failed export leaves no file that looks like a bundle."""
     place = tmp_path / "incident.zip"
 
     def export(*_asked: Any) -> Iterator[bytes]:

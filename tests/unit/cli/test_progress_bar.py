@@ -1,4 +1,4 @@
-"""Tests of `rosmop.tool.progress_bar`: a bar for people, nothing for programs."""
+"""Tests of `rosmop.tool.progress_bar`: a bar on terminals, nothing for programs."""
 
 import os
 import pty
@@ -15,7 +15,7 @@ print("end")
 
 
 def said(shares: bool, *, screen: bool) -> tuple[str, str]:
-    """Standard output, and what was said on the terminal or pipe of standard error."""
+    """Return standard output, and the output on the terminal or pipe of standard error."""
     near, far = pty.openpty()
     command = [sys.executable, "-c", PROGRAM.format(shares=shares)]
     process = subprocess.Popen(
@@ -40,22 +40,22 @@ def said(shares: bool, *, screen: bool) -> tuple[str, str]:
     return output, shown.decode(errors="replace")
 
 
-def test_on_a_terminal_there_is_a_bar() -> None:
-    """It shows what is done and how much of it."""
+def test_a_terminal_has_a_bar() -> None:
+    """The bar shows the part that is done."""
     output, shown = said(shares=False, screen=False)
     assert output == "end\n"
     assert "working" in shown
     assert "100%" in shown
 
 
-def test_where_the_work_itself_is_shown_there_is_none() -> None:
-    """Lines on the same terminal are not torn apart by a bar; with the lines in a file there is one."""
+def test_output_on_the_same_terminal_has_no_bar() -> None:
+    """A bar would break the lines; with output to a file there is one."""
     assert "working" not in said(shares=True, screen=True)[1]
     assert "working" in said(shares=True, screen=False)[1]
 
 
-def test_in_a_pipe_there_is_nothing() -> None:
-    """Programs read what was asked for and nothing else."""
+def test_a_pipe_has_no_bar() -> None:
+    """Programs read only the output."""
     command = [sys.executable, "-c", PROGRAM.format(shares=False)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("end\n", "")

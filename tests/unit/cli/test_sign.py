@@ -24,21 +24,21 @@ PLAIN = NoEncryption()
 def written(
     folder: Path, form: PrivateFormat = PrivateFormat.OpenSSH, encryption: KeySerializationEncryption = PLAIN
 ) -> Path:
-    """The site's private key in a file."""
+    """Write the site's private key."""
     file = folder / "site"
     file.write_bytes(KEY.private_bytes(Encoding.PEM, form, encryption))
     return file
 
 
 def sign(*arguments: object) -> tuple[int, str]:
-    """Exit status and output."""
+    """Return the exit status and output."""
     done = CliRunner().invoke(app, ["sign", *map(str, arguments)])
     return done.exit_code, done.output
 
 
 @pytest.mark.parametrize("form", [PrivateFormat.OpenSSH, PrivateFormat.PKCS8])
 def test_each_file_gets_a_signature_beside_it(tmp_path: Path, form: PrivateFormat) -> None:
-    """With a key of ssh-keygen's or of openssl's; the line of the key is told, as appliance.yaml takes it."""
+    """Keys of ssh-keygen and of openssl work; the output has the key's line for appliance.yaml."""
     files = [tmp_path / "p.ini", tmp_path / "a.rv"]
     for file in files:
         file.write_text(f"{file.name} ä\n", encoding="utf-8")
@@ -56,9 +56,7 @@ def test_each_file_gets_a_signature_beside_it(tmp_path: Path, form: PrivateForma
     ("content", "why"),
     [(b"a\r\n", "CR LF"), (b"\xef\xbb\xbfa\n", "byte order mark"), (b"\xff\n", "not UTF-8")],
 )
-def test_what_the_appliance_would_read_as_another_text_is_not_signed(
-    tmp_path: Path, content: bytes, why: str
-) -> None:
+def test_ambiguous_text_is_not_signed(tmp_path: Path, content: bytes, why: str) -> None:
     """Nothing is written then, not for the other files either."""
     good, bad = tmp_path / "a.rv", tmp_path / "b.rv"
     good.write_text("a\n")
@@ -68,8 +66,8 @@ def test_what_the_appliance_would_read_as_another_text_is_not_signed(
     assert why in said
 
 
-def test_a_key_that_cannot_sign_is_told_with_the_way(tmp_path: Path) -> None:
-    """A passphrase is for ssh-keygen to ask; what is no Ed25519 key, or not there, is said."""
+def test_a_key_that_cannot_sign_is_an_error_with_advice(tmp_path: Path) -> None:
+    """Covers a key with a passphrase (ssh-keygen asks for it), another kind of key, and a missing one."""
     file = tmp_path / "p.ini"
     file.write_text("[Nodes]\n")
     locked = written(tmp_path, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret"))
@@ -80,6 +78,6 @@ def test_a_key_that_cannot_sign_is_told_with_the_way(tmp_path: Path) -> None:
     )
     assert sign(file, "--key", other) == (
         2,
-        f"rosrv sign: {other} is no private Ed25519 key (ssh-keygen -t ed25519 -f KEY makes one)\n",
+        f"rosrv sign: {other} is not a private Ed25519 key; create one: ssh-keygen -t ed25519 -f KEY\n",
     )
     assert "cannot read" in sign(file, "--key", tmp_path / "nothing")[1]

@@ -1,4 +1,4 @@
-"""`rosrv topic echo --field`: what a look left out is not told as not there."""
+"""`rosrv topic echo --field`: omitted parts differ from missing ones."""
 
 import pytest
 import typer
@@ -13,15 +13,15 @@ DEFINITIONS = Definitions.from_files(
 
 
 def scan(length: int) -> dict[str, object]:
-    """A message with 720 ranges and a picture of 921,600 bytes, of which so many bytes are there."""
+    """Return a message with 720 ranges and a picture of 921,600 bytes, of which this number is present."""
     whole = (720).to_bytes(4, "little") + b"\0" * 2880 + (921_600).to_bytes(4, "little") + b"\1" * 921_600
     fields = read_fields(DEFINITIONS, "a/Scan", (whole + b"\0" * 4 + b"\7")[:length])
     assert fields is not None
     return fields
 
 
-def test_what_a_look_left_out_has_the_sign_of_it() -> None:
-    """An element that is not shown, a byte of a picture, a field after the end of the bytes."""
+def test_omitted_parts_are_marked() -> None:
+    """Covers an element that is not shown, a byte of a picture, and a field after the end of the bytes."""
     whole, cut = scan(1_000_000), scan(3000)
     assert part_of(whole, "ranges.3") == 0
     assert part_of(whole, "ranges.300") == f"{CUT} 704 more"
@@ -32,7 +32,7 @@ def test_what_a_look_left_out_has_the_sign_of_it() -> None:
 
 
 @pytest.mark.parametrize("path", ["nothing", "ranges.x", "pose.y", "last.x", "data.x"])
-def test_what_is_not_there_is_said(path: str) -> None:
+def test_a_missing_field_is_an_error(path: str) -> None:
     """The message has no such field."""
     with pytest.raises(typer.Exit):
         part_of(scan(1_000_000), path)

@@ -1,4 +1,4 @@
-"""Tests of what `rosrv up` says when nodes may connect."""
+"""Tests of the output of `rosrv up` when nodes may connect."""
 
 import errno
 import io
@@ -23,14 +23,14 @@ class Full(io.StringIO):
     """Standard output on a full disk."""
 
     def flush(self) -> None:
-        """Says so."""
+        """Fail as on a full disk."""
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_the_first_token_is_in_its_file_before_the_line_is_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Who waits for the line finds the file, readable for its owner only."""
+    """A program that waits for the line finds the file, readable for its owner only."""
     _announce(READY, Settings(state=tmp_path, api="off"), as_json=False)
     kept = tmp_path / "first-token"
     assert (kept.read_text(), stat.S_IMODE(kept.stat().st_mode)) == ("secret\n", 0o600)
@@ -39,8 +39,10 @@ def test_the_first_token_is_in_its_file_before_the_line_is_printed(
     assert str(kept) in said.err
 
 
-def test_the_policys_warnings_are_told_at_start(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """On standard error for a person, ten at most; all of them in the object of `--json`, which is one line."""
+def test_the_policys_warnings_are_printed_at_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A person gets at most ten on standard error; the object of `--json`, one line, has all."""
     said = msgspec.structs.replace(
         READY, token=None, warnings=tuple(f"p.ini:{n}:1: warning" for n in range(12))
     )
@@ -54,17 +56,15 @@ def test_the_policys_warnings_are_told_at_start(tmp_path: Path, capsys: pytest.C
     assert event["warnings"] == [*said.warnings]
 
 
-def test_a_first_token_that_cannot_be_written_is_an_error_in_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """No line says that nodes may connect; the error names the file and what to do."""
-    with pytest.raises(StartError, match=r"gone/first-token: No such file.*next start makes another"):
+def test_an_unwritable_first_token_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The ready line is not printed; the error names the file and gives advice."""
+    with pytest.raises(StartError, match=r"gone/first-token: No such file.*next start creates another"):
         _announce(READY, Settings(state=tmp_path / "gone", api="off"), as_json=False)
     assert capsys.readouterr().out == ""
 
 
-def test_a_token_that_is_half_written_is_no_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A full disk: the error, and nothing is left that looks like a token."""
+def test_a_partial_token_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a full disk the error leaves nothing that looks like a token."""
 
     def full(_descriptor: int, _data: bytes) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -76,10 +76,10 @@ def test_a_token_that_is_half_written_is_no_token(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize("as_json", [False, True])
-def test_standard_output_that_takes_nothing_does_not_end_the_start(
+def test_a_closed_standard_output_does_not_end_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, as_json: bool
 ) -> None:
-    """Nodes may connect whether anybody reads it or not; the token is in its file then, also with --json."""
+    """Nodes may connect although the line is lost; the token is in its file, also with --json."""
     monkeypatch.setattr(sys, "stdout", Full())
     with capture_logs() as said:
         _announce(READY, Settings(state=tmp_path, api="off"), as_json=as_json)

@@ -1,4 +1,4 @@
-"""The compiler's process: what it answers, when it ends, and what it may take."""
+"""The compiler's process: its answers, its end, and its limits."""
 
 import asyncio
 import contextlib
@@ -41,7 +41,7 @@ pytestmark = pytest.mark.anyio
 
 
 async def conversation(*wanted: messages.Message) -> list[Any]:
-    """What a compiler answers that is asked this; it has ended by itself when this returns."""
+    """Return the compiler's answers to these questions; the process has ended on return."""
     lifeline, its_lifeline = socket.socketpair()
     ours, theirs = socket.socketpair()
     supervisor, control = Channel(lifeline, messages.Lifeline), Channel(ours, messages.CompilerLink)
@@ -54,8 +54,8 @@ async def conversation(*wanted: messages.Message) -> list[Any]:
     for one in wanted:
         control.send(one)
     try:
-        await process.Process(Channel(its_lifeline, messages.Lifeline)).run()
-        await asyncio.sleep(0)  # what it said last is read in this turn
+        await process.CompilerProcess(Channel(its_lifeline, messages.Lifeline)).run()
+        await asyncio.sleep(0)  # the last message is read in this turn
         return answers
     finally:
         supervisor.close()
@@ -63,10 +63,10 @@ async def conversation(*wanted: messages.Message) -> list[Any]:
         its_lifeline.close()
 
 
-async def test_it_answers_each_question_and_ends_when_nobody_asks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What it finds is what `check` does here; what is wrong with texts is said as `check` says it."""
+async def test_it_answers_each_question_and_ends_with_its_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Findings and errors are those of `check`."""
     monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
-    monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)  # this process goes on
+    monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)  # the test's own process continues
     bad = GOOD.replace("shared + 1", "shred + 1")
     found, refused = await conversation(
         messages.ContentsWanted(7, {"a.rv": GOOD}, DEFINITIONS), messages.ContentsWanted(8, {"a.rv": bad}, {})
@@ -79,7 +79,7 @@ async def test_it_answers_each_question_and_ends_when_nobody_asks(monkeypatch: p
 
 
 async def test_a_defect_of_the_compiler_is_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever asked is told; what else is asked is answered."""
+    """The question gets an error; later questions are answered."""
     monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
     monkeypatch.setattr("appliance.specifications.checking._standard", lambda: 1 // 0)
@@ -89,8 +89,8 @@ async def test_a_defect_of_the_compiler_is_an_answer(monkeypatch: pytest.MonkeyP
     ] * 2
 
 
-async def test_it_makes_what_relays_run_of_what_it_has_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each its own, in the order of the question."""
+async def test_it_builds_what_relays_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each relay gets its own build, in the order of the question."""
     monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
     text = GOOD + GOOD.replace("a()", "c()").replace("b()", "d()").replace("shared", "another")
@@ -101,8 +101,8 @@ async def test_it_makes_what_relays_run_of_what_it_has_found(monkeypatch: pytest
     assert (made.number, found) == (3, [["c", "d"], ["a", "b"]])
 
 
-async def test_what_is_too_large_to_travel_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The whole set, and what one relay runs of it: no link breaks of them."""
+async def test_large_specifications_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This holds for the whole set and for a relay's part, so that no link breaks."""
     monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
     compiled = check(Sources({"a.rv": GOOD}, DEFINITIONS), ()).compiled
@@ -117,8 +117,8 @@ async def test_what_is_too_large_to_travel_is_refused(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(("memory", "seconds"), [(8 << 20, 4), (1 << 30, 1)], ids=["memory", "time"])
-def test_texts_that_take_too_much_are_no_burden(memory: int, seconds: int) -> None:
-    """They are refused, or end the process by the kernel's hand: within the bounds in either case."""
+def test_expensive_texts_stay_within_bounds(memory: int, seconds: int) -> None:
+    """They are rejected, or the kernel ends the process, within the limits."""
     program = f"""
 import resource, sys
 from pathlib import Path
@@ -143,7 +143,7 @@ print(process.answer(messages.ContentsWanted(1, {{"a.rv": sys.stdin.read()}}, {{
 
 
 def nested_repetitions(count: int) -> str:
-    """Short specifications whose automata take about a second of processor time each."""
+    """Return short specifications whose automata take about a second of processor time each."""
     formula = "(a | b)* a"
     for _ in range(12):
         formula = f"({formula} (a|b))"
@@ -153,7 +153,7 @@ def nested_repetitions(count: int) -> str:
 
 @contextlib.contextmanager
 def started(program: str) -> Iterator[tuple[subprocess.Popen[str], Channel, Channel]]:
-    """A compiler in a process of its own, with its lifeline and its link to control."""
+    """Start a compiler in its own process, with its lifeline and its link to control."""
     lifeline, its_lifeline = socket.socketpair()
     ours, theirs = socket.socketpair()
     supervisor, control = Channel(lifeline, messages.Lifeline), Channel(ours, messages.CompilerLink)
@@ -184,8 +184,8 @@ process.main(int(sys.argv[1]))
 """
 
 
-async def test_nested_repetitions_end_with_the_budget_of_a_dry_run() -> None:
-    """A dry run of 24 kB that would take minutes is refused with its seconds, and the process ends in order."""
+async def test_a_dry_run_ends_with_its_budget() -> None:
+    """A dry run of 24 kB that would take minutes is rejected with its seconds, and the process ends normally."""
     with started(_COMPILER.format(1)) as (running, _supervisor, control):
         answers: asyncio.Queue[Any] = asyncio.Queue()
         control.attach(
@@ -203,8 +203,8 @@ async def test_nested_repetitions_end_with_the_budget_of_a_dry_run() -> None:
         assert await asyncio.to_thread(running.wait, 60) == 0
 
 
-async def test_work_that_control_does_not_wait_for_ends() -> None:
-    """When control closes the link amid a dry run the process ends at once, as one that nobody needs."""
+async def test_abandoned_work_ends() -> None:
+    """When control closes the link during a dry run, the process ends at once."""
     with started(_COMPILER.format(1000)) as (running, _supervisor, control):
         control.send(messages.ContentsWanted(4, {"a.rv": nested_repetitions(118)}, {}, dry_run=True))
         await asyncio.to_thread(_until_working, running.pid)

@@ -14,21 +14,21 @@ from appliance.configuration.settings import Settings
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """A configuration file that is yet to be written."""
+    """Return the path of a configuration file."""
     return tmp_path / "appliance.yaml"
 
 
 def mistakes(
     file: Path | None, environment: dict[str, str] | None = None, flags: dict[str, Any] | None = None
 ) -> list[str]:
-    """What is wrong, one line each."""
+    """Return the mistakes, one line each."""
     with pytest.raises(ConfigError) as caught:
         resolve(file, environment or {}, flags or {})
     return [str(mistake) for mistake in caught.value.mistakes]
 
 
 def test_later_sources_override_earlier_ones(file: Path) -> None:
-    """File over default, environment over file, flag over environment; what is not said stays."""
+    """Files override defaults, the environment overrides files, flags override all; other keys keep their values."""
     file.write_text("listen: 127.0.0.1:1\nrosmaster_port: 1\nlimits: {nesting: 7, elements: 8}\n")
     environment = {"ROSRV_ROSMASTER_PORT": "2", "ROSRV_LISTEN": "127.0.0.1:2", "ROSRV_LIMITS__NESTING": "9"}
     settings = resolve(file, environment, {"listen": "127.0.0.1:3", "isolation": None})
@@ -38,8 +38,8 @@ def test_later_sources_override_earlier_ones(file: Path) -> None:
     assert settings.isolation == "netns"
 
 
-def test_all_mistakes_are_told_at_once_each_with_its_place(file: Path) -> None:
-    """File and line, variable or flag; and the nearest key for one that nobody knows."""
+def test_all_mistakes_are_reported_with_their_positions(file: Path) -> None:
+    """Each has its file and line, variable or flag, and an unknown key suggests the nearest."""
     file.write_text(
         "listn: 0.0.0.0:1\nlimits:\n  nesting: deep\n  bodybytes: 1\naudit:\n  durability: sometimes\n"
     )
@@ -55,14 +55,14 @@ def test_all_mistakes_are_told_at_once_each_with_its_place(file: Path) -> None:
     assert len(found) == 6
 
 
-def test_a_key_on_the_wrong_level_is_told_where_it_belongs(file: Path) -> None:
-    """A key that exists elsewhere is named with its section."""
+def test_a_key_in_the_wrong_section_names_the_right_one(file: Path) -> None:
+    """The mistake suggests the section where the key exists."""
     file.write_text("queue_messages: 10\n")
     assert mistakes(file) == [f"{file}:1: unknown key queue_messages: did you mean relay.queue_messages?"]
 
 
 def test_a_wrong_entry_of_a_list_has_its_line(file: Path) -> None:
-    """The place of a mistake is the entry, not the list."""
+    """The position is that of the entry, not of the list."""
     file.write_text(
         "advertise:\n- {network: 10.0.0.0/8, address: 10.0.0.1}\n"
         "- network: 10.0.0.0/99\n  address: 10.0.0.1\n  adress: 1\n"
@@ -75,8 +75,8 @@ def test_a_wrong_entry_of_a_list_has_its_line(file: Path) -> None:
 @pytest.mark.parametrize(
     "value", ["perhaps", 5.5, -1, None, [1], {"a": 1}, ["x"], "", 10**30, float("nan"), "5 parsecs"]
 )
-def test_what_a_value_must_be_is_said_in_our_words(value: Any) -> None:
-    """No key has a wrong value that is told in those of a library, or in those of Python."""
+def test_messages_about_values_are_our_own(value: Any) -> None:
+    """No wrong value of a key is described in the words of a library or of Python."""
     settings = asdict(Settings())
     given = [{key: value} for key in settings]
     given += [
@@ -99,7 +99,7 @@ def test_what_a_value_must_be_is_said_in_our_words(value: Any) -> None:
 
 
 def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
-    """YAML would silently take the last one."""
+    """YAML would silently use the last one."""
     file.write_text("relays: 1\nlisten: 127.0.0.1:1\nrelays: 1\n")
     assert mistakes(file) == [f"{file}:3: relays is given a second time"]
 
@@ -119,14 +119,14 @@ def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
         ("[" * 3000, "nested too deep"),
     ],
 )
-def test_a_strange_file_is_an_error_in_words(file: Path, text: str, expected: str) -> None:
-    """Whatever the file holds, the answer says what is wrong with it and where."""
+def test_an_unreadable_file_is_an_error(file: Path, text: str, expected: str) -> None:
+    """The error gives the reason and the position."""
     file.write_text(text)
     assert any(expected in one for one in mistakes(file))
 
 
-def test_a_file_that_is_named_must_be_there(tmp_path: Path) -> None:
-    """Only the file nobody asked for may be missing."""
+def test_a_named_file_must_exist(tmp_path: Path) -> None:
+    """Only the default file may be missing."""
     assert "cannot be read: No such file" in mistakes(tmp_path / "missing.yaml")[0]
     assert (
         "cannot be read: No such file" in mistakes(None, {"ROSRV_CONFIG": str(tmp_path / "missing.yaml")})[0]
@@ -134,15 +134,15 @@ def test_a_file_that_is_named_must_be_there(tmp_path: Path) -> None:
 
 
 def test_a_file_in_the_working_directory_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a name, `appliance.yaml` here is read; without that, the defaults hold."""
+    """Without a name, `./appliance.yaml` is read; without that file, the defaults apply."""
     monkeypatch.chdir(tmp_path)
     assert resolve(None, {}, {}).rosmaster_port == Settings().rosmaster_port
     (tmp_path / "appliance.yaml").write_text("rosmaster_port: 5\n")
     assert resolve(None, {}, {}).rosmaster_port == 5
 
 
-def test_relative_paths_start_where_they_are_written(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the file they are relative to it, in a flag to the working directory; absolute afterwards."""
+def test_relative_paths_depend_on_their_source(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the file they are relative to it, in a flag to the working directory; the result is absolute."""
     monkeypatch.chdir("/")
     file.write_text("policy: policies/a.ini\nstate: /srv/state\n")
     settings = resolve(file, {}, {})
@@ -151,14 +151,14 @@ def test_relative_paths_start_where_they_are_written(file: Path, monkeypatch: py
     assert resolve(file, {}, {"policy": Path("b.ini")}).policy == Path("/b.ini")
 
 
-def test_a_variable_that_nobody_knows_is_a_mistake() -> None:
-    """A typing error in the environment is not passed over."""
+def test_an_unknown_variable_is_a_mistake() -> None:
+    """A typing error in the environment is not ignored."""
     assert mistakes(None, {"ROSRV_LISTN": "x"}) == ["ROSRV_LISTN: unknown key listn: did you mean listen?"]
     assert "ROSRV_LISTEN__PORT: " in mistakes(None, {"ROSRV_LISTEN__PORT": "1"})[0]
 
 
-def test_variables_of_others_are_left_alone() -> None:
-    """Kubernetes' links to a service named rosrv and the token of the other verbs are no configuration."""
+def test_variables_of_other_programs_are_ignored() -> None:
+    """Kubernetes' links to a service named rosrv, and the token of other verbs, are not configuration."""
     environment = {
         "ROSRV_SERVICE_HOST": "10.0.0.1",
         "ROSRV_SERVICE_PORT_MASTER": "11311",
@@ -170,21 +170,21 @@ def test_variables_of_others_are_left_alone() -> None:
 
 
 def test_a_list_in_the_environment_is_yaml() -> None:
-    """Structured values can be given by a variable as well."""
+    """A variable can give a structured value."""
     value = "[{network: 10.0.0.0/8, address: 10.1.1.1}]"
     assert str(resolve(None, {"ROSRV_ADVERTISE": value}, {}).advertise[0].address) == "10.1.1.1"
     assert mistakes(None, {"ROSRV_ADVERTISE": "[{"})[0].startswith("ROSRV_ADVERTISE: is not YAML")
 
 
-def test_a_mistake_about_two_keys_stands_where_one_of_them_was_said() -> None:
-    """`--mediation monitored` without `--relay monitored` is a mistake of that flag, whatever else was given."""
+def test_a_mistake_about_two_keys_names_one_that_was_set() -> None:
+    """`--mediation monitored` without `--relay monitored` is a mistake of that flag, with any other settings."""
     with pytest.raises(ConfigError) as caught:
         resolve(None, {}, {"policy": Path("/a.ini"), "mediation": "monitored"})
     assert str(caught.value) == "--mediation: monitored needs relaying: monitored (--relay monitored)"
 
 
 def test_the_variable_of_a_flag_with_another_key() -> None:
-    """`ROSRV_RELAY` is `--relay`; a table, and what is in the section of that name, go to the section."""
+    """`ROSRV_RELAY` is `--relay`; a table, and the keys of the section of that name, go to the section."""
     assert (
         resolve(None, {"ROSRV_RELAY": "monitored", "ROSRV_MEDIATION": "monitored"}, {}).relaying
         == "monitored"

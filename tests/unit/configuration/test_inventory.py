@@ -27,26 +27,22 @@ Version: 9.0
 
 @pytest.fixture(autouse=True)
 def anew() -> Iterator[None]:
-    """It is gathered once in a process: here for each test."""
+    """Gather the inventory again for each test; a process does it once."""
     inventory.inventory.cache_clear()
     yield
     inventory.inventory.cache_clear()
 
 
-def test_of_debian_it_names_what_the_appliance_stands_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Installed packages that it needs; neither those of others nor what was removed."""
+def test_on_debian_it_lists_needed_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Installed packages that the appliance needs are listed, not others or removed ones."""
     (tmp_path / "status").write_text(STATUS)
     monkeypatch.setattr(inventory, "DPKG", tmp_path)
     found = [(part.name, part.version) for part in inventory.inventory().parts if part.kind == "debian"]
     assert found == [("nftables", "1.0.6-2+deb12u2")]
 
 
-def test_elsewhere_than_on_debian_there_are_pythons_parts_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without dpkg's list nothing is made up."""
+def test_elsewhere_it_lists_python_packages_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without dpkg's list nothing is invented."""
     monkeypatch.setattr(inventory, "DPKG", tmp_path)
     found = inventory.inventory()
     assert {part.kind for part in found.parts} == {"python"}
@@ -54,10 +50,10 @@ def test_elsewhere_than_on_debian_there_are_pythons_parts_alone(
     assert (own.version, own.licences) == (__version__, ["Apache-2.0"])
 
 
-def test_a_build_says_its_commit_and_the_hash_of_its_list(
+def test_a_build_has_its_commit_and_the_hash_of_its_list(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As an image has them; a checkout has neither."""
+    """An image has both, a checkout neither."""
     assert (inventory.inventory().build, inventory.inventory().parts_list) == (None, None)
     inventory.inventory.cache_clear()
     monkeypatch.setattr(inventory, "SHIPPED", tmp_path)
@@ -76,6 +72,6 @@ def test_a_build_says_its_commit_and_the_hash_of_its_list(
         ("", []),
     ],
 )
-def test_debians_licences(text: str, licences: list[str]) -> None:
-    """In Debian's own format, in words that name the common ones, or not said."""
+def test_licences_of_debian_packages(text: str, licences: list[str]) -> None:
+    """The licence is read from Debian's format or from common names; otherwise it is missing."""
     assert inventory.debian_licences(text) == licences

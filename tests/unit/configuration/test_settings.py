@@ -14,7 +14,7 @@ from appliance.configuration.settings import Settings, load_resolved, split_addr
 
 
 def test_every_key_has_a_default() -> None:
-    """An empty configuration is a whole one, with the limits of the design."""
+    """An empty configuration is complete, with the documented limits."""
     settings = Settings()
     assert settings.listen_address == ("0.0.0.0", 11311)
     assert settings.limits.body_bytes == 16 * 1024 * 1024
@@ -23,8 +23,8 @@ def test_every_key_has_a_default() -> None:
     assert settings.audit.durability == "batched"
 
 
-def test_children_read_what_the_supervisor_wrote(tmp_path: Path) -> None:
-    """The resolved settings survive the way through the file unchanged."""
+def test_children_read_the_supervisors_settings(tmp_path: Path) -> None:
+    """Resolved settings are unchanged after writing and reading the file."""
     settings = read(
         {
             "listen": "[::1]:0",
@@ -48,7 +48,7 @@ def test_children_read_what_the_supervisor_wrote(tmp_path: Path) -> None:
     ],
 )
 def test_an_address_is_host_and_port(text: str, address: tuple[str, int]) -> None:
-    """IPv4, IPv6 in brackets and names, with any port."""
+    """IPv4, IPv6 in brackets and names are accepted, with any port."""
     assert split_address(text) == address
 
 
@@ -68,7 +68,7 @@ def test_an_address_is_host_and_port(text: str, address: tuple[str, int]) -> Non
         "h:\u0661",
     ],
 )
-def test_what_is_no_address_is_refused(text: str) -> None:
+def test_an_invalid_address_is_rejected(text: str) -> None:
     """Anything else is an error, not a guess."""
     with pytest.raises(ValidationError):
         read({"listen": text})
@@ -76,22 +76,22 @@ def test_what_is_no_address_is_refused(text: str) -> None:
 
 @pytest.mark.parametrize("value", [0, -1, float("inf"), float("nan"), "soon"])
 def test_a_time_is_a_positive_number(value: object) -> None:
-    """No limit can be switched off by an odd number."""
+    """No number disables a limit."""
     with pytest.raises(ValidationError):
         read({"limits": {"header_seconds": value}})
 
 
 @pytest.mark.parametrize("api", ["0.0.0.0:8443", "[::]:8443", "10.0.0.2:8443", "robot:8443"])
 def test_rest_in_clear_text_stays_on_this_machine(api: str) -> None:
-    """Tokens never cross a network in clear text; on loopback they may."""
+    """Tokens never cross a network without TLS; on loopback they may."""
     with pytest.raises(ValidationError, match="clear text"):
         read({"api": api, "api_tls": False})
     for here in ("127.0.0.1:1", "[::1]:1", "localhost:1", "127.9.9.9:1", "off"):
         assert read({"api": here, "api_tls": False}).api == here
 
 
-def test_rest_can_be_off() -> None:
-    """`off`, also as YAML reads it, is no address."""
+def test_rest_can_be_disabled() -> None:
+    """`off`, also as YAML reads it, means no address."""
     assert read({"api": "off"}).api_address is None
     assert read({"api": False}).api_address is None
     assert Settings().api_address == ("127.0.0.1", 8443)
@@ -106,7 +106,7 @@ def test_rest_can_be_off() -> None:
     ],
 )
 def test_a_syslog_receiver(text: str, destination: tuple[str, str, int]) -> None:
-    """A receiver of the audit log is a protocol, an address and a port."""
+    """A receiver of the audit log has a protocol, an address and a port."""
     settings = read({"audit": {"syslog": {"to": text}}})
     assert settings.audit.syslog.destination == destination
 
@@ -125,8 +125,8 @@ def test_a_syslog_receiver(text: str, destination: tuple[str, str, int]) -> None
         ({"to": "udp://10.0.0.9:514", "facility": 24}, "facility"),
     ],
 )
-def test_a_syslog_receiver_that_cannot_be(syslog: dict[str, object], why: str) -> None:
-    """What could not work, or would do nothing, is an error that says which key and why."""
+def test_an_invalid_syslog_receiver_is_rejected(syslog: dict[str, object], why: str) -> None:
+    """A useless or impossible setting is an error with its key and the reason."""
     with pytest.raises(ValidationError, match=why):
         read({"audit": {"syslog": syslog}})
 
@@ -139,15 +139,15 @@ def test_a_syslog_receiver_that_cannot_be(syslog: dict[str, object], why: str) -
         ("10.0.0.0/8", "prefix length from 16 to 29"),
     ],
 )
-def test_a_pool_of_virtual_addresses_that_cannot_be(pool: str, said: str) -> None:
-    """IPv6, too small and too large: each says what is taken."""
+def test_an_invalid_pool_of_virtual_addresses_is_rejected(pool: str, said: str) -> None:
+    """IPv6, too small and too large: the error says what is valid."""
     with pytest.raises(ValidationError, match=said):
         read({"ipsec": {"pool": pool}})
 
 
 @pytest.mark.parametrize("endpoint", ["192.168.1.20", "fd00::20", "robot.example.org", "robot"])
-def test_where_hosts_reach_the_appliance(endpoint: str) -> None:
-    """An address or a name, as it stands in a kit."""
+def test_the_endpoint_is_an_address_or_a_name(endpoint: str) -> None:
+    """Kits contain it unchanged."""
     assert read({"ipsec": {"endpoint": endpoint}}).ipsec.endpoint == endpoint
 
 
@@ -159,25 +159,25 @@ def test_where_hosts_reach_the_appliance(endpoint: str) -> None:
         ("192.168.1.300", "neither an address nor a name"),
         (" ", "neither an address nor a name"),
         ("a b", "neither an address nor a name"),
-        ("127.0.0.1", "no address at which other hosts"),
-        ("0.0.0.0", "no address at which other hosts"),
-        ("fe80::1", "no address at which other hosts"),
+        ("127.0.0.1", "not an address at which other hosts"),
+        ("0.0.0.0", "not an address at which other hosts"),
+        ("fe80::1", "not an address at which other hosts"),
         ("localhost", "this machine only"),
     ],
 )
-def test_where_hosts_cannot_reach_the_appliance(endpoint: str, said: str) -> None:
-    """It is refused when the appliance is configured, not when a host cannot join."""
+def test_an_unreachable_endpoint_is_rejected(endpoint: str, said: str) -> None:
+    """The error comes with the configuration, not when a host cannot join."""
     with pytest.raises(ValidationError, match=said):
         read({"ipsec": {"endpoint": endpoint}})
 
 
-def test_an_empty_endpoint_is_none() -> None:
-    """What compose.yaml hands on of a variable that nobody set: found out, as without it."""
+def test_an_empty_endpoint_is_unset() -> None:
+    """compose.yaml passes an empty variable on: the address is then found automatically."""
     assert read({"ipsec": {"endpoint": ""}}).ipsec.endpoint is None
 
 
-def test_no_rule_of_a_key_is_lost() -> None:
-    """A rule stands in the annotation of an annotated type: pydantic passes over one beside it."""
+def test_rules_of_annotated_keys_are_enforced() -> None:
+    """A rule must be inside the annotation of an annotated type: pydantic ignores one beside it."""
 
     def sections(section: Any) -> Iterator[Any]:
         yield section

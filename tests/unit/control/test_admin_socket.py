@@ -1,4 +1,4 @@
-"""The admin socket: what a client that gives up has done."""
+"""The admin socket: orders of a client that gives up."""
 
 import asyncio
 import contextlib
@@ -13,8 +13,8 @@ from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer, PolicyConfirm, decode, encode
 from appliance.channel.answers.policy_answers import PolicyConfirmed
-from appliance.cli import admin_client
-from appliance.cli.admin_client import ADMIN_SOCKET, AdminSocket, NotRunningError
+from appliance.cli.connection import admin_client
+from appliance.cli.connection.admin_client import ADMIN_SOCKET, AdminSocket, NotRunningError
 from appliance.control.admin_socket import AdminServer
 from appliance.control.administration import Administration
 
@@ -22,13 +22,14 @@ pytestmark = pytest.mark.anyio
 
 
 class Slow:
-    """Orders of which one is slow: it takes effect when `goes_on` is set."""
+    """Orders with a slow one, which takes effect when `goes_on` is set."""
 
     def __init__(self) -> None:
         self.begun, self.goes_on = asyncio.Event(), asyncio.Event()
         self.ended: asyncio.Queue[str] = asyncio.Queue()
         self.done = 0
 
+    @admin.answers(admin.PolicyConfirm, who=True)
     async def confirm(self, _request: admin.PolicyConfirm, who: str) -> PolicyConfirmed:
         """Wait, then change something."""
         self.begun.set()
@@ -46,7 +47,7 @@ async def served(state: Path) -> AsyncIterator[Slow]:
     """Serve the socket in a state directory."""
 
     async def durable() -> None:
-        """It is on the disk."""
+        """Do nothing: the test's state needs no disk."""
 
     slow: Any = Slow()
     looks: Any = object()
@@ -61,10 +62,10 @@ async def served(state: Path) -> AsyncIterator[Slow]:
         server.close()
 
 
-async def test_what_is_not_answered_in_time_is_withdrawn(
+async def test_an_order_past_its_timeout_is_withdrawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A tool whose time is over withdraws its order, and says that nothing was changed."""
+    """A tool withdraws its order after the timeout and reports that nothing was changed."""
     async with served(tmp_path) as slow:
         monkeypatch.setattr(socket.socket, "shutdown", _then(socket.socket.shutdown, slow.goes_on.set))
         answer = await asyncio.to_thread(AdminSocket(tmp_path, 0.05).ask, PolicyConfirm())
@@ -72,7 +73,7 @@ async def test_what_is_not_answered_in_time_is_withdrawn(
         assert "nothing was changed" in answer.error
 
 
-async def test_an_order_that_took_effect_is_answered_late(tmp_path: Path) -> None:
+async def test_a_late_order_that_took_effect_is_answered(tmp_path: Path) -> None:
     """An order that takes effect before the tool gives up is answered as done."""
     async with served(tmp_path) as slow:
         slow.goes_on.set()
@@ -80,10 +81,10 @@ async def test_an_order_that_took_effect_is_answered_late(tmp_path: Path) -> Non
         assert (answer.ok, slow.done) == (True, 1)
 
 
-async def test_a_tool_without_an_answer_says_how_to_find_out(
+async def test_a_tool_without_an_answer_says_how_to_check(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where control does not even answer what became of the order, the tool names the command that finds out."""
+    """If control does not report the outcome, the tool names the command that does."""
     monkeypatch.setattr(admin_client, "_GRACE_SECONDS", 0.05)
     wanted = pytest.raises(NotRunningError, match=r"may have taken effect; .* rosrv audit search --since 5m")
     async with served(tmp_path) as slow:
@@ -94,7 +95,7 @@ async def test_a_tool_without_an_answer_says_how_to_find_out(
 
 
 async def test_the_order_of_a_killed_tool_is_withdrawn(tmp_path: Path) -> None:
-    """A tool that is gone, as one that was killed, has changed nothing; the next is served."""
+    """A killed tool has changed nothing; the next one is served."""
     async with served(tmp_path) as slow:
         _reader, writer = await asyncio.open_unix_connection(tmp_path / ADMIN_SOCKET)
         writer.write(encode(PolicyConfirm()) + b"\n")
@@ -112,7 +113,7 @@ async def test_the_order_of_a_killed_tool_is_withdrawn(tmp_path: Path) -> None:
 
 
 def _once(event: asyncio.Event, method: Any) -> Any:
-    """Return the method, for other threads: it waits for the event first."""
+    """Wrap the method for other threads: it waits for the event first."""
     loop = asyncio.get_running_loop()
 
     def later(*arguments: Any) -> Any:

@@ -6,7 +6,7 @@ from appliance.control.challenges import SECONDS, ChallengeRefusedError, Challen
 
 
 def refusal(challenges: Challenges, challenge: str, now: float) -> str:
-    """Why a challenge is not taken; empty when it is."""
+    """Return the reason why a challenge is rejected; empty if it is accepted."""
     try:
         challenges.take(challenge, now)
     except ChallengeRefusedError as error:
@@ -14,8 +14,8 @@ def refusal(challenges: Challenges, challenge: str, now: float) -> str:
     return ""
 
 
-def test_each_is_good_once_and_not_for_long() -> None:
-    """It is taken until its end, never twice, and after its end not at all."""
+def test_each_is_valid_once_and_until_its_end() -> None:
+    """It is accepted once, and not after its end."""
     challenges = Challenges()
     first, second = challenges.give(100.0), challenges.give(100.0)
     assert refusal(challenges, first, 100.0 + SECONDS - 0.01) == ""
@@ -25,18 +25,18 @@ def test_each_is_good_once_and_not_for_long() -> None:
 
 
 @pytest.mark.parametrize("text", ["", ".", "..", "9e9.x.y", "nan.x.y", "é", "99999999.000.x." + "0" * 64])
-def test_nobody_else_makes_one(text: str) -> None:
-    """What this process has not given is refused: made up, with another end, or of the process before it."""
+def test_only_this_process_makes_valid_ones(text: str) -> None:
+    """Rejected are invented ones, those with another end, and those of an earlier process."""
     challenges = Challenges()
     given = challenges.give(1.0)
-    assert "none that RVMaster gave" in refusal(challenges, text, 1.0)
-    assert "none that RVMaster gave" in refusal(challenges, given.replace("61.000", "99961.000"), 1.0)
-    assert "none that RVMaster gave" in refusal(Challenges(), given, 1.0)
+    assert "has not given this challenge" in refusal(challenges, text, 1.0)
+    assert "has not given this challenge" in refusal(challenges, given.replace("61.000", "99961.000"), 1.0)
+    assert "has not given this challenge" in refusal(Challenges(), given, 1.0)
     assert refusal(challenges, given, 1.0) == ""
 
 
-def test_what_was_taken_does_not_pile_up() -> None:
-    """So many are remembered, and forgotten when they have ended; asking for more fills nothing."""
+def test_used_challenges_are_bounded() -> None:
+    """A limited number is remembered until they end; requesting more uses no memory."""
     challenges = Challenges()
     refused = [refusal(challenges, challenges.give(5.0), 5.0) for _ in range(5000)]
     assert refused[:4096] == [""] * 4096

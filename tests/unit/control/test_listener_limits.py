@@ -1,18 +1,20 @@
-"""Who is let in to the listeners of control, and until when."""
+"""Limits of control's listeners: admission, and idle connections."""
 
 import asyncio
 import dataclasses
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from appliance.audit.log import AuditLog
 from appliance.configuration.settings import Settings
-from appliance.control.listener_limits import Doors, class_of
-from appliance.policy.model import address_of
+from appliance.control.listener_limits import ListenerLimits, class_of
+from appliance.policy.model import Address, address_of
 from appliance.policy.policy_compiler import compile_policy
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
+from appliance.rpc.connection_table import ConnectionTable, Stage
 from appliance.rpc.server import HttpRequest
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -24,64 +26,122 @@ CALL = b"POST / HTTP/1.1\r\nHost: here\r\nContent-Length: 1\r\n\r\n?"
 
 @pytest.mark.parametrize("guarded", [True, False])
 async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *, guarded: bool) -> None:
-    """Also where the ROS Master calls, which keeps a connection to each node that ever was."""
+    """This includes the ROS master, which keeps a connection to each node that ever existed."""
     given = Settings()
     settings = dataclasses.replace(given, limits=dataclasses.replace(given.limits, idle_seconds=0.1))
     policy = compile_policy("[Nodes]\ndefault = *\n", file="a.ini")
     log = AuditLog(tmp_path / "audit.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
-    doors = Doors(settings, trail, lambda: policy, lambda _host: Standing.NAMED)
+    listener_limits = ListenerLimits(settings, trail, lambda: policy, lambda _host: QuotaClass.NAMED)
 
     async def answer(_request: HttpRequest) -> bytes:
         return b"!"
 
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        await doors.open(listener, answer, guarded=guarded)
-        sweep = asyncio.get_running_loop().create_task(doors.sweep())
+        await listener_limits.open(listener, answer, guarded=guarded)
+        sweep = asyncio.get_running_loop().create_task(listener_limits.sweep())
         reader, writer = await asyncio.open_connection(*listener.getsockname())
         writer.write(CALL)
         async with asyncio.timeout(WAIT):
             assert (await reader.read()).endswith(b"!")
         writer.close()
         sweep.cancel()
-        doors.close()
+        listener_limits.close()
     log.close()
 
 
-def test_hosts_that_only_everybody_names_share_processor_time_as_one() -> None:
-    """Two hundred addresses that a rule for `*` lets in count as one host; an address or network that it names, as one.
-
-    Hosts of `*` that have a registration are one of their own, so that no number of addresses without one delays them.
-    """
+def test_hosts_of_a_wildcard_share_processor_time() -> None:
+    """Hosts that only `*` names count as one; a named or registered host, or a named network, counts as one each."""
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1 10.1.0.0/16\n/guest/** = *\n", file="a.ini")
     registered = address_of("10.9.0.7")
-    standing = {registered: Standing.REGISTERED}
+    quota_class = {registered: QuotaClass.REGISTERED}
 
     def kind(text: str) -> str:
-        return class_of(lambda: policy, lambda host: standing.get(host, Standing.NAMED), address_of(text))
+        return class_of(
+            lambda: policy, lambda host: quota_class.get(host, QuotaClass.NAMED), address_of(text)
+        )
 
     assert len({kind(f"10.9.1.{number}") for number in range(200)}) == 1
     assert len({kind(text) for text in ("10.0.0.1", "10.1.0.1", "10.9.0.7", "10.9.1.1", "127.0.0.1")}) == 5
     assert kind("10.1.0.1") == kind("10.1.255.9")
 
 
-def test_hosts_that_only_everybody_names_fill_no_place_of_a_named_host(tmp_path: Path) -> None:
-    """Two hundred hosts of `*` connect without end: a named host's connection may wait, before it has a registration.
-
-    A host of `*` with a registration has its place too.
-    """
+@pytest.fixture
+def everybodys(tmp_path: Path) -> Iterator[ListenerLimits]:
+    """Return limits under a policy that names `ROBOT` and all others by `*`; one of these has a registration."""
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
-    robot, registered = address_of("10.0.0.1"), address_of("10.9.0.7")
-    standing = {registered: Standing.REGISTERED}
     log = AuditLog(tmp_path / "audit.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
-    doors = Doors(Settings(), trail, lambda: policy, lambda host: standing.get(host, Standing.NAMED))
-    arriving = doors.visitors.arriving
+    yield ListenerLimits(
+        Settings(),
+        trail,
+        lambda: policy,
+        lambda host: {REGISTERED: QuotaClass.REGISTERED}.get(host, QuotaClass.NAMED),
+    )
+    log.close()
+
+
+def test_hosts_of_a_wildcard_leave_a_named_host_its_slot(everybodys: ListenerLimits) -> None:
+    """Two hundred hosts of `*` keep connecting: a named host may still connect, and so may a registered host of `*`."""
+    arriving = everybodys.connection_table.arriving
     for number in range(200):
         for _ in range(20):
             arriving.take(address_of(f"10.9.1.{number}"))
-    assert arriving.total == arriving.bounds.strangers
+    assert arriving.total == arriving.bounds.unknown
     assert arriving.take(address_of("10.9.1.1"))
-    assert not arriving.take(robot)
-    assert not arriving.take(registered)
+    assert not arriving.take(ROBOT)
+    assert not arriving.take(REGISTERED)
+
+
+def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots(tmp_path: Path) -> None:
+    """Two hundred hosts of `*` register a node each and keep connecting: the robot finds the kept part free."""
+    policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
+    log = AuditLog(tmp_path / "audit.db")
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    limits = ListenerLimits(Settings(), trail, lambda: policy, lambda _host: QuotaClass.REGISTERED)
+    table = limits.connection_table
+    for pool in (table.arriving, table.connected):
+        for number in range(200):
+            while not pool.take(address_of(f"10.9.1.{number}")):
+                pass
+        assert pool.total == pool.bounds.whole - pool.bounds.kept
+        assert [pool.take(ROBOT) for _ in range(pool.bounds.host)] == [""] * pool.bounds.host
     log.close()
+
+
+class Opened:
+    """A connection in the middle of a request."""
+
+    deadline = 0.0
+    holding = 0
+    cut = False
+
+    def __init__(
+        self, connection_table: ConnectionTable[Address], host: Address, stage: Stage = Stage.UNFINISHED
+    ) -> None:
+        self._visitors = connection_table
+        self.refused = connection_table.enter(self, host)
+        connection_table.file(self, stage)
+
+    def expire(self) -> None:
+        """Not used by this test."""
+
+    def abort(self) -> None:
+        """Free the slot."""
+        self.cut = True
+        self._visitors.leave(self)
+
+
+def test_connections_of_a_wildcard_displace_no_named_host(everybodys: ListenerLimits) -> None:
+    """Hosts of `*` keep thousands of requests unfinished: a named host connects and is never displaced."""
+    connection_table = everybodys.connection_table
+    robots = [Opened(connection_table, ROBOT, Stage.IDLE) for _ in range(100)]
+    crowd = [
+        Opened(connection_table, address_of(f"10.9.1.{number}")) for number in range(200) for _ in range(20)
+    ]
+    assert sum(not one.refused for one in crowd) == connection_table.connected.bounds.unknown
+    robots += [Opened(connection_table, host) for host in (ROBOT, REGISTERED)]
+    assert not any(one.refused or one.cut for one in robots)
+
+
+ROBOT, REGISTERED = address_of("10.0.0.1"), address_of("10.9.0.7")

@@ -1,4 +1,4 @@
-"""Tests of what control measures: bounded, whatever names others choose."""
+"""Tests of control's measurements: bounded, whatever names clients choose."""
 
 import ipaddress
 from typing import Any, cast
@@ -7,46 +7,48 @@ import pytest
 
 from appliance.channel.messages import TopicTraffic
 from appliance.control.measurements import by_resource, carried_of, from_zero
+from appliance.control.monitor_states import published_now
 from appliance.master.endpoints import traffic
-from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, Carried
-from appliance.master.graph.registry import Incarnation, Registry
+from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, RelayTraffic
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.specifications.live_topics import LiveType
 from roswire.uris import parse_node_uri
 
 
 def test_sums_by_name() -> None:
-    """What several incarnations carried of one topic is one sum."""
+    """Several incarnations of one topic are summed."""
     rows = [("/a", (1, 10)), ("/b", (2, 20)), ("/a", (3, 30))]
     assert by_resource(rows) == {"/a": [4, 40], "/b": [2, 20]}
 
 
 def test_counters_begin_at_zero() -> None:
-    """What did not happen yet is 0, so that its first time is an increase."""
+    """A counter exists with 0 before its first event, so that the first is an increase."""
     counts = from_zero({("fault", "safe"): 2}, [("fault", "safe"), ("drop", "safe")])
     assert counts == {("fault", "safe"): 2, ("drop", "safe"): 0}
 
 
-def test_names_without_end() -> None:
-    """Past the bound names are not told one by one, and nothing is lost from the sum."""
+def test_names_are_bounded() -> None:
+    """Past the limit names share one series, and the sum is complete."""
     sums = by_resource((f"/topic{number}", (1,)) for number in range(MOST_RESOURCES + 500))
     assert len(sums) == MOST_RESOURCES + 1
     assert sums[OTHERS] == [500]
     assert sum(row[0] for row in sums.values()) == MOST_RESOURCES + 500
 
 
-def test_few_topics_have_a_histogram_of_their_own() -> None:
-    """Histograms have many series each, so fewer names are told one by one."""
+def test_few_topics_have_their_own_histogram() -> None:
+    """Histograms have many series each, so their limit is lower."""
     sums = by_resource(((f"/topic{number}", (1, 0.5)) for number in range(5)), 3)
     assert sums == {"/topic0": [1, 0.5], "/topic1": [1, 0.5], "/topic2": [1, 0.5], OTHERS: [2, 1.0]}
 
 
-def test_counters_of_a_topic_outlive_the_nodes_that_published_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A node that restarts is another incarnation: its topic counts on, bounded in names."""
+def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A restarted node is another incarnation: its topic counts on, with bounded names."""
     monkeypatch.setattr(traffic, "MOST_RESOURCES", 2)
     registry, host = Registry(), ipaddress.ip_address("10.0.0.5")
     for number in range(4):
         uri = f"http://10.0.0.5:400{number}/"
         registry.add(Incarnation(f"k{number}", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2))
-    counted = Carried(cast(Any, None), registry, 1)
+    counted = RelayTraffic(cast(Any, None), registry, 1)
     for number in range(4):
         rows = [
             TopicTraffic(f"k{number}", "/a", 10, 100, 1, 1, [1, 2], 0.5),
@@ -62,3 +64,19 @@ def test_counters_of_a_topic_outlive_the_nodes_that_published_it(monkeypatch: py
         {"/a": [40, 400, 4], "/own0": [1, 1, 0], OTHERS: [3, 3, 0]},
         {"/a": [4, 8, 2.0]},
     )
+
+
+def test_a_publishers_md5sum_is_known_once_a_relay_has_seen_its_header() -> None:
+    """A registration has the type and a header the md5sum; a later report without one changes nothing."""
+    registry, uri = Registry(), "http://10.0.0.5:4000/"
+    host = ipaddress.ip_address("10.0.0.5")
+    node = Incarnation("k", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
+    registry.add(node)
+    registry.register(node, Kind.PUBLICATION, "/a", "std_msgs/String")
+    counted = RelayTraffic(cast(Any, None), registry, 1)
+    assert published_now(registry, counted.traffic) == {"/a": {"/node": LiveType("std_msgs/String")}}
+    for md5sum in ("992c", ""):
+        counted.reported([TopicTraffic("k", "/a", 1, 1, 0, 1, md5sum=md5sum)])
+        assert published_now(registry, counted.traffic) == {
+            "/a": {"/node": LiveType("std_msgs/String", "992c")}
+        }

@@ -1,4 +1,4 @@
-"""The policy in force over reloads, restarts, and the time limit of an unconfirmed change."""
+"""The policy in force after reloads, restarts, and the timeout of an unconfirmed change."""
 
 import asyncio
 import contextlib
@@ -32,16 +32,16 @@ OTHER = OPEN.replace("default=*", "default=10.0.0.5", 1)
 
 
 def fail(reason: str) -> None:
-    """The store could not write."""
+    """Fail if the store could not write."""
     raise AssertionError(reason)
 
 
 async def at_once() -> None:
-    """The relays have carried out what they were told."""
+    """Return as if the relays had applied the change."""
 
 
 class Appliance:
-    """The policy file and what is kept in the store; `started()` is one life of control."""
+    """The policy file and the store; `started()` is one run of control."""
 
     def __init__(self, directory: Path) -> None:
         self.state = directory / "state"
@@ -58,7 +58,7 @@ class Appliance:
         changed: Callable[[Policy, Policy], int] = lambda _before, _policy: 0,
         site_keys: Sequence[str] = (),
     ) -> Iterator[Policies]:
-        """The policies of a control that has started; it dies at the end."""
+        """Run control until the block ends, and return its policies."""
         store = StateStore(self.state, failed=fail)
         records = cast(Any, Records())
         policies = Policies(
@@ -87,8 +87,8 @@ async def until(policies: Policies, revision: int) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_an_unconfirmed_change_goes_back_after_a_start_of_the_appliance(tmp_path: Path) -> None:
-    """The engineer who locked himself out may restart the appliance: the time limit still holds."""
+async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(tmp_path: Path) -> None:
+    """Engineers who locked themselves out may restart the appliance: the timeout still applies."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
@@ -105,10 +105,10 @@ async def test_an_unconfirmed_change_goes_back_after_a_start_of_the_appliance(tm
         assert (policies.revision, policies.confirm_by) == (3, None)
 
 
-async def test_a_clock_that_was_set_back_makes_no_time_limit_longer(
+async def test_a_clock_set_back_does_not_extend_the_timeout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After a power cut the clock may stand years ago; whoever locked himself out waits no longer than he asked for."""
+    """After a power cut the clock may be years back; the rollback comes no later than requested."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
@@ -120,8 +120,8 @@ async def test_a_clock_that_was_set_back_makes_no_time_limit_longer(
         assert policies.current.text == OPEN
 
 
-async def test_a_file_that_was_edited_ends_the_time_limit(tmp_path: Path) -> None:
-    """Another file at the start is another policy: no old time limit goes off, at that start or after a crash."""
+async def test_an_edited_file_ends_the_timeout(tmp_path: Path) -> None:
+    """Another file at the start is another policy: no old timeout fires, at that start or after a crash."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
@@ -134,7 +134,7 @@ async def test_a_file_that_was_edited_ends_the_time_limit(tmp_path: Path) -> Non
 
 
 async def test_a_change_stays_confirmed_over_a_crash(tmp_path: Path) -> None:
-    """Confirmed is confirmed; a change that waits for it is still waiting after a crash of control."""
+    """Confirmed stays confirmed; an unconfirmed change is still unconfirmed after a crash of control."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
@@ -148,7 +148,7 @@ async def test_a_change_stays_confirmed_over_a_crash(tmp_path: Path) -> None:
 
 
 class Slow:
-    """The policy's tests, which are over when the loop says so."""
+    """Tests of the policy that finish when the loop says so."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, appliance: Appliance) -> None:
         self.rounds = 0
@@ -163,12 +163,12 @@ class Slow:
         return []
 
     async def until_begun(self) -> None:
-        """Wait until they run."""
+        """Wait until the tests run."""
         assert await asyncio.to_thread(self.begun.wait, 10)
 
 
-async def test_a_reload_does_not_keep_nodes_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A long policy with many tests is read, compiled and tested beside the loop."""
+async def test_a_reload_does_not_block_nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long policy with many tests is read, compiled and tested outside the loop."""
     appliance = Appliance(tmp_path)
     slow = Slow(monkeypatch, appliance)
     with appliance.started() as policies:
@@ -181,10 +181,10 @@ async def test_a_reload_does_not_keep_nodes_waiting(tmp_path: Path, monkeypatch:
         assert policies.current.text == OTHER
 
 
-async def test_a_reload_that_another_change_overtakes_is_refused(
+async def test_a_reload_overtaken_by_another_change_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What came into force while the file was being tested is not silently replaced."""
+    """A policy that came into force during the tests is not silently replaced."""
     appliance = Appliance(tmp_path)
     slow = Slow(monkeypatch, appliance)
     with appliance.started() as policies:
@@ -198,10 +198,10 @@ async def test_a_reload_that_another_change_overtakes_is_refused(
         assert policies.revision == 2
 
 
-async def test_hosts_that_change_while_a_policy_is_tested_are_known_to_it(
+async def test_hosts_changed_during_the_tests_are_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A host whose certificate is revoked in that moment has no right by its old address."""
+    """A host whose certificate is revoked meanwhile has no rights by its old address."""
     appliance = Appliance(tmp_path)
     slow = Slow(monkeypatch, appliance)
     hosts = {"ocu": ipaddress.ip_address("10.0.0.7"), "new": ipaddress.ip_address("10.0.0.8")}
@@ -221,13 +221,11 @@ async def test_hosts_that_change_while_a_policy_is_tested_are_known_to_it(
 
 
 class DiedError(Exception):
-    """Control dies."""
+    """Control crashes."""
 
 
-async def test_a_change_to_be_confirmed_goes_back_though_control_dies_while_it_is_made(
-    tmp_path: Path,
-) -> None:
-    """Whoever may lock himself out is safe from the moment on in which the new revision is the one in force."""
+async def test_a_crash_during_an_unconfirmed_change_rolls_it_back(tmp_path: Path) -> None:
+    """The timeout protects from the time at which the new revision comes into force."""
     appliance = Appliance(tmp_path)
 
     def die(_before: object, _policy: object) -> int:
@@ -243,10 +241,8 @@ async def test_a_change_to_be_confirmed_goes_back_though_control_dies_while_it_i
         assert policies.current.text == OPEN
 
 
-async def test_nothing_waits_for_the_disk_on_the_loop(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What the store is asked while nodes are served is asked in a thread: a slow disk keeps none of them waiting."""
+async def test_the_loop_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The store is read in a thread while nodes are served, so a slow disk delays no node."""
     with Appliance(tmp_path).started() as policies:
         read, loop_thread, asked = policies.store.database.query, threading.get_ident(), []
 
@@ -272,7 +268,7 @@ async def test_nothing_waits_for_the_disk_on_the_loop(
 
 
 async def unsigned(policies: Policies, change: Callable[[], Awaitable[object]]) -> str:
-    """What a refused change says; the policy in force stays."""
+    """Return the message of a refused change; the policy in force stays."""
     before = policies.revision, policies.current.text
     with pytest.raises(PolicyRefusedError) as refused:
         await change()
@@ -280,8 +276,8 @@ async def unsigned(policies: Policies, change: Callable[[], Awaitable[object]]) 
     return refused.value.findings[0]
 
 
-async def test_where_the_site_signs_nothing_else_comes_into_force(tmp_path: Path) -> None:
-    """Start, reload, posted text, rollback, and the start after a crash: each asks for the site's signature."""
+async def test_a_site_that_signs_accepts_only_signed_policies(tmp_path: Path) -> None:
+    """Start, reload, posted text, rollback, and the start after a crash each check the site's signature."""
     appliance = Appliance(tmp_path)
     beside = tmp_path / "policy.ini.sig"
     with pytest.raises(PolicyRefusedError, match="it has no signature of the site"):
@@ -308,8 +304,8 @@ async def test_where_the_site_signs_nothing_else_comes_into_force(tmp_path: Path
         appliance.started(site_keys=[OTHER_LINE]).__enter__()
 
 
-async def test_a_trial_goes_back_to_what_is_signed(tmp_path: Path) -> None:
-    """The revision that an unconfirmed change goes back to has its signature still."""
+async def test_a_rollback_restores_a_signed_revision(tmp_path: Path) -> None:
+    """The revision before an unconfirmed change still has its signature."""
     appliance = Appliance(tmp_path)
     (tmp_path / "policy.ini.sig").write_text(signed(OPEN))
     with appliance.started(site_keys=[LINE]) as policies:
@@ -318,8 +314,8 @@ async def test_a_trial_goes_back_to_what_is_signed(tmp_path: Path) -> None:
         assert (policies.current.text, policies.in_force.signature) == (OPEN, signed(OPEN))
 
 
-async def test_keys_are_changed_over_with_both_in_force(tmp_path: Path) -> None:
-    """The same text, signed anew, is a new revision: no crash afterwards asks for the key that is gone."""
+async def test_keys_are_replaced_while_both_are_valid(tmp_path: Path) -> None:
+    """The same text with a new signature is a new revision, so no later crash asks for the old key."""
     appliance = Appliance(tmp_path)
     beside = tmp_path / "policy.ini.sig"
     beside.write_text(signed(OPEN))
@@ -335,7 +331,7 @@ async def test_keys_are_changed_over_with_both_in_force(tmp_path: Path) -> None:
 
 
 async def test_the_same_text_posted_twice_is_one_revision(tmp_path: Path) -> None:
-    """Who repeats an order changes nothing; a time limit that runs goes on; another text is another revision."""
+    """A repeated order changes nothing, and a running timeout continues; another text is another revision."""
     with Appliance(tmp_path).started() as policies:
         first = await policies.load(PolicyLoad(OTHER, confirm_within=100.0), "adam")
         again = await policies.load(PolicyLoad(OTHER, "once more"), "eve")

@@ -1,4 +1,4 @@
-"""What control does before it serves again."""
+"""Control's start and end."""
 
 import asyncio
 import ipaddress
@@ -9,8 +9,8 @@ from typing import Any, cast
 import pytest
 
 from appliance.control.process import _end_others, _restore
-from appliance.master.endpoints.endpoint_addresses import Places
-from appliance.master.endpoints.proxy_endpoints import Faces
+from appliance.master.endpoints.node_ports import NodePorts
+from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
 from appliance.master.reconcile.enactor import Enactor, write
@@ -23,20 +23,20 @@ URI = "http://10.0.0.5:4000/"
 
 
 def fail(reason: str) -> None:
-    """The store could not write."""
+    """Fail if the store could not write."""
     raise AssertionError(reason)
 
 
-class Ports(idle_class(Faces)):  # type: ignore[misc]  # it is made
-    """Every port can be had again."""
+class Ports(idle_class(ProxyEndpoints)):  # type: ignore[misc]  # it is made
+    """Ports that can all be bound again."""
 
     async def reopen(self, _incarnation: Incarnation) -> list[Durable]:
-        """As `Faces`."""
+        """Reopen, as `ProxyEndpoints` does."""
         return []
 
 
-async def test_what_comes_back_is_decided_by_the_policy_in_force(tmp_path: Path) -> None:
-    """The policy may have changed while the appliance was down: it is applied when all nodes are there again."""
+async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None:
+    """The policy may have changed during a stop: it is applied when all nodes are restored."""
     store = StateStore(tmp_path, failed=fail)
     before = Registry()
     host = ipaddress.ip_address("10.0.0.5")
@@ -54,12 +54,13 @@ async def test_what_comes_back_is_decided_by_the_policy_in_force(tmp_path: Path)
 
     policies = SimpleNamespace(current="the new policy")
     parts = SimpleNamespace(
-        registry=registry,
-        grants=idle(Grants),
-        enactor=idle(Enactor),
-        faces=Ports(),
-        places=idle(Places),
-        policy_changed=changed,
+        core=SimpleNamespace(registry=registry, grants=idle(Grants)),
+        endpoints=SimpleNamespace(
+            enactor=idle(Enactor),
+            faces=Ports(),
+            places=idle(NodePorts),
+            enforcement=SimpleNamespace(policy_changed=changed),
+        ),
     )
     base = SimpleNamespace(sockets={}, store=store, policies=policies)
     await _restore(cast(Any, base), cast(Any, parts))
@@ -67,8 +68,8 @@ async def test_what_comes_back_is_decided_by_the_policy_in_force(tmp_path: Path)
     assert decided == [("the new policy", ["/secret"])]
 
 
-def test_what_is_under_way_at_the_end_is_written_before_the_state_is_closed(tmp_path: Path) -> None:
-    """A request that changes state while it is being ended does so before the store is closed, and is kept."""
+def test_requests_in_progress_are_stored_before_the_end(tmp_path: Path) -> None:
+    """A request that changes state during the shutdown is written before the store is closed."""
     store = StateStore(tmp_path, failed=fail)
 
     async def scenario() -> bool:

@@ -1,38 +1,36 @@
-"""What a host is to the shares: by the policy in force, and by what it has registered."""
+"""The quota class of a host: from the policy in force and its registrations."""
 
 import ipaddress
 
 from appliance.channel.answers.recording_answers import APPLIANCE, ROBOT, UNKNOWN
-from appliance.control.quota_class import HostStanding, charged_to
+from appliance.control.quota_class import HostQuotaClass, charged_to
 from appliance.policy.policy_compiler import compile_policy
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 
 NAMED, OTHER = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
 
 
-def test_standing_follows_reloads_and_registrations() -> None:
-    """A rule that names the address, then a registration, raise a host; without them it is a stranger again."""
+def test_the_class_follows_reloads_and_registrations() -> None:
+    """A rule with the address, then a registration, raise a host; without them it is unknown again."""
     policies = [
         compile_policy("[Nodes]\n/a = 10.0.0.1\n", file="a.ini"),
         compile_policy("[Nodes]\n/a = 10.0.0.2\n", file="b.ini"),
     ]
     registered = dict[object, int]()
-    standing = HostStanding(lambda: policies[0], lambda host: registered.get(host, 0))
-    assert (standing(NAMED), standing(OTHER)) == (Standing.NAMED, Standing.STRANGER)
+    quota_class = HostQuotaClass(lambda: policies[0], lambda host: registered.get(host, 0))
+    assert (quota_class(NAMED), quota_class(OTHER)) == (QuotaClass.NAMED, QuotaClass.UNKNOWN)
     registered[OTHER] = 1
-    assert standing(OTHER) is Standing.REGISTERED
+    assert quota_class(OTHER) is QuotaClass.REGISTERED
     registered.clear()
     policies.reverse()
-    assert (standing(NAMED), standing(OTHER)) == (Standing.STRANGER, Standing.NAMED)
-    assert standing(ipaddress.ip_address("127.0.0.1")) is Standing.NAMED
+    assert (quota_class(NAMED), quota_class(OTHER)) == (QuotaClass.UNKNOWN, QuotaClass.NAMED)
+    assert quota_class(ipaddress.ip_address("127.0.0.1")) is QuotaClass.NAMED
 
 
 def test_recordings_are_charged_by_the_policys_names() -> None:
-    """The robot's machine is the robot, hosts of one network are one, and so are all unknown hosts."""
+    """The robot's host counts as the robot; hosts of one network, and all unknown hosts, count as one."""
     policy = compile_policy(
-        "[Nodes]\n/a = robot 10.0.0.9 10.1.0.0/16\n",
-        file="p.ini",
-        robot=[ipaddress.ip_address("172.17.0.1")],
+        "[Nodes]\n/a = robot 10.0.0.9 10.1.0.0/16\n", file="p.ini", robot=[ipaddress.ip_address("172.17.0.1")]
     )
     hosts = ("172.17.0.1", "127.0.0.1", "10.0.0.9", "10.1.2.3", "10.9.9.9", "")
     assert [charged_to(policy, host) for host in hosts] == [

@@ -1,12 +1,13 @@
-"""Tests of `appliance.control.rest` over a real link, with stand-ins for what it administers."""
+"""Tests of `appliance.control.rest` over a real link, with stand-ins for administration, tokens and trail."""
 
 import asyncio
 import socket
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
+import pytest
 
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import messages
@@ -15,7 +16,7 @@ from appliance.channel.answers.status import Status
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages.api import (
     ApiLink,
-    Asked,
+    ClientRequest,
     RequestAnswered,
     RequestMade,
     RequestWithdrawn,
@@ -29,19 +30,21 @@ from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
 from tests.support.heard import Heard
 
+pytestmark = pytest.mark.anyio
+
 VIEWER, VIEWER_TOKEN = make_token("alice", "viewer", now=time.time(), seconds=600)
 ADMIN, TOKEN = make_token("w", "admin", now=time.time(), seconds=600)
 
 
 def kept(row: TokenRow) -> TokenKept:
-    """What the api is told of a token."""
+    """Return a token's record as the api gets it."""
     assert row.keys is not None
     return TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires, row.keys.reading)
 
 
 def loading(number: int, text: str, shown: str = TOKEN) -> RequestMade:
-    """A policy to load, as an honest api passes it on."""
-    asked = Asked("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", text.encode())
+    """Return a policy to load, as an honest api passes it on."""
+    asked = ClientRequest("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", text.encode())
     return RequestMade(number, PolicyLoad(text), shown, asked)
 
 
@@ -52,13 +55,13 @@ class Everything:
         self.asked: list[tuple[AnyRequest, str]] = []
         self.recorded: list[dict[str, Any]] = []
         self.obstacle: str | None = None
-        self.ends: list[Channel] = []  # closed after the play
-        self.only_slow = False  # whether only others than the status wait for `go`
+        self.ends: list[Channel] = []  # closed after the run
+        self.only_slow = False  # whether only requests other than the status wait for `go`
         self.go = asyncio.Event()
         self.go.set()
 
     async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer[Any]:
-        """Answer when told to."""
+        """Answer when the test says so."""
         if not isinstance(request, StatusWanted) or not self.only_slow:
             await self.go.wait()
         try:
@@ -71,15 +74,15 @@ class Everything:
         return AdminAnswer(True, example(Status, nodes=len(self.asked)))
 
     def usable(self) -> list[TokenKept]:
-        """Two tokens."""
+        """Return two tokens."""
         return [kept(VIEWER), kept(ADMIN)]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
-        """One of them."""
+        """Return one of them."""
         return {VIEWER.id: VIEWER, ADMIN.id: ADMIN}.get(token_id)
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
-        """Note a record."""
+        """Add a record."""
         self.recorded.append({"event": event, "reason": reason, **fields})
         return "id"
 
@@ -99,269 +102,213 @@ class Api:
         self.heard = self._ear.messages
 
     async def until(self, count: int) -> list[Any]:
-        """What was heard, once it is so much."""
+        """Return what was received, once it has this length."""
         return await self._ear.until(count)
 
 
-def run(
-    play: Callable[[Everything, RestLink], Awaitable[None]], served: Callable[[str], None] = print
-) -> None:
-    """Play one conversation."""
+@pytest.fixture
+def pins() -> list[str]:
+    """Return what the api reports of its key."""
+    return []
 
-    async def whole() -> None:
-        world = Everything()
-        link = RestLink(world, world, world, served=served, require_proof=False)  # type: ignore[arg-type]  # stands in for all three
-        try:
-            await play(world, link)
-        finally:
-            for end in world.ends:
-                end.close()
 
-    asyncio.run(whole())
+@pytest.fixture
+def world() -> Iterator[Everything]:
+    """Return the parts around the link, whose channels are closed at the end."""
+    world = Everything()
+    yield world
+    for end in world.ends:
+        end.close()
+
+
+@pytest.fixture
+def link(world: Everything, pins: list[str]) -> RestLink:
+    """Return control's end."""
+    return RestLink(world, world, world, served=pins.append, require_proof=False)  # type: ignore[arg-type]  # stands in for all three
+
+
+@pytest.fixture
+async def api(world: Everything, link: RestLink) -> Api:
+    """Return the first api of the link."""
+    return Api(world, link)
 
 
 def answer_of(message: RequestAnswered) -> AdminAnswer[Status]:
-    """What was answered; a status, if anything."""
+    """Return the answer; a status, if any."""
     return decode(message.answer, StatusWanted())
 
 
-def test_tokens_are_told_at_once_and_after_every_change() -> None:
-    """A new api knows them first of all; a change is told without being asked."""
+async def test_tokens_are_sent_at_once_and_after_every_change(link: RestLink, api: Api) -> None:
+    """A new api gets the tokens first, and each change without a request."""
+    assert await api.until(1) == [TokensStated([kept(VIEWER), kept(ADMIN)])]
+    link.state_tokens()
+    assert len(await api.until(2)) == 2
 
-    async def play(world: Everything, link: RestLink) -> None:
+
+async def test_enrolments_block_no_other_requests(world: Everything, api: Api) -> None:
+    """Those that wait for charon run beside other requests, up to a limit, and are then answered."""
+    world.only_slow = True
+    world.go.clear()
+    for number in range(20):
+        api.channel.send(RequestMade(number, HostEnrol(f"h{number}", "request", "10.0.0.1")))
+    api.channel.send(RequestMade(99, StatusWanted(), TOKEN))
+    heard = (await api.until(6))[1:]
+    assert [answer_of(one).trouble for one in heard if one.number != 99] == ["busy"] * 4
+    assert [answer_of(one).ok for one in heard if one.number == 99] == [True]
+    world.go.set()
+    assert sum(answer_of(one).ok for one in (await api.until(22))[1:]) == 17
+
+
+async def test_the_pin_of_the_api_is_passed_on(link: RestLink, api: Api, pins: list[str]) -> None:
+    """The api sends the pin of its key; an invalid one ends the link."""
+    pin = "sha256//" + "A" * 43 + "="
+    api.channel.send(RestServed(pin))
+    api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
+    await api.until(2)
+    assert pins == [pin]
+    api.channel.send(RestServed("$(reboot)"))
+    async with asyncio.timeout(20):
+        await api.closed.wait()
+    assert pins == [pin]
+
+
+async def test_answers_are_in_order_with_their_numbers(world: Everything, api: Api) -> None:
+    """Requests run one after the other, each on behalf of its token."""
+    for number in (7, 3, 9):
+        api.channel.send(RequestMade(number, StatusWanted(), VIEWER_TOKEN if number == 3 else TOKEN))
+    heard = await api.until(4)
+    assert [one.number for one in heard[1:]] == [7, 3, 9]
+    assert [answer_of(one).given().nodes for one in heard[1:]] == [1, 2, 3]
+    assert [who for _request, who in world.asked] == ["w", "alice", "w"]
+
+
+async def test_a_flood_is_answered_busy_at_once(world: Everything, api: Api) -> None:
+    """Requests beyond the limit are answered busy while the others are served."""
+    world.go.clear()
+    for number in range(200):
+        api.channel.send(RequestMade(number, StatusWanted(), TOKEN))
+    heard = await api.until(1 + 200 - 65)
+    assert {answer_of(one).trouble for one in heard[1:]} == {"busy"}
+    world.go.set()
+    heard = await api.until(201)
+    assert sum(answer_of(one).ok for one in heard[1:]) == len(world.asked) <= 65
+
+
+async def test_abandoned_orders_do_not_take_effect(world: Everything, api: Api, pins: list[str]) -> None:
+    """An order past its timeout, or whose client or api is gone, is withdrawn; others take effect."""
+    world.go.clear()
+    api.channel.send(loading(1, "answered"))
+    api.channel.send(msgspec.structs.replace(loading(2, "late"), until=time.monotonic() - 1.0))
+    api.channel.send(loading(3, "gone"))
+    api.channel.send(RequestWithdrawn(3))
+    api.channel.send(RequestWithdrawn(77))
+    api.channel.send(RequestMade(4, StatusWanted(), "nobody's"))
+    api.channel.send(RestServed("sha256//" + "A" * 43 + "="))
+    async with asyncio.timeout(20):
+        while not pins:  # the last message: the others are read as well
+            await asyncio.sleep(0)
+    world.go.set()
+    heard = {one.number: answer_of(one) for one in (await api.until(5))[1:]}
+    assert [heard[number].trouble for number in (1, 2, 3)] == ["", "busy", "busy"]
+    assert "nothing was changed" in heard[2].error
+    assert [request.text for request, _who in world.asked if isinstance(request, PolicyLoad)] == ["answered"]
+
+
+async def test_a_defect_costs_one_answer(api: Api) -> None:
+    """The answer reveals nothing of the error, and the next request is served."""
+    api.channel.send(loading(1, "defect"))
+    api.channel.send(RequestMade(2, StatusWanted(), TOKEN))
+    _tokens, failed, served = await api.until(3)
+    assert (answer_of(failed).ok, answer_of(failed).trouble) == (False, "failed")
+    assert "secret" not in answer_of(failed).error
+    assert answer_of(served).ok
+
+
+async def test_nothing_is_changed_while_the_log_cannot_be_written(world: Everything, api: Api) -> None:
+    """With on_audit_failure deny a change is refused with the reason; reading is possible."""
+    world.obstacle = "the audit log cannot be written: disk full"
+    api.channel.send(loading(1, "[Nodes]"))
+    api.channel.send(RequestMade(2, StatusWanted(), TOKEN))
+    _tokens, refused, served = await api.until(3)
+    assert (answer_of(refused).trouble, answer_of(refused).error) == ("failed", world.obstacle)
+    assert answer_of(served).ok
+    assert [request for request, _who in world.asked] == [StatusWanted()]
+
+
+async def test_a_change_with_a_wrong_name_is_refused(world: Everything, api: Api) -> None:
+    """An api that invents a name, or a role for a token, changes nothing; reading continues."""
+    for number, shown in enumerate(("operator", "disk", "", VIEWER_TOKEN)):
+        api.channel.send(loading(number, "[Nodes]", shown))
+    api.channel.send(RequestMade(8, StatusWanted(), VIEWER_TOKEN))
+    api.channel.send(loading(9, "[Nodes]"))
+    answers = (await api.until(7))[1:]
+    assert [answer_of(one).trouble for one in answers] == ["forbidden"] * 4 + ["", ""]
+    assert [who for _request, who in world.asked] == ["alice", "w"]
+
+
+async def test_invalid_messages_end_the_link(world: Everything, link: RestLink) -> None:
+    """A request for a token's creation, a message of another link, and garbage close it; another api is served."""
+    token = {"message": "RequestMade", "number": 1, "shown": TOKEN, "request": {"verb": "token add"}}
+    for body in (
+        msgspec.msgpack.encode(token),
+        msgspec.msgpack.encode(messages.Stop()),
+        b"\xc1nonsense",
+        msgspec.msgpack.encode(TokensStated([])),
+    ):
         api = Api(world, link)
-        assert await api.until(1) == [TokensStated([kept(VIEWER), kept(ADMIN)])]
-        link.state_tokens()
-        assert len(await api.until(2)) == 2
-
-    run(play)
-
-
-def test_enrolments_hold_nobody_up() -> None:
-    """Those that wait for charon are served beside the others, so many at most; then they are answered too."""
-
-    async def play(world: Everything, link: RestLink) -> None:
-        world.only_slow = True
-        world.go.clear()
-        api = Api(world, link)
-        for number in range(20):
-            api.channel.send(RequestMade(number, HostEnrol(f"h{number}", "request", "10.0.0.1")))
-        api.channel.send(RequestMade(99, StatusWanted(), TOKEN))
-        heard = (await api.until(6))[1:]
-        assert [answer_of(one).trouble for one in heard if one.number != 99] == ["busy"] * 4
-        assert [answer_of(one).ok for one in heard if one.number == 99] == [True]
-        world.go.set()
-        assert sum(answer_of(one).ok for one in (await api.until(22))[1:]) == 17
-
-    run(play)
-
-
-def test_what_it_is_recognised_by_is_passed_on() -> None:
-    """The api says the pin of its key; anything but one ends the link."""
-
-    pins: list[str] = []
-
-    async def play(world: Everything, link: RestLink) -> None:
-        api = Api(world, link)
-        pin = "sha256//" + "A" * 43 + "="
-        api.channel.send(RestServed(pin))
-        api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
-        await api.until(2)
-        assert pins == [pin]
-        api.channel.send(RestServed("$(reboot)"))
+        await api.until(1)
+        api.raw.sendall(len(body).to_bytes(4, "big") + body)
         async with asyncio.timeout(20):
             await api.closed.wait()
-        assert pins == [pin]
-
-    run(play, pins.append)
-
-
-def test_answers_bear_their_numbers_in_order() -> None:
-    """Requests are carried out one after the other, each on behalf of its token."""
-
-    async def play(world: Everything, link: RestLink) -> None:
-        api = Api(world, link)
-        for number in (7, 3, 9):
-            api.channel.send(RequestMade(number, StatusWanted(), VIEWER_TOKEN if number == 3 else TOKEN))
-        heard = await api.until(4)
-        assert [one.number for one in heard[1:]] == [7, 3, 9]
-        assert [answer_of(one).given().nodes for one in heard[1:]] == [1, 2, 3]
-        assert [who for _request, who in world.asked] == ["w", "alice", "w"]
-
-    run(play)
+    assert world.asked == []
+    api = Api(world, link)
+    api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
+    assert answer_of((await api.until(2))[1]).ok
 
 
-def test_more_than_may_wait_are_told_so_at_once() -> None:
-    """A flood of requests is bounded: what is too much is answered busy while the others are served."""
-
-    async def play(world: Everything, link: RestLink) -> None:
-        world.go.clear()
-        api = Api(world, link)
-        for number in range(200):
-            api.channel.send(RequestMade(number, StatusWanted(), TOKEN))
-        heard = await api.until(1 + 200 - 65)
-        assert {answer_of(one).trouble for one in heard[1:]} == {"busy"}
-        world.go.set()
-        heard = await api.until(201)
-        assert sum(answer_of(one).ok for one in heard[1:]) == len(world.asked) <= 65
-
-    run(play)
-
-
-def test_what_no_client_waits_for_does_not_take_effect() -> None:
-    """An order whose time is over, whose client is gone, or whose api is, is withdrawn; the others take effect."""
-    read = asyncio.Event()
-
-    async def play(world: Everything, link: RestLink) -> None:
-        world.go.clear()
-        api = Api(world, link)
-        api.channel.send(loading(1, "answered"))
-        api.channel.send(msgspec.structs.replace(loading(2, "late"), until=time.monotonic() - 1.0))
-        api.channel.send(loading(3, "gone"))
-        api.channel.send(RequestWithdrawn(3))
-        api.channel.send(RequestWithdrawn(77))
-        api.channel.send(RequestMade(4, StatusWanted(), "nobody's"))
-        api.channel.send(RestServed("sha256//" + "A" * 43 + "="))
-        async with asyncio.timeout(20):
-            await read.wait()  # what was sent before the pin, too
-        world.go.set()
-        heard = {one.number: answer_of(one) for one in (await api.until(5))[1:]}
-        assert [heard[number].trouble for number in (1, 2, 3)] == ["", "busy", "busy"]
-        assert "nothing was changed" in heard[2].error
-        assert [request.text for request, _who in world.asked if isinstance(request, PolicyLoad)] == [
-            "answered"
-        ]
-
-    run(play, lambda _pin: read.set())
+async def test_a_new_api_does_not_wait_for_the_old_ones_request(world: Everything, link: RestLink) -> None:
+    """An api that dies during a request leaves none behind, and its successor is served at once."""
+    world.go.clear()
+    first = Api(world, link)
+    for number in range(3):
+        first.channel.send(RequestMade(number, StatusWanted(), VIEWER_TOKEN))
+    await first.until(1)
+    first.channel.close()
+    second = Api(world, link)
+    second.channel.send(RequestMade(9, StatusWanted(), TOKEN))
+    await second.until(1)
+    world.go.set()
+    assert (await second.until(2))[1].number == 9
+    assert [who for _request, who in world.asked].count("alice") <= 1
 
 
-def test_a_defect_is_one_answer() -> None:
-    """What fails inside tells nothing of itself, and the next request is served."""
-
-    async def play(world: Everything, link: RestLink) -> None:
-        api = Api(world, link)
-        api.channel.send(loading(1, "defect"))
-        api.channel.send(RequestMade(2, StatusWanted(), TOKEN))
-        _tokens, failed, served = await api.until(3)
-        assert (answer_of(failed).ok, answer_of(failed).trouble) == (False, "failed")
-        assert "secret" not in answer_of(failed).error
-        assert answer_of(served).ok
-
-    run(play)
-
-
-def test_nothing_is_changed_while_the_log_cannot_be_written() -> None:
-    """With on_audit_failure deny a change is refused with the reason; looking is still possible."""
-
-    async def play(world: Everything, link: RestLink) -> None:
-        world.obstacle = "the audit log cannot be written: disk full"
-        api = Api(world, link)
-        api.channel.send(loading(1, "[Nodes]"))
-        api.channel.send(RequestMade(2, StatusWanted(), TOKEN))
-        _tokens, refused, served = await api.until(3)
-        assert (answer_of(refused).trouble, answer_of(refused).error) == ("failed", world.obstacle)
-        assert answer_of(served).ok
-        assert [request for request, _who in world.asked] == [StatusWanted()]
-
-    run(play)
+async def test_an_api_that_does_not_read_loses_its_link(world: Everything, link: RestLink) -> None:
+    """Unread answers are bounded."""
+    here, there = socket.socketpair()
+    control = Channel(here, ApiLink, limit=100_000)
+    link.attach(control)
+    for _ in range(5000):
+        link.state_tokens()
+    peer = Channel(there, ApiLink)
+    world.ends += [control, peer]
+    heard = 0
+    async with asyncio.timeout(20):
+        while True:
+            try:
+                heard += len(peer.receive())
+            except ChannelClosedError:
+                break
+            await asyncio.sleep(0)
+    assert 0 < heard < 5000
 
 
-def test_a_change_in_a_name_that_may_not_is_refused() -> None:
-    """An api that says a name of its own, or of a token with another role, changes nothing; looking goes on."""
-
-    async def play(world: Everything, link: RestLink) -> None:
-        api = Api(world, link)
-        for number, shown in enumerate(("operator", "disk", "", VIEWER_TOKEN)):
-            api.channel.send(loading(number, "[Nodes]", shown))
-        api.channel.send(RequestMade(8, StatusWanted(), VIEWER_TOKEN))
-        api.channel.send(loading(9, "[Nodes]"))
-        answers = (await api.until(7))[1:]
-        assert [answer_of(one).trouble for one in answers] == ["forbidden"] * 4 + ["", ""]
-        assert [who for _request, who in world.asked] == ["alice", "w"]
-
-    run(play)
-
-
-def test_what_is_not_of_the_link_ends_it() -> None:
-    """A request that makes a token, a message of another link and nonsense close it; another api is served."""
-
-    async def play(world: Everything, link: RestLink) -> None:
-        token = {"message": "RequestMade", "number": 1, "shown": TOKEN, "request": {"verb": "token add"}}
-        for body in (
-            msgspec.msgpack.encode(token),
-            msgspec.msgpack.encode(messages.Stop()),
-            b"\xc1nonsense",
-            msgspec.msgpack.encode(TokensStated([])),
-        ):
-            api = Api(world, link)
-            await api.until(1)
-            api.raw.sendall(len(body).to_bytes(4, "big") + body)
-            async with asyncio.timeout(20):
-                await api.closed.wait()
-        assert world.asked == []
-        api = Api(world, link)
-        api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
-        assert answer_of((await api.until(2))[1]).ok
-
-    run(play)
-
-
-def test_the_next_api_does_not_wait_for_the_last_ones_request() -> None:
-    """An api that dies amid a request leaves none of its own behind, and its successor is served at once."""
-
-    async def play(world: Everything, link: RestLink) -> None:
-        world.go.clear()
-        first = Api(world, link)
-        for number in range(3):
-            first.channel.send(RequestMade(number, StatusWanted(), VIEWER_TOKEN))
-        await first.until(1)
-        first.channel.close()
-        second = Api(world, link)
-        second.channel.send(RequestMade(9, StatusWanted(), TOKEN))
-        await second.until(1)
-        world.go.set()
-        assert (await second.until(2))[1].number == 9
-        assert [who for _request, who in world.asked].count("alice") <= 1
-
-    run(play)
-
-
-def test_an_api_that_does_not_read_loses_its_link() -> None:
-    """Answers that nobody takes are bounded."""
-
-    async def play(world: Everything, link: RestLink) -> None:
-        here, there = socket.socketpair()
-        control = Channel(here, ApiLink, limit=100_000)
-        link.attach(control)
-        for _ in range(5000):
-            link.state_tokens()
-        peer = Channel(there, ApiLink)
-        world.ends += [control, peer]
-        heard = 0
-        async with asyncio.timeout(20):
-            while True:
-                try:
-                    heard += len(peer.receive())
-                except ChannelClosedError:
-                    break
-                await asyncio.sleep(0)
-        assert 0 < heard < 5000
-
-    run(play)
-
-
-def test_calls_are_recorded_with_their_outcome() -> None:
-    """Who was refused is a denial and a warning; who is nobody has no name; long texts are cut."""
-
-    async def play(world: Everything, link: RestLink) -> None:
-        api = Api(world, link)
-        api.channel.send(RestCalled("10.0.0.1", "alice", "GET", "/v1/policy", 200, "", 12))
-        api.channel.send(RestCalled("10.0.0.2", "", "GET", "/" + "x" * 5000, 401, "no token", 5, 3))
-        api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
-        await api.until(2)
-        served, refused = world.recorded
-        assert (served["event"], served["decision"], served["who"]) == ("rest call", "allow", "alice")
-        assert (refused["decision"], refused["who"], refused["count"]) == ("deny", None, 3)
-        assert len(refused["resource"]) <= 300
-
-    run(play)
+async def test_calls_are_recorded_with_their_outcome(world: Everything, api: Api) -> None:
+    """A refusal is a denial and a warning; an unknown caller has no name; long texts are cut."""
+    api.channel.send(RestCalled("10.0.0.1", "alice", "GET", "/v1/policy", 200, "", 12))
+    api.channel.send(RestCalled("10.0.0.2", "", "GET", "/" + "x" * 5000, 401, "no token", 5, 3))
+    api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
+    await api.until(2)
+    served, refused = world.recorded
+    assert (served["event"], served["decision"], served["who"]) == ("rest call", "allow", "alice")
+    assert (refused["decision"], refused["who"], refused["count"]) == ("deny", None, 3)
+    assert len(refused["resource"]) <= 300

@@ -1,4 +1,4 @@
-"""What the allocator keeps of large values goes back to the system, and only then."""
+"""Free memory that the allocator keeps goes back to the system, if it is much."""
 
 import subprocess
 import sys
@@ -9,7 +9,7 @@ from appliance.control.spare_memory import MUCH, SpareMemory
 
 pytestmark = pytest.mark.anyio
 
-# A hundred megabytes in pieces come free below the last piece, which is still in use.
+# Pieces of a hundred megabytes are freed below the last piece, which is still in use.
 _FREED = """
 import asyncio
 from appliance.control.spare_memory import MUCH, SpareMemory, resident
@@ -25,26 +25,26 @@ print(kept > MUCH, resident() - before < MUCH, kept >> 20, (resident() - before)
 
 
 class Process:
-    """A process of some size, of which nothing is live beyond `live`."""
+    """A process of some size, with only `live` in use."""
 
     def __init__(self, size: int) -> None:
         self.size = self.live = size
         self.times = 0
 
     def give_back(self) -> None:
-        """What is not live goes."""
+        """Return the memory that is not in use."""
         self.size = self.live
         self.times += 1
 
 
-async def test_what_was_freed_goes_back() -> None:
-    """Of what was freed, glibc keeps more than is much; after one look it does not."""
+async def test_freed_memory_is_returned() -> None:
+    """glibc keeps much of the freed memory; after one check it does not."""
     done = subprocess.run([sys.executable, "-c", _FREED], capture_output=True, text=True, check=True)
     assert done.stdout.split()[:2] == ["True", "True"], done.stdout
 
 
-async def test_what_comes_free_late_goes_back_as_well() -> None:
-    """Much is in use at one look, and free and kept at the next: that look gives it back."""
+async def test_memory_freed_later_is_returned() -> None:
+    """Memory in use at one check and freed before the next is returned by the next."""
     process = Process(100 << 20)
     spare = SpareMemory(size=lambda: process.size, give_back=process.give_back)
     process.size = process.live = (100 << 20) + 2 * MUCH
@@ -54,8 +54,8 @@ async def test_what_comes_free_late_goes_back_as_well() -> None:
     assert process.size == 100 << 20
 
 
-async def test_little_is_not_worth_it() -> None:
-    """Where there is little more than the least that the process has had, nothing is done."""
+async def test_a_little_memory_is_kept() -> None:
+    """Slightly above the lowest use of the process nothing is returned."""
     process = Process(200 << 20)
     spare = SpareMemory(size=lambda: process.size, give_back=process.give_back)
     process.size = process.live = 50 << 20

@@ -1,4 +1,4 @@
-"""What is switched off and forgotten."""
+"""Alarms about what was disabled and forgotten."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +12,7 @@ from appliance.store.state_file import StateStore
 
 
 class Scene:
-    """Monitors and a policy, as far as the watch looks at them; `recorded` are the alarms."""
+    """Monitors and a policy for the watch; `recorded` are the alarms."""
 
     def __init__(self, store: StateStore) -> None:
         self.store = store
@@ -22,7 +22,7 @@ class Scene:
         self.recorded: list[str] = []
 
     def watch(self, forgotten_after: float | None = 3600.0) -> SwitchedOffWatch:
-        """Begin a life of control."""
+        """Begin a run of control."""
         monitors: Any = SimpleNamespace(
             switches=SimpleNamespace(switched_off=lambda: self.off),
             returns=SimpleNamespace(until=lambda name: self.until.get(name)),  # noqa: PLW0108  of whatever is there then
@@ -38,16 +38,16 @@ class Scene:
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Iterator[Scene]:
-    """Nothing is off."""
+    """Return a scene where everything is enabled."""
     store = StateStore(tmp_path, failed=pytest.fail)
     yield Scene(store)
     store.close()
 
 
 @pytest.mark.anyio
-async def test_what_is_off_without_an_end_is_an_alarm_once(scene: Scene) -> None:
-    """After `forgotten_after` of running it is recorded and marked, over restarts, until it is brought back."""
-    scene.off = {"a": False, "b": "on trial"}
+async def test_a_disabled_monitor_is_an_alarm_once(scene: Scene) -> None:
+    """After `forgotten_after` of running it is recorded and marked, over restarts, until it is enabled."""
+    scene.off = {"a": False, "b": "shadow"}
     watch = scene.watch()
     watch.look(3000.0)
     assert [row.forgotten for row in watch.rows()] == [False, False]
@@ -70,8 +70,8 @@ async def test_what_is_off_without_an_end_is_an_alarm_once(scene: Scene) -> None
     assert [row.forgotten for row in watch.rows()] == [False]
 
 
-def test_what_comes_back_by_itself_is_not_forgotten(scene: Scene) -> None:
-    """While its time goes it has no age; when it is still off after its time, it has."""
+def test_a_timed_change_is_not_forgotten(scene: Scene) -> None:
+    """It has an age only if it is still disabled after its time."""
     scene.off, scene.until = {"a": False}, {"a": 1e12}
     watch = scene.watch()
     watch.look(9000.0)
@@ -81,8 +81,8 @@ def test_what_comes_back_by_itself_is_not_forgotten(scene: Scene) -> None:
     assert len(scene.recorded) == 1
 
 
-def test_an_audit_only_section_is_forgotten_as_a_monitor_is(scene: Scene) -> None:
-    """A section of the policy that refuses nothing is listed with its age, and may be configured to be no alarm."""
+def test_an_audit_only_section_is_forgotten_like_a_monitor(scene: Scene) -> None:
+    """It is listed with its age; the configuration may turn the alarm off."""
     scene.audit_only = {"publish", "subscribe"}
     watch = scene.watch(None)
     watch.look(1e9)

@@ -7,7 +7,7 @@ import pytest
 
 from appliance.audit.log import AuditLog
 from appliance.channel.admin import TokenAdd
-from appliance.control.token_orders import Tokens
+from appliance.control.token_orders import TokenOrders
 from appliance.store.access_tokens import is_secret, parse_token
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.anyio
 
 
 class Lives:
-    """The lives of control on one state."""
+    """Several runs of control on one state."""
 
     def __init__(self, home: Path) -> None:
         self.home = home
@@ -25,17 +25,17 @@ class Lives:
         self.trail = AuditTrail(self.log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
         self.store: StateStore | None = None
 
-    def next(self) -> Tokens:
-        """A control starts, after the one before died."""
+    def next(self) -> TokenOrders:
+        """Start control after the previous one died."""
         if self.store is not None:
             self.store.close()
         self.store = StateStore(self.home, failed=pytest.fail)
-        return Tokens(self.store, self.trail, lambda: None)
+        return TokenOrders(self.store, self.trail, lambda: None)
 
 
 @pytest.fixture
 def lives(tmp_path: Path) -> Iterator[Lives]:
-    """A state directory."""
+    """Return a state directory."""
     lives = Lives(tmp_path)
     yield lives
     assert lives.store is not None
@@ -43,16 +43,16 @@ def lives(tmp_path: Path) -> Iterator[Lives]:
     lives.log.close()
 
 
-def opens(tokens: Tokens, text: str | None) -> bool:
-    """Whether a token's text is that of one that may be used."""
+def opens(tokens: TokenOrders, text: str | None) -> bool:
+    """Whether a token is valid."""
     assert text is not None
     parsed = parse_token(text)
     assert parsed is not None
     return any(one.id == parsed[0] and is_secret(parsed[1], one.salt, one.hash) for one in tokens.usable())
 
 
-async def test_a_token_that_nobody_was_told_is_replaced(lives: Lives) -> None:
-    """Control dies before it could say what the first token is: the next one makes another, the lost one ends."""
+async def test_an_unannounced_token_is_replaced(lives: Lives) -> None:
+    """Control dies before it could announce the first token: the next one makes another and revokes the lost one."""
     lost = await lives.next().first()
     tokens = lives.next()
     assert opens(tokens, lost)
@@ -62,8 +62,8 @@ async def test_a_token_that_nobody_was_told_is_replaced(lives: Lives) -> None:
     assert [one.name for one in tokens.usable()] == ["first"]
 
 
-async def test_a_token_that_was_told_stays(lives: Lives) -> None:
-    """Once it is told, no later control makes another, be it before or after it learns so."""
+async def test_an_announced_token_stays(lives: Lives) -> None:
+    """No later control makes another, whether or not it knows of the announcement."""
     tokens = lives.next()
     text = await tokens.first()
     tokens.told()
@@ -74,8 +74,8 @@ async def test_a_token_that_was_told_stays(lives: Lives) -> None:
     assert opens(later, text)
 
 
-async def test_a_control_that_learns_late_that_it_was_told_keeps_it(lives: Lives) -> None:
-    """The supervisor announced it, control died before it heard so: the next one is told first, and makes no other."""
+async def test_a_late_notice_of_the_announcement_counts(lives: Lives) -> None:
+    """Control died before the supervisor's notice: the next one gets it first, and makes no other token."""
     text = await lives.next().first()
     tokens = lives.next()
     tokens.told()
@@ -83,15 +83,15 @@ async def test_a_control_that_learns_late_that_it_was_told_keeps_it(lives: Lives
     assert opens(tokens, text)
 
 
-async def test_a_state_from_before_has_no_first_token_made(lives: Lives) -> None:
-    """Tokens that were made without this being noted are taken as told."""
+async def test_an_old_state_gets_no_first_token(lives: Lives) -> None:
+    """Tokens from a version without this mark count as announced."""
     tokens = lives.next()
     await tokens.add(TokenAdd("alice", "admin", 60))
     assert await lives.next().first() is None
 
 
-async def test_a_token_that_cannot_be_kept_is_none(lives: Lives, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its text is told to nobody then; it does not stand in the way of the next one of its name."""
+async def test_a_token_that_cannot_be_stored_is_void(lives: Lives, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its text is never announced, and it does not block the next one of its name."""
     tokens = lives.next()
     assert lives.store is not None
 

@@ -1,4 +1,4 @@
-"""Tests of the signature of a release: tools that are none of ours check it, and see what was changed."""
+"""Tests of a release's signature: standard tools check it and find changes."""
 
 import hashlib
 import json
@@ -12,11 +12,11 @@ from distribution.release import main, release
 
 @pytest.fixture
 def released(tmp_path: Path) -> Path:
-    """A folder with two files, signed; key.pem and public.pem beside it."""
+    """Return a folder with two signed files, with key.pem and public.pem beside it."""
     folder = tmp_path / "dist"
     folder.mkdir()
-    (folder / "rosrv_0.1.0_amd64.deb").write_bytes(b"a package")
-    (folder / "rosrv-image_0.1.0_amd64.tar").write_bytes(b"an image")
+    (folder / "rosrv_0.2.0_amd64.deb").write_bytes(b"a package")
+    (folder / "rosrv-image_0.2.0_amd64.tar").write_bytes(b"an image")
     key = tmp_path / "key.pem"
     for command in (
         ("ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", str(key)),
@@ -28,7 +28,7 @@ def released(tmp_path: Path) -> Path:
 
 
 def checks(folder: Path) -> bool:
-    """Whether a site with openssl and coreutils believes it, by the two commands of docs/install.md."""
+    """Whether the two commands of docs/install.md, with openssl and coreutils, accept it."""
     signature = folder.parent / "signature"
     decoded = subprocess.run(
         ["base64", "--decode", "SHA256SUMS.sig"], cwd=folder, capture_output=True, check=False
@@ -52,22 +52,22 @@ def checks(folder: Path) -> bool:
     )
 
 
-def test_others_tools_check_it(released: Path) -> None:
-    """As it was signed it is believed; a second release of the same files says the same of them."""
+def test_standard_tools_check_it(released: Path) -> None:
+    """An unchanged release is accepted; a second one of the same files has the same sums."""
     assert checks(released)
 
 
-@pytest.mark.parametrize("name", ["rosrv_0.1.0_amd64.deb", "provenance.json", "SHA256SUMS", "SHA256SUMS.sig"])
-def test_what_was_changed_is_seen(released: Path, name: str) -> None:
-    """A file, its provenance, the sums or the signature: none can be another."""
+@pytest.mark.parametrize("name", ["rosrv_0.2.0_amd64.deb", "provenance.json", "SHA256SUMS", "SHA256SUMS.sig"])
+def test_changes_are_found(released: Path, name: str) -> None:
+    """Covers a file, its provenance, the sums and the signature."""
     changed = bytearray((released / name).read_bytes())
     changed[5] ^= 1
     (released / name).write_bytes(changed)
     assert not checks(released)
 
 
-def test_the_provenance_names_every_file_and_what_it_was_built_from(released: Path) -> None:
-    """Each file by its digest, the commit, and the lock files."""
+def test_the_provenance_names_files_and_sources(released: Path) -> None:
+    """It has the digest of each file, the commit, and the lock files."""
     statement = json.loads((released / "provenance.json").read_text())
     assert statement["_type"] == "https://in-toto.io/Statement/v1"
     assert {one["name"]: one["digest"]["sha256"] for one in statement["subject"]} == {
@@ -81,10 +81,10 @@ def test_the_provenance_names_every_file_and_what_it_was_built_from(released: Pa
     assert "requirements.lock" in sources
 
 
-def test_another_kind_of_key_is_refused(
+def test_another_kind_of_key_is_rejected(
     released: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What cosign would not take is not signed with."""
+    """A key that cosign does not support is not used."""
     other = tmp_path / "other.pem"
     subprocess.run(
         ["openssl", "genpkey", "-algorithm", "ed25519", "-out", str(other)], check=True, capture_output=True

@@ -1,4 +1,4 @@
-"""What tests of evidence share: a signed log with loads, denials and strange texts, and the appliance that is asked."""
+"""Fixtures of evidence: a signed log with loads, denials and unusual texts, and the appliance of an export."""
 
 import asyncio
 import hashlib
@@ -16,7 +16,7 @@ from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.channel.answers.recording_answers import Recording
 from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
-from appliance.evidence.bundle import Kept, Span, export
+from appliance.evidence.bundle import RecordingSelection, TimeSpan, export
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.answers import example
@@ -55,7 +55,7 @@ NUMBERS = (
 
 
 class Control:
-    """The running appliance of a test, as it is asked by an export."""
+    """A running appliance, as an export sees it."""
 
     def __init__(self, log: AuditLog) -> None:
         self.log = log
@@ -68,20 +68,20 @@ class Control:
         self.recordings: dict[str, Recording] = {}
 
     def load_policy(self, revision: int, text: str, **changes: Any) -> None:
-        """A policy comes into force."""
+        """Bring a policy into force."""
         self.policies[revision] = text
         self.trail.revision = revision
         detail = {"sha256": fingerprint(text), "who": "disk", **changes}
         self.trail.happened("policy loaded", "it is in force", severity=Severity.NOTICE, more=detail)
 
     def load_specifications(self, revision: int, files: dict[str, str]) -> None:
-        """Specifications come into force."""
+        """Bring specifications into force."""
         self.specifications[revision] = files
         detail = {"revision_of_specifications": revision, "sha256": fingerprint_of_all(files)}
         self.trail.happened("specifications loaded", "they are in force", category="monitor", more=detail)
 
     def work(self, count: int = 20) -> None:
-        """Nodes ask, and every third is denied."""
+        """Make requests of nodes; every third is denied."""
         self.worked += count
         for number in range(self.worked - count, self.worked):
             length, whole = LENGTHS[number % len(LENGTHS)], NUMBERS[number % len(NUMBERS)]
@@ -92,8 +92,8 @@ class Control:
             )  # fmt: skip
         assert settle(self.log) is None
 
-    def record(self, folder: Path, bag: bytes, **about: Any) -> Kept:
-        """The recorder has closed a recording of the time up to now; it is in a folder of its own there."""
+    def record(self, folder: Path, bag: bytes, **about: Any) -> RecordingSelection:
+        """Record the time until now and close the recording, in its own folder."""
         digest = hashlib.sha256(bag).hexdigest()
         recording = example(
             Recording, id="ab" * 10, began=self.begun, ended=time.time_ns(), sha256=digest, **about
@@ -102,7 +102,7 @@ class Control:
         (folder / recording.id).mkdir()
         (folder / recording.id / "recording.bag").write_bytes(bag)
         self.recordings[recording.id] = recording
-        return Kept(recording.id, folder)
+        return RecordingSelection(recording.id, folder)
 
     def ask(self, request: AdminRequest[Any]) -> AdminAnswer[Any]:
         """Answer as control does."""
@@ -135,15 +135,15 @@ class Control:
         return None
 
     def exported(self, place: Path, since: int | None = None, until: int | None = None) -> Path:
-        """A bundle in a file."""
-        span = Span(self.begun if since is None else since, time.time_ns() if until is None else until)
+        """Return a bundle in a file."""
+        span = TimeSpan(self.begun if since is None else since, time.time_ns() if until is None else until)
         place.write_bytes(b"".join(export(self.log.path, span, self.ask)))
         return place
 
 
 @pytest.fixture
 def control(make_log: MakeLog) -> Control:
-    """An appliance whose policy and specifications were loaded before the time that is exported."""
+    """Return an appliance whose policy and specifications were loaded before the exported time."""
     running = Control(make_log(checkpoint_every=12, checkpoint_seconds=3600))
     running.load_policy(6, "[Nodes]\nold = *\n")
     running.load_policy(7, "[Nodes]\ndefault = *\né = *\n")

@@ -1,4 +1,4 @@
-"""A bundle has what happened and what was in force, and proves itself with Python and openssl alone."""
+"""A bundle has the events and the rules in force, and proves itself with only Python and openssl."""
 
 import ast
 import hashlib
@@ -31,7 +31,7 @@ from appliance.audit.search import search
 from appliance.channel.answers.recording_answers import RecordedTopic, Trigger
 from appliance.evidence import bundle as bundles
 from appliance.evidence import bundle_verifier
-from appliance.evidence.bundle import VERIFIER, BundleError, Span, export
+from appliance.evidence.bundle import VERIFIER, BundleError, TimeSpan, export
 from tests.support.answers import example
 from tests.support.audit import decision, settle
 from tests.support.control_parts import OPEN
@@ -44,13 +44,13 @@ Members = dict[str, bytes]
 
 
 def members_of(bundle: Path) -> Members:
-    """Everything in a bundle."""
+    """Return all members of a bundle."""
     with zipfile.ZipFile(bundle) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
 def written(members: Members, place: Path) -> Path:
-    """A bundle with these members."""
+    """Write a bundle with these members."""
     with zipfile.ZipFile(place, "w") as archive:
         for name, data in members.items():
             archive.writestr(name, data)
@@ -59,20 +59,20 @@ def written(members: Members, place: Path) -> Path:
 
 @pytest.fixture
 def bundle(control: Control, tmp_path: Path) -> Path:
-    """A bundle of the appliance's working time."""
+    """Return a bundle of the appliance's working time."""
     return control.exported(tmp_path / "bundle.zip")
 
 
 @pytest.fixture
 def pem(key: Ed25519PrivateKey, tmp_path: Path) -> Path:
-    """The key that the reviewer has."""
+    """Return the reviewer's copy of the key."""
     place = tmp_path / "kept.pub"
     place.write_bytes(key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
     return place
 
 
 class Reviewer:
-    """Runs the verifier in this process; `said` is what it printed."""
+    """Runs the verifier in this process; `said` is its output."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str], key: Path) -> None:
         self._capsys = capsys
@@ -80,7 +80,7 @@ class Reviewer:
         self.said = ""
 
     def status(self, bundle: Path, *options: object) -> int:
-        """The exit status."""
+        """Return the exit status."""
         self._capsys.readouterr()
         status = bundle_verifier.main([str(bundle), "--key", str(self._key), *map(str, options)])
         self.said = self._capsys.readouterr().out
@@ -89,12 +89,12 @@ class Reviewer:
 
 @pytest.fixture
 def reviewer(capsys: pytest.CaptureFixture[str], pem: Path) -> Reviewer:
-    """Somebody with the key."""
+    """Return a reviewer with the key."""
     return Reviewer(capsys, pem)
 
 
-def test_it_proves_itself_on_a_machine_with_nothing(bundle: Path, pem: Path, tmp_path: Path) -> None:
-    """The verifier that is in it, run by the system's Python without an environment, on the file and on the folder."""
+def test_it_proves_itself_on_a_bare_machine(bundle: Path, pem: Path, tmp_path: Path) -> None:
+    """The system's Python runs the bundle's verifier without an environment, on the file and on the folder."""
     folder = tmp_path / "unpacked"
     shutil.unpack_archive(bundle, folder)
     options: list[list[object]] = [[bundle, "--key", pem], [folder, "--key", pem], []]
@@ -108,7 +108,7 @@ def test_it_proves_itself_on_a_machine_with_nothing(bundle: Path, pem: Path, tmp
 
 
 def test_an_old_python_runs_the_verifier(tmp_path: Path) -> None:
-    """Python 3.8, as Ubuntu 20.04 has it, knows every word, module and method of it; one that it lacks is found."""
+    """Python 3.8, as in Ubuntu 20.04, supports its syntax, modules and methods; unsupported ones are found."""
     newer = tmp_path / "newer.py"
     newer.write_text(VERIFIER.read_text() + "print('a'.removeprefix('a'))\n")
     for program, status in ((VERIFIER, 0), (newer, 1)):
@@ -117,8 +117,8 @@ def test_an_old_python_runs_the_verifier(tmp_path: Path) -> None:
         assert done.returncode == status, done.stdout + done.stderr
 
 
-def test_it_has_what_happened_and_what_was_in_force(bundle: Path, control: Control) -> None:
-    """All records of the time, the loads before it, the texts with their signatures, and nothing of other revisions."""
+def test_it_has_the_events_and_the_rules_in_force(bundle: Path, control: Control) -> None:
+    """It has all records of the time, earlier loads, and signed texts, but no other revisions."""
     found = members_of(bundle)
     specifications = ["%2E%2E/b%0A.rv", "a.rv", "msg/p/T.msg"]
     assert list(found) == [
@@ -139,7 +139,7 @@ def test_it_has_what_happened_and_what_was_in_force(bundle: Path, control: Contr
 
 
 def test_the_same_time_is_the_same_bundle(control: Control, tmp_path: Path) -> None:
-    """Exported twice, the manifest and all under it are the same bytes; the proof is another record."""
+    """Two exports have the same manifest and members; only the record of the proof differs."""
     until = time.time_ns()
     control.work(3)
     first, second = (
@@ -150,7 +150,7 @@ def test_the_same_time_is_the_same_bundle(control: Control, tmp_path: Path) -> N
 
 
 def test_every_change_of_a_member_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """Every byte of small members and a sample of the others, made another one: each time the member is named."""
+    """Every byte of small members and a sample of the others are changed: each time the member is named."""
     members, chance = members_of(bundle), random.Random(5)  # noqa: S311  the same each time
     for name, data in members.items():
         places = range(len(data)) if len(data) <= 40 else chance.sample(range(len(data)), examples(12))
@@ -163,10 +163,10 @@ def test_every_change_of_a_member_is_named(bundle: Path, tmp_path: Path, reviewe
             assert re.search(named.get(name, re.escape(name)), reviewer.said), (name, place, reviewer.said)
 
 
-def test_what_is_removed_added_or_exchanged_is_named(
+def test_removed_added_or_exchanged_members_are_named(
     bundle: Path, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """Each member removed, cut short or put in the place of another, and files that do not belong there."""
+    """Covers each member removed, cut or replaced by another, and extra files."""
     members = members_of(bundle)
     for name, data in members.items():
         without = {other: data for other, data in members.items() if other != name}
@@ -193,7 +193,7 @@ def test_what_is_removed_added_or_exchanged_is_named(
 
 
 def test_modules_in_the_folder_are_not_imported(bundle: Path, pem: Path, tmp_path: Path) -> None:
-    """A forger may put a json.py beside the verifier, also beside the one that the reviewer copies there."""
+    """A forger may put a json.py beside the verifier, or beside the copy that the reviewer makes."""
     folder = tmp_path / "unpacked"
     shutil.unpack_archive(bundle, folder)
     (folder / "json.py").write_text(
@@ -205,10 +205,8 @@ def test_modules_in_the_folder_are_not_imported(bundle: Path, pem: Path, tmp_pat
     assert "WRONG     'json.py': does not belong to the bundle" in done.stdout
 
 
-def test_nothing_in_a_bundle_reaches_the_terminal_as_it_is(
-    bundle: Path, tmp_path: Path, reviewer: Reviewer
-) -> None:
-    """In the place of a number may stand what erases the line above and says that all is right."""
+def test_a_bundle_cannot_control_the_terminal(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
+    """An escape sequence instead of a number could erase the result."""
     spoilt = "\x1b[2J\nright: this is what the appliance has sealed"
 
     def change(records: list[dict[str, Any]]) -> None:
@@ -220,17 +218,15 @@ def test_nothing_in_a_bundle_reaches_the_terminal_as_it_is(
     assert reviewer.said.splitlines()[-1] == "not as it was exported"
 
 
-def test_a_bundle_that_is_not_there_is_named(tmp_path: Path, reviewer: Reviewer) -> None:
-    """In words, without the number of an error."""
+def test_a_missing_bundle_is_named(tmp_path: Path, reviewer: Reviewer) -> None:
+    """The error has words and no number."""
     assert reviewer.status(tmp_path / "gone.zip") == 2
     assert reviewer.said == f"nothing can be verified: {tmp_path}/gone.zip: No such file or directory\n"
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "proof.json", "records.ndjson"])
-def test_members_that_unpack_to_much_take_no_memory(
-    bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str
-) -> None:
-    """A text of 100 MB that is small in the ZIP file is looked at by pieces."""
+def test_large_members_use_little_memory(bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str) -> None:
+    """A text of 100 MB that is small in the ZIP file is read in pieces."""
     place = tmp_path / "x.zip"
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
         for member, data in members_of(bundle).items():
@@ -243,18 +239,16 @@ def test_members_that_unpack_to_much_take_no_memory(
         tracemalloc.stop()
 
 
-def test_a_name_that_is_there_twice_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """Which of two a tool unpacks nobody knows."""
+def test_a_duplicate_name_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
+    """Tools differ in which of the two they unpack."""
     with zipfile.ZipFile(bundle, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
         archive.writestr("policies/7.ini", members_of(bundle)["policies/7.ini"])
     assert reviewer.status(bundle) == 1
     assert "'policies/7.ini': is there more than once" in reviewer.said
 
 
-def test_a_file_that_is_cut_or_damaged_is_never_right(
-    bundle: Path, tmp_path: Path, reviewer: Reviewer
-) -> None:
-    """Cut anywhere, or with another byte anywhere: it is wrong, or each text is what it was, and a header says it."""
+def test_a_cut_or_damaged_file_is_never_valid(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
+    """After any cut or changed byte it is invalid, or a header differs and each text is unchanged."""
     whole, members, chance = bundle.read_bytes(), members_of(bundle), random.Random(6)  # noqa: S311  the same each time
     place = tmp_path / "damaged.zip"
     for length in [0, 1, len(whole) - 1, *chance.sample(range(len(whole)), 5)]:
@@ -272,7 +266,7 @@ def test_a_file_that_is_cut_or_damaged_is_never_right(
 
 
 def _longer(place: Path) -> bytes:
-    """With four bytes in the last member that its size counts, and that nobody unpacks."""
+    """Return a bundle whose last member counts four bytes more, which no tool unpacks."""
     with zipfile.ZipFile(place) as archive:
         last, end, whole = archive.infolist()[-1], archive.start_dir, place.read_bytes()
     whole = whole[:end] + b"evil" + whole[end:]
@@ -285,8 +279,8 @@ def _longer(place: Path) -> bytes:
     return whole
 
 
-def test_what_is_beside_the_members_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """Before, between and behind them, in comments and extra fields: a ZIP tool shows none of it."""
+def test_data_outside_members_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
+    """ZIP tools do not show data before, between and after members, in comments and in extra fields."""
     members, place = members_of(bundle), tmp_path / "x.zip"
     whole = bundle.read_bytes()
 
@@ -305,7 +299,7 @@ def test_what_is_beside_the_members_is_named(bundle: Path, tmp_path: Path, revie
         return place
 
     def between(archive: zipfile.ZipFile) -> None:
-        """As a tool does that removes a member from the directory alone."""
+        """Remove a member only from the directory, as a tool does."""
         archive.writestr("left", b"out")
         archive.filelist.pop()
 
@@ -329,8 +323,8 @@ def test_what_is_beside_the_members_is_named(bundle: Path, tmp_path: Path, revie
         (lambda: packed(comment=b"read me"), "'verify.py': has a comment or an extra field"),
         (lambda: packed(extra=b"\xca\xfe\x04\0evil"), "'verify.py': has an extra field"),
         (lambda: packed(extra=struct.pack("<2HQ", 1, 8, 0xE511)), "'verify.py': has an extra field"),
-        (lambda: raw(_longer(packed(compress_type=zipfile.ZIP_DEFLATED))), "'proof.json': something stands behind"),
-        (lambda: raw(_longer(packed())), "'proof.json': something stands behind it"),
+        (lambda: raw(_longer(packed(compress_type=zipfile.ZIP_DEFLATED))), "'proof.json': there are bytes behind"),
+        (lambda: raw(_longer(packed())), "'proof.json': there are bytes behind it"),
     ]  # fmt: skip
     for wrong, words in cases:
         assert reviewer.status(wrong()) == 1, (words, reviewer.said)
@@ -338,8 +332,10 @@ def test_what_is_beside_the_members_is_named(bundle: Path, tmp_path: Path, revie
 
 
 @pytest.mark.parametrize("kind", ["link", "fifo", "folder"])
-def test_what_is_no_file_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer, kind: str) -> None:
-    """A link, a pipe or a folder in the place of a member is not followed or waited for."""
+def test_a_member_that_is_not_a_file_is_named(
+    bundle: Path, tmp_path: Path, reviewer: Reviewer, kind: str
+) -> None:
+    """A link, a pipe or a folder instead of a member is not followed or waited for."""
     folder = tmp_path / "unpacked"
     shutil.unpack_archive(bundle, folder)
     policy = folder / "policies/7.ini"
@@ -355,8 +351,8 @@ def test_what_is_no_file_is_named(bundle: Path, tmp_path: Path, reviewer: Review
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "proof.json", "records.ndjson", "audit.pub"])
-def test_a_pipe_keeps_nobody_waiting(bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str) -> None:
-    """A named pipe is opened nowhere: in the place of any member, of the bundle, of the key, of the checkpoints."""
+def test_a_pipe_does_not_block(bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str) -> None:
+    """A named pipe is never opened as a member, bundle, key or file of checkpoints."""
     folder = tmp_path / "unpacked"
     shutil.unpack_archive(bundle, folder)
     (folder / name).unlink()
@@ -369,8 +365,8 @@ def test_a_pipe_keeps_nobody_waiting(bundle: Path, tmp_path: Path, reviewer: Rev
     assert "is not a regular file" in reviewer.said
 
 
-def test_an_empty_file_is_no_bundle(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """An empty bundle, folder or key is not right, with a reason; of an empty file of checkpoints none is kept."""
+def test_an_empty_file_is_not_a_bundle(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
+    """An empty bundle, folder or key is invalid, with a reason; an empty file of checkpoints has none."""
     empty = tmp_path / "empty"
     empty.touch()
     (tmp_path / "folder").mkdir()
@@ -379,10 +375,10 @@ def test_an_empty_file_is_no_bundle(bundle: Path, tmp_path: Path, reviewer: Revi
     assert reviewer.status(bundle, "--checkpoints", empty) == 0
 
 
-def test_a_bomb_is_not_unpacked(
+def test_a_zip_bomb_is_not_unpacked(
     bundle: Path, tmp_path: Path, reviewer: Reviewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A ZIP file that unpacks to more than a bundle of its size can, or whose members overlap, is not read."""
+    """A ZIP file with overlapping members, or that unpacks to too much, is not read."""
     monkeypatch.setattr(bundle_verifier, "UNPACKED", 1 << 20)
     place, many = tmp_path / "x.zip", bytes(1 << 25)
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -394,15 +390,15 @@ def test_a_bomb_is_not_unpacked(
         assert "unpacks to more than" in reviewer.said
         large.file_size, large.compress_size = 100, 10_000
         archive.filelist += [large] * 3
-        archive.comment = b"written again"  # a directory whose entries have one place
+        archive.comment = b"written again"  # a directory whose entries have one position
         archive.close()
         assert reviewer.status(tmp_path / "y.zip") == 2
         assert "overlap" in reviewer.said
 
 
 @pytest.mark.parametrize("runs", [[[1, 5], [3, 9]], [[5, 9], [1, 3]], [[4, 3]], [[1, 3], [4, 9]]])
-def test_runs_are_in_their_order(bundle: Path, tmp_path: Path, reviewer: Reviewer, runs: list[Any]) -> None:
-    """Runs that overlap, touch or go back are refused: a record is looked up in one step for each doubling of them."""
+def test_runs_are_in_order(bundle: Path, tmp_path: Path, reviewer: Reviewer, runs: list[Any]) -> None:
+    """Overlapping, touching or descending runs are rejected, because lookups use binary search."""
     members = members_of(bundle)
     manifest = {**json.loads(members["manifest.json"]), "runs": runs}
     members["manifest.json"] = json.dumps(manifest).encode()
@@ -411,7 +407,7 @@ def test_runs_are_in_their_order(bundle: Path, tmp_path: Path, reviewer: Reviewe
 
 
 def test_many_runs_take_few_steps() -> None:
-    """Whether a record is in a run takes as many steps as the number of runs has bits."""
+    """The lookup of a record takes as many steps as the number of runs has bits."""
     asked = 0
 
     class Counted(int):
@@ -436,7 +432,7 @@ def test_many_runs_take_few_steps() -> None:
 
 
 def resealed(members: Members) -> Members:
-    """What a forger makes who can hash: the manifest has the hashes of what is there."""
+    """Return a forger's bundle whose manifest has matching hashes."""
     manifest = json.loads(members["manifest.json"])
     for name, about in manifest["members"].items():
         data = members[name]
@@ -445,7 +441,7 @@ def resealed(members: Members) -> Members:
 
 
 def lines(members: Members, change: Callable[[list[dict[str, Any]]], None]) -> Members:
-    """The same with other records."""
+    """Return the bundle with other records."""
     records = [json.loads(line) for line in members["records.ndjson"].splitlines()]
     change(records)
     text = "".join(json.dumps(record, separators=(",", ":")) + "\n" for record in records)
@@ -481,16 +477,16 @@ def _invent(records: list[dict[str, Any]]) -> None:
 
 
 @pytest.mark.parametrize("change", [_hide, _take_out, _swap, _cut, _unseal, _invent])
-def test_a_forger_who_makes_hashes_anew_has_no_signature(
+def test_a_forger_who_rehashes_has_no_signature(
     bundle: Path, tmp_path: Path, reviewer: Reviewer, change: Callable[[list[dict[str, Any]]], None]
 ) -> None:
-    """Records changed and the manifest made to fit: the log has another manifest, and records do not fit."""
+    """Changed records with a matching manifest do not match the log."""
     assert reviewer.status(written(lines(members_of(bundle), change), tmp_path / "x.zip")) == 1
     assert "manifest.json: is not the one that the log has the hash of" in reviewer.said
     assert re.search(r"WRONG +(records?[ .]|checkpoint|policies)", reviewer.said), reviewer.said
 
 
-def test_another_policy_under_a_fitting_manifest_is_named(
+def test_another_policy_with_a_matching_manifest_is_named(
     bundle: Path, tmp_path: Path, reviewer: Reviewer
 ) -> None:
     """The record of the load has the hash of the text."""
@@ -500,22 +496,22 @@ def test_another_policy_under_a_fitting_manifest_is_named(
         assert f"{place}: is not what the log has the hash of" in reviewer.said
 
 
-def test_a_bundle_of_another_key_is_not_right(
+def test_a_bundle_of_another_key_is_invalid(
     bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whoever signs with a key of his own convinces nobody who kept the right one."""
+    """A forger's own key does not convince a reviewer with the right one."""
     other = Ed25519PrivateKey.generate().public_key()
     place = tmp_path / "other.pub"
     place.write_bytes(other.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
-    stranger = Reviewer(capsys, place)
-    assert stranger.status(bundle) == 1
-    assert "is not signed with the key" in stranger.said
+    unknown = Reviewer(capsys, place)
+    assert unknown.status(bundle) == 1
+    assert "is not signed with the key" in unknown.said
 
 
-def test_copies_of_checkpoints_show_a_history_written_anew(
+def test_copied_checkpoints_show_a_rewritten_history(
     bundle: Path, control: Control, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """They agree, or it is said which does not; a copy that was not signed accuses nobody."""
+    """They agree, or the first that differs is named; an unsigned copy proves nothing."""
     assert reviewer.status(bundle, "--json") == 0
     said = json.loads(reviewer.said)
     assert (said["ok"], said["findings"], said["kept_elsewhere"]) == (True, [], 0)
@@ -532,8 +528,8 @@ def test_copies_of_checkpoints_show_a_history_written_anew(
     assert "is another one than was kept elsewhere, which is not signed with the key" in reviewer.said
 
 
-def test_of_a_recording_it_has_the_messages(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
-    """The bag that the log has the hash of, the recording's time, and why it was made; another bag is named."""
+def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
+    """The bag matches the hash in the log, with the time and the reason of the recording; another bag is named."""
     bag = random.Random(7).randbytes(3 << 20)  # noqa: S311  the same each time
     trigger = Trigger(control.begun, "drop", "r", "<b>\x1b")
     kept = control.record(tmp_path, bag, triggers=[trigger], topics=[example(RecordedTopic, topic="/scan")])
@@ -557,8 +553,8 @@ def test_of_a_recording_it_has_the_messages(control: Control, tmp_path: Path, re
         export(control.log.path, kept._replace(id="../audit"), control.ask)
 
 
-def test_what_is_not_proven_is_said(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
-    """A load without a hash, a text that the appliance lost, a time before the first load."""
+def test_unproven_facts_are_listed(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
+    """Covers a load without a hash, a text that the appliance lost, and a time before the first load."""
     control.load_policy(8, "[Nodes]\n", sha256=None)
     control.work(3)
     control.load_policy(9, "[Nodes]\n# nine\n")
@@ -571,12 +567,14 @@ def test_what_is_not_proven_is_said(control: Control, tmp_path: Path, reviewer: 
 
 
 def _as_before(previous: bytes, columns: tuple[object, ...]) -> bytes:
-    """The hash that version 0.1.0 made of a record."""
+    """Return the hash of a record as version 0.1.0 computed it."""
     return hashlib.sha256(previous + msgspec.msgpack.encode(columns)).digest()
 
 
-def test_a_load_before_the_upgrade(make_log: MakeLog, tmp_path: Path, reviewer: Reviewer) -> None:
-    """What version 0.1.0 wrote is right as it is; that nothing leads from its load to a checkpoint is said."""
+def test_a_load_before_the_upgrade_is_listed_as_unproven(
+    make_log: MakeLog, tmp_path: Path, reviewer: Reviewer
+) -> None:
+    """A bundle of version 0.1.0 is valid; it lists that no checkpoint covers its load."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("appliance.audit.log_writer.record_hash", _as_before)
         before = Control(make_log(checkpoint_seconds=3600))
@@ -599,10 +597,10 @@ def test_a_load_before_the_upgrade(make_log: MakeLog, tmp_path: Path, reviewer: 
     assert re.search(r"WRONG +records \d+ to \d+: lead to no checkpoint", reviewer.said)
 
 
-def test_what_retention_removed_is_said(
+def test_records_removed_by_retention_are_listed(
     make_log: MakeLog, path: Path, notary: Notary, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """Loads that went are named, and that nothing shows what was before."""
+    """Removed loads are named, and that the state before them is unknown."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log))
@@ -617,10 +615,8 @@ def test_what_retention_removed_is_said(
     assert re.search(r"unproven  what was before record \d+: retention has removed it", reviewer.said)
 
 
-def test_records_out_of_their_time_are_runs_of_their_own(
-    control: Control, tmp_path: Path, reviewer: Reviewer
-) -> None:
-    """What retention wrote again at the end of the log, long after, belongs to its time, and nothing between."""
+def test_copied_records_are_separate_runs(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
+    """Records that retention copied to the end of the log belong to their original time."""
     until = time.time_ns()
     for number in range(1200):
         control.log.record(decision(control.log, number))
@@ -635,21 +631,19 @@ def test_records_out_of_their_time_are_runs_of_their_own(
     assert reviewer.status(bundle) == 0, reviewer.said
 
 
-def test_a_time_without_records_and_one_with_too_many(
+def test_empty_and_too_large_time_spans_are_rejected(
     control: Control, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both are refused in words, and nothing is recorded as exported."""
+    """The error is a sentence, and no export is recorded."""
     with pytest.raises(BundleError, match="no record of that time"):
-        export(control.log.path, Span(0, 1), control.ask)
+        export(control.log.path, TimeSpan(0, 1), control.ask)
     monkeypatch.setattr(bundles, "MOST_RECORDS", 3)
     with pytest.raises(BundleError, match="more than 3 records"):
-        export(control.log.path, Span(0, time.time_ns()), control.ask)
+        export(control.log.path, TimeSpan(0, time.time_ns()), control.ask)
 
 
-def test_without_a_signer_there_is_no_bundle(
-    path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """A signer that does not answer is waited for so long, and named."""
+def test_an_export_needs_the_signer(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Without an answer the export ends after a timeout and names the signer."""
     monkeypatch.setattr("appliance.control.evidence_orders.SEAL_SECONDS", 0.2)
     log = AuditLog(path, signer=lambda _number, _text: None)
     running = Control(log)
@@ -659,16 +653,16 @@ def test_without_a_signer_there_is_no_bundle(
     log.close()
 
 
-def test_a_text_that_changes_while_it_is_exported_ends_the_export(control: Control) -> None:
-    """What is written is what the manifest has the hash of, or the bundle breaks off."""
-    pieces = export(control.log.path, Span(control.begun, time.time_ns()), control.ask)
+def test_a_text_changed_during_the_export_ends_it(control: Control) -> None:
+    """The written text matches the manifest, or the export fails."""
+    pieces = export(control.log.path, TimeSpan(control.begun, time.time_ns()), control.ask)
     control.policies[7] = "[Nodes]\n"
     with pytest.raises(BundleError, match=r"policies/7\.ini was changed while it was exported"):
         list(pieces)
 
 
-def test_columns_are_packed_as_the_log_packs_them() -> None:
-    """The verifier's MessagePack is msgspec's, for every length and number at which the form changes."""
+def test_columns_are_packed_as_in_the_log() -> None:
+    """The verifier's MessagePack equals msgspec's, for every length and number where the format changes."""
     texts = ["é" * length for length in LENGTHS] + ["x" * length for length in (*LENGTHS, 65535, 65536)]
     numbers = [sign * (2**power + step) for power in range(63) for step in (-1, 0, 1) for sign in (-1, 1)]
     values = [None, *texts, *(text.encode() for text in texts), *NUMBERS, *numbers, -(2**63), 2**64 - 1]
@@ -679,8 +673,8 @@ def test_columns_are_packed_as_the_log_packs_them() -> None:
     assert struct.unpack(">b", bundle_verifier.packed(-32)) == (-32,)
 
 
-def test_the_verifier_is_a_program_for_python_3_8() -> None:
-    """It imports nothing but the standard library, and has no syntax that came later."""
+def test_the_verifier_runs_on_python_3_8() -> None:
+    """It imports only the standard library, and has no newer syntax."""
     tree = ast.parse(VERIFIER.read_text(), feature_version=(3, 8))
     imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
     imported |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}

@@ -1,4 +1,4 @@
-"""Tests of what the Ansible role and the cloud-init example put on a robot (their own syntax: tests/system)."""
+"""Tests of the files that the Ansible role and the cloud-init example install (tests/system checks their syntax)."""
 
 from pathlib import Path
 from typing import Any
@@ -14,19 +14,19 @@ CLOUD = ROOT / "examples/cloud-init/user-data.yaml"
 
 
 def written() -> dict[str, str]:
-    """The files that cloud-init writes: path, text."""
+    """Return the files that cloud-init writes: path, text."""
     data: dict[str, Any] = yaml.safe_load(CLOUD.read_text())
     return {one["path"]: one["content"] for one in data["write_files"]}
 
 
-def test_the_role_configures_what_the_package_does(tmp_path: Path) -> None:
-    """Without a word in the inventory the configuration is the one that the package brings."""
+def test_the_role_has_the_packages_defaults(tmp_path: Path) -> None:
+    """Without settings in the inventory the configuration equals the package's."""
     settings = yaml.safe_load((ROLE / "defaults/main.yml").read_text())["rosrv_settings"]
     assert settings == yaml.safe_load((ROOT / "distribution/appliance.yaml").read_text())
 
 
 def test_the_role_checks_before_it_writes() -> None:
-    """A configuration or policy that is wrong never reaches its place; what changes is loaded."""
+    """An invalid configuration or policy is never installed; a changed one is loaded."""
     tasks = {task["name"]: task for task in yaml.safe_load((ROLE / "tasks/main.yml").read_text())}
     handlers = {handler["name"] for handler in yaml.safe_load((ROLE / "handlers/main.yml").read_text())}
     placed = [task for task in tasks.values() if "/etc/rosrv" in str(task.get("ansible.builtin.copy"))]
@@ -36,8 +36,8 @@ def test_the_role_checks_before_it_writes() -> None:
         assert task["notify"] in handlers
 
 
-def test_cloud_init_writes_what_is_right(tmp_path: Path) -> None:
-    """Its policy compiles, its configuration names it and has no mistake."""
+def test_cloud_init_writes_valid_files(tmp_path: Path) -> None:
+    """Its policy compiles, and its configuration names it without a mistake."""
     files = written()
     policy = compile_policy(files["/etc/rosrv/policies/robot.ini"], file="robot.ini")
     assert list(policy.warnings) == []
@@ -46,8 +46,8 @@ def test_cloud_init_writes_what_is_right(tmp_path: Path) -> None:
     assert resolve(configuration, {}, {}).policy == tmp_path / "policies/robot.ini"
 
 
-def test_cloud_init_installs_only_what_it_knows() -> None:
-    """The package's checksum is looked at before it is installed; as shipped, the example installs nothing."""
+def test_cloud_init_checks_the_package() -> None:
+    """The package's checksum is checked before the installation; the shipped example installs nothing."""
     steps = yaml.safe_load(CLOUD.read_text())["runcmd"]
     assert steps[0] == "set -e", "cloud-init makes one script of them"
     order = [

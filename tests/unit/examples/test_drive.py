@@ -1,4 +1,4 @@
-"""The simulated drive says the same every time, and its recording is what was published."""
+"""The simulated drive is deterministic, and its recording has what was published."""
 
 from pathlib import Path
 
@@ -11,20 +11,20 @@ from examples.landshark.messages import Messages
 SHORT = (Part(0.5, tilt=0.2), Part(1.0, forward=1.0), Part(0.5, fire=True))
 
 
-def test_two_drives_are_one() -> None:
-    """The same commands give the same messages, to the byte."""
+def test_two_drives_are_equal() -> None:
+    """The same commands give the same bytes."""
     assert Simulation().run(SHORT).messages == Simulation().run(SHORT).messages
 
 
-def test_the_base_stops_when_commands_cease() -> None:
-    """Each part drives as it says; the last command counts for half a second and no longer."""
+def test_the_base_stops_without_commands() -> None:
+    """Each part follows its commands; the last one counts for half a second."""
     drive = Simulation().run(SHORT)
     assert drive.poses[-1].x == pytest.approx(1.0, abs=0.11)
     assert [shot.fired for shot in drive.shots] == [True]
 
 
 def test_the_recording_has_every_message_in_order(tmp_path: Path) -> None:
-    """With the time, the topic, the bytes and the definition of its type."""
+    """It has the time, the topic, the bytes and the definition of each type."""
     drive = Simulation().run(SHORT)
     record(drive, tmp_path / "drive.bag")
     with Reader(tmp_path / "drive.bag") as reader:
@@ -36,8 +36,8 @@ def test_the_recording_has_every_message_in_order(tmp_path: Path) -> None:
         record(drive, tmp_path / "drive.bag")
 
 
-def test_fields_that_are_not_given_are_zero() -> None:
-    """And those that are given come back."""
+def test_missing_fields_are_zero() -> None:
+    """Given fields are read back."""
     messages = Messages()
     data = messages.encode("nav_msgs/Odometry", pose__pose__position={"x": 2.0}, child_frame_id="base_link")
     odometry = messages.decode("nav_msgs/Odometry", data)

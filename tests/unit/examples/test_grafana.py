@@ -1,4 +1,4 @@
-"""Tests of the Grafana dashboard that is shipped: it asks for what is measured, and Grafana can draw it."""
+"""Tests of the shipped Grafana dashboard: its metrics exist, and Grafana can draw it."""
 
 import json
 import re
@@ -20,14 +20,14 @@ KNOWN = {metric.name: metric for metric in METRICS}
 
 
 def expressions() -> Iterator[tuple[str, str, str]]:
-    """Panel, query and legend of each series; the annotations, too."""
+    """Yield panel, query and legend of each series, also of annotations."""
     for panel in PANELS:
         yield from ((panel["title"], target["expr"], target["legendFormat"]) for target in panel["targets"])
     yield from ((one["name"], one["expr"], "") for one in DASHBOARD["annotations"]["list"])
 
 
 @pytest.mark.parametrize(("panel", "query", "legend"), list(expressions()), ids=lambda text: text[:40])
-def test_what_is_asked_for_is_measured(panel: str, query: str, legend: str) -> None:
+def test_queried_metrics_exist(panel: str, query: str, legend: str) -> None:
     """Every metric exists, with every label that selects, groups or names a series."""
     names = re.findall(r"\brosrv_\w+", query)
     assert names or query.startswith("up{"), panel
@@ -47,7 +47,7 @@ def test_what_is_asked_for_is_measured(panel: str, query: str, legend: str) -> N
 
 
 def test_prometheus_reads_every_query(tmp_path: Path) -> None:
-    """As rules of a rule file, once Grafana has put in its variables."""
+    """The queries are tried as rules of a rule file, with Grafana's variables replaced."""
     promtool = need_program("promtool", "prometheus")
     queries = [re.sub(r"\$__rate_interval", "1m", query) for _, query, _ in expressions()]
     rules = [{"record": f"query:{number}", "expr": query} for number, query in enumerate(queries)]
@@ -59,8 +59,8 @@ def test_prometheus_reads_every_query(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_panels_stand_beside_each_other() -> None:
-    """On Grafana's grid of 24 columns none covers another; each has a number, a unit and a sentence of its own."""
+def test_panels_do_not_overlap() -> None:
+    """On Grafana's grid of 24 columns each panel has its own space, number, unit and description."""
     taken: set[tuple[int, int]] = set()
     for panel in DASHBOARD["panels"]:
         place = panel["gridPos"]
@@ -78,7 +78,7 @@ def test_panels_stand_beside_each_other() -> None:
     )
 
 
-# What Grafana's published schema (`grafana-foundation-sdk`, JSON) requires of the options of a panel.
+# Panel options that Grafana's published schema (`grafana-foundation-sdk`, JSON) requires.
 REQUIRED = {
     "stat": {
         "graphMode", "colorMode", "justifyMode", "textMode", "wideLayout", "showPercentChange", "reduceOptions",
@@ -89,15 +89,15 @@ REQUIRED = {
 
 
 @pytest.mark.parametrize("panel", PANELS, ids=lambda panel: str(panel["title"]))
-def test_options_are_whole(panel: dict[str, Any]) -> None:
-    """As Grafana's schema wants them: an option that is left out is another one after each of its releases."""
+def test_options_are_complete(panel: dict[str, Any]) -> None:
+    """Grafana's releases differ in the defaults of missing options."""
     options = panel["options"]
     assert options.keys() == REQUIRED[panel["type"]]
     if "legend" in options:
         assert {"displayMode", "placement", "showLegend", "calcs"} == options["legend"].keys()
 
 
-def test_it_names_no_source_of_ours() -> None:
-    """Which Prometheus and which appliance it shows is chosen at its head; it is imported as it is."""
+def test_the_data_source_is_a_variable() -> None:
+    """Prometheus and the appliance are chosen in its header, so that it can be imported unchanged."""
     assert [one["name"] for one in DASHBOARD["templating"]["list"]] == ["source", "instance"]
     assert {panel["datasource"]["uid"] for panel in PANELS} == {"${source}"}

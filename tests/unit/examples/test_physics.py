@@ -1,4 +1,4 @@
-"""The simulated LandShark moves and measures as the geometry says."""
+"""The simulated LandShark moves and measures by its geometry."""
 
 import importlib.util
 import math
@@ -14,7 +14,7 @@ FILE = Path(__file__).parents[3] / "examples" / "landshark" / "nodes" / "physics
 
 
 def load() -> ModuleType:
-    """The module as the nodes import it: by its file, it is part of no package."""
+    """Load the module by its file, as the nodes do: it is not in a package."""
     spec = importlib.util.spec_from_file_location("landshark_physics", FILE)
     assert spec is not None
     assert spec.loader is not None
@@ -31,20 +31,20 @@ seconds = st.floats(0.001, 5)
 
 
 def test_straight_ahead() -> None:
-    """One metre a second for two seconds is two metres in the direction of the nose."""
+    """One metre a second for two seconds is two metres forward."""
     pose = physics.drive(physics.Pose(0, 0, math.pi / 2), physics.Velocity(1.0, 0.0), 2.0)
     assert (pose.x, pose.y) == (pytest.approx(0), pytest.approx(2))
 
 
 def test_full_circle() -> None:
-    """Driving a whole circle ends where it began, looking the same way."""
+    """A full circle ends at its start, with the same heading."""
     pose = physics.drive(physics.Pose(3, 4, 0.5), physics.Velocity(1.0, 0.5), math.tau / 0.5)
     assert (pose.x, pose.y, pose.heading) == (pytest.approx(3), pytest.approx(4), pytest.approx(0.5))
 
 
 @given(heading=angles, forward=speeds, turn=speeds, first=seconds, second=seconds)
 def test_steps_add_up(heading: float, forward: float, turn: float, first: float, second: float) -> None:
-    """Two steps at one velocity end where one long step ends, however small the turn rate."""
+    """Two steps at one velocity equal one long step, for any turn rate."""
     velocity = physics.Velocity(forward, turn)
     start = physics.Pose(0, 0, heading)
     whole = physics.drive(start, velocity, first + second)
@@ -55,7 +55,7 @@ def test_steps_add_up(heading: float, forward: float, turn: float, first: float,
 
 @given(forward=st.floats(), turn=st.floats())
 def test_motors_have_limits(forward: float, turn: float) -> None:
-    """No command, infinite or not a number, moves the robot faster than it can."""
+    """No command, infinite or not a number, exceeds the robot's top speed."""
     velocity = physics.possible(physics.Velocity(forward, turn))
     assert abs(velocity.forward) <= physics.TOP_SPEED
     assert abs(velocity.turn) <= physics.TOP_TURN_RATE
@@ -71,7 +71,7 @@ def test_turret_has_limits(pan: float, tilt: float, step: float) -> None:
 
 
 def test_turret_arrives() -> None:
-    """Told often enough, the gun points where it was told."""
+    """With repeated commands the gun reaches its target."""
     turret = physics.Turret()
     for _ in range(100):
         turret = physics.aim(turret, physics.Turret(1.0, -0.5), 0.05)
@@ -79,7 +79,7 @@ def test_turret_arrives() -> None:
 
 
 def test_laser_sees_the_obstacle() -> None:
-    """A wall two metres ahead is two metres away, nothing is to the left, and nothing is seen behind."""
+    """A wall two metres ahead is measured at two metres, nothing to the left or behind."""
     thing = physics.Obstacle(x=3, y=0, radius=1)
     ahead, left, behind = physics.scan(physics.Pose(), [0.0, math.pi / 2, math.pi], (thing,))
     assert ahead == pytest.approx(2)
@@ -87,19 +87,19 @@ def test_laser_sees_the_obstacle() -> None:
     assert math.isinf(behind)
 
 
-def test_laser_reach() -> None:
-    """What is farther than the laser reaches is not seen."""
+def test_laser_has_a_maximum_range() -> None:
+    """Obstacles beyond the range are not seen."""
     assert physics.scan(physics.Pose(), [0.0], (physics.Obstacle(50, 0, 1),), reach=30.0) == [math.inf]
 
 
 def test_position_on_earth() -> None:
-    """A degree of latitude is about 111 km; at the origin the position is the origin's."""
+    """A degree of latitude is about 111 km; the origin has the configured position."""
     assert physics.position_on_earth(physics.Pose()) == physics.ORIGIN
     north, east = physics.position_on_earth(physics.Pose(x=0, y=111_195))
     assert (north - physics.ORIGIN[0], east) == (pytest.approx(1, abs=1e-4), physics.ORIGIN[1])
 
 
-def test_battery_ends_at_empty() -> None:
-    """Driving costs more than standing, and the charge never goes below zero."""
+def test_battery_is_never_negative() -> None:
+    """Driving uses more charge than quota class still."""
     assert physics.drained(1.0, 1.0, 10) < physics.drained(1.0, 0.0, 10) < 1.0
     assert physics.drained(0.001, 2.0, 1000) == 0.0

@@ -1,4 +1,4 @@
-"""The picture in the documentation is what the simulation does."""
+"""The picture in the documentation matches the simulation."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -10,7 +10,7 @@ PICTURE = Path(__file__).parents[3] / "docs" / "pictures" / "landshark-drive.svg
 
 
 def test_the_picture_is_up_to_date() -> None:
-    """Drawn again from the shipped monitors, it is the same file: `python -m examples.landshark.drive --svg …`."""
+    """The shipped monitors draw the same file again: `python -m examples.landshark.drive --svg …`."""
     drawn = draw(Simulation().run(), Simulation(SHIPPED).run())
     assert drawn == PICTURE.read_text(encoding="utf-8")
     root = ElementTree.fromstring(drawn)  # noqa: S314  our own text

@@ -1,4 +1,4 @@
-"""Tests of the alert rules that are shipped: they name what there is, and say what to do."""
+"""Tests of the shipped alert rules: their metrics exist, and each has advice."""
 
 import re
 from pathlib import Path
@@ -13,13 +13,13 @@ FOLDER = Path(__file__).parents[3] / "examples" / "prometheus"
 
 
 def rules() -> list[dict[str, Any]]:
-    """All alerts."""
+    """Return all alerts."""
     groups = yaml.safe_load((FOLDER / "alerts.yaml").read_text())["groups"]
     return [rule for group in groups for rule in group["rules"]]
 
 
-def test_every_metric_that_an_alert_names_is_measured() -> None:
-    """An alert on a name that nothing measures would never fire; its labels are those of the metric, too."""
+def test_metrics_of_alerts_exist() -> None:
+    """An alert on an unknown metric or label would never fire."""
     known = {metric.name: metric for metric in METRICS}
     for rule in rules():
         names = re.findall(r"\brosrv_\w+", rule["expr"].replace('job="rosrv"', ""))
@@ -32,8 +32,8 @@ def test_every_metric_that_an_alert_names_is_measured() -> None:
                 assert given <= set(metric.labels), f"{rule['alert']}: {given}"
 
 
-def test_every_alert_says_what_it_means_and_what_to_do() -> None:
-    """Who is woken by it reads what happened and the next step; the records it points to are of known events."""
+def test_every_alert_has_an_explanation_and_advice() -> None:
+    """The person on duty reads what happened and the next step; events of records exist."""
     for rule in rules():
         notes = rule["annotations"]
         assert set(notes) == {"summary", "what_to_do"}, rule["alert"]
@@ -50,6 +50,6 @@ def test_every_alert_is_tested() -> None:
 
 
 def test_the_page_names_every_alert() -> None:
-    """docs/metrics.md has each alert with what it is about."""
-    page = (FOLDER.parents[1] / "docs" / "metrics.md").read_text()
+    """docs/reference/metrics.md lists each alert with its subject."""
+    page = (FOLDER.parents[1] / "docs" / "reference" / "metrics.md").read_text()
     assert [rule["alert"] for rule in rules() if rule["alert"] not in page] == []

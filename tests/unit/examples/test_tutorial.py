@@ -1,4 +1,4 @@
-"""The tutorial's specifications, and what it says of them, are true."""
+"""The tutorial's specifications work, and its quoted output is real."""
 
 import re
 import shutil
@@ -12,25 +12,25 @@ from examples.landshark.drive import TRIGGERED, Simulation, record
 from examples.landshark.messages import MONITORS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "monitors-tutorial.md").read_text(encoding="utf-8")
-FIRST, SECOND = re.findall(r"```cpp\n(.*?)```", PAGE, re.DOTALL)
+FIRST, SECOND, *_OTHERS = re.findall(r"```cpp\n(.*?)```", PAGE, re.DOTALL)
 RIGHT = FIRST.replace("positions:angles", "position:angles")
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where the reader works: `my-monitors` with the LandShark's message beside."""
+    """Return the reader's folder: `my-monitors` with the LandShark's message beside it."""
     shutil.copytree(MONITORS / "msg", tmp_path / "my-monitors" / "msg")
     monkeypatch.chdir(tmp_path)
     return tmp_path / "my-monitors"
 
 
 def said(*arguments: str) -> list[str]:
-    """What `rosrv monitor` prints."""
+    """Return the output of `rosrv monitor`."""
     return CliRunner().invoke(app, ["monitor", *arguments]).output.splitlines()
 
 
 def shown(command: str) -> list[str]:
-    """What the page shows below a command, for each time that it does."""
+    """Return the outputs that the page shows below a command."""
     return [
         line.strip()
         for block in re.findall(rf"    \$ {re.escape(command)}\n((?:    [^$\n].*\n)*)", PAGE)
@@ -38,16 +38,16 @@ def shown(command: str) -> list[str]:
     ]
 
 
-def test_check_says_what_the_page_shows(folder: Path) -> None:
-    """First the errors, then that it is right."""
+def test_the_page_quotes_check(folder: Path) -> None:
+    """First the errors, then the success."""
     (folder / "gun.rv").write_text(FIRST)
     wrong = said("check", "my-monitors/gun.rv")
     (folder / "gun.rv").write_text(RIGHT)
     assert wrong + said("check", "my-monitors/gun.rv") == shown("rosrv monitor check my-monitors/gun.rv")
 
 
-def test_run_says_what_the_page_shows(folder: Path) -> None:
-    """Of the simulated mission, to the millisecond."""
+def test_the_page_quotes_run(folder: Path) -> None:
+    """The output of the simulated mission is the same, to the millisecond."""
     (folder / "gun.rv").write_text(RIGHT)
     record(Simulation().run(), Path("mission.bag"))
     found = said("run", "my-monitors/gun.rv", "--bag", "mission.bag")

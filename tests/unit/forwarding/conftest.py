@@ -1,4 +1,4 @@
-"""What tests of forwarding share: a log that is written, and certificates of a receiver."""
+"""Fixtures of forwarding: an audit log, and a receiver's certificates."""
 
 from pathlib import Path
 
@@ -7,16 +7,16 @@ import pytest
 from tests.support.certificates import Certificates, make_certificates
 from tests.unit.audit.conftest import MakeLog, Notary, key, make_log, notary
 
-__all__ = ["MakeLog", "Notary", "key", "make_log", "notary"]  # fixtures, and what they are
+__all__ = ["MakeLog", "Notary", "key", "make_log", "notary"]  # fixtures and their types
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Where the log of a test is."""
+    """Return the path of the test's log."""
     return tmp_path / "audit.db"
 
 
 @pytest.fixture
 def certificates(tmp_path: Path) -> Certificates:
-    """Those of a receiver."""
+    """Return the certificates of a receiver."""
     return make_certificates(tmp_path / "tls")

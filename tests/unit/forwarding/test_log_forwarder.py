@@ -1,4 +1,4 @@
-"""Tests of forwarding a real log: at least once, in order, from where it was, whatever the receiver does."""
+"""Tests of forwarding a real log: at least once, in order, and continued after a restart."""
 
 import json
 import shutil
@@ -13,9 +13,15 @@ from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.record import Severity
 from appliance.audit.retention import Retention
-from appliance.audit.search import Page, search
+from appliance.audit.search import SearchPage, search
 from appliance.audit.verification import verify
-from appliance.forwarding.log_forwarder import Chosen, Forwarder
+from appliance.forwarding.log_forwarder import (
+    Chosen,
+    ForwardingPosition,
+    LogForwarder,
+    load_position,
+    save_position,
+)
 from appliance.forwarding.syslog import Formatter
 from tests.support.audit import decision, settle
 from tests.support.syslog import Message, parse
@@ -25,7 +31,7 @@ _DAY = 86_400_000_000_000
 
 
 class Kept:
-    """A receiver that keeps what it gets, and fails when it is told to."""
+    """A receiver that stores messages, and fails when the test says so."""
 
     def __init__(self) -> None:
         self.lines: list[bytes] = []
@@ -33,7 +39,7 @@ class Kept:
         self.torn = False
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Keep them; with `torn`, the first half arrives and then it fails."""
+        """Store the messages; with `torn`, only the first half before a failure."""
         if self.torn:
             self.lines += messages[: len(messages) // 2]
             raise ConnectionResetError("cut in the middle")
@@ -43,32 +49,32 @@ class Kept:
         self.lines += messages
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: no resource is open."""
 
     @property
     def messages(self) -> list[Message]:
-        """What it has, taken apart."""
+        """Return the parsed messages."""
         return [parse(one) for one in self.lines]
 
     def sequences(self) -> list[int]:
-        """The sequences of the records."""
+        """Return the sequences of the records."""
         return [int(one.fields["sequence"]) for one in self.messages if SYSLOG_ELEMENT not in one.elements]
 
 
 @pytest.fixture
 def kept() -> Kept:
-    """A receiver."""
+    """Return a receiver."""
     return Kept()
 
 
-def forwarder(path: Path, kept: Kept, chosen: Chosen = "all") -> Forwarder:
-    """As the process makes it."""
+def forwarder(path: Path, kept: Kept, chosen: Chosen = "all") -> LogForwarder:
+    """Return a forwarder as the process makes it."""
     formatter = Formatter(facility=13, longest=8192, host_name="robot")
-    return Forwarder(path, path.with_name("position.json"), kept, formatter, chosen=chosen)
+    return LogForwarder(path, path.with_name("position.json"), kept, formatter, chosen=chosen)
 
 
-def run(one: Forwarder, steps: int = 100) -> None:
-    """Step until nothing is left to do at once."""
+def run(one: LogForwarder, steps: int = 100) -> None:
+    """Step until the forwarder has to wait."""
     for _ in range(steps):
         if one.step() > 0:
             return
@@ -76,14 +82,14 @@ def run(one: Forwarder, steps: int = 100) -> None:
 
 
 def record(log: AuditLog, count: int, **fields: object) -> None:
-    """Record some and wait until they are on disk."""
+    """Record some events and wait until they are on disk."""
     for number in range(count):
         log.record(decision(log, number, **fields))
     assert settle(log) is None
 
 
 def everything(path: Path) -> list[int]:
-    """All sequences of the log."""
+    """Return all sequences of the log."""
     found: list[int] = []
     cursor: str | None = "0"
     while cursor is not None:
@@ -93,8 +99,8 @@ def everything(path: Path) -> list[int]:
     return found
 
 
-def test_the_whole_log_in_order(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """Every record is sent once and in order, also what was there before; then it waits for more."""
+def test_the_whole_log_is_sent_in_order(make_log: MakeLog, path: Path, kept: Kept) -> None:
+    """Every record, also an old one, is sent once and in order; then the forwarder waits."""
     log = make_log()
     record(log, 700)
     one = forwarder(path, kept)
@@ -106,8 +112,8 @@ def test_the_whole_log_in_order(make_log: MakeLog, path: Path, kept: Kept) -> No
     assert one.progress.trouble == ""
 
 
-def test_a_receiver_that_is_away(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """Nothing is passed over: after a failure the same batch is sent again, at growing distances."""
+def test_a_failed_batch_is_sent_again(make_log: MakeLog, path: Path, kept: Kept) -> None:
+    """The same batch is repeated at growing intervals, and no record is skipped."""
     log = make_log()
     record(log, 10)
     kept.failing = 4
@@ -123,16 +129,16 @@ def test_a_receiver_that_is_away(make_log: MakeLog, path: Path, kept: Kept) -> N
     assert one.progress.trouble == ""
 
 
-def test_the_distance_is_bounded(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """However long the receiver is away, it is asked for again within half a minute."""
+def test_the_interval_is_bounded(make_log: MakeLog, path: Path, kept: Kept) -> None:
+    """However long the receiver is down, the next attempt comes within half a minute."""
     record(make_log(), 1)
     kept.failing = 50
     one = forwarder(path, kept)
     assert max(one.step() for _ in range(50)) == 30.0
 
 
-def test_over_a_restart(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """A forwarder that is started again goes on where the one before ended."""
+def test_it_continues_after_a_restart(make_log: MakeLog, path: Path, kept: Kept) -> None:
+    """A restarted forwarder continues where the previous one ended."""
     log = make_log()
     record(log, 300)
     first = forwarder(path, kept)
@@ -144,14 +150,14 @@ def test_over_a_restart(make_log: MakeLog, path: Path, kept: Kept) -> None:
     assert kept.sequences() == everything(path)
 
 
-def test_a_forwarder_that_was_killed(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """After a death in the middle of a batch the batch is sent again: nothing is missing, some is there twice."""
+def test_a_killed_forwarder_repeats_its_batch(make_log: MakeLog, path: Path, kept: Kept) -> None:
+    """No record is missing, some arrive twice."""
     log = make_log()
     record(log, 300)
     first = forwarder(path, kept)
     first.step()
     kept.torn = True
-    first.step()  # and is killed: nothing is closed
+    first.step()  # killed: nothing is closed
     kept.torn = False
     run(forwarder(path, kept))
     sequences = kept.sequences()
@@ -159,8 +165,8 @@ def test_a_forwarder_that_was_killed(make_log: MakeLog, path: Path, kept: Kept) 
     assert len(sequences) > len(set(sequences))
 
 
-def test_only_denials(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """With `denials`, what was refused, warnings and alarms are sent, and every checkpoint; nothing else."""
+def test_only_denials_are_sent_if_configured(make_log: MakeLog, path: Path, kept: Kept) -> None:
+    """With `denials`, only refusals, warnings, alarms and every checkpoint are sent."""
     log = make_log(checkpoint_every=5)
     record(log, 20)
     log.record(decision(log, decision="deny", severity=Severity.WARNING, resource="/arm"))
@@ -176,10 +182,10 @@ def test_only_denials(make_log: MakeLog, path: Path, kept: Kept) -> None:
     assert one.progress.behind == 0
 
 
-def test_checkpoints_at_the_receiver_are_proof(
+def test_checkpoints_at_the_receiver_prove_the_log(
     make_log: MakeLog, path: Path, kept: Kept, tmp_path: Path
 ) -> None:
-    """The receiver's file is what `verify --checkpoints` takes: each checkpoint comes after the records it seals."""
+    """`verify --checkpoints` reads the receiver's file: each checkpoint follows the records it seals."""
     log = make_log(checkpoint_every=50)
     for _ in range(10):
         record(log, 30)
@@ -201,8 +207,10 @@ def test_checkpoints_at_the_receiver_are_proof(
             seen = int(message.fields["sequence"])
 
 
-def test_what_retention_took_before(make_log: MakeLog, path: Path, kept: Kept, notary: Notary) -> None:
-    """Records that were removed before they could be sent are counted, not passed over in silence."""
+def test_records_removed_before_sending_are_counted(
+    make_log: MakeLog, path: Path, kept: Kept, notary: Notary
+) -> None:
+    """Records that retention removed first are reported, not silently skipped."""
     notary.ago = 2 * _DAY
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     record(log, 100, time=1)
@@ -226,8 +234,8 @@ def test_what_retention_took_before(make_log: MakeLog, path: Path, kept: Kept, n
     assert one.progress.behind == 0
 
 
-def test_a_log_that_was_there_long_before(make_log: MakeLog, path: Path, kept: Kept, notary: Notary) -> None:
-    """What retention removed before forwarding was ever asked for is not missed."""
+def test_an_old_log_has_no_missed_records(make_log: MakeLog, path: Path, kept: Kept, notary: Notary) -> None:
+    """Records removed before forwarding was configured do not count as missed."""
     notary.ago = 2 * _DAY
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     record(log, 100, time=1)
@@ -244,8 +252,8 @@ def test_a_log_that_was_there_long_before(make_log: MakeLog, path: Path, kept: K
     assert one.progress.missed == 0
 
 
-def test_another_log(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """A new log in the place of the old one is forwarded from its beginning."""
+def test_another_log_is_sent_from_its_start(make_log: MakeLog, path: Path, kept: Kept) -> None:
+    """A new log at the same path is forwarded from its beginning."""
     log = make_log()
     record(log, 20)
     one = forwarder(path, kept)
@@ -255,20 +263,20 @@ def test_another_log(make_log: MakeLog, path: Path, kept: Kept) -> None:
         file.unlink()
     kept.lines.clear()
     record(make_log(), 4)
-    one.step()  # finds that it is another one
+    one.step()  # notices the new log
     run(one)
     assert kept.sequences() == everything(path)
 
 
-def test_no_log_yet(path: Path, kept: Kept) -> None:
-    """Without a log it says so and comes again."""
+def test_a_missing_log_is_waited_for(path: Path, kept: Kept) -> None:
+    """The forwarder reports it and tries again."""
     one = forwarder(path, kept)
     assert one.step() > 0
     assert "no audit log yet" in one.progress.trouble
 
 
-def test_a_position_that_cannot_be_read(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """A damaged position stops the forwarding with the reason; nothing is sent twice or not at all in silence."""
+def test_an_unreadable_position_stops_it(make_log: MakeLog, path: Path, kept: Kept) -> None:
+    """The reason is reported; no record is silently repeated or skipped."""
     record(make_log(), 3)
     path.with_name("position.json").write_text("rubbish")
     one = forwarder(path, kept)
@@ -278,17 +286,17 @@ def test_a_position_that_cannot_be_read(make_log: MakeLog, path: Path, kept: Kep
 
 
 def put_back(path: Path, copy: Path) -> None:
-    """The log as the copy has it."""
+    """Restore the log from its copy."""
     for file in path.parent.glob("audit.db*"):
         file.unlink()
     shutil.copy(copy, path)
 
 
 @pytest.mark.parametrize("later", [0, 2, 40])
-def test_a_log_that_was_put_back(
+def test_a_restored_log_is_continued(
     make_log: MakeLog, path: Path, kept: Kept, tmp_path: Path, later: int
 ) -> None:
-    """After a restore what is recorded from then on is sent, also in the place of what had been sent before."""
+    """New records after a restore are sent, even with sequences that were sent before."""
     log = make_log(checkpoint_every=5)
     record(log, 20)
     log.close()
@@ -317,10 +325,8 @@ def test_a_log_that_was_put_back(
     assert sealed[-1] == signed_checkpoints(path)[-1].number
 
 
-def test_a_position_without_the_record_is_held_against_the_end(
-    make_log: MakeLog, path: Path, kept: Kept
-) -> None:
-    """A position that an earlier version kept, ahead of the log, goes back to the log's end."""
+def test_an_old_position_beyond_the_end_is_corrected(make_log: MakeLog, path: Path, kept: Kept) -> None:
+    """A position from an earlier version, ahead of the log, moves back to the log's end."""
     log = make_log()
     record(log, 5)
     (last,) = everything(path)[-1:]
@@ -334,10 +340,10 @@ def test_a_position_without_the_record_is_held_against_the_end(
     assert kept.sequences() == [last + 1, last + 2]
 
 
-def test_what_retention_takes_while_it_is_read(
+def test_records_removed_while_reading_are_counted(
     make_log: MakeLog, path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Records that go between the look at the log's extent and the reading of it are counted as missed."""
+    """Records removed between the query of the log's range and the reading count as missed."""
     log = make_log()
     record(log, 30)
     one = forwarder(path, kept)
@@ -345,11 +351,30 @@ def test_what_retention_takes_while_it_is_read(
     before = kept.sequences()[-1]
     record(log, 30)
 
-    def removing(*arguments: Any, **named: Any) -> Page:
+    def removing(*arguments: Any, **named: Any) -> SearchPage:
         page = search(*arguments, **named)
-        return Page(page.entries[5:], page.cursor)
+        return SearchPage(page.entries[5:], page.cursor)
 
     monkeypatch.setattr("appliance.forwarding.log_forwarder.search", removing)
     one.step()
     assert kept.sequences()[-1] > before
     assert one.progress.missed == 5
+
+
+def test_a_position_is_stored_and_loaded(tmp_path: Path) -> None:
+    """The loaded position is the last stored one."""
+    file = tmp_path / "position.json"
+    assert load_position(file) is None
+    for position in (ForwardingPosition("a" * 32, 7, 1), ForwardingPosition("a" * 32, 9, 2)):
+        save_position(file, position)
+        assert load_position(file) == position
+    assert [one.name for one in tmp_path.iterdir()] == ["position.json"]
+
+
+@pytest.mark.parametrize("text", ["", "{}", "rubbish", '{"log":1,"sequence":2}'])
+def test_an_unreadable_position_is_an_error(tmp_path: Path, text: str) -> None:
+    """The error has the file and advice; the forwarder neither skips nor repeats records silently."""
+    file = tmp_path / "position.json"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=r"position\.json.*remove it"):
+        load_position(file)

@@ -1,4 +1,4 @@
-"""Tests of the way to a receiver, over real sockets on loopback."""
+"""Tests of sending to a receiver, over real sockets on loopback."""
 
 import socket
 import ssl
@@ -16,12 +16,12 @@ HOST = "127.0.0.1"
 
 
 def message(number: int) -> bytes:
-    """A small message with a number."""
+    """Return a small message with a number."""
     return f'<110>1 - robot rosrv - decision [rosrv@32473 sequence="{number}"]'.encode()
 
 
 def server_context(certificates: Certificates, *, clients: bool = False) -> ssl.SSLContext:
-    """The receiver's side."""
+    """Return the receiver's TLS context."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificates.certificate, certificates.key)
     if clients:
@@ -30,8 +30,8 @@ def server_context(certificates: Certificates, *, clients: bool = False) -> ssl.
     return context
 
 
-def test_datagrams() -> None:
-    """Over UDP each message is a datagram."""
+def test_udp_sends_datagrams() -> None:
+    """Each message is one datagram."""
     with DatagramCollector() as collector:
         receiver = DatagramReceiver(HOST, collector.port)
         receiver.send([message(1), message(2)])
@@ -40,8 +40,8 @@ def test_datagrams() -> None:
         receiver.close()
 
 
-def test_octet_counting() -> None:
-    """Over TCP each message has its length before it, whatever is in it, on one connection that stays open."""
+def test_tcp_counts_octets() -> None:
+    """Each message has its length before it, on one connection that stays open."""
     with StreamCollector() as collector:
         receiver = StreamReceiver(HOST, collector.port)
         receiver.send([message(1), message(2)])
@@ -52,8 +52,8 @@ def test_octet_counting() -> None:
         receiver.close()
 
 
-def test_a_receiver_that_went_away() -> None:
-    """That the receiver closed is an error before anything more is taken for sent; the next connection works."""
+def test_a_closed_connection_is_an_error() -> None:
+    """The error comes before more messages count as sent; the next connection works."""
     with StreamCollector() as collector:
         receiver = StreamReceiver(HOST, collector.port)
         receiver.send([message(1)])
@@ -71,8 +71,8 @@ def test_a_receiver_that_went_away() -> None:
         receiver.close()
 
 
-def test_a_receiver_that_reads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the other side's kernel does not acknowledge is not taken for sent: an error within the limit."""
+def test_a_receiver_that_reads_nothing_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unacknowledged data does not count as sent: an error comes within the timeout."""
     monkeypatch.setattr("appliance.forwarding.receiver._SEND_SECONDS", 0.3)
     with socket.socket() as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -85,8 +85,8 @@ def test_a_receiver_that_reads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
         receiver.close()
 
 
-def test_tls(certificates: Certificates) -> None:
-    """Over TLS the receiver shows a certificate of the given authority, for its address or the given name."""
+def test_tls_checks_the_receiver(certificates: Certificates) -> None:
+    """The receiver shows a certificate of the given authority, for its address or the given name."""
     with StreamCollector(context=server_context(certificates)) as collector:
         for name in (None, "logs.example"):
             receiver = StreamReceiver(
@@ -97,8 +97,8 @@ def test_tls(certificates: Certificates) -> None:
         collector.wait_for(lambda messages: len(messages) == 2)
 
 
-def test_tls_with_the_wrong_receiver(certificates: Certificates, tmp_path: Path) -> None:
-    """A certificate of another authority, or for another name, gets nothing sent."""
+def test_a_wrong_certificate_gets_nothing(certificates: Certificates, tmp_path: Path) -> None:
+    """A certificate of another authority, or for another name, gets no record."""
     other = make_certificates(tmp_path / "other")
     with StreamCollector(context=server_context(certificates)) as collector:
         for ca, name in ((other.ca, None), (certificates.ca, "evil.example")):
@@ -109,8 +109,8 @@ def test_tls_with_the_wrong_receiver(certificates: Certificates, tmp_path: Path)
         assert collector.messages == []
 
 
-def test_tls_clients_that_must_show_a_certificate(certificates: Certificates) -> None:
-    """With ours the receiver takes it; without, the refusal is an error although TLS 1.3 tells it late."""
+def test_tls_with_client_certificates(certificates: Certificates) -> None:
+    """The receiver accepts ours; without it, the refusal is an error although TLS 1.3 reports it late."""
     with StreamCollector(context=server_context(certificates, clients=True)) as collector:
         receiver = StreamReceiver(
             HOST,
@@ -127,7 +127,7 @@ def test_tls_clients_that_must_show_a_certificate(certificates: Certificates) ->
         assert collector.sequences() == [1]
 
 
-def test_files_that_cannot_be_read(tmp_path: Path, certificates: Certificates) -> None:
+def test_unreadable_files_are_errors(tmp_path: Path, certificates: Certificates) -> None:
     """A missing authority or certificate is an error that names the file."""
     with pytest.raises(OSError, match=r"nowhere\.pem.*authority"):
         tls_context(tmp_path / "nowhere.pem", None, None)
@@ -135,8 +135,8 @@ def test_files_that_cannot_be_read(tmp_path: Path, certificates: Certificates) -
         tls_context(certificates.ca, certificates.certificate, tmp_path / "nowhere.key")
 
 
-def test_clear_text_where_tls_is_meant(certificates: Certificates) -> None:
-    """A receiver that does not speak TLS is an error, and is sent no record."""
+def test_a_receiver_without_tls_gets_nothing(certificates: Certificates) -> None:
+    """If TLS is configured, such a receiver is an error and gets no record."""
     with socket.socket() as listener:
         listener.bind((HOST, 0))
         listener.listen(1)

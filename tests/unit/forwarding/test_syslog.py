@@ -1,4 +1,4 @@
-"""Tests of records as messages of RFC 5424, read back by its grammar."""
+"""Tests of records as messages of RFC 5424, parsed by its grammar."""
 
 import json
 from typing import Any
@@ -8,27 +8,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
-from appliance.audit.record import Record, RuleReference, Severity
-from appliance.audit.record_format import Entry
+from appliance.audit.record import AuditRecord, RuleReference, Severity
+from appliance.audit.record_format import LogEntry
 from appliance.forwarding.syslog import ELEMENT, Formatter
 from tests.support.syslog import parse
 
 _TIME = 1_700_000_000_123_456_789
 
 
-def entry(**fields: Any) -> Entry:
-    """A record at place 7."""
+def entry(**fields: Any) -> LogEntry:
+    """Return a record with sequence 7."""
     all_fields: dict[str, Any] = {"id": "0" * 20, "time": _TIME, "event": "decision"} | fields
-    return Entry(7, Record(**all_fields))
+    return LogEntry(7, AuditRecord(**all_fields))
 
 
 def formatter(longest: int = 8192) -> Formatter:
-    """As the appliance has it."""
+    """Return a formatter as the appliance makes it."""
     return Formatter(facility=13, longest=longest, host_name="robot-1")
 
 
-def test_a_denial() -> None:
-    """Who, what, the rule and the reason are there, each in its own parameter, and the time to the microsecond."""
+def test_a_denial_has_all_its_parameters() -> None:
+    """Host, resource, rule and reason have their own parameters; the time has microseconds."""
     message = parse(
         formatter().record(
             entry(
@@ -62,13 +62,13 @@ def test_a_denial() -> None:
         (Severity.ALARM, 1),
     ],
 )
-def test_severities(severity: Severity, number: int) -> None:
+def test_severities_are_mapped(severity: Severity, number: int) -> None:
     """Each severity has its own in syslog: an alarm is an alert."""
     assert parse(formatter().record(entry(severity=severity))).severity == number
 
 
-def test_an_event_of_several_words() -> None:
-    """The event is the message id, without spaces."""
+def test_the_event_is_the_message_id() -> None:
+    """Spaces of the event are replaced."""
     assert parse(formatter().record(entry(event="denials folded"))).event == "denials-folded"
 
 
@@ -76,8 +76,10 @@ def test_an_event_of_several_words() -> None:
     caller=st.text(max_size=80), resource=st.text(max_size=80), reason=st.text(max_size=200),
     detail=st.dictionaries(st.text(max_size=8), st.text(max_size=30), max_size=4),
 )  # fmt: skip
-def test_strangers_text(caller: str, resource: str, reason: str, detail: dict[str, str]) -> None:
-    """Whatever a stranger is called, the message is printable ASCII, and ends no parameter and no line."""
+def test_names_of_unknown_hosts_are_escaped(
+    caller: str, resource: str, reason: str, detail: dict[str, str]
+) -> None:
+    """The message is printable ASCII whatever the name, and the name ends no parameter or line."""
     record = entry(caller_id=caller, resource=resource, reason=reason, detail=detail)
     data = formatter().record(record)
     assert all(0x20 <= one <= 0x7E for one in data)
@@ -87,8 +89,8 @@ def test_strangers_text(caller: str, resource: str, reason: str, detail: dict[st
         assert json.loads(fields["detail"].encode().decode("unicode_escape")) is not None
 
 
-def test_injection() -> None:
-    """A name that is written like the end of an element, or a second message, is the value of its parameter."""
+def test_a_name_cannot_inject_fields() -> None:
+    """A name that looks like the end of an element, or a second message, is the value of its parameter."""
     evil = '/x"] [rosrv@32473 decision="allow"]\n<0>1 - - - - - -'
     message = parse(formatter().record(entry(caller_id=evil, decision="deny")))
     assert message.fields["decision"] == "deny"
@@ -97,8 +99,8 @@ def test_injection() -> None:
 
 
 @pytest.mark.parametrize("longest", [2048, 8192])
-def test_a_bound(longest: int) -> None:
-    """However long everything is, the message is within the bound and says what was left out."""
+def test_a_message_is_bounded(longest: int) -> None:
+    """A long message is cut to the limit and names what was omitted."""
     huge = "\\]" * 4096
     data = formatter(longest).record(
         entry(
@@ -117,7 +119,7 @@ def test_a_bound(longest: int) -> None:
     assert message.text.startswith("rrr")
 
 
-def test_the_bound_of_a_datagram() -> None:
+def test_a_message_fits_a_datagram() -> None:
     """An ordinary record with large details fits a datagram, with its whole reason."""
     data = formatter(2048).record(entry(reason="why it was so", detail={"before": "00" * 4000}))
     assert len(data) <= 2048
@@ -125,19 +127,19 @@ def test_the_bound_of_a_datagram() -> None:
 
 
 @pytest.mark.parametrize("time", [-1, 0, 2**62, -(2**62)])
-def test_any_time(time: int) -> None:
-    """A clock that is far off makes no message that a receiver refuses."""
+def test_any_time_is_valid(time: int) -> None:
+    """A wrong clock makes no message that a receiver rejects."""
     parse(formatter().record(entry(time=time)))
 
 
 @pytest.mark.parametrize("name", ["", "räuber", "two words", "x" * 300, "\n"])
-def test_any_host_name(name: str) -> None:
-    """Whatever the machine is called, the header has its form."""
+def test_any_host_name_is_valid(name: str) -> None:
+    """The header is well-formed for any name of the machine."""
     assert parse(Formatter(facility=0, longest=2048, host_name=name).record(entry())).host
 
 
-def test_a_checkpoint() -> None:
-    """A checkpoint carries all that was signed, and the signature, under a name of its own."""
+def test_a_checkpoint_has_its_signature() -> None:
+    """A checkpoint has all signed fields and the signature, under its own name."""
     one = SignedCheckpoint("a" * 32, 3, 120, "b" * 64, _TIME, "c" * 64, "d" * 128, "e" * 64)
     message = parse(formatter().checkpoint(one))
     assert message.event == "checkpoint-signed"

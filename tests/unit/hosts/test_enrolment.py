@@ -5,7 +5,7 @@ import ipaddress
 import itertools
 import socket
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,15 @@ from appliance.channel.admin import (
     HostToken,
     RevocationsWanted,
 )
-from appliance.channel.answers.host_answers import Endpoint, EnrolmentToken, KitParts, PortsSeen
+from appliance.channel.answers.host_answers import (
+    Endpoint,
+    EnrolmentToken,
+    KitParts,
+    NewCertificate,
+    PortsSeen,
+    Reloaded,
+    Revoked,
+)
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 from appliance.channel.messages import (
@@ -45,15 +53,15 @@ from appliance.channel.messages import (
 )
 from appliance.hosts.certificate_requests import Authority, AuthorityError
 from appliance.hosts.certification import Certification
-from appliance.hosts.enrolment import Hosts
+from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.host_table import (
     HostForbiddenError,
     HostRefusedError,
     HostsChangedError,
     HostTable,
 )
-from appliance.hosts.hosts_file import Declared
-from appliance.hosts.rest_place import RestPlace
+from appliance.hosts.hosts_file import DeclaredHosts
+from appliance.hosts.rest_address import RestAddress
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.ipsec import certificate_authority as ipsec
 from appliance.ipsec.proof_of_possession import RequestRefusedError
@@ -61,7 +69,9 @@ from appliance.ipsec.requests import make_key, signing_request
 from appliance.policy.model import Address
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
-from tests.support.audit import HeardTrail
+from tests.support.audit import RecordingTrail
+
+pytestmark = pytest.mark.anyio
 
 
 class NearAuthority(Authority):
@@ -69,7 +79,7 @@ class NearAuthority(Authority):
 
     def __init__(self, directory: Path) -> None:
         super().__init__(Link(lambda _message: None))
-        self._near = ipsec.Authority(directory)
+        self._near = ipsec.CertificateAuthority(directory)
         self.meanwhile: Callable[[], object] = lambda: None
         self.lists = 0
 
@@ -107,8 +117,8 @@ class Bench:
         self.log = AuditLog(directory / "audit.db")
         self.declared = directory / "hosts.yaml"
         self.authority = NearAuthority(directory)
-        self.trail = HeardTrail(self.log)
-        self.table = HostTable(self.store, ipaddress.IPv4Network(pool), Declared(self.declared))
+        self.trail = RecordingTrail(self.log)
+        self.table = HostTable(self.store, ipaddress.IPv4Network(pool), DeclaredHosts(self.declared))
         self.tunnels = Tunnels(self.table, self.trail, self.authority, listen=(listen, 11311), say=self._said)
         self.certification = certification = Certification(
             self.store,
@@ -117,7 +127,7 @@ class Bench:
             self.table,
             self.tunnels,
             master_port=11311,
-            rest=RestPlace(8443, "", 8443),
+            rest=RestAddress(8443, "", 8443),
             changed=self._changed,
         )
         certification.served_by("sha256//pin")
@@ -125,7 +135,7 @@ class Bench:
         self.each_hour = certification.each_hour
         self.relays = asyncio.Event()
         self.relays.set()
-        self.hosts = Hosts(
+        self.hosts = HostEnrolment(
             certification,
             self._endpoint,
             expel=self._expel,
@@ -137,6 +147,49 @@ class Bench:
         """End the threads."""
         self.store.close()
         self.log.close()
+
+    def add(
+        self, name: str, address: str | None = None, *, key: bytes | None = None
+    ) -> Coroutine[Any, Any, KitParts]:
+        """Enrol a host with this key, or one of its own."""
+        request = signing_request(key or make_key(), name).decode()
+        return self.hosts.add(HostAdd(name, request, 90, address), "tester")
+
+    def renew(self, name: str) -> Coroutine[Any, Any, KitParts]:
+        """An operator renews a host's certificate."""
+        return self.hosts.renew(HostRenew(name, request_of(name), 90), "tester")
+
+    def revoke(self, name: str) -> Coroutine[Any, Any, Revoked]:
+        """Revoke a host."""
+        return self.hosts.revoke(HostRevoke(name), "tester")
+
+    def reload(self) -> Coroutine[Any, Any, Reloaded]:
+        """Read the declared hosts."""
+        return self.hosts.reload(HostsReload(), "tester")
+
+    def token(
+        self, name: str, *, seconds: float = 60, new: bool = True
+    ) -> Coroutine[Any, Any, EnrolmentToken]:
+        """A one-time token."""
+        return self.hosts.token(HostToken(name, "10.0.0.1", token_seconds=seconds, new=new), "tester")
+
+    def enrol(self, token: str, name: str) -> Coroutine[Any, Any, KitParts]:
+        """A host enrols itself with a token."""
+        return self.hosts.itself.enrol(HostEnrol(token, request_of(name), "10.9.9.9"))
+
+    def renew_itself(
+        self, name: str, request: str, former: bytes, peer: str = "10.113.11.2"
+    ) -> Coroutine[Any, Any, NewCertificate]:
+        """A host renews its certificate in its tunnel, with its former key."""
+        return self.hosts.itself.renew(HostRenewItself(name, request, sign(former, request), peer))
+
+    def renewed(self, name: str) -> Coroutine[Any, Any, Any]:
+        """A host reports that the new certificate is in place."""
+        return self.hosts.itself.renewed(HostRenewed(name, "10.113.11.2"))
+
+    def recorded(self, event: str) -> list[str]:
+        """The reasons of all records of an event."""
+        return [fields["reason"] for name, fields in self.trail.heard if name == event]
 
     def _said(self, message: Message) -> None:
         self.asked.append(message)
@@ -164,9 +217,17 @@ def sign(key: bytes, request: str) -> bytes:
     return private.sign(request.encode(), ec.ECDSA(hashes.SHA384()))
 
 
-def add(bench: Bench, name: str, address: str | None = None) -> Coroutine[Any, Any, KitParts]:
-    """Enrol a host with a key of its own."""
-    return bench.hosts.add(HostAdd(name, signing_request(make_key(), name).decode(), 90, address), "tester")
+def request_of(name: str) -> str:
+    """A signing request for a new key."""
+    return signing_request(make_key(), name).decode()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    """Hosts of one life of control."""
+    bench = Bench(tmp_path)
+    yield bench
+    bench.close()
 
 
 @pytest.fixture(autouse=True)
@@ -188,53 +249,54 @@ def run(directory: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **o
     asyncio.run(inside())
 
 
-def test_addresses_are_given_in_order_and_kept(tmp_path: Path) -> None:
+async def test_addresses_are_given_in_order_and_kept(bench: Bench) -> None:
     """The first is the appliance's; declared ones are kept free; a revoked host's is given to no other."""
-
-    async def work(bench: Bench) -> None:
-        bench.declared.write_text("hosts:\n  - name: laptop\n    address: 10.113.11.3\n")
-        await bench.hosts.reload(HostsReload(), "tester")
-        assert (await add(bench, "a")).address == "10.113.11.2"
-        assert (await add(bench, "b")).address == "10.113.11.4"
-        assert (await add(bench, "laptop")).address == "10.113.11.3"
-        await bench.hosts.revoke(HostRevoke("a"), "tester")
-        assert (await add(bench, "c")).address == "10.113.11.5"
-        assert (await add(bench, "a")).address == "10.113.11.2"
-        assert (await add(bench, "d")).address == "10.113.11.6"
-        with pytest.raises(HostRefusedError, match=r"take a larger ipsec\.pool"):
-            await add(bench, "e")
-
-    run(tmp_path, work)
+    bench.declared.write_text("hosts:\n  - name: laptop\n    address: 10.113.11.3\n")
+    await bench.reload()
+    assert (await bench.add("a")).address == "10.113.11.2"
+    assert (await bench.add("b")).address == "10.113.11.4"
+    assert (await bench.add("laptop")).address == "10.113.11.3"
+    await bench.revoke("a")
+    assert (await bench.add("c")).address == "10.113.11.5"
+    assert (await bench.add("a")).address == "10.113.11.2"
+    assert (await bench.add("d")).address == "10.113.11.6"
+    with pytest.raises(HostRefusedError, match=r"take a larger ipsec\.pool"):
+        await bench.add("e")
 
 
-@pytest.mark.parametrize("address", ["10.113.11.1", "10.113.12.2", "10.113.11", "::1", "10.113.11.2"])
-def test_an_address_that_cannot_be_had_is_refused(tmp_path: Path, address: str) -> None:
-    """The appliance's own, one outside the pool, nonsense, and one that is taken."""
-
-    async def work(bench: Bench) -> None:
-        await add(bench, "a")
-        with pytest.raises(HostRefusedError, match="address"):
-            await add(bench, "b", address)
-
-    run(tmp_path, work)
-
-
-@pytest.mark.parametrize("name", ["", "rosrv-appliance", "a b", "../a", "x" * 64, "a\n"])
-def test_a_name_that_cannot_be_had_is_refused(tmp_path: Path, name: str) -> None:
-    """Above all not the appliance's own: a host with it could stand for the appliance."""
-
-    async def work(bench: Bench) -> None:
-        with pytest.raises(HostRefusedError, match="no name for a host"):
-            await bench.hosts.add(HostAdd(name, "", 90), "tester")
-
-    run(tmp_path, work)
+@pytest.mark.parametrize(
+    ("name", "address", "why"),
+    [
+        *(
+            ("b", taken, "address")
+            for taken in ("10.113.11.1", "10.113.12.2", "10.113.11", "::1", "10.113.11.2")
+        ),
+        *(
+            (wrong, None, "no name for a host")
+            for wrong in ("", "rosrv-appliance", "a b", "../a", "x" * 64, "a\n")
+        ),
+        *((other, None, "large and small letters") for other in ("Laptop", "LAPTOP")),
+        ("ROSRV-Appliance", None, "no name"),
+    ],
+)
+async def test_a_name_or_an_address_that_cannot_be_had_is_refused(
+    bench: Bench, name: str, address: str | None, why: str
+) -> None:
+    """Above all not the appliance's own: a host with its name could stand for it. IKE compares names without regard to
+    case, so no second host may answer to the first one's; an address is in the pool and free.
+    """
+    await bench.add("laptop")
+    with pytest.raises(HostRefusedError, match=why):
+        await bench.hosts.add(
+            HostAdd(name, "" if why == "no name for a host" else request_of("b"), 90, address), "tester"
+        )
 
 
 def test_without_a_firewall_no_name_stands_for_an_address(tmp_path: Path) -> None:
     """The supervisor cannot keep clear text out: nobody is enrolled, and hosts of an earlier life are nobody."""
 
     async def enrol(bench: Bench) -> None:
-        await add(bench, "a")
+        await bench.add("a")
         assert list(bench.tunnels.addresses) == ["a"]
 
     async def again(bench: Bench) -> None:
@@ -244,7 +306,7 @@ def test_without_a_firewall_no_name_stands_for_an_address(tmp_path: Path) -> Non
         assert bench.tunnels.addresses == {}
         assert "no firewall here" in bench.hosts.status().troubles[0]
         with pytest.raises(HostRefusedError, match="no firewall here"):
-            await add(bench, "b")
+            await bench.add("b")
 
     run(tmp_path, enrol)
     run(tmp_path, again)
@@ -255,145 +317,98 @@ def test_a_master_that_cannot_be_reached_in_the_tunnel_is_said(tmp_path: Path) -
 
     async def work(bench: Bench) -> None:
         with pytest.raises(HostRefusedError, match=r"listen: 0\.0\.0\.0:11311"):
-            await add(bench, "a")
+            await bench.add("a")
 
     run(tmp_path, work, listen="192.168.1.20")
 
 
-def test_revoked_is_out_of_the_policy_before_anything_is_awaited(tmp_path: Path) -> None:
+async def test_revoked_is_out_of_the_policy_before_anything_is_awaited(bench: Bench) -> None:
     """The policy first, then what the host has; and its certificate is on the list for good."""
-
-    async def work(bench: Bench) -> None:
-        await add(bench, "a")
-        bench.order.clear()
-        body = await bench.hosts.revoke(HostRevoke("a"), "tester")
-        assert bench.order == ["policy []", "expel 10.113.11.2"]
-        assert body.taken_back == 3
-        assert [row.serial for row in bench.store.hosts.revoked()] == [body.serial]
-        with pytest.raises(HostRefusedError, match="enrolled are: none"):
-            await bench.hosts.revoke(HostRevoke("a"), "tester")
-
-    run(tmp_path, work)
+    await bench.add("a")
+    bench.order.clear()
+    body = await bench.revoke("a")
+    assert bench.order == ["policy []", "expel 10.113.11.2"]
+    assert body.taken_back == 3
+    assert [row.serial for row in bench.store.hosts.revoked()] == [body.serial]
+    with pytest.raises(HostRefusedError, match="enrolled are: none"):
+        await bench.revoke("a")
 
 
-def test_a_new_certificate_revokes_the_one_before(tmp_path: Path) -> None:
+async def test_a_new_certificate_revokes_the_one_before(bench: Bench) -> None:
     """The address stays; there is no second enrolment of a name that is enrolled."""
-
-    async def work(bench: Bench) -> None:
-        first = await add(bench, "a")
-        with pytest.raises(HostRefusedError, match="rosrv host kit a"):
-            await add(bench, "a")
-        second = await bench.hosts.renew(
-            HostRenew("a", signing_request(make_key(), "a").decode(), 90), "tester"
-        )
-        assert second.address == first.address
-        assert [row.serial for row in bench.store.hosts.revoked()] == [first.serial]
-
-    run(tmp_path, work)
+    first = await bench.add("a")
+    with pytest.raises(HostRefusedError, match="rosrv host kit a"):
+        await bench.add("a")
+    second = await bench.renew("a")
+    assert second.address == first.address
+    assert [row.serial for row in bench.store.hosts.revoked()] == [first.serial]
 
 
-def test_a_bad_request_enrols_nobody(tmp_path: Path) -> None:
+async def test_a_bad_request_enrols_nobody(bench: Bench) -> None:
     """What the authority refuses is refused whole."""
-
-    async def work(bench: Bench) -> None:
-        with pytest.raises(HostRefusedError, match="not a signing request"):
-            await bench.hosts.add(HostAdd("a", "rubbish", 90), "tester")
-        assert bench.hosts.rows() == []
-
-    run(tmp_path, work)
+    with pytest.raises(HostRefusedError, match="not a signing request"):
+        await bench.hosts.add(HostAdd("a", "rubbish", 90), "tester")
+    assert bench.hosts.rows() == []
 
 
-def test_declared_and_not_enrolled_is_shown(tmp_path: Path) -> None:
+async def test_declared_and_not_enrolled_is_shown(bench: Bench) -> None:
     """The list has both kinds of divergence from the baseline."""
-
-    async def work(bench: Bench) -> None:
-        bench.declared.write_text("hosts:\n  - name: laptop\n")
-        await bench.hosts.reload(HostsReload(), "tester")
-        await add(bench, "a")
-        rows = {row.name: (row.state, row.declared) for row in bench.hosts.rows()}
-        assert rows == {"a": ("down", False), "laptop": ("not enrolled", True)}
-        bench.declared.write_text("hosts: [")
-        with pytest.raises(HostRefusedError, match="what was declared before holds"):
-            await bench.hosts.reload(HostsReload(), "tester")
-        assert [row.name for row in bench.hosts.rows()] == ["a", "laptop"]
-        assert any("hosts.yaml" in trouble for trouble in bench.hosts.status().troubles)
-
-    run(tmp_path, work)
+    bench.declared.write_text("hosts:\n  - name: laptop\n")
+    await bench.reload()
+    await bench.add("a")
+    rows = {row.name: (row.state, row.declared) for row in bench.hosts.rows()}
+    assert rows == {"a": ("down", False), "laptop": ("not enrolled", True)}
+    bench.declared.write_text("hosts: [")
+    with pytest.raises(HostRefusedError, match="what was declared before holds"):
+        await bench.reload()
+    assert [row.name for row in bench.hosts.rows()] == ["a", "laptop"]
+    assert any("hosts.yaml" in trouble for trouble in bench.hosts.status().troubles)
 
 
-def request_of(name: str) -> str:
-    """A signing request for a new key."""
-    return signing_request(make_key(), name).decode()
-
-
-def token(
-    bench: Bench, name: str, *, seconds: float = 60, new: bool = True
-) -> Coroutine[Any, Any, EnrolmentToken]:
-    """A one-time token."""
-    return bench.hosts.token(HostToken(name, "10.0.0.1", token_seconds=seconds, new=new), "tester")
-
-
-def recorded(bench: Bench, event: str) -> list[str]:
-    """The reasons of all records of an event."""
-    return [fields["reason"] for name, fields in bench.trail.heard if name == event]
-
-
-def test_a_one_time_token_enrols_once(tmp_path: Path) -> None:
+async def test_a_one_time_token_enrols_once(bench: Bench, tmp_path: Path) -> None:
     """Used again, or after a newer one of the name, it opens nothing; it is nowhere in the state."""
-
-    async def work(bench: Bench) -> None:
-        first = await token(bench, "a")
-        second = await token(bench, "a")
-        for text in (first.token, "rosrv-enrol_000000000000_" + "x" * 43, "rubbish"):
-            with pytest.raises(HostForbiddenError, match="wrong, was used before, or has ended"):
-                await bench.hosts.itself.enrol(HostEnrol(text, request_of("a"), "10.9.9.9"))
-        assert bench.hosts.rows()[0].state == "awaited"
-        body = await bench.hosts.itself.enrol(HostEnrol(second.token, request_of("a"), "10.9.9.9"))
-        assert body.address == second.address
-        assert body.kept["endpoint"] == "10.0.0.1"
-        with pytest.raises(HostForbiddenError):
-            await bench.hosts.itself.enrol(HostEnrol(second.token, request_of("a"), "10.9.9.9"))
-        secret = second.token.split("_", 2)[2].encode()
-        for file in tmp_path.rglob("*"):
-            if file.is_file():
-                assert secret not in file.read_bytes(), file
-
-    run(tmp_path, work)
+    first = await bench.token("a")
+    second = await bench.token("a")
+    for text in (first.token, "rosrv-enrol_000000000000_" + "x" * 43, "rubbish"):
+        with pytest.raises(HostForbiddenError, match="wrong, was used before, or has ended"):
+            await bench.enrol(text, "a")
+    assert bench.hosts.rows()[0].state == "awaited"
+    body = await bench.enrol(second.token, "a")
+    assert body.address == second.address
+    assert body.kept["endpoint"] == "10.0.0.1"
+    with pytest.raises(HostForbiddenError):
+        await bench.enrol(second.token, "a")
+    secret = second.token.split("_", 2)[2].encode()
+    for file in tmp_path.rglob("*"):
+        if file.is_file():
+            assert secret not in file.read_bytes(), file
 
 
-def test_two_who_bring_a_token_at_once_get_one_certificate(tmp_path: Path) -> None:
+async def test_two_who_bring_a_token_at_once_get_one_certificate(bench: Bench) -> None:
     """It is used up before the authority is asked."""
-
-    async def work(bench: Bench) -> None:
-        text = (await token(bench, "a")).token
-        both = await asyncio.gather(
-            bench.hosts.itself.enrol(HostEnrol(text, request_of("a"), "10.9.9.8")),
-            bench.hosts.itself.enrol(HostEnrol(text, request_of("a"), "10.9.9.9")),
-            return_exceptions=True,
-        )
-        assert sorted(isinstance(one, HostForbiddenError) for one in both) == [False, True]
-
-    run(tmp_path, work)
+    text = (await bench.token("a")).token
+    both = await asyncio.gather(
+        bench.hosts.itself.enrol(HostEnrol(text, request_of("a"), "10.9.9.8")),
+        bench.enrol(text, "a"),
+        return_exceptions=True,
+    )
+    assert sorted(isinstance(one, HostForbiddenError) for one in both) == [False, True]
 
 
-def test_a_bad_request_does_not_use_the_token_up(tmp_path: Path) -> None:
+async def test_a_bad_request_does_not_use_the_token_up(bench: Bench) -> None:
     """The host may come again with a right one; an ended or revoked token is good for nothing."""
-
-    async def work(bench: Bench) -> None:
-        text = (await token(bench, "a")).token
-        with pytest.raises(HostRefusedError, match="not a signing request"):
-            await bench.hosts.itself.enrol(HostEnrol(text, "rubbish", "10.9.9.9"))
-        await bench.hosts.itself.enrol(HostEnrol(text, request_of("a"), "10.9.9.9"))
-        short = (await token(bench, "b", seconds=0.05)).token
-        await asyncio.sleep(0.06)
-        with pytest.raises(HostForbiddenError):
-            await bench.hosts.itself.enrol(HostEnrol(short, request_of("b"), "10.9.9.9"))
-        taken_back = (await token(bench, "c")).token
-        assert (await bench.hosts.revoke(HostRevoke("c"), "tester")).serial == ""
-        with pytest.raises(HostForbiddenError):
-            await bench.hosts.itself.enrol(HostEnrol(taken_back, request_of("c"), "10.9.9.9"))
-
-    run(tmp_path, work)
+    text = (await bench.token("a")).token
+    with pytest.raises(HostRefusedError, match="not a signing request"):
+        await bench.hosts.itself.enrol(HostEnrol(text, "rubbish", "10.9.9.9"))
+    await bench.enrol(text, "a")
+    short = (await bench.token("b", seconds=0.05)).token
+    await asyncio.sleep(0.06)
+    with pytest.raises(HostForbiddenError):
+        await bench.enrol(short, "b")
+    taken_back = (await bench.token("c")).token
+    assert (await bench.revoke("c")).serial == ""
+    with pytest.raises(HostForbiddenError):
+        await bench.enrol(taken_back, "c")
 
 
 def test_tokens_outlive_a_restart(tmp_path: Path) -> None:
@@ -401,71 +416,59 @@ def test_tokens_outlive_a_restart(tmp_path: Path) -> None:
     texts: list[str] = []
 
     async def before(bench: Bench) -> None:
-        texts.append((await token(bench, "a")).token)
+        texts.append((await bench.token("a")).token)
 
     async def after(bench: Bench) -> None:
-        assert (await bench.hosts.itself.enrol(HostEnrol(texts[0], request_of("a"), "10.9.9.9"))).name == "a"
+        assert (await bench.enrol(texts[0], "a")).name == "a"
 
     run(tmp_path, before)
     run(tmp_path, after)
 
 
 @pytest.mark.parametrize("how", ["kit", "token", "itself"])
-def test_revoked_while_a_certificate_is_made(tmp_path: Path, how: str) -> None:
+async def test_revoked_while_a_certificate_is_made(bench: Bench, how: str) -> None:
     """What is under way for a revoked host comes to nothing, however it comes; it stays revoked."""
+    key = make_key()
+    await bench.add("a", key=key)
+    text = (await bench.token("a", new=False)).token
+    tasks: list[asyncio.Task[Any]] = []
 
-    async def work(bench: Bench) -> None:
-        key = make_key()
-        await bench.hosts.add(HostAdd("a", signing_request(key, "a").decode(), 90), "tester")
-        text = (await token(bench, "a", new=False)).token
-        tasks: list[asyncio.Task[Any]] = []
+    def revoke() -> None:
+        bench.authority.meanwhile = lambda: None
+        tasks.append(asyncio.get_running_loop().create_task(bench.revoke("a")))
 
-        def revoke() -> None:
-            bench.authority.meanwhile = lambda: None
-            tasks.append(
-                asyncio.get_running_loop().create_task(bench.hosts.revoke(HostRevoke("a"), "tester"))
-            )
-
-        bench.authority.meanwhile = revoke
-        request = request_of("a")
-        with pytest.raises(HostForbiddenError, match="revoked meanwhile"):
-            if how == "kit":
-                await bench.hosts.renew(HostRenew("a", request, 90), "tester")
-            elif how == "token":
-                await bench.hosts.itself.enrol(HostEnrol(text, request, "10.9.9.9"))
-            else:
-                await bench.hosts.itself.renew(
-                    HostRenewItself("a", request, sign(key, request), "10.113.11.2")
-                )
-        await asyncio.gather(*tasks)
-        assert bench.hosts.rows()[0].state == "revoked"
-        assert bench.tunnels.addresses == {}
-
-    run(tmp_path, work)
+    bench.authority.meanwhile = revoke
+    request = request_of("a")
+    with pytest.raises(HostForbiddenError, match="revoked meanwhile"):
+        if how == "kit":
+            await bench.hosts.renew(HostRenew("a", request, 90), "tester")
+        elif how == "token":
+            await bench.hosts.itself.enrol(HostEnrol(text, request, "10.9.9.9"))
+        else:
+            await bench.renew_itself("a", request, key)
+    await asyncio.gather(*tasks)
+    assert bench.hosts.rows()[0].state == "revoked"
+    assert bench.tunnels.addresses == {}
 
 
-def test_a_host_renews_itself(tmp_path: Path) -> None:
+async def test_a_host_renews_itself(bench: Bench) -> None:
     """In its tunnel and with its key: both certificates are good until it says that the new one is in place."""
-
-    async def work(bench: Bench) -> None:
-        key = make_key()
-        first = await bench.hosts.add(HostAdd("a", signing_request(key, "a").decode(), 90), "tester")
-        request = request_of("a")
-        made = await bench.hosts.itself.renew(
-            HostRenewItself("a", request, sign(key, request), "::ffff:10.113.11.2")
-        )
-        assert made.serial != first.serial
-        assert bench.hosts.rows()[0].renewing
-        assert bench.store.hosts.revoked() == []
-        await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
-        assert [row.serial for row in bench.store.hosts.revoked()] == [first.serial]
-        assert bench.hosts.rows()[0].serial == made.serial
-        with pytest.raises(HostRefusedError, match="renew first"):
-            await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
-        with pytest.raises(HostRefusedError, match="again in"):
-            await bench.hosts.itself.renew(HostRenewItself("a", request, sign(key, request), "10.113.11.2"))
-
-    run(tmp_path, work)
+    key = make_key()
+    first = await bench.add("a", key=key)
+    request = request_of("a")
+    made = await bench.hosts.itself.renew(
+        HostRenewItself("a", request, sign(key, request), "::ffff:10.113.11.2")
+    )
+    assert made.serial != first.serial
+    assert bench.hosts.rows()[0].renewing
+    assert bench.store.hosts.revoked() == []
+    await bench.renewed("a")
+    assert [row.serial for row in bench.store.hosts.revoked()] == [first.serial]
+    assert bench.hosts.rows()[0].serial == made.serial
+    with pytest.raises(HostRefusedError, match="renew first"):
+        await bench.renewed("a")
+    with pytest.raises(HostRefusedError, match="again in"):
+        await bench.renew_itself("a", request, key)
 
 
 def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:
@@ -473,179 +476,131 @@ def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:
     keys = [make_key(), make_key(), make_key()]
 
     async def first(bench: Bench) -> None:
-        await bench.hosts.add(HostAdd("a", signing_request(keys[0], "a").decode(), 90), "tester")
+        await bench.add("a", key=keys[0])
         request = signing_request(keys[1], "a").decode()
-        await bench.hosts.itself.renew(HostRenewItself("a", request, sign(keys[0], request), "10.113.11.2"))
-        await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
+        await bench.renew_itself("a", request, keys[0])
+        await bench.renewed("a")
 
     async def second(bench: Bench) -> None:
         await bench.tunnels.start()
         request = signing_request(keys[2], "a").decode()
         with pytest.raises(HostRefusedError, match="again in 4 days"):
-            await bench.hosts.itself.renew(
-                HostRenewItself("a", request, sign(keys[1], request), "10.113.11.2")
-            )
+            await bench.renew_itself("a", request, keys[1])
         await bench.hosts.renew(HostRenew("a", request, 90), "tester")
 
     run(tmp_path, first)
     run(tmp_path, second)
 
 
-def test_a_short_life_needs_a_short_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_short_life_needs_a_short_wait(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is renewed often ends soon, and is on the list of revoked certificates for as short a time."""
-
-    async def work(bench: Bench) -> None:
-        keys = [make_key(), make_key(), make_key()]
-        await bench.hosts.add(HostAdd("a", signing_request(keys[0], "a").decode(), 100 / 86_400), "tester")
-        for former, key in itertools.pairwise(keys):
-            request = signing_request(key, "a").decode()
-            await bench.hosts.itself.renew(
-                HostRenewItself("a", request, sign(former, request), "10.113.11.2")
-            )
-            await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
-            now = time.time()
-            monkeypatch.setattr(time, "time", lambda now=now: now + 6)
-
-    run(tmp_path, work)
+    keys = [make_key(), make_key(), make_key()]
+    await bench.hosts.add(HostAdd("a", signing_request(keys[0], "a").decode(), 100 / 86_400), "tester")
+    for former, key in itertools.pairwise(keys):
+        request = signing_request(key, "a").decode()
+        await bench.renew_itself("a", request, former)
+        await bench.renewed("a")
+        now = time.time()
+        monkeypatch.setattr(time, "time", lambda now=now: now + 6)
 
 
-def test_nobody_renews_for_another(tmp_path: Path) -> None:
+async def test_nobody_renews_for_another(bench: Bench) -> None:
     """Another address, another host's tunnel, another key, another name, no tunnels at all: refused and recorded."""
-
-    async def work(bench: Bench) -> None:
-        key, other = make_key(), make_key()
-        await bench.hosts.add(HostAdd("a", signing_request(key, "a").decode(), 90), "tester")
-        await bench.hosts.add(HostAdd("b", signing_request(other, "b").decode(), 90), "tester")
-        request = request_of("a")
-        good = sign(key, request)
-        for name, peer in (
-            ("a", "192.168.1.5"),
-            ("a", "10.113.11.3"),
-            ("zz", "10.113.11.2"),
-            ("b", "10.113.11.2"),
-        ):
-            with pytest.raises(HostForbiddenError):
-                await bench.hosts.itself.renew(HostRenewItself(name, request, good, peer))
-            with pytest.raises(HostForbiddenError):
-                await bench.hosts.itself.renewed(HostRenewed(name, peer))
-        with pytest.raises(HostRefusedError, match="not signed by the key"):
-            await bench.hosts.itself.renew(HostRenewItself("a", request, sign(other, request), "10.113.11.2"))
-        assert len(recorded(bench, "renewal refused")) == 8
-        bench.tunnels.answered(TunnelsEnclosed(None, "the firewall is gone"))
+    key, other = make_key(), make_key()
+    await bench.add("a", key=key)
+    await bench.add("b", key=other)
+    request = request_of("a")
+    good = sign(key, request)
+    for name, peer in (
+        ("a", "192.168.1.5"),
+        ("a", "10.113.11.3"),
+        ("zz", "10.113.11.2"),
+        ("b", "10.113.11.2"),
+    ):
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.itself.renew(HostRenewItself("a", request, good, "10.113.11.2"))
+            await bench.hosts.itself.renew(HostRenewItself(name, request, good, peer))
+        with pytest.raises(HostForbiddenError):
+            await bench.hosts.itself.renewed(HostRenewed(name, peer))
+    with pytest.raises(HostRefusedError, match="not signed by the key"):
+        await bench.renew_itself("a", request, other)
+    assert len(bench.recorded("renewal refused")) == 8
+    bench.tunnels.answered(TunnelsEnclosed(None, "the firewall is gone"))
+    with pytest.raises(HostForbiddenError):
+        await bench.hosts.itself.renew(HostRenewItself("a", request, good, "10.113.11.2"))
 
-    run(tmp_path, work)
 
-
-def test_revoking_amid_a_renewal_revokes_both_certificates(tmp_path: Path) -> None:
+async def test_revoking_amid_a_renewal_revokes_both_certificates(bench: Bench) -> None:
     """The one that was to follow is as dead as the present one, over a restart too."""
-
-    async def work(bench: Bench) -> None:
-        key = make_key()
-        first = await bench.hosts.add(HostAdd("a", signing_request(key, "a").decode(), 90), "tester")
-        request = request_of("a")
-        made = await bench.hosts.itself.renew(
-            HostRenewItself("a", request, sign(key, request), "10.113.11.2")
-        )
-        await bench.hosts.revoke(HostRevoke("a"), "tester")
-        assert {row.serial for row in bench.store.hosts.revoked()} == {
-            first.serial,
-            made.serial,
-        }
-        with pytest.raises(HostForbiddenError):
-            await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
-        again = await add(bench, "a")
-        assert again.address == first.address
-        assert again.serial not in {first.serial, made.serial}
-
-    run(tmp_path, work)
+    key = make_key()
+    first = await bench.add("a", key=key)
+    request = request_of("a")
+    made = await bench.renew_itself("a", request, key)
+    await bench.revoke("a")
+    assert {row.serial for row in bench.store.hosts.revoked()} == {
+        first.serial,
+        made.serial,
+    }
+    with pytest.raises(HostForbiddenError):
+        await bench.renewed("a")
+    again = await bench.add("a")
+    assert again.address == first.address
+    assert again.serial not in {first.serial, made.serial}
 
 
-def test_the_list_is_signed_once_however_often_it_is_asked_for(tmp_path: Path) -> None:
+async def test_the_list_is_signed_once_however_often_it_is_asked_for(bench: Bench) -> None:
     """Whoever asks without a token costs no signature, and for the certificate never; who is revoked is on at once."""
-
-    async def work(bench: Bench) -> None:
-        first = await add(bench, "a")
-        assert "BEGIN CERTIFICATE" in (await bench.certification.authority(AuthorityWanted())).authority
-        assert bench.authority.lists == 0
-        answers = await asyncio.gather(
-            *(bench.certification.revocations(RevocationsWanted()) for _ in range(20))
-        )
-        assert bench.authority.lists == 1
-        assert len({one.revocations for one in answers}) == 1
-        await bench.hosts.revoke(HostRevoke("a"), "tester")
-        after = x509.load_pem_x509_crl(
-            (await bench.certification.revocations(RevocationsWanted())).revocations.encode()
-        )
-        assert [f"{one.serial_number:x}" for one in after] == [first.serial]
-        assert bench.authority.lists == 2
-
-    run(tmp_path, work)
+    first = await bench.add("a")
+    assert "BEGIN CERTIFICATE" in (await bench.certification.authority(AuthorityWanted())).authority
+    assert bench.authority.lists == 0
+    answers = await asyncio.gather(*(bench.certification.revocations(RevocationsWanted()) for _ in range(20)))
+    assert bench.authority.lists == 1
+    assert len({one.revocations for one in answers}) == 1
+    await bench.revoke("a")
+    after = x509.load_pem_x509_crl(
+        (await bench.certification.revocations(RevocationsWanted())).revocations.encode()
+    )
+    assert [f"{one.serial_number:x}" for one in after] == [first.serial]
+    assert bench.authority.lists == 2
 
 
-def test_a_full_list_replaces_no_certificate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_full_list_replaces_no_certificate(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Refused with the day when there is room; a host that is new needs none, and revoking one makes some."""
     monkeypatch.setattr("appliance.hosts.revoked_certificates.ENTRIES_BYTES", 120)
-
-    async def work(bench: Bench) -> None:
-        for name in ("a", "b"):
-            await add(bench, name)
-        for _ in range(2):
-            await bench.hosts.renew(HostRenew("a", request_of("a"), 90), "tester")
-        key_before = bench.hosts.rows()[1].serial
-        with pytest.raises(HostRefusedError, match=r"list of revoked certificates is full.*before 2"):
-            await bench.hosts.renew(HostRenew("b", request_of("b"), 90), "tester")
-        assert bench.hosts.rows()[1].serial == key_before
-        await add(bench, "c")
-        await bench.hosts.revoke(HostRevoke("a"), "tester")
-        await bench.hosts.renew(HostRenew("b", request_of("b"), 90), "tester")
-        assert bench.hosts.status().troubles == []
-
-    run(tmp_path, work)
+    for name in ("a", "b"):
+        await bench.add(name)
+    for _ in range(2):
+        await bench.renew("a")
+    key_before = bench.hosts.rows()[1].serial
+    with pytest.raises(HostRefusedError, match=r"list of revoked certificates is full.*before 2"):
+        await bench.renew("b")
+    assert bench.hosts.rows()[1].serial == key_before
+    await bench.add("c")
+    await bench.revoke("a")
+    await bench.renew("b")
+    assert bench.hosts.status().troubles == []
 
 
-def test_a_change_for_another_state_is_refused(tmp_path: Path) -> None:
+async def test_a_change_for_another_state_is_refused(bench: Bench) -> None:
     """Two engineers cannot overwrite each other: the revision grows with every change, over restarts."""
-
-    async def work(bench: Bench) -> None:
-        seen = (await bench.hosts.listed(HostList())).revision
-        await add(bench, "a")
-        for late in (
-            bench.hosts.revoke(HostRevoke("a", seen), "tester"),
-            bench.hosts.renew(HostRenew("a", request_of("a"), 90, seen), "tester"),
-            bench.hosts.ports.tell(HostPorts("a", "closed", [], 1.0, seen), "tester"),
-            bench.hosts.reload(HostsReload(seen), "tester"),
-        ):
-            with pytest.raises(HostsChangedError):
-                await late
-        await bench.hosts.revoke(HostRevoke("a", (await bench.hosts.listed(HostList())).revision), "tester")
-
-    run(tmp_path, work)
-
-
-@pytest.mark.parametrize("name", ["Laptop", "LAPTOP", "ROSRV-Appliance"])
-def test_names_that_ike_does_not_tell_apart(tmp_path: Path, name: str) -> None:
-    """IKE compares names without regard to case: no second host may answer to the first one's."""
-
-    async def work(bench: Bench) -> None:
-        await add(bench, "laptop")
-        with pytest.raises(HostRefusedError, match=r"large and small letters|no name"):
-            await add(bench, name)
-
-    run(tmp_path, work)
+    seen = (await bench.hosts.listed(HostList())).revision
+    await bench.add("a")
+    for late in (
+        bench.hosts.revoke(HostRevoke("a", seen), "tester"),
+        bench.hosts.renew(HostRenew("a", request_of("a"), 90, seen), "tester"),
+        bench.hosts.ports.tell(HostPorts("a", "closed", [], 1.0, seen), "tester"),
+        bench.hosts.reload(HostsReload(seen), "tester"),
+    ):
+        with pytest.raises(HostsChangedError):
+            await late
+    await bench.hosts.revoke(HostRevoke("a", (await bench.hosts.listed(HostList())).revision), "tester")
 
 
 @pytest.mark.parametrize("name", ["a.b-c_d", "0", "x" * 63, "con.fig", "host-a"])
-def test_odd_names_that_are_names(tmp_path: Path, name: str) -> None:
+async def test_odd_names_that_are_names(bench: Bench, name: str) -> None:
     """Everything the form allows can be enrolled, listed and revoked."""
-
-    async def work(bench: Bench) -> None:
-        await add(bench, name)
-        assert bench.hosts.rows()[0].name == name
-        await bench.hosts.revoke(HostRevoke(name), "tester")
-
-    run(tmp_path, work)
+    await bench.add(name)
+    assert bench.hosts.rows()[0].name == name
+    await bench.revoke(name)
 
 
 def test_two_hundred_hosts(tmp_path: Path) -> None:
@@ -665,47 +620,43 @@ def test_two_hundred_hosts(tmp_path: Path) -> None:
     run(tmp_path, again, pool="10.113.0.0/16")
 
 
-def test_a_tunnel_that_is_not_wanted_stays_closed(tmp_path: Path) -> None:
+async def test_a_tunnel_that_is_not_wanted_stays_closed(bench: Bench) -> None:
     """On reload a host goes out of the policy and loses what it has; wanted again it is back; none is lost."""
-
-    async def work(bench: Bench) -> None:
-        await add(bench, "a")
-        await add(bench, "b")
-        bench.order.clear()
-        bench.declared.write_text("hosts:\n  - {name: a, tunnel: false, groups: [ocu]}\n  - name: c\n")
-        body = await bench.hosts.reload(HostsReload(), "tester")
-        assert bench.order == ["policy ['b']", "expel 10.113.11.2"]
-        assert (body.closed, body.opened) == (["a"], [])
-        assert body.divergence == ["b: enrolled, not in hosts.yaml", "c: in hosts.yaml, not enrolled"]
-        rows = {row.name: row for row in bench.hosts.rows()}
-        assert (rows["a"].state, rows["a"].groups, rows["b"].state) == (
-            "not wanted",
-            ["ocu"],
-            "down",
-        )
-        bench.declared.unlink()
-        assert (await bench.hosts.reload(HostsReload(), "tester")).opened == ["a"]
-        assert sorted(bench.tunnels.addresses) == ["a", "b"]
-
-    run(tmp_path, work)
+    await bench.add("a")
+    await bench.add("b")
+    bench.order.clear()
+    bench.declared.write_text("hosts:\n  - {name: a, tunnel: false, groups: [ocu]}\n  - name: c\n")
+    body = await bench.reload()
+    assert bench.order == ["policy ['b']", "expel 10.113.11.2"]
+    assert (body.closed, body.opened) == (["a"], [])
+    assert body.divergence == ["b: enrolled, not in hosts.yaml", "c: in hosts.yaml, not enrolled"]
+    rows = {row.name: row for row in bench.hosts.rows()}
+    assert (rows["a"].state, rows["a"].groups, rows["b"].state) == (
+        "not wanted",
+        ["ocu"],
+        "down",
+    )
+    bench.declared.unlink()
+    assert (await bench.reload()).opened == ["a"]
+    assert sorted(bench.tunnels.addresses) == ["a", "b"]
 
 
 def test_the_first_tunnel_that_is_wanted_counts_in_the_policy(tmp_path: Path) -> None:
     """What `host:NAME` means is told when clear text is kept out, which a reload may be the first to ask for."""
 
     async def enrol(bench: Bench) -> None:
-        await add(bench, "a")
+        await bench.add("a")
 
     async def again(bench: Bench) -> None:
         await bench.tunnels.start()
         assert not bench.asked
         bench.declared.unlink()
-        body = await bench.hosts.reload(HostsReload(), "tester")
+        body = await bench.reload()
         assert body.opened == ["a"]
         assert list(bench.tunnels.addresses) == ["a"]
         assert bench.order[-1] == "policy ['a']"
         bench.order.clear()
-        await bench.hosts.reload(HostsReload(), "tester")
+        await bench.reload()
         assert not bench.order
 
     run(tmp_path, enrol)
@@ -713,100 +664,82 @@ def test_the_first_tunnel_that_is_wanted_counts_in_the_policy(tmp_path: Path) ->
     run(tmp_path, again)
 
 
-def test_a_certificate_that_ends_soon_is_said_once(tmp_path: Path) -> None:
+async def test_a_certificate_that_ends_soon_is_said_once(bench: Bench) -> None:
     """In the log once, in the status as long as it is so; a short life warns in its last third."""
-
-    async def work(bench: Bench) -> None:
-        await bench.hosts.add(HostAdd("short", request_of("a"), 10), "tester")
-        assert bench.hosts.status().troubles == []
-        await bench.hosts.renew(HostRenew("short", request_of("a"), 1e-5), "tester")
-        await asyncio.sleep(0.7)
-        bench.each_hour()
-        bench.each_hour()
-        ended = recorded(bench, "certificate ends soon") + recorded(bench, "certificate ended")
-        assert len(ended) == 1
-        assert "short" in bench.hosts.status().troubles[0]
-
-    run(tmp_path, work)
+    await bench.hosts.add(HostAdd("short", request_of("a"), 10), "tester")
+    assert bench.hosts.status().troubles == []
+    await bench.hosts.renew(HostRenew("short", request_of("a"), 1e-5), "tester")
+    await asyncio.sleep(0.7)
+    bench.each_hour()
+    bench.each_hour()
+    ended = bench.recorded("certificate ends soon") + bench.recorded("certificate ended")
+    assert len(ended) == 1
+    assert "short" in bench.hosts.status().troubles[0]
 
 
-def test_what_was_seen_of_ports_is_kept(tmp_path: Path) -> None:
+async def test_what_was_seen_of_ports_is_kept(bench: Bench) -> None:
     """By a host's name, its address, or a machine's in clear text; a name nobody has is refused."""
-
-    async def work(bench: Bench) -> None:
-        await add(bench, "a")
-        bench.machines = {"10.0.0.7": 3, "127.0.0.1": 1, "10.113.11.2": 2}
-        assert (
-            await bench.hosts.ports.tell(HostPorts("10.113.11.2", "open", [40001], 5.0), "eve")
-        ).name == "a"
-        await bench.hosts.ports.tell(HostPorts("10.0.0.7", "closed", [], 6.0), "eve")
-        with pytest.raises(HostRefusedError, match="enrolled are: a"):
-            await bench.hosts.ports.tell(HostPorts("nobody", "open", [], 5.0), "eve")
-        with pytest.raises(HostRefusedError, match="a day ahead"):
-            await bench.hosts.ports.tell(HostPorts("a", "closed", [], 4e9), "eve")
-        overview = await bench.hosts.listed(HostList())
-        assert overview.hosts[0].ports == PortsSeen("open", 5.0, [40001], "eve")
-        assert [(one.address, one.nodes, one.ports.state) for one in overview.machines] == [
-            ("10.0.0.7", 3, "closed")
-        ]
-
-    run(tmp_path, work)
+    await bench.add("a")
+    bench.machines = {"10.0.0.7": 3, "127.0.0.1": 1, "10.113.11.2": 2}
+    assert (await bench.hosts.ports.tell(HostPorts("10.113.11.2", "open", [40001], 5.0), "eve")).name == "a"
+    await bench.hosts.ports.tell(HostPorts("10.0.0.7", "closed", [], 6.0), "eve")
+    with pytest.raises(HostRefusedError, match="enrolled are: a"):
+        await bench.hosts.ports.tell(HostPorts("nobody", "open", [], 5.0), "eve")
+    with pytest.raises(HostRefusedError, match="a day ahead"):
+        await bench.hosts.ports.tell(HostPorts("a", "closed", [], 4e9), "eve")
+    overview = await bench.hosts.listed(HostList())
+    assert overview.hosts[0].ports == PortsSeen("open", 5.0, [40001], "eve")
+    assert [(one.address, one.nodes, one.ports.state) for one in overview.machines] == [
+        ("10.0.0.7", 3, "closed")
+    ]
 
 
 @pytest.mark.parametrize("order", [HostRevoke("a"), HostsReload()], ids=["revoke", "reload"])
-def test_who_is_told_that_a_host_is_out_finds_its_connections_closed(
-    tmp_path: Path, order: HostRevoke | HostsReload
+async def test_who_is_told_that_a_host_is_out_finds_its_connections_closed(
+    bench: Bench, order: HostRevoke | HostsReload
 ) -> None:
     """The answer waits for the relays."""
-
-    async def work(bench: Bench) -> None:
-        await add(bench, "a")
-        bench.relays.clear()
-        hosts = bench.hosts
-        asked = asyncio.ensure_future(
-            hosts.revoke(order, "alice") if isinstance(order, HostRevoke) else hosts.reload(order, "alice")
-        )
-        await bench.store.settled()
-        for _ in range(10):
-            await asyncio.sleep(0)
-        assert not asked.done()
-        bench.relays.set()
-        await asked
-
-    run(tmp_path, work)
+    await bench.add("a")
+    bench.relays.clear()
+    hosts = bench.hosts
+    asked = asyncio.ensure_future(
+        hosts.revoke(order, "alice") if isinstance(order, HostRevoke) else hosts.reload(order, "alice")
+    )
+    await bench.store.settled()
+    for _ in range(10):
+        await asyncio.sleep(0)
+    assert not asked.done()
+    bench.relays.set()
+    await asked
 
 
-def test_only_what_charon_took_of_this_life_counts_as_taken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+async def test_only_what_charon_took_of_this_life_counts_as_taken(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its process may report a greater number of an earlier life of control: the clock was set back since."""
     monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 0.05)
+    ours, theirs = socket.socketpair()
+    link, charon = Channel(ours, TunnelLink), Channel(theirs, TunnelLink)
+    stated: asyncio.Queue[int] = asyncio.Queue()
 
-    async def work(bench: Bench) -> None:
-        ours, theirs = socket.socketpair()
-        link, charon = Channel(ours, TunnelLink), Channel(theirs, TunnelLink)
-        stated: asyncio.Queue[int] = asyncio.Queue()
+    def heard(message: Message, _descriptors: tuple[int, ...]) -> None:
+        if isinstance(message, TunnelsStated):
+            stated.put_nowait(message.number)
 
-        def heard(message: Message, _descriptors: tuple[int, ...]) -> None:
-            if isinstance(message, TunnelsStated):
-                stated.put_nowait(message.number)
-
-        charon.attach(asyncio.get_running_loop(), heard, lambda: None)
-        await add(bench, "a")
-        bench.tunnels.attach(link)
-        running = asyncio.create_task(bench.tunnels.run(lambda: None))
-        charon.send(CertificateNeeded(signing_request(make_key(), "rosrv-appliance")))
-        number = await stated.get()
-        charon.send(TunnelsReported(number + 3_600_000_000_000, []))
-        assert not await bench.tunnels.until_taken()
-        charon.send(TunnelsReported(number, []))
-        monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 30.0)
-        assert await bench.tunnels.until_taken()
-        running.cancel()
-        for one in (link, charon):
-            one.close()
-
-    run(tmp_path, work)
+    charon.attach(asyncio.get_running_loop(), heard, lambda: None)
+    await bench.add("a")
+    bench.tunnels.attach(link)
+    running = asyncio.create_task(bench.tunnels.run(lambda: None))
+    charon.send(CertificateNeeded(signing_request(make_key(), "rosrv-appliance")))
+    number = await stated.get()
+    charon.send(TunnelsReported(number + 3_600_000_000_000, []))
+    assert not await bench.tunnels.until_taken()
+    charon.send(TunnelsReported(number, []))
+    monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 30.0)
+    assert await bench.tunnels.until_taken()
+    running.cancel()
+    for one in (link, charon):
+        one.close()
 
 
 def test_a_host_whose_disk_fills_meanwhile_is_told_how_it_stands(
@@ -823,7 +756,7 @@ def test_a_host_whose_disk_fills_meanwhile_is_told_how_it_stands(
             with pytest.raises(
                 StoreError, match=r"^state\.db: full; make room; .*no kit: rosrv host kit a, or revoke"
             ):
-                await add(bench, "a")
-        await bench.hosts.renew(HostRenew("a", signing_request(make_key(), "a").decode(), 90), "tester")
+                await bench.add("a")
+        await bench.renew("a")
 
     run(tmp_path, work)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.hosts.hosts_file import Declared, DeclaredHost, DeclaredHostsError, read_declared
+from appliance.hosts.hosts_file import DeclaredHost, DeclaredHosts, DeclaredHostsError, read_declared
 
 
 def test_hosts_with_and_without_an_address(tmp_path: Path) -> None:
@@ -63,20 +63,20 @@ def test_mistakes_are_named(tmp_path: Path, text: str | bytes, said: str) -> Non
     assert said in str(error.value)
 
 
-def test_groups_and_tunnels_that_are_not_wanted(tmp_path: Path) -> None:
-    """A host of no other word is wanted; groups are in their order, each once."""
+def test_groups_and_unwanted_tunnels_are_read(tmp_path: Path) -> None:
+    """Hosts are wanted by default; groups are in order, each once."""
     path = tmp_path / "hosts.yaml"
     path.write_text("hosts:\n  - {name: a, groups: [x, y, x], tunnel: false}\n  - name: b\n")
-    declared = Declared(path)
+    declared = DeclaredHosts(path)
     assert declared.hosts["a"].groups == ("x", "y")
     assert [declared.wants(name) for name in ("a", "b", "nobody")] == [False, True, True]
 
 
-def test_a_file_that_went_bad_changes_nothing(tmp_path: Path) -> None:
-    """What was read before holds, and why it was not taken is kept until it is mended."""
+def test_an_invalid_file_changes_nothing(tmp_path: Path) -> None:
+    """The last valid state stays, and the reason is shown until the file is valid."""
     path = tmp_path / "hosts.yaml"
     path.write_text("hosts:\n  - name: a\n")
-    declared = Declared(path)
+    declared = DeclaredHosts(path)
     path.write_text("hosts: 5\n")
     with pytest.raises(DeclaredHostsError):
         declared.reload()
@@ -87,8 +87,8 @@ def test_a_file_that_went_bad_changes_nothing(tmp_path: Path) -> None:
     assert (declared.hosts, declared.error) == ({}, "")
 
 
-def test_the_file_that_comes_with_the_product_is_read() -> None:
-    """ipsec/hosts.yaml declares nobody, and its example is one."""
+def test_the_shipped_file_is_read() -> None:
+    """ipsec/hosts.yaml declares no host, and its example declares one."""
     path = Path(__file__).parents[3] / "ipsec" / "hosts.yaml"
     assert read_declared(path) == {}
 

@@ -12,7 +12,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from appliance.hosts.revoked_certificates import RevokedCertificates
-from appliance.ipsec.certificate_authority import Authority
+from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.store.state_file import StateStore
 
 DAY = 86_400.0
@@ -37,7 +37,7 @@ def bytes_of_list(revoked: RevokedCertificates, enrolled: set[str], directory: P
     """How long the list becomes that charon is given."""
     directory.mkdir()
     rows = [(row.serial, row.moment) for row in revoked.listed(enrolled)]
-    signed = x509.load_pem_x509_crl(Authority(directory).revocations(rows))
+    signed = x509.load_pem_x509_crl(CertificateAuthority(directory).revocations(rows))
     assert len(signed) == len(rows)
     return len(signed.public_bytes(Encoding.DER))
 

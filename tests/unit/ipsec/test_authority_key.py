@@ -1,4 +1,4 @@
-"""Tests of the authority's key: kinds, passphrases, and what is said when one is wrong."""
+"""Tests of the authority's key: kinds, passphrases, and error messages."""
 
 import os
 from pathlib import Path
@@ -8,14 +8,14 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ed25519
 
 from appliance.ipsec.authority_key import read_passphrase
-from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE, Authority
+from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE, CertificateAuthority
 from appliance.ipsec.key_files import SignerKeyError
 from appliance.ipsec.requests import make_key, signing_request
 
 
 def test_an_ed25519_authority_makes_certificates_and_lists(tmp_path: Path) -> None:
     """By choice the authority's key is Ed25519; hosts' keys are what they are."""
-    authority = Authority(tmp_path, "ed25519")
+    authority = CertificateAuthority(tmp_path, "ed25519")
     own = x509.load_pem_x509_certificate(authority.certificate)
     assert isinstance(own.public_key(), ed25519.Ed25519PublicKey)
     issued = authority.issue(signing_request(make_key(), "a"), "a", 1)
@@ -24,37 +24,37 @@ def test_an_ed25519_authority_makes_certificates_and_lists(tmp_path: Path) -> No
     public = own.public_key()
     assert isinstance(public, ed25519.Ed25519PublicKey)
     assert listed.is_signature_valid(public)
-    assert Authority(tmp_path, "ed25519").certificate == authority.certificate
+    assert CertificateAuthority(tmp_path, "ed25519").certificate == authority.certificate
 
 
 def test_another_kind_than_the_key_that_is_there_is_an_error(tmp_path: Path) -> None:
     """A setting that could have no effect is refused, and says what it must be."""
-    Authority(tmp_path)
+    CertificateAuthority(tmp_path)
     with pytest.raises(SignerKeyError, match=r"kind ecdsa, and ipsec\.ca is ed25519: set it to ecdsa"):
-        Authority(tmp_path, "ed25519")
+        CertificateAuthority(tmp_path, "ed25519")
 
 
 def test_the_key_is_encrypted_by_its_passphrase(tmp_path: Path) -> None:
-    """Right, it opens; wrong or missing, the error says which and what to do; nothing is made anew."""
-    made = Authority(tmp_path, passphrase=b"correct horse")
+    """The right one opens it; a wrong or missing one is an error with advice, and no new key is made."""
+    made = CertificateAuthority(tmp_path, passphrase=b"correct horse")
     assert b"ENCRYPTED" in (tmp_path / KEY_FILE).read_bytes()
-    assert Authority(tmp_path, passphrase=b"correct horse").certificate == made.certificate
+    assert CertificateAuthority(tmp_path, passphrase=b"correct horse").certificate == made.certificate
     before = (tmp_path / KEY_FILE).read_bytes()
     with pytest.raises(SignerKeyError, match="the passphrase is wrong"):
-        Authority(tmp_path, passphrase=b"battery")
+        CertificateAuthority(tmp_path, passphrase=b"battery")
     with pytest.raises(SignerKeyError, match=r"is encrypted: .* ROSRV_CA_PASSPHRASE_FILE"):
-        Authority(tmp_path)
+        CertificateAuthority(tmp_path)
     assert (tmp_path / KEY_FILE).read_bytes() == before
 
 
 def test_a_key_in_the_clear_is_encrypted_when_there_is_a_passphrase(tmp_path: Path) -> None:
     """The authority stays the same; from then on the file needs the passphrase."""
-    made = Authority(tmp_path)
-    assert Authority(tmp_path, passphrase=b"late").certificate == made.certificate
+    made = CertificateAuthority(tmp_path)
+    assert CertificateAuthority(tmp_path, passphrase=b"late").certificate == made.certificate
     assert b"ENCRYPTED" in (tmp_path / KEY_FILE).read_bytes()
     assert (tmp_path / KEY_FILE).stat().st_mode & 0o777 == 0o600
     with pytest.raises(SignerKeyError, match="is encrypted"):
-        Authority(tmp_path)
+        CertificateAuthority(tmp_path)
     assert (tmp_path / CERTIFICATE_FILE).exists()
 
 

@@ -18,7 +18,7 @@ from appliance.ipsec.certificate_authority import (
     KEY_FILE,
     LIST_FILE,
     LONGEST_REQUEST,
-    Authority,
+    CertificateAuthority,
 )
 from appliance.ipsec.key_files import SignerKeyError
 from appliance.ipsec.proof_of_possession import RequestRefusedError
@@ -42,7 +42,7 @@ def request_of(
 @pytest.mark.parametrize("kind", ["p384", "ed25519"])
 def test_a_certificate_has_the_key_of_the_request_and_nothing_else_of_it(tmp_path: Path, kind: str) -> None:
     """Name, uses and alternative names are the authority's; the requester's wish to be an authority is not heard."""
-    authority = Authority(tmp_path)
+    authority = CertificateAuthority(tmp_path)
     key = ec.generate_private_key(ec.SECP384R1()) if kind == "p384" else ed25519.Ed25519PrivateKey.generate()
     issued = authority.issue(request_of(key), "ocu-1", 90)
     made = x509.load_pem_x509_certificate(issued.certificate)
@@ -61,8 +61,8 @@ def test_a_certificate_has_the_key_of_the_request_and_nothing_else_of_it(tmp_pat
 
 
 def test_a_weak_key_is_refused(tmp_path: Path) -> None:
-    """RSA and the shorter curve get no certificate; the message says what would."""
-    authority = Authority(tmp_path)
+    """RSA and the shorter curve get no certificate; the error lists the accepted keys."""
+    authority = CertificateAuthority(tmp_path)
     for key in (rsa.generate_private_key(65537, 2048), ec.generate_private_key(ec.SECP256R1())):
         with pytest.raises(RequestRefusedError, match="P-384 nor Ed25519"):
             authority.issue(request_of(key), "ocu-1", 90)
@@ -74,7 +74,7 @@ def test_a_request_without_its_key_is_refused(tmp_path: Path) -> None:
     der = x509.load_pem_x509_csr(request_of(key, "aaaaaaa")).public_bytes(Encoding.DER)
     changed = x509.load_der_x509_csr(der.replace(b"aaaaaaa", b"bbbbbbb")).public_bytes(Encoding.PEM)
     with pytest.raises(RequestRefusedError, match="not signed by the key"):
-        Authority(tmp_path).issue(changed, "ocu-1", 90)
+        CertificateAuthority(tmp_path).issue(changed, "ocu-1", 90)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_a_request_without_its_key_is_refused(tmp_path: Path) -> None:
 def test_what_is_no_request_is_refused(tmp_path: Path, request_text: bytes) -> None:
     """Rubbish is refused with a reason."""
     with pytest.raises(RequestRefusedError, match="not a signing request"):
-        Authority(tmp_path).issue(request_text, "ocu-1", 90)
+        CertificateAuthority(tmp_path).issue(request_text, "ocu-1", 90)
 
 
 def with_another_version(request: bytes) -> bytes:
@@ -97,7 +97,7 @@ def with_another_version(request: bytes) -> bytes:
 
 def test_a_request_of_another_version_is_refused(tmp_path: Path) -> None:
     """A version that there is not is what is wrong with the request, in words."""
-    authority = Authority(tmp_path)
+    authority = CertificateAuthority(tmp_path)
     request = with_another_version(request_of(ec.generate_private_key(ec.SECP384R1())))
     with pytest.raises(RequestRefusedError, match="not a signing request"):
         authority.issue(request, "ocu-1", 90)
@@ -105,10 +105,10 @@ def test_a_request_of_another_version_is_refused(tmp_path: Path) -> None:
 
 def test_limits_of_a_request(tmp_path: Path) -> None:
     """Too long a request, an odd name, and a life beyond the limit are refused."""
-    authority = Authority(tmp_path)
+    authority = CertificateAuthority(tmp_path)
     good = request_of(ec.generate_private_key(ec.SECP384R1()))
     for name in ("", "-x", "a b", "x" * 64, "../x", "a\n", 'a"b'):
-        with pytest.raises(RequestRefusedError, match="is no name"):
+        with pytest.raises(RequestRefusedError, match="is not a name"):
             authority.issue(good, name, 90)
     for days in (0, -1, 399, float("nan")):
         with pytest.raises(RequestRefusedError, match="at most 398 days"):
@@ -119,7 +119,7 @@ def test_limits_of_a_request(tmp_path: Path) -> None:
 
 def test_the_list_of_revoked_certificates_is_signed_and_complete(tmp_path: Path) -> None:
     """It has exactly the serial numbers given, and is signed by the authority."""
-    authority = Authority(tmp_path)
+    authority = CertificateAuthority(tmp_path)
     root = x509.load_pem_x509_certificate(authority.certificate)
     first = x509.load_pem_x509_crl(authority.revocations([]))
     second = x509.load_pem_x509_crl(authority.revocations([("a1b2", 1_700_000_000.0)]))
@@ -140,10 +140,10 @@ def test_the_number_of_the_list_grows_whatever_the_clock_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """charon keeps the list it has when one with a lower number comes: what was revoked since would be good there."""
-    numbers = [number_of(Authority(tmp_path).revocations([]))]
+    numbers = [number_of(CertificateAuthority(tmp_path).revocations([]))]
     an_hour_ago = time.time_ns() - 3_600_000_000_000
     monkeypatch.setattr(time, "time_ns", lambda: an_hour_ago)
-    authority = Authority(tmp_path)  # the signer was started again
+    authority = CertificateAuthority(tmp_path)  # the signer was started again
     numbers += [number_of(authority.revocations([])) for _ in range(2)]
     (tmp_path / LIST_FILE).unlink()
     (tmp_path / LIST_FILE).mkdir()  # nothing can be written any more
@@ -152,13 +152,13 @@ def test_the_number_of_the_list_grows_whatever_the_clock_does(
     (tmp_path / LIST_FILE).rmdir()
     (tmp_path / LIST_FILE).write_bytes(b"")
     with pytest.raises(SignerKeyError, match="damaged"):
-        Authority(tmp_path)
+        CertificateAuthority(tmp_path)
 
 
 def test_the_authority_is_made_once(tmp_path: Path) -> None:
     """A second start has the same certificate; the key is for its owner only."""
-    first = Authority(tmp_path).certificate
-    assert Authority(tmp_path).certificate == first
+    first = CertificateAuthority(tmp_path).certificate
+    assert CertificateAuthority(tmp_path).certificate == first
     assert stat.S_IMODE((tmp_path / KEY_FILE).stat().st_mode) == 0o600
     root = x509.load_pem_x509_certificate(first)
     assert root.extensions.get_extension_for_class(x509.BasicConstraints).value.path_length == 0
@@ -166,31 +166,31 @@ def test_the_authority_is_made_once(tmp_path: Path) -> None:
 
 def test_a_damaged_authority_is_an_error_and_never_replaced(tmp_path: Path) -> None:
     """A missing, readable, damaged or foreign half is named, and the files are left as they are."""
-    Authority(tmp_path)
+    CertificateAuthority(tmp_path)
     other = tmp_path / "other"
     other.mkdir()
-    Authority(other)
+    CertificateAuthority(other)
     key, certificate = tmp_path / KEY_FILE, tmp_path / CERTIFICATE_FILE
     text = certificate.read_bytes()
 
     certificate.write_bytes((other / CERTIFICATE_FILE).read_bytes())
     with pytest.raises(SignerKeyError, match="is not the certificate of"):
-        Authority(tmp_path)
+        CertificateAuthority(tmp_path)
     certificate.write_bytes(b"rubbish")
     with pytest.raises(SignerKeyError, match="not a certificate"):
-        Authority(tmp_path)
+        CertificateAuthority(tmp_path)
     assert certificate.read_bytes() == b"rubbish"
     certificate.unlink()
     with pytest.raises(SignerKeyError, match="but its key is there"):
-        Authority(tmp_path)
+        CertificateAuthority(tmp_path)
     certificate.write_bytes(text)
     key.chmod(0o640)
     with pytest.raises(SignerKeyError, match="others may read"):
-        Authority(tmp_path)
+        CertificateAuthority(tmp_path)
     key.chmod(0o600)
     key.write_bytes(b"rubbish")
     with pytest.raises(SignerKeyError, match="not a private key"):
-        Authority(tmp_path)
+        CertificateAuthority(tmp_path)
     key.unlink()
     with pytest.raises(SignerKeyError, match="but its certificate is there"):
-        Authority(tmp_path)
+        CertificateAuthority(tmp_path)

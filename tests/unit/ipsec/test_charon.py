@@ -1,4 +1,4 @@
-"""Tests of the conversation with charon: what it says that nobody expects is an error in words, of one kind."""
+"""Tests of the conversation with charon: unexpected answers become one kind of error."""
 
 import base64
 import socket
@@ -13,7 +13,7 @@ import pytest
 from vici.protocol import FiniteStream, Message, Packet
 
 from appliance.channel.messages import TunnelHost, TunnelsStated
-from appliance.ipsec.charon import CharonError, Vici
+from appliance.ipsec.charon import CharonError, ViciClient
 from appliance.ipsec.strongswan import connection_name
 
 
@@ -33,10 +33,7 @@ class Standing(NamedTuple):
 
 
 class StandIn:
-    """A charon that answers every command with success; `events` is what it says to who registers for events.
-
-    `standing` are its tunnels, whatever it is asked to end, `asked` the commands it got.
-    """
+    """A charon that accepts every command; `standing` are its tunnels, `asked` its commands, `events` its notices."""
 
     def __init__(self, path: Path) -> None:
         self.events = bytes([Packet.EVENT_CONFIRM])
@@ -69,33 +66,33 @@ class StandIn:
         return [body[by].decode() for name, body in asked if name == "terminate" and by in body]
 
     def close(self) -> None:
-        """End it, after whoever speaks to it."""
+        """Stop it after its clients."""
         self._thread.join()
         self._listener.close()
 
 
 def pem_of(count: int) -> bytes:
-    """What stands for a list of so many bytes."""
+    """Return text of this size instead of a list."""
     text = base64.encodebytes(b"x" * count)
     return b"-----BEGIN X509 CRL-----\n" + text + b"-----END X509 CRL-----\n"
 
 
 def stated(count: int) -> TunnelsStated:
-    """No hosts, and a list of so many bytes."""
+    """Return a state without hosts and with a list of this size."""
     return TunnelsStated(1, "kernel", "10.113.11.1", b"authority", b"certificate", pem_of(count), [])
 
 
 @pytest.fixture
-def charon(tmp_path: Path) -> Iterator[tuple[StandIn, Vici]]:
-    """A charon and the conversation with it."""
+def charon(tmp_path: Path) -> Iterator[tuple[StandIn, ViciClient]]:
+    """Return a charon and the conversation with it."""
     stand_in = StandIn(tmp_path / "vici.sock")
-    vici = Vici(tmp_path / "vici.sock")
+    vici = ViciClient(tmp_path / "vici.sock")
     yield stand_in, vici
     vici.close()
     stand_in.close()
 
 
-def test_an_answer_of_another_kind_is_said(charon: tuple[StandIn, Vici]) -> None:
+def test_an_answer_of_another_kind_is_said(charon: tuple[StandIn, ViciClient]) -> None:
     """What the library calls an error of the session is one of ours, with what was asked for."""
     stand_in, vici = charon
     stand_in.events = bytes([Packet.CMD_RESPONSE])
@@ -103,7 +100,7 @@ def test_an_answer_of_another_kind_is_said(charon: tuple[StandIn, Vici]) -> None
         vici.seen()
 
 
-def test_a_list_that_is_too_long_is_said(charon: tuple[StandIn, Vici]) -> None:
+def test_a_list_that_is_too_long_is_said(charon: tuple[StandIn, ViciClient]) -> None:
     """A value has 65,535 bytes at most: more is an error that names the list, and what was loaded before stays."""
     _stand_in, vici = charon
     vici.provision(stated(65_535))
@@ -111,8 +108,8 @@ def test_a_list_that_is_too_long_is_said(charon: tuple[StandIn, Vici]) -> None:
         vici.provision(stated(65_536))
 
 
-def test_what_stands_and_is_not_wanted_is_closed_at_each_look(charon: tuple[StandIn, Vici]) -> None:
-    """An end that charon agreed to is not believed: who is revoked while keys are made anew stays out."""
+def test_unwanted_tunnels_are_closed_at_each_check(charon: tuple[StandIn, ViciClient]) -> None:
+    """charon's confirmation is not enough: a host revoked during rekeying stays out."""
     stand_in, vici = charon
     vici.provision(stated(1))
     stand_in.standing = [Standing(connection_name("gone"), 1, 1), Standing("(unnamed)", 2, 2)]
@@ -122,7 +119,7 @@ def test_what_stands_and_is_not_wanted_is_closed_at_each_look(charon: tuple[Stan
 
 
 def test_what_stands_of_a_certificate_that_was_replaced_is_closed_at_each_look(
-    charon: tuple[StandIn, Vici],
+    charon: tuple[StandIn, ViciClient],
 ) -> None:
     """By the numbers of what stood then, and of what new keys made of it; not the tunnel of the new certificate."""
     stand_in, vici = charon

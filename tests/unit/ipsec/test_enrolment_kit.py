@@ -96,7 +96,7 @@ def test_the_tunnel_carries_the_way_to_the_appliance_only() -> None:
 
 
 def test_the_firewall_of_a_host_names_the_appliance_in_the_tunnel() -> None:
-    """Its ROS ports are open to the appliance's tunnel address, through IPsec, and to nobody else."""
+    """Its ROS ports are open only to the appliance's tunnel address, through IPsec."""
     text = unpack(KIT)["rosrv-ocu-1/protect.nft"][0]
     named = [line.strip() for line in text.splitlines() if " saddr {" in line]
     assert named == [

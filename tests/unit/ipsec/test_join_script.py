@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.ipsec.certificate_authority import Authority
+from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.enrolment_kit import filled
 from appliance.ipsec.requests import make_key, signing_request
 
@@ -23,7 +23,7 @@ class Machine:
     """A host with a kit, and the certificate of a renewal in place."""
 
     def __init__(self, folder: Path, spelling: str) -> None:
-        self._folder, self._authority = folder, Authority(folder)
+        self._folder, self._authority = folder, CertificateAuthority(folder)
         self._kit, self._etc, programs = folder / "kit/swanctl", folder / "etc", folder / "bin"
         for root in (self._kit, self._etc):
             for part in ("x509", "x509ca", "private"):
@@ -38,7 +38,7 @@ class Machine:
         self._path = f"{programs}:{os.environ['PATH']}"
 
     def put(self, where: str, name: str, days: float) -> None:
-        """A certificate in the kit, or in place."""
+        """Write a certificate into the kit, or into its final place."""
         made = self._authority.issue(signing_request(make_key(), name), name, days).certificate
         root = self._kit if where == "kit" else self._etc
         (root / "x509/rosrv.pem").write_bytes(made)

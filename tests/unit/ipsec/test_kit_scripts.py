@@ -25,7 +25,7 @@ def test_it_is_for_the_plainest_shell(script: Path) -> None:
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
 def test_it_needs_no_python(script: Path) -> None:
-    """A robot with Python 3.8, or none, can be enrolled."""
+    """A robot with Python 3.8, or without Python, can be enrolled."""
     assert re.findall(r"python|perl|ruby", script.read_text(), re.IGNORECASE) == []
 
 

@@ -1,5 +1,7 @@
 """appliance/ipsec/leftovers.py: what of the kernel's states and policies is charon's."""
 
+import subprocess
+
 import pytest
 
 from appliance.ipsec import leftovers
@@ -36,8 +38,8 @@ src 0.0.0.0/0 dst 0.0.0.0/0\x20
 """
 
 
-def test_states_of_charon_and_no_others() -> None:
-    """ESP in UDP on port 4500, at either end, is charon's; other states are somebody else's."""
+def test_only_states_of_charon_are_found() -> None:
+    """ESP in UDP on port 4500, at either end, is charon's; other states belong to other programs."""
     assert state_orders(STATES) == [
         "xfrm state delete src 10.88.0.2 dst 10.88.0.20 proto esp spi 0xcc1b8f7c",
         "xfrm state delete src 10.88.0.20 dst 10.88.0.2 proto esp spi 0x0814b96a",
@@ -55,8 +57,29 @@ def test_policies_of_the_tunnels_and_no_others() -> None:
     assert policy_orders(POLICIES, "10.113.11.9") == []
 
 
-def test_what_stays_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """When the kernel keeps a state, it is said which one, and charon is not started beside it."""
+def test_a_remaining_state_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error names the state that the kernel keeps, and charon is not started beside it."""
     monkeypatch.setattr(leftovers, "_ip", lambda *words, text="": STATES if "state" in words else "")
     with pytest.raises(LeftoversError, match="0xcc1b8f7c"):
         clear_leftovers("10.113.11.1")
+
+
+@pytest.mark.parametrize(
+    ("complaint", "known"),
+    [
+        ("RTNETLINK answers: Operation not permitted", False),
+        ("Cannot open netlink socket: Protocol not supported", True),
+    ],
+)
+def test_a_kernel_that_lists_nothing(monkeypatch: pytest.MonkeyPatch, complaint: str, known: bool) -> None:
+    """A list that cannot be read is an error, unless the kernel has no IPsec."""
+
+    def run(*_arguments: object, **_options: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess([], 1, "", complaint)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    if known:
+        assert clear_leftovers("10.113.11.1") == 0
+    else:
+        with pytest.raises(LeftoversError, match="not permitted"):
+            clear_leftovers("10.113.11.1")

@@ -21,14 +21,16 @@ from appliance.channel.messages import (
     TunnelsStated,
 )
 from appliance.ipsec import process
-from appliance.ipsec.charon import Vici
+from appliance.ipsec.charon import ViciClient
 from appliance.ipsec.requests import make_key
+
+pytestmark = pytest.mark.anyio
 
 _LIMIT_SECONDS = 30
 
 
 class Conversation:
-    """Takes what is stated as long as nobody asks for the tunnels meanwhile, or a little longer than that takes."""
+    """Accepts the configuration unless tunnels are queried meanwhile, or shortly after."""
 
     def __init__(self) -> None:
         self._busy = threading.Event()
@@ -52,42 +54,38 @@ class Bench(process.TunnelProcess):
 
     conversation = Conversation()
 
-    async def _start(self, _wanted: TunnelsStated) -> Vici:
-        return cast(Vici, self.conversation)
+    async def _start(self, _wanted: TunnelsStated) -> ViciClient:
+        return cast(ViciClient, self.conversation)
 
 
-def test_charon_is_asked_one_thing_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The look at the tunnels waits until what is stated was taken: both would read each other's answers."""
+async def test_charon_gets_one_request_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The query of tunnels waits for the configuration: each would read the other's answers."""
     monkeypatch.setattr(process, "REPORT_SECONDS", 0.01)
+    (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
+    own, supervisor, link = (
+        Channel(child, Lifeline),
+        Channel(lifeline, Lifeline),
+        Channel(ours, TunnelLink),
+    )
+    bench = Bench(own, tmp_path, make_key())
+    running = asyncio.create_task(bench.run())
+    supervisor.send(LinkOpened("control", 0), (theirs.fileno(),))
+    theirs.close()
+    taken = asyncio.Event()
 
-    async def work() -> None:
-        (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
-        own, supervisor, link = (
-            Channel(child, Lifeline),
-            Channel(lifeline, Lifeline),
-            Channel(ours, TunnelLink),
-        )
-        bench = Bench(own, tmp_path, make_key())
-        running = asyncio.create_task(bench.run())
-        supervisor.send(LinkOpened("control", 0), (theirs.fileno(),))
-        theirs.close()
-        taken = asyncio.Event()
+    def heard(message: Any, _descriptors: tuple[int, ...]) -> None:
+        if isinstance(message, TunnelsReported) and message.taken == 7:
+            taken.set()
 
-        def heard(message: Any, _descriptors: tuple[int, ...]) -> None:
-            if isinstance(message, TunnelsReported) and message.taken == 7:
-                taken.set()
-
-        link.attach(asyncio.get_running_loop(), heard, taken.set)
-        link.send(TunnelsStated(7, "kernel", "10.113.11.1", b"a", b"c", b"r", []))
-        await asyncio.wait_for(taken.wait(), _LIMIT_SECONDS)
-        assert not bench.conversation.interrupted.is_set()
-        supervisor.send(Stop())
-        await asyncio.wait_for(running, _LIMIT_SECONDS)
-        assert not bench.failed
-        for one in (own, supervisor, link):
-            one.close()
-
-    asyncio.run(work())
+    link.attach(asyncio.get_running_loop(), heard, taken.set)
+    link.send(TunnelsStated(7, "kernel", "10.113.11.1", b"a", b"c", b"r", []))
+    await asyncio.wait_for(taken.wait(), _LIMIT_SECONDS)
+    assert not bench.conversation.interrupted.is_set()
+    supervisor.send(Stop())
+    await asyncio.wait_for(running, _LIMIT_SECONDS)
+    assert not bench.failed
+    for one in (own, supervisor, link):
+        one.close()
 
 
 def failure_of(directory: Path, esp: Esp) -> Failed:
@@ -134,7 +132,7 @@ def test_what_charon_printed_last_is_kept(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_charon_is_not_started_without_its_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where ESP is to run in user space and the TUN device cannot be opened, that is said, with what to do."""
+    """If ESP runs in user space and the TUN device cannot be opened, the error gives advice."""
     monkeypatch.setattr(process, "PROGRAM", tmp_path / "none")
     monkeypatch.setattr(process, "TUN", tmp_path / "tun")
     said = failure_of(tmp_path, "user space")

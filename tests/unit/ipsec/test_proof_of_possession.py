@@ -7,7 +7,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from appliance.ipsec.certificate_authority import Authority
+from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.proof_of_possession import RequestRefusedError
 from appliance.ipsec.requests import make_key, signing_request
 
@@ -21,7 +21,7 @@ def sign(key: bytes, request: bytes) -> bytes:
 
 def test_the_present_key_asks_for_the_next(tmp_path: Path) -> None:
     """Signed by the key of the present certificate, a request for another key is granted."""
-    authority, old, new = Authority(tmp_path), make_key(), make_key()
+    authority, old, new = CertificateAuthority(tmp_path), make_key(), make_key()
     present = authority.issue(signing_request(old, "a"), "a", 1)
     request = signing_request(new, "a")
     following = authority.issue(request, "a", 1, proof=sign(old, request), former=present.certificate)
@@ -32,7 +32,7 @@ def test_nobody_else_does(tmp_path: Path) -> None:
     """Another key, another request, no proof, another name, another authority's or an ended certificate: refused."""
     (tmp_path / "mine").mkdir()
     (tmp_path / "foreign").mkdir()
-    authority, foreign = Authority(tmp_path / "mine"), Authority(tmp_path / "foreign")
+    authority, foreign = CertificateAuthority(tmp_path / "mine"), CertificateAuthority(tmp_path / "foreign")
     old, thief = make_key(), make_key()
     present = authority.issue(signing_request(old, "a"), "a", 1).certificate
     other = authority.issue(signing_request(old, "b"), "b", 1).certificate

@@ -1,6 +1,6 @@
-"""Tests of reading charon's log for those it refused."""
+"""Tests of reading refused hosts from charon's log."""
 
-from appliance.ipsec.refusals import Refusal, Refusals
+from appliance.ipsec.refusals import Refusal, RefusalParser
 
 REVOKED = """\
 09[NET] received packet: from 10.88.0.20[4500] to 10.88.0.2[4500] (1184 bytes)
@@ -15,7 +15,7 @@ REVOKED = """\
 
 def refusals(text: str) -> list[Refusal]:
     """What a log says."""
-    reader = Refusals()
+    reader = RefusalParser()
     return [found for line in text.splitlines() if (found := reader.read(line)) is not None]
 
 
@@ -34,14 +34,14 @@ def test_a_handshake_that_goes_well_is_no_refusal() -> None:
 
 
 def test_the_answer_may_have_more_than_the_error() -> None:
-    """A refused child or address among other payloads is a refusal too."""
+    """A refused child or address among other payloads is also a refusal."""
     (found,) = refusals(
         REVOKED.replace("[ N(AUTH_FAILED) ]", "[ IDr CERT AUTH N(MOBIKE_SUP) N(TS_UNACCEPT) ]")
     )
     assert found.reason.startswith("traffic that is not allowed")
 
 
-def test_a_name_chosen_by_a_stranger_makes_no_long_reason() -> None:
+def test_a_name_chosen_by_an_unknown_host_makes_no_long_reason() -> None:
     """What is passed on is bounded, whatever the certificate says."""
     (found,) = refusals(REVOKED.replace("unspecified", "x" * 5000))
     assert len(found.reason) <= 400

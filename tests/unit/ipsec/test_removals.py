@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.ipsec.removals import LARGEST_RECORD, Kept, RemovalRefusedError, Removals
-from appliance.ipsec.signed_checkpoints import CheckpointRefusedError, SignedCheckpoints, read_checkpoint
+from appliance.ipsec.removals import LARGEST_RECORD, RemovalApprover, RemovalRefusedError, RetentionLimits
+from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError, read_checkpoint
 
 LOG = "a" * 32
 _DAY = 86_400_000_000_000
@@ -16,10 +16,10 @@ _STEP = 100  # records of a checkpoint
 class Desk:
     """A signer with its memory and a clock that the test moves; ten checkpoints, signed a day after each other."""
 
-    def __init__(self, directory: Path, kept: Kept) -> None:
+    def __init__(self, directory: Path, kept: RetentionLimits) -> None:
         self.now = 1000 * _DAY
-        self.signed = SignedCheckpoints(directory, clock=lambda: self.now)
-        self.removals = Removals(self.signed, kept, clock=lambda: self.now)
+        self.signed = CheckpointMemory(directory, clock=lambda: self.now)
+        self.removals = RemovalApprover(self.signed, kept, clock=lambda: self.now)
         self.texts: list[bytes] = []
         for _ in range(10):
             self.sign(removed=0)
@@ -48,7 +48,7 @@ class Desk:
 
 def test_what_is_old_by_the_signers_clock_goes(tmp_path: Path) -> None:
     """Records go by the time at which the signer signed them, whatever time control wrote into the checkpoint."""
-    desk = Desk(tmp_path, Kept(days=5))
+    desk = Desk(tmp_path, RetentionLimits(days=5))
     text = desk.approve(5)
     assert text.startswith("rosrv audit removal 1\n")
     assert f"checkpoint 5\nsequence {5 * _STEP}\n" in text
@@ -60,14 +60,14 @@ def test_what_is_old_by_the_signers_clock_goes(tmp_path: Path) -> None:
 
 def test_nothing_goes_that_is_kept_for_ever(tmp_path: Path) -> None:
     """Without retention in the settings nothing is removed, however old control says it is."""
-    desk = Desk(tmp_path, Kept())
+    desk = Desk(tmp_path, RetentionLimits())
     with pytest.raises(RemovalRefusedError, match="kept for ever"):
         desk.approve(1)
 
 
 def test_for_the_size_enough_must_come_after(tmp_path: Path) -> None:
     """By size only so much goes that what is left can have that size."""
-    desk = Desk(tmp_path, Kept(size=3 * _STEP * LARGEST_RECORD))
+    desk = Desk(tmp_path, RetentionLimits(size=3 * _STEP * LARGEST_RECORD))
     assert desk.approve(7).endswith("bytes\n")
     with pytest.raises(RemovalRefusedError, match="too few came after"):
         desk.approve(8)
@@ -75,14 +75,14 @@ def test_for_the_size_enough_must_come_after(tmp_path: Path) -> None:
 
 def test_a_future_that_was_not_signed_counts_for_nothing(tmp_path: Path) -> None:
     """An invented newest checkpoint makes no room."""
-    desk = Desk(tmp_path, Kept(size=3 * _STEP * LARGEST_RECORD))
+    desk = Desk(tmp_path, RetentionLimits(size=3 * _STEP * LARGEST_RECORD))
     with pytest.raises(RemovalRefusedError, match="too few came after"):
         desk.removals.approve(desk.texts[7], desk.text(removed=0, number=1000))
 
 
-def test_what_was_not_signed_here_does_not_go(tmp_path: Path) -> None:
-    """A removal up to a checkpoint that the signer did not sign is refused, and so is what is no checkpoint."""
-    desk = Desk(tmp_path, Kept(days=1))
+def test_only_signed_checkpoints_allow_a_removal(tmp_path: Path) -> None:
+    """Any other text or checkpoint is refused."""
+    desk = Desk(tmp_path, RetentionLimits(days=1))
     forged = desk.texts[2].replace(b"b" * 64, b"c" * 64)
     for text in (forged, desk.text(removed=0), desk.texts[0].replace(LOG.encode(), b"d" * 32)):
         with pytest.raises(RemovalRefusedError, match="was not signed here"):
@@ -93,7 +93,7 @@ def test_what_was_not_signed_here_does_not_go(tmp_path: Path) -> None:
 
 def test_a_checkpoint_says_no_more_is_removed_than_was_approved(tmp_path: Path) -> None:
     """Control cannot have it sealed that records are gone whose removal was not approved, or leave it out."""
-    desk = Desk(tmp_path, Kept(days=5))
+    desk = Desk(tmp_path, RetentionLimits(days=5))
     with pytest.raises(CheckpointRefusedError, match="approved was the removal up to 0"):
         desk.sign(removed=_STEP)
     with pytest.raises(CheckpointRefusedError, match="does not say how many records are removed"):
@@ -109,7 +109,7 @@ def test_a_log_begun_before_removals_were_signed_goes_on(tmp_path: Path) -> None
     """Where checkpoints did not say what is removed, the first that does is believed, and held to from then on."""
     desk = Desk.__new__(Desk)
     desk.now, desk.texts = 1000 * _DAY, []
-    desk.signed = SignedCheckpoints(tmp_path, clock=lambda: desk.now)
+    desk.signed = CheckpointMemory(tmp_path, clock=lambda: desk.now)
     desk.sign(removed=None)
     desk.sign(removed=None)
     (tmp_path / f"{LOG}.times").unlink()  # it kept none
@@ -124,7 +124,7 @@ def test_a_new_log_has_nothing_removed(tmp_path: Path) -> None:
     """The first checkpoint of a log cannot say that something was removed before it."""
     desk = Desk.__new__(Desk)
     desk.texts = []
-    desk.signed = SignedCheckpoints(tmp_path, lambda: _DAY)
+    desk.signed = CheckpointMemory(tmp_path, lambda: _DAY)
     with pytest.raises(CheckpointRefusedError, match="approved was the removal up to 0"):
         desk.sign(removed=7)
     assert not list(tmp_path.iterdir())

@@ -1,7 +1,4 @@
-"""Tests of the kit's `renew.sh`: what a host takes of an appliance whose REST server has fallen to a stranger.
-
-The script runs as it is, on a folder of its own in the place of `/etc/swanctl`; `curl` and `swanctl` are stand-ins.
-"""
+"""Tests of the kit's `renew.sh`: a host checks the answers of an appliance whose REST server is compromised."""
 
 import json
 import os
@@ -12,7 +9,7 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from appliance.ipsec.certificate_authority import Authority
+from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.enrolment_kit import filled
 from appliance.ipsec.requests import make_key, signing_request
 
@@ -39,7 +36,10 @@ class Host:
         for path in (self.swanctl / "x509ca", self.swanctl / "x509", self.swanctl / "private", self.answers,
                      self._programs, folder / "ca", folder / "another"):  # fmt: skip
             path.mkdir(parents=True)
-        self.authority, self.another = Authority(folder / "ca"), Authority(folder / "another")
+        self.authority, self.another = (
+            CertificateAuthority(folder / "ca"),
+            CertificateAuthority(folder / "another"),
+        )
         key = make_key()
         self.key = self.swanctl / "private" / "rosrv.key"
         self.certificate = self.swanctl / "x509" / "rosrv.pem"
@@ -58,7 +58,7 @@ class Host:
         self._script = folder / "renew.sh"
 
     def answer(self, name: str, body: bytes) -> None:
-        """What the appliance says from now on."""
+        """Set the appliance's answer."""
         (self.answers / name).write_bytes(body)
 
     def renew(self, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -86,7 +86,7 @@ def host(tmp_path: Path) -> Host:
 
 
 def test_the_authoritys_list_of_revoked_certificates_is_kept(host: Host) -> None:
-    """Each look brings the list anew, in the shorter form; a certificate that is new is not renewed."""
+    """Each run fetches the list again, in the shorter form; a new certificate is not renewed."""
     done = host.renew()
     assert done.returncode == 0, done.stderr
     assert "nothing to do" in done.stdout

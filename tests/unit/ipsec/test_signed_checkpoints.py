@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from appliance.ipsec.signed_checkpoints import MOST_LOGS, CheckpointRefusedError, SignedCheckpoints
+from appliance.ipsec.signed_checkpoints import MOST_LOGS, CheckpointMemory, CheckpointRefusedError
 
 _NONE = "0" * 64
 
 
 def checkpoint(number: int, previous: str = _NONE, log: str = "a" * 32, digest: str = "b" * 64) -> bytes:
-    """The text of a checkpoint."""
+    """Return the text of a checkpoint."""
     return (
         f"rosrv audit checkpoint 1\nlog {log}\nnumber {number}\nsequence {number * 10}\n"
         f"hash {digest}\ntime 1\nprevious {previous}\n"
@@ -25,11 +25,11 @@ def digest(text: bytes) -> str:
 
 
 def test_each_follows_the_one_before(tmp_path: Path) -> None:
-    """Checkpoints in order are signed, also by a signer that was started anew in between."""
+    """Checkpoints in order are signed, also after a restart of the signer."""
     previous = _NONE
     for number in range(1, 10):
         text = checkpoint(number, previous)
-        SignedCheckpoints(tmp_path, time.time_ns).approve(text)
+        CheckpointMemory(tmp_path, time.time_ns).approve(text)
         previous = digest(text)
 
 
@@ -37,7 +37,7 @@ def test_asked_again(tmp_path: Path) -> None:
     """A checkpoint whose signature was lost on the way is signed again, if it is the same."""
     first = checkpoint(1)
     second = checkpoint(2, digest(first))
-    signed = SignedCheckpoints(tmp_path, time.time_ns)
+    signed = CheckpointMemory(tmp_path, time.time_ns)
     for text in (first, second, first, second):
         signed.approve(text)
 
@@ -61,8 +61,8 @@ def test_asked_again(tmp_path: Path) -> None:
     ],
 )
 def test_refused(tmp_path: Path, text: bytes, reason: str) -> None:
-    """A second past, a gap, and what is no checkpoint are refused with the reason, and change nothing."""
-    signed = SignedCheckpoints(tmp_path, time.time_ns)
+    """A second history, a gap, and other texts are refused with the reason, and change nothing."""
+    signed = CheckpointMemory(tmp_path, time.time_ns)
     signed.approve(checkpoint(1))
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(CheckpointRefusedError, match=reason):
@@ -72,7 +72,7 @@ def test_refused(tmp_path: Path, text: bytes, reason: str) -> None:
 
 def test_logs_are_apart_and_bounded(tmp_path: Path) -> None:
     """Each log has its own past; control cannot fill the signer's disk with invented logs."""
-    signed = SignedCheckpoints(tmp_path, time.time_ns)
+    signed = CheckpointMemory(tmp_path, time.time_ns)
     for number in range(MOST_LOGS):
         signed.approve(checkpoint(1, log=f"{number:032x}"))
     with pytest.raises(CheckpointRefusedError, match=r"remove \.signed files"):
@@ -83,7 +83,7 @@ def test_cut_by_a_crash(tmp_path: Path) -> None:
     """A hash that a crash cut short was not approved; the checkpoint can be approved again."""
     first = checkpoint(1)
     second = checkpoint(2, digest(first))
-    signed = SignedCheckpoints(tmp_path, time.time_ns)
+    signed = CheckpointMemory(tmp_path, time.time_ns)
     signed.approve(first)
     signed.approve(second)
     (memory,) = tmp_path.glob("*.signed")

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from appliance.audit.checkpoints import read_remembered
+from appliance.audit.checkpoints import read_signer_memory
 from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.search import search
@@ -28,8 +28,8 @@ from appliance.audit.signatures import read_public_key
 from appliance.audit.verification import verify
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages import (
+    AuthorityRequest,
     AuthorityStated,
-    AuthorityWanted,
     CertificateMade,
     CertificateRefused,
     CertificateWanted,
@@ -40,7 +40,7 @@ from appliance.channel.messages import (
     Pong,
     Ready,
     RevocationsMade,
-    RevocationsWanted,
+    RevocationsRequest,
     RevokedCertificate,
     SignatureMade,
     SignatureRefused,
@@ -48,10 +48,12 @@ from appliance.channel.messages import (
     SignerLink,
     Stop,
 )
-from appliance.ipsec.certificate_authority import Authority
-from appliance.ipsec.removals import Kept
+from appliance.ipsec.certificate_authority import CertificateAuthority
+from appliance.ipsec.removals import RetentionLimits
 from appliance.ipsec.signer import KEY_FILE, PUBLIC_KEY_FILE, Signer, load_or_create_key
 from tests.support.audit import decision, settle
+
+pytestmark = pytest.mark.anyio
 
 _LIMIT_SECONDS = 30
 _TEXT = (
@@ -128,7 +130,7 @@ def test_key_is_made_once_and_private(tmp_path: Path) -> None:
 
 
 def test_signs_a_checkpoint(signer: SignerProcess) -> None:
-    """A checkpoint comes back with a right signature of the signer's key."""
+    """A checkpoint comes back with a valid signature of the signer's key."""
     link = signer.open_link()
     link.send(SignatureWanted(1, _TEXT))
     made = hear(link)
@@ -140,7 +142,7 @@ def test_signs_a_checkpoint(signer: SignerProcess) -> None:
 
 
 def test_signs_nothing_else(signer: SignerProcess) -> None:
-    """What is no checkpoint, or a second past, is refused with the reason, and the signer goes on."""
+    """Another text, or a second history, is refused with the reason, and the signer continues."""
     link = signer.open_link()
     link.send(SignatureWanted(1, b"a certificate for me, please"))
     assert hear(link) == SignatureRefused(1, "what was to be signed is not an audit checkpoint")
@@ -158,8 +160,8 @@ def test_new_link_replaces_the_old(signer: SignerProcess) -> None:
     assert isinstance(hear(link), SignatureMade)
 
 
-def test_rubbish_on_the_link(signer: SignerProcess) -> None:
-    """Bytes that are no message do not end the signer; the next link is served."""
+def test_garbage_on_the_link_does_not_end_it(signer: SignerProcess) -> None:
+    """Invalid bytes do not end the signer; the next link is served."""
     link = signer.open_link()
     os.write(link.fileno(), b"\xff" * 5000)
     again = signer.open_link()
@@ -224,14 +226,14 @@ def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
     result = verify(path, signer=tmp_path / "signer")
     assert result.ok, result.findings
     assert result.signed_checkpoints >= 5
-    assert read_remembered(tmp_path / "signer", result.log) is not None
+    assert read_signer_memory(tmp_path / "signer", result.log) is not None
     assert not search(path, Filter(event="signature refused")).entries
 
 
-def test_whatever_a_request_does_to_the_parser_is_answered(
+async def test_an_unexpected_parser_error_is_a_refusal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An error that nobody thought of is a refusal in words, and what was read with the request is answered too."""
+    """The refusal has words, and other requests in the same read are answered."""
 
     class OddError(Exception):
         """Of no kind that is expected."""
@@ -239,37 +241,34 @@ def test_whatever_a_request_does_to_the_parser_is_answered(
     def fail(*_arguments: object, **_named: object) -> None:
         raise OddError("something is odd")
 
-    async def work() -> None:
-        (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
-        own = Channel(child, Lifeline)
-        authority = Authority(tmp_path)
-        monkeypatch.setattr(authority, "issue", fail)
-        signer = Signer(own, tmp_path, load_or_create_key(tmp_path), authority, Kept())
-        running = asyncio.create_task(signer.run())
-        supervisor, link = Channel(lifeline, Lifeline), Channel(ours, SignerLink)
-        supervisor.send(LinkOpened("control", 0), (theirs.fileno(),))
-        theirs.close()
-        link.send(CertificateWanted(1, b"x", "a", 1))
-        link.send(AuthorityWanted(2))
-        heard: list[Any] = []
-        both = asyncio.Event()
+    (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
+    own = Channel(child, Lifeline)
+    authority = CertificateAuthority(tmp_path)
+    monkeypatch.setattr(authority, "issue", fail)
+    signer = Signer(own, tmp_path, load_or_create_key(tmp_path), authority, RetentionLimits())
+    running = asyncio.create_task(signer.run())
+    supervisor, link = Channel(lifeline, Lifeline), Channel(ours, SignerLink)
+    supervisor.send(LinkOpened("control", 0), (theirs.fileno(),))
+    theirs.close()
+    link.send(CertificateWanted(1, b"x", "a", 1))
+    link.send(AuthorityRequest(2))
+    heard: list[Any] = []
+    both = asyncio.Event()
 
-        def hear_one(message: Any, _descriptors: tuple[int, ...]) -> None:
-            heard.append(message)
-            if len(heard) == 2:
-                both.set()
+    def hear_one(message: Any, _descriptors: tuple[int, ...]) -> None:
+        heard.append(message)
+        if len(heard) == 2:
+            both.set()
 
-        link.attach(asyncio.get_running_loop(), hear_one, both.set)
-        await asyncio.wait_for(both.wait(), _LIMIT_SECONDS)
-        assert isinstance(heard[0], CertificateRefused)
-        assert "something is odd" in heard[0].reason
-        assert isinstance(heard[1], AuthorityStated)
-        supervisor.send(Stop())
-        await asyncio.wait_for(running, _LIMIT_SECONDS)
-        for one in (own, supervisor, link):
-            one.close()
-
-    asyncio.run(work())
+    link.attach(asyncio.get_running_loop(), hear_one, both.set)
+    await asyncio.wait_for(both.wait(), _LIMIT_SECONDS)
+    assert isinstance(heard[0], CertificateRefused)
+    assert "something is odd" in heard[0].reason
+    assert isinstance(heard[1], AuthorityStated)
+    supervisor.send(Stop())
+    await asyncio.wait_for(running, _LIMIT_SECONDS)
+    for one in (own, supervisor, link):
+        one.close()
 
 
 def test_certificates_over_the_link(tmp_path: Path) -> None:
@@ -284,7 +283,7 @@ def test_certificates_over_the_link(tmp_path: Path) -> None:
     )
     try:
         link = signer.open_link()
-        link.send(AuthorityWanted(1))
+        link.send(AuthorityRequest(1))
         stated = hear(link)
         assert isinstance(stated, AuthorityStated)
         link.send(CertificateWanted(2, request, "ocu-1", 90))
@@ -292,7 +291,7 @@ def test_certificates_over_the_link(tmp_path: Path) -> None:
         assert isinstance(made, CertificateMade)
         root = x509.load_pem_x509_certificate(stated.certificate)
         x509.load_pem_x509_certificate(made.certificate).verify_directly_issued_by(root)
-        link.send(RevocationsWanted(3, [RevokedCertificate(made.serial, 1_700_000_000)]))
+        link.send(RevocationsRequest(3, [RevokedCertificate(made.serial, 1_700_000_000)]))
         revocations = hear(link)
         assert isinstance(revocations, RevocationsMade)
         assert [one.serial_number for one in x509.load_pem_x509_crl(revocations.revocations)] == [

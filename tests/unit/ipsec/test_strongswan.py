@@ -1,4 +1,4 @@
-"""Tests of what charon is told."""
+"""Tests of charon's configuration."""
 
 from pathlib import Path
 
@@ -28,8 +28,8 @@ def test_a_host_gets_one_address_and_reaches_the_appliance_only() -> None:
     assert made["children"]["ros"]["remote_ts"] == ["dynamic"]
 
 
-def test_a_host_is_its_certificate() -> None:
-    """Its name in the certificate, of this authority, not revoked: without a valid list nobody comes in."""
+def test_a_host_is_identified_by_its_certificate() -> None:
+    """The name must be in a valid certificate of this authority; without a valid list no host connects."""
     remote = connection(HOST, STATED, Proposals())["host-ocu-1"]["remote"]
     assert remote == {"auth": "pubkey", "cacerts": [b"A"], "id": "fqdn:ocu-1", "revocation": "strict"}
 
@@ -60,7 +60,7 @@ def test_a_connection_that_is_not_ours_is_nobodys() -> None:
 
 
 def test_ml_kem_is_offered_where_charon_has_it() -> None:
-    """First of all and beside Curve25519; a charon without it is told of what it has, and nothing weaker."""
+    """It is the first proposal, beside Curve25519; a charon without it gets the others, and nothing weaker."""
     assert proposals_of(["CURVE_25519", "ECP_384"]).key_exchange == ["x25519", "ecp384"]
     found = proposals_of(["ECP_384", "CURVE_25519", "ML_KEM_768", "MODP_1024"])
     assert found.key_exchange == ["x25519+mlkem768", "x25519", "ecp384"]

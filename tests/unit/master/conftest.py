@@ -1,9 +1,9 @@
-"""What the tests of control share."""
+"""Fixtures that the tests of control share."""
 
 import pytest
 
 
 @pytest.fixture
 def anyio_backend() -> str:
-    """The loop that control runs on."""
+    """Return the loop that control runs on."""
     return "asyncio"

@@ -1,4 +1,4 @@
-"""Small calls go one after the other; those that wait for the same answer travel together."""
+"""Small calls are sent one after the other. Calls that arrive in the meantime are sent together."""
 
 import asyncio
 from typing import Any
@@ -9,9 +9,11 @@ from appliance.master.rosmaster import BatchingClient
 from appliance.rpc.xmlrpc_client import BrokenOffError, CallFailedError
 from roswire.errors import EncodingError
 
+pytestmark = pytest.mark.anyio
+
 
 class Server:
-    """Answers as ROSMaster would, and remembers what travelled."""
+    """A connection that answers as the ROS master does, and remembers its requests."""
 
     def __init__(self) -> None:
         self.travelled: list[tuple[str, tuple[Any, ...]]] = []
@@ -34,7 +36,7 @@ class Server:
 
 
 def run(server: Server, *calls: tuple[str, Any]) -> list[Any]:
-    """Make all calls in one turn; their outcomes."""
+    """Make all calls in one turn, and return their outcomes."""
 
     async def scene() -> list[Any]:
         client = BatchingClient(server, {"hasParam", "searchParam", "lookupNode", "registerPublisher"})  # type: ignore[arg-type]  # the server stands for the connection
@@ -43,15 +45,15 @@ def run(server: Server, *calls: tuple[str, Any]) -> list[Any]:
     return asyncio.run(scene())
 
 
-def test_a_call_alone_travels_alone() -> None:
-    """No multicall is made of one call."""
+def test_a_single_call_is_sent_alone() -> None:
+    """One call is not wrapped in a multicall."""
     server = Server()
     assert run(server, ("getPid", 7)) == [[1, "getPid", 7]]
     assert server.travelled == [("getPid", (7,))]
 
 
-def test_calls_that_wait_travel_as_one_in_their_order() -> None:
-    """What finds nothing under way goes at once; each caller gets its own answer, in the order of the calls."""
+def test_waiting_calls_are_sent_as_one_in_order() -> None:
+    """The first call is sent at once; each caller gets its own answer, in the order of the calls."""
     server = Server()
     assert run(server, ("registerPublisher", 0), ("hasParam", 1), ("lookupNode", 2), ("hasParam", 3)) == [
         [1, "registerPublisher", 0],
@@ -65,8 +67,8 @@ def test_calls_that_wait_travel_as_one_in_their_order() -> None:
     assert [part["methodName"] for part in parts] == ["hasParam", "lookupNode", "hasParam"]
 
 
-def test_one_is_under_way_at_a_time() -> None:
-    """What comes while a call is under way waits for its answer, also when nobody waits for that any more."""
+async def test_one_request_is_under_way_at_a_time() -> None:
+    """Calls wait for the answer to the request under way, also if its caller was cancelled."""
     server, go = Server(), asyncio.Event()
     answer = server.call
 
@@ -75,27 +77,24 @@ def test_one_is_under_way_at_a_time() -> None:
             await go.wait()
         return await answer(method, *params)
 
-    async def scene() -> None:
-        server.call = slow  # type: ignore[method-assign]  # a peer that takes its time
-        client = BatchingClient(server, {"hasParam", "lookupNode"})  # type: ignore[arg-type]  # as in `run`
-        calls = [asyncio.ensure_future(client.call("hasParam", one)) for one in (1, 2, 3)]
-        for _ in range(5):
-            await asyncio.sleep(0)
-        assert server.travelled == []
-        calls[1].cancel()
-        go.set()
-        assert [await calls[0], await calls[2]] == [[1, "hasParam", 1], [1, "hasParam", 3]]
-        calls = [asyncio.ensure_future(client.call("lookupNode", one)) for one in (1, 2)]
+    server.call = slow  # type: ignore[method-assign]  # a peer that takes its time
+    client = BatchingClient(server, {"hasParam", "lookupNode"})  # type: ignore[arg-type]  # as in `run`
+    calls = [asyncio.ensure_future(client.call("hasParam", one)) for one in (1, 2, 3)]
+    for _ in range(5):
         await asyncio.sleep(0)
-        calls[0].cancel()
-        assert await calls[1] == [1, "lookupNode", 2]
-        assert await client.call("hasParam", 4) == [1, "hasParam", 4]
+    assert server.travelled == []
+    calls[1].cancel()
+    go.set()
+    assert [await calls[0], await calls[2]] == [[1, "hasParam", 1], [1, "hasParam", 3]]
+    calls = [asyncio.ensure_future(client.call("lookupNode", one)) for one in (1, 2)]
+    await asyncio.sleep(0)
+    calls[0].cancel()
+    assert await calls[1] == [1, "lookupNode", 2]
+    assert await client.call("hasParam", 4) == [1, "hasParam", 4]
 
-    asyncio.run(scene())
 
-
-def test_a_fault_is_its_own_callers_only() -> None:
-    """One part fails, the others have their answers."""
+def test_a_fault_reaches_its_own_caller_only() -> None:
+    """One part fails; the other callers get their answers."""
     _, first, second, third = run(
         Server(), ("hasParam", 0), ("hasParam", 1), ("searchParam", 2), ("lookupNode", 3)
     )
@@ -105,8 +104,8 @@ def test_a_fault_is_its_own_callers_only() -> None:
     assert third == [1, "lookupNode", 3]
 
 
-def test_a_broken_connection_is_everybodys_as_what_it_is() -> None:
-    """Each caller learns that the connection broke, so that each can try again."""
+def test_a_broken_connection_is_reported_to_each_caller() -> None:
+    """Each caller gets the error of the connection, so that it can retry."""
     server = Server()
     server.broken = True
     _, *outcomes = run(server, ("hasParam", 1), ("lookupNode", 2), ("lookupNode", 3))
@@ -123,8 +122,8 @@ def test_many_calls_are_split(count: int) -> None:
     assert max(len(params[0]) for method, params in server.travelled if method == "system.multicall") <= 64
 
 
-def test_values_travel_alone() -> None:
-    """A parameter's value, which may be large or impossible to write, takes nobody else's call with it."""
+def test_values_are_sent_alone() -> None:
+    """A value, which may be large or unserializable, cannot fail another caller's call."""
     server = Server()
     run(server, ("lookupNode", 0), ("setParam", 1), ("hasParam", 2), ("getParam", 3), ("lookupNode", 4))
     assert sorted(method for method, _ in server.travelled) == [
@@ -137,8 +136,8 @@ def test_values_travel_alone() -> None:
     assert [part["methodName"] for part in parts] == ["hasParam", "lookupNode"]
 
 
-def test_what_cannot_be_written_is_the_callers_error() -> None:
-    """Whatever goes wrong with a call, its caller hears it; nobody waits for ever."""
+def test_an_unserializable_call_is_its_callers_error() -> None:
+    """Each failure of a call reaches its caller; no caller waits for ever."""
 
     async def call(_method: str, *_params: Any) -> Any:
         raise EncodingError("no notation")
@@ -149,8 +148,8 @@ def test_what_cannot_be_written_is_the_callers_error() -> None:
     assert [type(one) for one in outcomes] == [EncodingError] * 3
 
 
-def test_what_is_given_up_does_not_travel() -> None:
-    """Who waits no longer, and has not been sent for, is not sent for."""
+def test_a_cancelled_call_is_not_sent() -> None:
+    """A call that is cancelled while it waits is never sent."""
     server = Server()
 
     async def scene() -> None:

@@ -1,7 +1,7 @@
-"""Conversations of nodes with RVMaster, and what follows from each line, as text; no socket is opened.
+"""Conversations of nodes with RVMaster, and the effects of each line, as text; no socket is opened.
 
-They stand in `conversations.txt`: a line at the margin is what somebody does, the lines below it are what follows
-(`tests/support/conversation.py` says how to read them).
+`conversations.txt` has them: a line at the margin is an action, the indented lines below it are its effects
+(`tests/support/conversation.py` describes the form).
 """
 
 from pathlib import Path
@@ -12,10 +12,21 @@ from tests.support.control_parts import OPEN, POLICY, ControlParts
 from tests.support.conversation import Conversation
 
 pytestmark = pytest.mark.anyio
+_PARAMETERS = f"{OPEN}[Parameters]\nwrite default=*\n"
 _POLICIES = {
     "open": OPEN,
     "closed": POLICY.format("/secret=\n", "/secret=\n"),
     "no_clients": f"{OPEN}[Clients]\n",
+    "alike": "[Groups]\nsome = 10.0.0.0/24\n" + OPEN.replace("[Nodes]\n", "[Nodes]\n/some=some\n"),
+    "closed_to_publishers": POLICY.format("/secret=\n", ""),
+    "exact": f"{_PARAMETERS}read /arm = 10.0.0.5\nread /arm/free = 10.0.0.5\nread default = 10.0.0.9\n",
+    "whole": f"{_PARAMETERS}read /arm/** = 10.0.0.5\nread default = 10.0.0.9\n",
+    "no_parameters": _PARAMETERS,
+    "closed_to_subscribers": POLICY.format("", "/secret=\n"),
+    "no_service": f"{OPEN}[Services]\n/secret=\ndefault=*\n",
+    "no_secret_parameter": f"{_PARAMETERS}read default=*\nread /secret=\n",
+    "no_server": f"{OPEN}[Services]\ndefault = 10.0.0.3\n",
+    "no_setting": OPEN.replace("[Commands]\n", "[Commands]\nsetParam=10.0.0.9\n"),
     "limited": f"{OPEN}[Limits]\n/chatter = publisher 10.0.0.1 30 Hz, subscriber 5 Hz\n",
 }
 _TEXTS = (

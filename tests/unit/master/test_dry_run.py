@@ -1,4 +1,4 @@
-"""A dry run names what a reload then takes, and nothing else: generated policies, registries and grants."""
+"""A dry run names exactly what a reload revokes, for generated policies, registries and grants."""
 
 import asyncio
 import ipaddress
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.master.graph.registry import Incarnation, Kind, new_key
-from appliance.policy.live_rights import Live, endings
+from appliance.policy.live_rights import LiveRight, endings
 from appliance.policy.policy_compiler import compile_policy
 from appliance.store.state_file import PermissionRow
 from roswire.uris import parse_node_uri
@@ -29,7 +29,7 @@ Row = tuple[str, str, str, str]
 
 
 def sections(keys: tuple[str, ...], verbs: tuple[str, ...] = ("",)) -> st.SearchStrategy[dict[str, str]]:
-    """Lines of a section: keys and who is granted them."""
+    """Draw lines of a section: keys and their hosts."""
     written = [verb + key for verb in verbs for key in (*keys, "default")]
     who = st.sampled_from(["", "*", *HOSTS, " ".join(HOSTS)])
     return st.dictionaries(st.sampled_from(written), who, max_size=4)
@@ -68,7 +68,7 @@ TREES = st.sampled_from([{}, {"x": 1}, {"x": {"y": 1}}, {"x": {"y": {"z": 1}}}])
 
 
 def text_of(written: dict[str, dict[str, str]]) -> str:
-    """The policy's file."""
+    """Return the policy's file."""
     return "".join(
         f"[{name}]\n" + "".join(f"{key} = {who}\n" for key, who in lines.items())
         for name, lines in written.items()
@@ -76,7 +76,7 @@ def text_of(written: dict[str, dict[str, str]]) -> str:
 
 
 def held(world: ControlParts) -> set[Row]:
-    """What everybody has."""
+    """Return the registrations and grants of all nodes."""
     return {
         (str(node.host), node.name, WORDS[each.kind], each.resource)
         for node in world.registry.all()
@@ -90,7 +90,7 @@ def held(world: ControlParts) -> set[Row]:
 async def taken(
     policy: str, registrations: frozenset[Any], grants: frozenset[Any], tree: dict[str, Any]
 ) -> tuple[set[Row], set[Row], int]:
-    """What a dry run of this policy names, what a reload then takes, and how much it says that was."""
+    """Return the list of a dry run, the losses by the reload after it, and the number that the reload reports."""
     world = await ControlParts.begun()
     world.parameters = mirror(tree)
     nodes: dict[tuple[str, str], Incarnation] = {}
@@ -106,7 +106,7 @@ async def taken(
     for host, name, kind, thing in grants:
         world.grants.give(PermissionRow("key", kind, thing, host, name))
     before = held(world)
-    seen = [Live.of(live.fields()) for live in world.revocation.live()]
+    seen = [LiveRight.of(live.fields()) for live in world.revocation.live()]
     named = endings(compile_policy(policy, file="policy"), seen)
     assert held(world) == before
     count = world.reload(policy)
@@ -117,13 +117,13 @@ async def taken(
 
 @settings(max_examples=examples(100))
 @given(POLICIES, REGISTRATIONS, GRANTS, TREES)
-def test_a_dry_run_names_exactly_what_a_reload_then_takes(
+def test_a_dry_run_names_exactly_what_a_reload_revokes(
     written: dict[str, dict[str, str]],
     registrations: frozenset[Any],
     grants: frozenset[Any],
     tree: dict[str, Any],
 ) -> None:
-    """Publications, subscriptions, services, calls and parameters of all who have them: no more and no less."""
+    """Publications, subscriptions, services, calls and parameters of all nodes are compared."""
     named, gone, count = asyncio.run(taken(text_of(written), registrations, grants, tree))
     assert named == gone
     assert bool(count) == bool(gone)

@@ -1,4 +1,4 @@
-"""Who sets a parameter is charged for it: what the charges are is counted naively, one parameter at a time."""
+"""The host that sets a parameter is charged for it, compared with a naive count of single parameters."""
 
 import contextlib
 import copy
@@ -13,20 +13,20 @@ from hypothesis import strategies as st
 from appliance.master.parameter_charges import APPLIANCE, LimitReachedError, measure, member_weight
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.model import Address
-from appliance.quotas.pool import Bounds, Standing
+from appliance.quotas.pool import Bounds, QuotaClass
 from roswire.parameter_tree import parts_of
 from roswire.xmlrpc import Value
 from tests.support.examples import examples
 from tests.support.parameters import Owners, mirror, put
 
-ROBOT, GUEST, OTHER, STRANGER = (ipaddress.ip_address(f"10.0.0.{number}") for number in (1, 2, 3, 4))
+ROBOT, GUEST, OTHER, UNKNOWN = (ipaddress.ip_address(f"10.0.0.{number}") for number in (1, 2, 3, 4))
 STANDINGS = {
-    ROBOT: Standing.REGISTERED,
-    GUEST: Standing.NAMED,
-    OTHER: Standing.NAMED,
-    APPLIANCE: Standing.NAMED,
+    ROBOT: QuotaClass.REGISTERED,
+    GUEST: QuotaClass.NAMED,
+    OTHER: QuotaClass.NAMED,
+    APPLIANCE: QuotaClass.NAMED,
 }
-BOUNDS = Bounds(whole=3000, host=1500, strangers=400, kept=1000)
+BOUNDS = Bounds(whole=3000, host=1500, unknown=400, kept=1000)
 PART = st.sampled_from(["a", "b", "c"])
 KEY = st.lists(PART, max_size=4).map(lambda parts: "/" + "/".join(parts))
 VALUE: st.SearchStrategy[Any] = st.recursive(
@@ -34,7 +34,7 @@ VALUE: st.SearchStrategy[Any] = st.recursive(
     lambda inner: st.dictionaries(PART, inner, max_size=3),
     max_leaves=5,
 )
-HOST: st.SearchStrategy[Address] = st.sampled_from([ROBOT, GUEST, OTHER, STRANGER])
+HOST: st.SearchStrategy[Address] = st.sampled_from([ROBOT, GUEST, OTHER, UNKNOWN])
 STEP = st.one_of(
     st.tuples(st.just("set"), KEY, VALUE, HOST),
     st.tuples(st.just("delete"), KEY, st.none(), HOST),
@@ -42,24 +42,24 @@ STEP = st.one_of(
 )
 
 
-def standing(host: Address) -> Standing:
-    """Three hosts that the policy names, one of them with nodes."""
-    return STANDINGS.get(host, Standing.STRANGER)
+def quota_class(host: Address) -> QuotaClass:
+    """Return the class of three hosts that the policy names, one of them with nodes."""
+    return STANDINGS.get(host, QuotaClass.UNKNOWN)
 
 
 def charged(there: ParameterMirror) -> dict[Address, int]:
-    """What each host is charged."""
+    """Return the charge of each host."""
     return dict(there.charges.pool.holders())
 
 
 class Ledger:
-    """Every namespace and value with its owner, as a dictionary: slow, and easy to see through."""
+    """Every namespace and value with its owner, as a dictionary: slow and simple."""
 
     def __init__(self) -> None:
         self.owners: dict[tuple[str, ...], Address] = {(): APPLIANCE}
 
     def set(self, tree: Value, key: str, owner: Address) -> None:
-        """`tree` is what there is after this host has set the key."""
+        """Note `tree` after this host has set the key."""
         parts = tuple(parts_of(key))
         new = next(
             parts[:depth] for depth in range(len(parts) + 1) if self._is_new(tree, parts[:depth], parts)
@@ -70,11 +70,11 @@ class Ledger:
                 self.owners[place] = owner
 
     def drop(self, key: tuple[str, ...]) -> None:
-        """The key is gone, and what is below it."""
+        """Drop the key and all keys below it."""
         self.owners = {place: owner for place, owner in self.owners.items() if place[: len(key)] != key}
 
     def charges(self, tree: Value) -> dict[Address, int]:
-        """What each host is charged."""
+        """Return the charge of each host."""
         found: Counter[Address] = Counter()
         for place, value in _places(tree).items():
             alone: Value = {} if isinstance(value, dict) else value
@@ -97,8 +97,8 @@ def _places(value: Value, place: tuple[str, ...] = ()) -> dict[tuple[str, ...], 
 
 @settings(max_examples=examples(400))
 @given(st.lists(STEP, max_size=14))
-def test_who_set_it_is_charged(steps: list[tuple[str, str, Any, Address]]) -> None:
-    """After any sequence, restarts included: each host's bytes are those of what it set last, names and all."""
+def test_the_host_that_set_a_parameter_is_charged(steps: list[tuple[str, str, Any, Address]]) -> None:
+    """After any sequence, restarts included: each host is charged for the names and values that it set last."""
     owners, ledger = Owners(), Ledger()
     there = mirror(owners=owners)
     for do, key, value, host in steps:
@@ -120,9 +120,9 @@ def test_who_set_it_is_charged(steps: list[tuple[str, str, Any, Address]]) -> No
 
 @settings(max_examples=examples(400))
 @given(st.lists(STEP, max_size=20))
-def test_no_sequence_gets_beyond_a_share(steps: list[tuple[str, str, Any, Address]]) -> None:
-    """Whatever hosts set, replace, take over and delete: no share and no sum is passed, whoever works together."""
-    there = mirror(bounds=BOUNDS, standing=standing)
+def test_no_sequence_exceeds_a_quota(steps: list[tuple[str, str, Any, Address]]) -> None:
+    """No combination of hosts that set, replace, take over and delete exceeds a quota or the sum."""
+    there = mirror(bounds=BOUNDS, quota_class=quota_class)
     for do, key, value, host in steps:
         if do == "delete":
             there.delete(key)
@@ -132,18 +132,18 @@ def test_no_sequence_gets_beyond_a_share(steps: list[tuple[str, str, Any, Addres
         pool = there.charges.pool
         assert all(amount <= BOUNDS.host for _host, amount in pool.holders())
         assert pool.total == there.weight <= BOUNDS.whole
-        assert pool.held_by(Standing.STRANGER) <= BOUNDS.strangers
-        named = pool.held_by(Standing.NAMED) + pool.held_by(Standing.STRANGER)
+        assert pool.held_by(QuotaClass.UNKNOWN) <= BOUNDS.unknown
+        named = pool.held_by(QuotaClass.NAMED) + pool.held_by(QuotaClass.UNKNOWN)
         assert named <= BOUNDS.whole - BOUNDS.kept
 
 
 @settings(max_examples=examples(200))
 @given(st.lists(STEP, max_size=10), st.integers(0, 3), HOST)
-def test_a_value_is_always_replaced_by_one_that_takes_no_more(
+def test_a_value_can_always_be_replaced_by_one_of_its_size(
     steps: list[tuple[str, str, Any, Address]], place: int, host: Address
 ) -> None:
-    """However full all shares are: whoever may write a parameter may correct it."""
-    there = mirror(bounds=BOUNDS, standing=standing)
+    """Even with all quotas full, a host that may write a parameter may correct it."""
+    there = mirror(bounds=BOUNDS, quota_class=quota_class)
     for do, key, value, who in steps:
         if do == "set" and key != "/":
             with contextlib.suppress(LimitReachedError):
@@ -156,13 +156,13 @@ def test_a_value_is_always_replaced_by_one_that_takes_no_more(
     put(there, "/" + "/".join(parts), smaller, host)
 
 
-def test_a_guest_fills_its_share_and_nobody_elses() -> None:
-    """The robot sets and overwrites what it wants when a guest has all it can get; the guest is told why."""
-    there = mirror(bounds=BOUNDS, standing=standing)
+def test_a_guest_fills_only_its_own_quota() -> None:
+    """The robot can set and overwrite any parameter after a guest has filled its quota; the guest gets the reason."""
+    there = mirror(bounds=BOUNDS, quota_class=quota_class)
     for number in range(20):
         with contextlib.suppress(LimitReachedError):
             put(there, f"/guest/{number}", "x" * 100, GUEST)
-    with pytest.raises(LimitReachedError, match=r"10\.0\.0\.2 has \d+ bytes of parameters; the share"):
+    with pytest.raises(LimitReachedError, match=r"10\.0\.0\.2 has \d+ bytes of parameters; the quota"):
         put(there, "/guest/more", "x" * 1000, GUEST)
     put(there, "/robot", "x" * 1000, ROBOT)
     put(there, "/guest/1", "y", ROBOT)
@@ -172,8 +172,8 @@ def test_a_guest_fills_its_share_and_nobody_elses() -> None:
     put(there, "/guest/more", "x" * 1000, GUEST)
 
 
-def test_room_is_kept_while_rosmaster_is_asked() -> None:
-    """Several values on their way together get no more than one after the other would."""
+def test_quota_is_reserved_during_a_call_of_rosmaster() -> None:
+    """Several concurrent values get no more room than one after the other."""
     there = mirror(whole=1000)
     kept = there.reserve("/a", measure("x" * 400)[0], GUEST)
     second = there.reserve("/b", measure("x" * 300)[0], GUEST)
@@ -185,14 +185,14 @@ def test_room_is_kept_while_rosmaster_is_asked() -> None:
     assert there.charges.pool.total == there.weight
 
 
-def test_charges_survive_rosmasters_and_controls_end() -> None:
-    """Control starts anew with its state, or takes the tree that ROSMaster has: whoever set it is charged."""
+def test_charges_survive_restarts_of_rosmaster_and_control() -> None:
+    """Control restarts with its state, or adopts the tree of the ROS master: the host that set it is charged."""
     owners = Owners()
     there = mirror(owners=owners)
     put(there, "/guest/map", "x" * 1000, GUEST)
     put(there, "/robot/name", "r", ROBOT)
     before, tree = charged(there), copy.deepcopy(there.tree)
-    again = mirror({"robot": {"name": "r"}}, owners=owners)  # the large value was not kept before the end
+    again = mirror({"robot": {"name": "r"}}, owners=owners)  # the large value was not saved before the end
     again.replace(copy.deepcopy(tree))
     assert charged(again) == before
     again.replace({"robot": {"name": "r"}})

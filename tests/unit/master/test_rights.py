@@ -1,6 +1,6 @@
-"""Everybody who says whether a call is allowed says the same: the gate, and whoever explains, tests, learns or revokes.
+"""The gate, `explain`, the cases, `diff`, `grant`, learning and revocation decide alike on each call.
 
-The rules are made so that a host stands inside or outside each of them; what each call needs is written here once more,
+Each rule includes or excludes a host. The rights that each call needs are written here again,
 by hand, section by section, as docs/policy.md says it.
 """
 
@@ -18,14 +18,14 @@ from appliance.master.calls.call import (
     SERVICE_API,
     TOPIC,
     Attempt,
-    Call,
+    CallParameter,
+    CallVerb,
     Identity,
-    Parameter,
-    Verb,
+    RosCall,
     method,
 )
 from appliance.master.calls.call_table import MASTER_CALLS
-from appliance.master.calls.gate import Contest, Gate, HostLimits
+from appliance.master.calls.gate import CallGate, HostLimits, NameConflict
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.graph.registry import Incarnation, Kind, Registry, new_key
@@ -35,10 +35,10 @@ from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
 from appliance.policy.decision_reasons import explain
 from appliance.policy.diff import diff
-from appliance.policy.grant import Asked, UngrantableError, grant
-from appliance.policy.judgement import Known
+from appliance.policy.grant import DecidedRequest, UngrantableError, grant
+from appliance.policy.judgement import PolicyContext
 from appliance.policy.learn import Observation, learn
-from appliance.policy.live_rights import Live, may_keep
+from appliance.policy.live_rights import LiveRight, may_keep
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -55,7 +55,7 @@ NAME, THING, KEY_GIVEN = "/me", "/thing", "/arm/speed"
 URI = "http://10.0.0.5:4000/"
 ROWS = [*MASTER_CALLS.values(), *NODE_CALLS.values()]
 SECTIONS = ("Nodes", "Publishers", "Subscribers", "Services", "Clients", "read", "write", "Commands")
-# What a call needs besides [Commands] under its own name, which all others need.
+# Calls that need other sections than [Commands] under their own name, which all others need.
 NEEDS = {
     "registerPublisher": ("Publishers", "Nodes"),
     "unregisterPublisher": ("Publishers", "Nodes"),
@@ -90,12 +90,12 @@ SAID = {category: verb for verb, category in VERBS.items()}
 
 @pytest.fixture
 def anyio_backend() -> str:
-    """The loop that control runs on."""
+    """Return the loop that control runs on."""
     return "asyncio"
 
 
 def text_of(granted: frozenset[str], missing: frozenset[str], keyed: bool) -> str:
-    """A policy that grants this host what is needed in these sections; `missing` ones are not there at all."""
+    """Return a policy that grants this host the rights in these sections; `missing` sections are left out."""
     lines: dict[str, list[str]] = {}
     for section in SECTIONS:
         verb = f"{section} " if section in {"read", "write"} else ""
@@ -112,32 +112,32 @@ def text_of(granted: frozenset[str], missing: frozenset[str], keyed: bool) -> st
     return "".join(f"[{title}]\n" + "\n".join(rules) + "\n" for title, rules in lines.items())
 
 
-def argument_of(parameter: Parameter[Any]) -> Any:
-    """A canonical value for a parameter of a call."""
+def argument_of(parameter: CallParameter[Any]) -> Any:
+    """Return a canonical value for a parameter of a call."""
     if parameter in {CALLER_API, SERVICE_API}:
         return ApiUri(URI, parse_node_uri(URI))
     return KEY_GIVEN if parameter is KEY else THING
 
 
-def gate_says(policy: Policy, call: Call[Any], tree: Tree) -> Decision:
-    """What RVMaster answers to the call."""
-    gate = Gate(lambda: policy, Registry(), HostLimits())
+def gate_says(policy: Policy, call: RosCall[Any], tree: Tree) -> Decision:
+    """Return RVMaster's answer to the call."""
+    gate = CallGate(lambda: policy, Registry(), HostLimits())
     name = "" if call.identity is Identity.NOBODY else NAME
     arguments = tuple(argument_of(one) for one in call.method.parameters)
     caller = Caller(Peer(HOST, str(HOST), "10.0.0.1"), name, 0)
     decision = gate.decide(Attempt(caller, call, arguments), tree)
-    assert not isinstance(decision, Contest)
+    assert not isinstance(decision, NameConflict)
     return decision
 
 
-def needed(call: Call[Any], missing: frozenset[str]) -> list[str]:
-    """The sections that must grant it, by the table above."""
+def needed(call: RosCall[Any], missing: frozenset[str]) -> list[str]:
+    """Return the sections that must grant it, by the table above."""
     free = EXTENSIONS & (missing | ({"read", "write"} if {"read", "write"} & missing else set()))
     return [section for section in NEEDS.get(call.name, ("Commands",)) if section not in free]
 
 
-def deeds(call: Call[Any]) -> list[Request]:
-    """What a person would ask about the call: the deed, and the parameter that it is about."""
+def deeds(call: RosCall[Any]) -> list[Request]:
+    """Return the action of the call and its parameter, as a person would ask about it."""
     found = [
         Request(
             HOST, NAME, call.category, THING if call.category is not Category.COMMAND else call.policy_name
@@ -149,7 +149,7 @@ def deeds(call: Call[Any]) -> list[Request]:
 
 
 def case_passes(policy: Policy, request: Request, allowed: bool) -> bool:
-    """Whether a case that expects this answer passes."""
+    """Return whether a case that expects this answer passes."""
     word = "allow" if allowed else "deny"
     deed = f"{SAID[request.category]} {request.resource}"
     text = f"cases:\n- host: {request.host}\n  node: {NAME}\n  {word}: ['{deed}']\n"
@@ -162,8 +162,8 @@ def case_passes(policy: Policy, request: Request, allowed: bool) -> bool:
     st.frozensets(st.sampled_from(SECTIONS), max_size=2),
     st.booleans(),
 )
-def test_all_answer_alike(granted: frozenset[str], missing: frozenset[str], keyed: bool) -> None:
-    """Every row of every table of calls, whatever sections grant it or are missing: one answer, and the right one."""
+def test_all_parts_decide_alike(granted: frozenset[str], missing: frozenset[str], keyed: bool) -> None:
+    """Each call has the same, correct answer in all parts, for any granted or missing sections."""
     policy = compile_policy(text_of(granted, missing, keyed), file="policy")
     nobody = compile_policy("[Nodes]\n", file="nobody")
     for call in ROWS:
@@ -193,7 +193,7 @@ NAMED = st.sampled_from(["default", "/**", "/arm/**", *RESOURCES])
 
 
 def rules_of(keys: st.SearchStrategy[str]) -> st.SearchStrategy[dict[str, str] | None]:
-    """The rules of a section, which the policy may lack."""
+    """Draw the rules of a section, which may be missing."""
     return st.none() | st.dictionaries(keys, WHO, max_size=4)
 
 
@@ -209,24 +209,22 @@ POLICIES = st.fixed_dictionaries(
 
 
 def granted_by(decision: Decision) -> bool:
-    """Whether the rules grant it: audit-only mode lets pass what they deny."""
+    """Return whether the rules grant it; audit-only mode allows denied requests."""
     return decision.allowed and not decision.would_deny
 
 
 @settings(max_examples=examples(300), suppress_health_check=[HealthCheck.too_slow], deadline=None)
 @given(POLICIES, st.sampled_from(list(ROLES.values())))
-def test_a_deed_is_answered_as_the_call_that_does_it(
-    rules: dict[str, dict[str, str] | None], host: str
-) -> None:
-    """Under any policy the gate, `explain`, the cases, `diff` and `grant` give one answer on each deed of each host."""
+def test_an_action_has_the_answer_of_its_call(rules: dict[str, dict[str, str] | None], host: str) -> None:
+    """Under any policy the gate, `explain`, the cases, `diff` and `grant` agree on each action of each host."""
     sections = {"Groups": ROLES, **{name: lines for name, lines in rules.items() if lines is not None}}
     text = "".join(
         f"[{name}]\n" + "".join(f"{key} = {who}\n" for key, who in lines.items())
         for name, lines in sections.items()
     )
-    policy, known = compile_policy(text, file="policy"), Known()
+    policy, known = compile_policy(text, file="policy"), PolicyContext()
     nobody = compile_policy("[Nodes]\n[Services]\n[Clients]\n[Parameters]\n", file="nobody")
-    gate = Gate(lambda: policy, Registry(), HostLimits())
+    gate = CallGate(lambda: policy, Registry(), HostLimits())
     deeds_and_calls = [
         *((category, thing, MASTER_CALLS[call]) for category, call in CARRIED_OUT_BY.items() for thing in RESOURCES),
         *((Category.COMMAND, row.policy_name, row) for row in ROWS if row.category is Category.COMMAND
@@ -247,7 +245,7 @@ def test_a_deed_is_answered_as_the_call_that_does_it(
         assert case_passes(policy, request, granted_by(answer)), request
         assert bool(diff(policy, nobody, [request])) == answer.allowed, request
         try:
-            lines = grant(text, "policy", known, Asked(request, rights_of(request))).added
+            lines = grant(text, "policy", known, DecidedRequest(request, rights_of(request))).added
         except UngrantableError:
             assert not granted_by(answer), request
         else:
@@ -256,8 +254,8 @@ def test_a_deed_is_answered_as_the_call_that_does_it(
 
 @pytest.mark.anyio
 @pytest.mark.parametrize("kind", list(Kind))
-async def test_what_is_live_is_decided_as_the_call_that_made_it(kind: Kind) -> None:
-    """A reload takes back what the gate would not grant any more, and nothing else: registrations and grants."""
+async def test_live_registrations_are_decided_as_their_calls(kind: Kind) -> None:
+    """A reload revokes exactly the registrations and grants that the gate would deny now."""
     world = ControlParts()
     call = MASTER_CALLS[GRANTS[kind]]
     resource = KEY_GIVEN if kind is Kind.PARAMETER else THING
@@ -269,7 +267,7 @@ async def test_what_is_live_is_decided_as_the_call_that_made_it(kind: Kind) -> N
         assert world.revocation.may_have(node, kind, resource) == verdict
         for live, name in (("topic", "requestTopic"), ("service", "lookupService")):
             given_by = MASTER_CALLS.get(name) or NODE_CALLS[name]
-            may = may_keep(world.current, Live(HOST, NAME, name, THING)).allowed
+            may = may_keep(world.current, LiveRight(HOST, NAME, name, THING)).allowed
             assert may == gate_says(world.current, given_by, {}).allowed, live
 
 
@@ -277,8 +275,8 @@ async def test_what_is_live_is_decided_as_the_call_that_made_it(kind: Kind) -> N
 @pytest.mark.parametrize(
     "tree", [{}, {"arm": {"speed": 1}}, {"arm": {"speed": {"max": 1}}}], ids=["empty", "value", "namespace"]
 )
-def test_what_was_learned_from_a_call_lets_it_pass(call: Call[Any], tree: dict[str, Value]) -> None:
-    """A policy that was learned from the records of a call grants the whole call, and it alone needs no more."""
+def test_a_policy_learned_from_a_call_grants_it(call: RosCall[Any], tree: dict[str, Value]) -> None:
+    """A policy that was learned from the records of a call grants the whole call."""
     key = KEY_GIVEN if call.touches is not None else ""
     learned = learn([Observation(deeds(call)[0], call.name, key)])
     assert not learned.left_out
@@ -289,34 +287,34 @@ def test_what_was_learned_from_a_call_lets_it_pass(call: Call[Any], tree: dict[s
 
 
 def test_every_command_can_be_granted() -> None:
-    """`[Commands]` knows the name of each call that it decides, and no name of which there is no call."""
+    """`[Commands]` knows the name of each call that it decides, and no others."""
     named = {call.policy_name for call in ROWS if call.category is Category.COMMAND}
     assert named | {"lookupService"} == COMMANDS
 
 
 def test_a_call_that_makes_a_node_binds_its_name() -> None:
-    """What the policy asks [Nodes] about is what the gate binds to a host as a node's name."""
+    """The gate binds a node's name to a host for exactly the calls that [Nodes] decides."""
     for call in ROWS:
         assert needs_node(deeds(call)[0]) == (call.identity is Identity.NODE), call.name
 
 
-def test_what_a_call_registers_another_gives_up() -> None:
-    """Each kind of thing has one call that registers it and one that gives it up."""
-    assert {call.kind: call.name for call in ROWS if call.verb is Verb.REGISTER} == GRANTS
-    assert {call.name: call.kind for call in ROWS if call.verb is Verb.UNREGISTER} == GIVES_UP
+def test_each_registering_call_has_an_unregistering_one() -> None:
+    """Each kind of registration has one call that makes it and one that ends it."""
+    assert {call.kind: call.name for call in ROWS if call.verb is CallVerb.REGISTER} == GRANTS
+    assert {call.name: call.kind for call in ROWS if call.verb is CallVerb.UNREGISTER} == GIVES_UP
     assert {GIVES_UP[name]: (GRANTS[GIVES_UP[name]], name) for name in GIVES_UP} == CALLS
 
 
-def test_a_command_records_what_it_names() -> None:
-    """A call without a kind is decided by its name alone, and its record has the topic that its parameter names."""
-    row = Call("countPublishers", method(LookupCalls.lookup_node, TOPIC), Verb.READ)
+def test_a_command_records_its_topic() -> None:
+    """A call without a kind is decided by its name alone; its record has the topic of its parameter."""
+    row = RosCall("countPublishers", method(LookupCalls.lookup_node, TOPIC), CallVerb.READ)
     attempt = Attempt(Caller(Peer(HOST, str(HOST), "10.0.0.1"), NAME, 0), row, (THING,))
     assert (attempt.request.category, attempt.request.resource) == (Category.COMMAND, "countPublishers")
     assert attempt.about == {"topic": THING}
 
 
 def test_a_service_that_cannot_be_looked_up_cannot_be_called() -> None:
-    """Who may call a service and not make the call that finds it is denied, by the gate and in every explanation."""
+    """A host that may call a service but not look it up is denied, by the gate and in every explanation."""
     policy = compile_policy(
         "[Groups]\nocu = 10.0.0.5\nrobot1 = 10.0.0.9\n[Nodes]\ndefault = ocu\n[Clients]\ndefault = ocu\n"
         "[Commands]\ndefault = robot1\n",

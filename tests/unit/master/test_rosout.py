@@ -1,4 +1,4 @@
-"""What monitors say on /rosout: the right bytes, the right level, and no flood."""
+"""Messages of monitors on /rosout: correct bytes, correct level, and no flood."""
 
 import msgspec
 import pytest
@@ -13,7 +13,7 @@ LINE = MonitorEvent("log", "gate", "key", "/chatter", 1_700_000_000_250_000_000,
 
 
 class Desk:
-    """A Rosout whose clock stands still unless it is set."""
+    """A Rosout whose clock only moves when a test sets it."""
 
     def __init__(self) -> None:
         self.now = 10.0
@@ -21,13 +21,13 @@ class Desk:
         self.rosout = Rosout("/rosrv", self.sent.append, lambda monitor: f"{monitor}.rv", lambda: self.now)
 
     def said(self) -> list[dict[str, object]]:
-        """The messages, read as a subscriber would."""
+        """Return the messages as a subscriber reads them."""
         fields = [read_fields(DEFINITIONS, "rosgraph_msgs/Log", one.data) for one in self.sent]
         return [one for one in fields if one is not None]
 
 
 def test_a_line_is_a_log_message() -> None:
-    """With the appliance as node, the monitor as function, its file, its level and when it was said."""
+    """With the appliance as node, the monitor as function, its file, its level and its time."""
     desk = Desk()
     desk.rosout.reported(LINE)
     (said,) = desk.said()
@@ -51,15 +51,15 @@ def test_a_line_is_a_log_message() -> None:
         ("publish", {}, None),
     ],
 )
-def test_what_is_said_and_how_loud(kind: str, detail: dict[str, str], level: int | None) -> None:
-    """Output, verdicts and faults; what a monitor did to messages is for the audit log."""
+def test_reports_have_the_level_of_their_kind(kind: str, detail: dict[str, str], level: int | None) -> None:
+    """Output, verdicts and faults are sent; interventions of a monitor are for the audit log only."""
     desk = Desk()
     desk.rosout.reported(msgspec.structs.replace(LINE, kind=kind, detail=detail))
     assert [one["level"] for one in desk.said()] == ([] if level is None else [level])
 
 
-def test_a_flood_is_cut_and_said() -> None:
-    """Fifty in a second; how many more there were comes with the next."""
+def test_a_flood_is_cut_and_reported() -> None:
+    """Fifty messages a second are sent; the next one has the number of dropped ones."""
     desk = Desk()
     for _ in range(60):
         desk.rosout.reported(LINE)
@@ -75,5 +75,5 @@ def test_a_flood_is_cut_and_said() -> None:
 
 
 def test_the_header_is_that_of_ros() -> None:
-    """As `rosmsg md5 rosgraph_msgs/Log` says."""
+    """The sum equals the output of `rosmsg md5 rosgraph_msgs/Log`."""
     assert header(DEFINITIONS).md5sum == "acffd30cd6b6de30f120938c17c593fb"

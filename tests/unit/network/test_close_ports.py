@@ -15,7 +15,7 @@ RANGE = PortRange(32768, 60999)
 
 
 def test_the_file_closes_the_range_after_all_that_stays_open() -> None:
-    """Loopback, the appliances and the services come first, then TCP by SYN and new UDP, then what leaves."""
+    """Loopback, the appliances and the services come first, then TCP by SYN and new UDP, then outgoing packets."""
     services = parse_services(["tcp/40022,udp/40123", "tcp/41000-41009", "tcp/40022"])
     text = protection(["192.168.1.20", "fd00::20"], RANGE, services)
     rules = [line.strip() for line in text.splitlines() if line.startswith("        ")]
@@ -37,7 +37,7 @@ def test_the_file_closes_the_range_after_all_that_stays_open() -> None:
 
 
 def test_no_appliance_is_an_error() -> None:
-    """A file that would shut everyone out, the appliance included, is not made."""
+    """A file that would block every host, including the appliance, is not made."""
     with pytest.raises(ValueError, match="at least one appliance"):
         protection([], RANGE, ())
 
@@ -46,23 +46,23 @@ def test_no_appliance_is_an_error() -> None:
     "text", ["ssh", "tcp", "tcp/", "tcp/0", "tcp/65536", "icmp/1", "tcp/9-3", "tcp/22;", ""]
 )
 def test_a_wrong_service_is_named(text: str) -> None:
-    """What is no service is an error with the text in it, and nothing of it gets into a file."""
-    with pytest.raises(ValueError, match=r"--open .* is no service"):
+    """An invalid service is an error that quotes it, and nothing of it gets into a file."""
+    with pytest.raises(ValueError, match=r"--open .* is not a service"):
         parse_services([f"tcp/22,{text}"])
 
 
 @pytest.mark.parametrize("text", ["", "x", "1-x", "0-5", "5-1", "1-70000", "-5"])
 def test_a_wrong_range_is_named(text: str) -> None:
-    """What is no range of ports is an error."""
-    with pytest.raises(ValueError, match="is no range of ports"):
+    """An invalid range of ports is an error."""
+    with pytest.raises(ValueError, match="is not a range of ports"):
         parse_ports(text)
 
 
 @pytest.mark.parametrize(
     "text", ["0.0.0.0", "::", "127.0.0.1", "::1", "224.0.0.1", "10.0.0.0/8", "10.0.0.1; x"]
 )
-def test_an_address_that_is_no_appliances_is_named(text: str) -> None:
-    """Everyone's, nobody's and this machine's own addresses are refused, and so is text for nft."""
+def test_an_address_that_no_appliance_can_have_is_named(text: str) -> None:
+    """Wildcard, multicast and loopback addresses are refused, and so is text for nft."""
     with pytest.raises(ValueError, match="appliance"):
         parse_address(text)
 

@@ -1,4 +1,4 @@
-"""Tests of finding out where ESP can run."""
+"""Tests of the choice where ESP runs."""
 
 import errno
 import os
@@ -15,7 +15,7 @@ from tests.support.requirements import need_root
 
 
 def answers(monkeypatch: pytest.MonkeyPatch, status: int) -> list[list[str]]:
-    """Let `ip` end with this status; the commands it was given."""
+    """Let `ip` end with this status; return the commands it received."""
     given: list[list[str]] = []
 
     def run(command: list[str], **_options: object) -> "subprocess.CompletedProcess[str]":
@@ -27,7 +27,7 @@ def answers(monkeypatch: pytest.MonkeyPatch, status: int) -> list[list[str]]:
 
 
 def test_a_kernel_that_takes_the_cipher_is_used_and_left_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The state that was tried is taken away again."""
+    """The trial state is removed again."""
     given = answers(monkeypatch, 0)
     assert esp.choose_esp(Namespace.own()) == "kernel"
     assert [command[3] for command in given] == ["add", "delete"]
@@ -37,7 +37,7 @@ def test_a_kernel_that_takes_the_cipher_is_used_and_left_as_it_was(monkeypatch: 
 
 
 def test_the_device_is_lent_to_one_user(tmp_path: Path) -> None:
-    """A device that only root may open is opened by that user then, and by no other; its mode allows no more."""
+    """A device that only root may open can then be opened by that user and by no other; its mode allows no more."""
     need_root()
     place = Path(tempfile.mkdtemp(dir="/dev/shm"))
     try:
@@ -60,8 +60,8 @@ def test_the_device_is_lent_to_one_user(tmp_path: Path) -> None:
         shutil.rmtree(place)
 
 
-def test_a_device_that_cannot_be_lent_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """What is missing and what to do is said before charon is started."""
+def test_a_device_that_cannot_be_lent_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The message says what is missing and what to do, before charon is started."""
     (tmp_path / "tun").touch(0o600)
 
     def refuse(*_arguments: object) -> None:
@@ -99,7 +99,7 @@ def test_without_it_esp_runs_in_user_space(monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 def test_with_neither_the_message_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """It has what the kernel said, and how a container gets the device."""
+    """It has the kernel's error, and how a container gets the device."""
     answers(monkeypatch, 2)
     monkeypatch.setattr(esp, "TUN", tmp_path / "none")
     with pytest.raises(NetworkError, match=r"AEAD algorithm not found.*--device"):

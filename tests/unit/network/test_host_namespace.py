@@ -1,11 +1,11 @@
-"""Tests of how the appliance sees that its network is the machine's own."""
+"""Tests of the check whether the network namespace is the machine's own."""
 
 from pathlib import Path
 
-from appliance.network.host_namespace import bridges, is_contained, lives_on_the_machines_network
+from appliance.network.namespaces import bridges, is_contained, lives_on_the_machines_network
 
 
-def test_the_machines_network_has_settings_that_no_other_has(tmp_path: Path) -> None:
+def test_only_the_machines_own_network_has_its_settings(tmp_path: Path) -> None:
     """A namespace that was made later lacks the settings of the whole machine."""
     settings = tmp_path / "sys/net/core"
     settings.mkdir(parents=True)
@@ -33,8 +33,8 @@ def test_a_container_is_known_by_its_process_ids(tmp_path: Path) -> None:
     assert is_contained(tmp_path)
 
 
-def test_bridges_are_told_from_other_interfaces(tmp_path: Path) -> None:
-    """An engine's machine has a bridge; a container's interfaces are none."""
+def test_bridges_differ_from_other_interfaces(tmp_path: Path) -> None:
+    """The machine of a container engine has a bridge; a container has only other interfaces."""
     (tmp_path / "eth0").mkdir()
     assert bridges(tmp_path) == []
     (tmp_path / "docker0" / "bridge").mkdir(parents=True)

@@ -22,7 +22,7 @@ def test_open_and_refused_ports_are_told_apart() -> None:
     assert (result.open, result.refused, result.silent, result.answered) == ((listening,), 1, 0, True)
 
 
-def test_few_files_make_a_scan_slower_and_no_error() -> None:
+def test_few_file_descriptors_make_a_scan_slower_without_an_error() -> None:
     """A process that may open few files, of which others are open, scans with fewer connections at once."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with socket.create_server(("127.0.0.1", 0), backlog=500) as server, contextlib.ExitStack() as others:
@@ -43,11 +43,11 @@ class Stuck(socket.socket):
     number = errno.ENETUNREACH
 
     def connect_ex(self, _address: object) -> int:
-        """As the kernel answers: the socket itself shows nothing of it later."""
+        """Return the kernel's error; the socket itself does not show it later."""
         return self.number
 
     def connect(self, address: object) -> None:
-        """The same, raised."""
+        """Raise the same error."""
         raise OSError(self.connect_ex(address), "stuck")
 
 
@@ -55,7 +55,7 @@ class Stuck(socket.socket):
 def test_a_port_that_could_not_be_tried_is_neither_open_nor_closed(
     monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    """No way to the network, or a rule of this machine's own: it is told, with the reason."""
+    """Without a route, or with a firewall rule of this machine, the reason is reported."""
     monkeypatch.setattr("appliance.network.scan.socket.socket", Stuck)
     monkeypatch.setattr(Stuck, "number", number)
     result = scan("192.0.2.7", [1, 2, 3], seconds=10)
@@ -65,10 +65,10 @@ def test_a_port_that_could_not_be_tried_is_neither_open_nor_closed(
 
 
 @pytest.mark.parametrize("number", [errno.EADDRNOTAVAIL, errno.EINVAL])
-def test_an_address_that_cannot_be_used_is_an_error_in_words(
+def test_an_unusable_address_is_an_error_with_the_reason(
     monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    """The error names the address and port, and what stood in the way."""
+    """The error names the address, the port and the reason."""
     monkeypatch.setattr("appliance.network.scan.socket.socket", Stuck)
     monkeypatch.setattr(Stuck, "number", number)
     with pytest.raises(NetworkError, match=f"192.0.2.7 port 1: {os.strerror(number)}"):
@@ -76,7 +76,7 @@ def test_an_address_that_cannot_be_used_is_an_error_in_words(
 
 
 def test_a_machine_without_a_family_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    """IPv6 is off here: an error in words, for the scan and for the look at whose address it is."""
+    """Without IPv6, both the scan and the check of the address raise a clear error."""
 
     def none_of_it(*_arguments: object) -> socket.socket:
         raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
@@ -87,8 +87,8 @@ def test_a_machine_without_a_family_says_so(monkeypatch: pytest.MonkeyPatch) -> 
     assert addresses_of("2001:db8::7") == ("2001:db8::7",)
 
 
-def test_a_link_without_a_zone_is_an_error_in_words() -> None:
-    """The kernel itself: a link-local address is no place without its interface."""
+def test_a_link_local_address_without_a_zone_is_an_error() -> None:
+    """The kernel cannot use a link-local address without its interface."""
     if not Path("/proc/sys/net/ipv6").exists():
         pytest.skip("no IPv6 here")
     with pytest.raises(NetworkError, match="fe80::1 port 9"):
@@ -96,7 +96,7 @@ def test_a_link_without_a_zone_is_an_error_in_words() -> None:
 
 
 def test_a_scan_of_no_ports_ends() -> None:
-    """Nothing to scan is nothing found, and nothing answered."""
+    """A scan of no ports finds nothing."""
     assert not scan("127.0.0.1", [], seconds=10).answered
 
 

@@ -1,4 +1,4 @@
-"""Addresses of hosts: those of `address_of` are what `ipaddress` makes of the same text, in every table."""
+"""Addresses of hosts: `address_of` returns objects that equal those of `ipaddress`."""
 
 import ipaddress
 
@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.policy.host_sets import HostTable
+from appliance.policy.host_sets import HostSets
 from appliance.policy.model import address_of
 
 
 @given(address=st.ip_addresses())
-def test_as_any_other_address(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> None:
-    """Equal, with the same hash, text, order and networks; and the same object the next time."""
+def test_addresses_equal_those_of_ipaddress(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> None:
+    """They have the same hash, text, order and networks; the next call returns the same object."""
     ours = address_of(str(address))
     assert ours == address and hash(ours) == hash(address) and str(ours) == str(address) and repr(ours)
     assert {address: 1}[ours] == {ours: 1}[address] == 1
@@ -22,16 +22,16 @@ def test_as_any_other_address(address: ipaddress.IPv4Address | ipaddress.IPv6Add
 
 
 @pytest.mark.parametrize("text", ["", "host", "10.0.0", "10.0.0.1/8", "1", "::g", "10.0.0.1:1"])
-def test_what_is_no_address(text: str) -> None:
-    """It is refused as `ipaddress` refuses it, also the second time."""
+def test_an_invalid_address_is_refused(text: str) -> None:
+    """It raises the same error as `ipaddress`, also the second time."""
     for _ in range(2):
         with pytest.raises(ValueError, match=r"\S"):
             address_of(text)
 
 
 def test_hosts_that_are_named_alike() -> None:
-    """Addresses of one network are alike, each time they are asked; others are not."""
-    table = HostTable()
+    """Addresses of one network share their rights at every call; other addresses do not."""
+    table = HostSets()
     table.network(ipaddress.ip_network("10.1.0.0/16"))
     for _ in range(2):
         assert table.alike(address_of("10.1.2.3")) == table.alike(address_of("10.1.9.9")) == "10.1.0.0/16"

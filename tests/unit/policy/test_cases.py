@@ -1,4 +1,4 @@
-"""The cases beside a policy: who, does what, allow or deny."""
+"""The test cases beside a policy: host, action, allow or deny."""
 
 import pytest
 from hypothesis import given, settings
@@ -9,6 +9,7 @@ from appliance.policy.cases import CaseResult, run_cases
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
 from tests.support.examples import examples
+from tests.unit.policy.mistakes import mistakes
 
 POLICY = compile_policy(
     """[Groups]
@@ -27,12 +28,12 @@ audit-only = Commands
 
 
 def run(text: str) -> list[CaseResult]:
-    """The results of cases against the policy above."""
+    """Return the results of cases against the policy above."""
     return run_cases(POLICY, text, "p.ini.tests.yaml")
 
 
 def test_cases_pass_and_fail_with_their_place() -> None:
-    """Each action is one check with the line and column it stands on, and the decision that was made."""
+    """Each action is one check with its line and column, and the decision that was made."""
     results = run(
         "cases:\n"
         "  - host: 10.0.0.5\n"
@@ -58,53 +59,22 @@ def test_given_addresses_stand_for_robot_and_enrolled_hosts() -> None:
     assert all(r.passed for r in results)
 
 
-def test_audit_only_counts_as_the_denial_it_stands_for() -> None:
-    """A case says what the rules say: that a section is in audit-only mode does not turn deny into allow."""
+def test_audit_only_counts_as_denial() -> None:
+    """A case tests the rules: audit-only mode does not turn a deny into an allow."""
     assert run("cases: [{host: 10.9.9.9, deny: [command getPid]}]")[0].passed
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("", "1:1: there is no case in this file"),
-        ("cases: []", "1:1: there is no case in this file"),
-        ("- a", "1:1: the file is a mapping with given, cases"),
-        ("case: []", '1:1: unknown key "case"; did you mean cases?'),
-        ("cases: x", "1:8: cases is a list"),
-        ("cases: [{host: x, allow: [publish /a]}]", '1:16: "x" is not an address, robot or host:NAME'),
-        ("cases: [{host: robot, allow: [publish /a]}]", "1:16: it is not said which address robot is"),
-        (
-            "cases: [{host: 10.0.0.1, allow: [publish /a]}]",
-            '1:34: "publish /a" makes a node part of the graph',
-        ),
-        (
-            "cases: [{host: 10.0.0.1, allow: [publsh /a]}]",
-            '1:34: "publsh /a" begins with no known verb; did you mean',
-        ),
-        (
-            "cases: [{host: 10.0.0.1, allow: [command shutDown]}]",
-            '1:34: "shutDown" is not a command; did you mean',
-        ),
-        ("cases: [{host: 10.0.0.1, allow: [call a]}]", '1:34: "a" is not a resolved ROS name'),
-        ("cases: [{host: 10.0.0.1}]", "1:9: a case needs allow: or deny:"),
-        ("cases: [{allow: [call /a]}]", "1:9: a case needs host:"),
-        ("cases: [{host: 10.0.0.1, node: x, allow: [call /a]}]", '1:32: "x" is not a node name'),
-        ("cases: [{host: 10.0.0.1, host: 10.0.0.1, allow: [call /a]}]", '1:26: the key "host" is repeated'),
-        ("given: {robot: x}", '1:16: "x" is not an IP address'),
-        ("cases: [", "1:9: not YAML"),
-        ("a: !!python/object:os.system x", '1:1: unknown key "a"'),
-    ],
-)
-def test_mistake_in_the_cases_is_an_error_with_its_place(text: str, expected: str) -> None:
-    """A file of cases that cannot be understood is refused with line and column, never passed over."""
+@pytest.mark.parametrize(("text", "expected"), mistakes("cases"))
+def test_a_mistake_in_the_cases_is_an_error_with_its_place(text: str, expected: str) -> None:
+    """An invalid file of cases is refused with line and column, never ignored."""
     with pytest.raises(PolicyError) as caught:
         run(text)
     shown = [f"{f.line}:{f.column}: {f.text}" for f in caught.value.findings]
     assert any(line.startswith(expected) for line in shown)
 
 
-def test_aliases_cannot_multiply_cases_without_end() -> None:
-    """YAML aliases that would blow a small file up to millions of checks are refused with the limit."""
+def test_yaml_aliases_cannot_multiply_cases() -> None:
+    """YAML aliases that expand a small file to millions of checks are refused with the limit."""
     hosts = ", ".join(["10.0.0.1"] * 1000)
     text = f"cases:\n  - {{host: [{hosts}], allow: &a [{', '.join(['call /x'] * 1000)}]}}\n"
     with pytest.raises(PolicyError, match="more than 100000 checks"):

@@ -1,6 +1,6 @@
 """The compiled policy against a naive decider written from the documentation.
 
-The naive one is slow and obvious: it tries every rule on every request, and shares no code with the other.
+The naive decider is slow and simple: it tries every rule on every request, and shares no code with the policy.
 """
 
 import fnmatch
@@ -21,7 +21,7 @@ Rules = list[tuple[str, str, list[str]]]  # section, key, words of the value
 
 
 def group_members(word: str, groups: dict[str, list[str]], seen: tuple[str, ...] = ()) -> list[str]:
-    """The addresses, networks and stars that a word of a value stands for."""
+    """Return the addresses, networks and stars that a word of a value means."""
     if word not in groups or word in seen:
         return [word]
     return [leaf for inner in groups[word] for leaf in group_members(inner, groups, (*seen, word))]
@@ -37,7 +37,7 @@ def names_host(words: list[str], groups: dict[str, list[str]], host: str) -> boo
 
 
 def key_matches(key: str, name: str) -> bool:
-    """Whether a key speaks of a name, by a regular expression made from it."""
+    """Whether a key matches a name, by a regular expression made from it."""
     if key.endswith("/**"):
         beginning = re.escape(key[:-3]).replace(r"\*", "[^/]*")
         return re.fullmatch(beginning + "(/.*)?", name) is not None
@@ -45,14 +45,14 @@ def key_matches(key: str, name: str) -> bool:
 
 
 def rank(key: str) -> tuple[int, int, int]:
-    """The greater one is more specific."""
+    """Return a rank; the greater one is more specific."""
     return ("*" not in key, len(key.partition("*")[0]), "**" not in key)
 
 
 def decide_slowly(
     rules: Rules, groups: dict[str, list[str]], section: str, host: str, name: str
 ) -> bool | None:
-    """Allowed or not; None when the section is not there."""
+    """Return whether a request is allowed; None without the section."""
     mine = [(key, words) for its, key, words in rules if its == section]
     if not mine:
         return None
@@ -79,7 +79,7 @@ NAME = st.lists(st.sampled_from([*NAMES, "arms"]), min_size=1, max_size=4).map(l
 
 @st.composite
 def policies(draw: st.DrawFn) -> tuple[Rules, dict[str, list[str]]]:
-    """Rules and groups; groups name later groups only, so that none contains itself."""
+    """Draw rules and groups; groups name later groups only, so that none contains itself."""
     leaves = st.lists(WORDS.filter(lambda word: not word.startswith("g")), max_size=2, unique=True)
     groups = {
         f"g{n}": draw(leaves) + ([f"g{n + 1}"] if n < 2 and draw(st.booleans()) else []) for n in range(3)
@@ -99,7 +99,7 @@ def policies(draw: st.DrawFn) -> tuple[Rules, dict[str, list[str]]]:
 def test_compiled_decisions_are_those_of_the_naive_decider(
     policy: tuple[Rules, dict[str, list[str]]], requests: list[tuple[str, str]]
 ) -> None:
-    """Whatever the rules, the compiled policy decides as a decider that tries every rule on every request."""
+    """For any rules, the compiled policy and the naive decider give the same decision."""
     rules, groups = policy
     text = "[Groups]\n" + "".join(f"{name} = {' '.join(words)}\n" for name, words in groups.items())
     text += "[Publishers]\n" + "".join(f"{key} = {', '.join(words)}\n" for _, key, words in rules)
@@ -111,7 +111,7 @@ def test_compiled_decisions_are_those_of_the_naive_decider(
         assert len(decision.reason) < 300
 
 
-# Every literal of the keys, and for each beginning before a star a name that no literal is.
+# Every literal of the keys, and a new name for each prefix before a star.
 LEVELS = ["a", "b", "ab", "arm", "ax", "arx", "zz"]
 BELOW = ["/" + "/".join(parts) for depth in (1, 2, 3) for parts in itertools.product(LEVELS, repeat=depth)]
 BELOW += [f"{below}/zz" for below in BELOW if below.count("/") == 3]
@@ -122,9 +122,9 @@ BELOW += [f"{below}/zz" for below in BELOW if below.count("/") == 3]
 def test_namespace_may_be_touched_only_if_everything_in_it_may(
     policy: tuple[Rules, dict[str, list[str]]], host: str, key: str
 ) -> None:
-    """A call on a namespace passes if and only if every key that can be in it may be touched.
+    """A call on a namespace passes if and only if every key that can be in it is allowed.
 
-    With stars before the end of keys, "only if": a rule that others overshadow may deny too much.
+    With stars before the end of keys only "only if" holds: an overridden rule may deny too much.
     """
     rules, groups = policy
     text = "[Groups]\n" + "".join(f"{name} = {' '.join(words)}\n" for name, words in groups.items())
@@ -171,6 +171,6 @@ def test_keys_that_load_together_never_tie(keys: list[str], names: list[str]) ->
         ("/**", "/x/y", True),
     ],
 )
-def test_naive_decider_reads_keys_as_documented(key: str, name: str, matches: bool) -> None:
-    """The yardstick itself is right about the forms of keys in docs/policy.md."""
+def test_the_naive_decider_reads_keys_as_documented(key: str, name: str, matches: bool) -> None:
+    """The naive decider agrees with the forms of keys in docs/policy.md."""
     assert key_matches(key, name) is matches

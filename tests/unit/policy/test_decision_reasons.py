@@ -1,8 +1,8 @@
-"""Explaining a decision: the rule that decides, how it means the host, the rules that lost."""
+"""Explaining a decision: the deciding rule, how it matches the host, and the overridden rules."""
 
 import ipaddress
 
-from appliance.policy.decision_reasons import Explanation, explain, render
+from appliance.policy.decision_reasons import DecisionExplanation, explain, render
 from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of
@@ -25,13 +25,13 @@ listMethods = 10.0.0.1
 )
 
 
-def explained(host: str, category: Category, resource: str, node: str = "/ocu") -> Explanation:
-    """The explanation of one request."""
+def explained(host: str, category: Category, resource: str, node: str = "/ocu") -> DecisionExplanation:
+    """Return the explanation of one request."""
     return explain(POLICY, Request(ipaddress.ip_address(host), node, category, resource))
 
 
 def test_rules_that_lost_are_named_most_specific_first() -> None:
-    """Every rule that matches the name is there once: the one that decides, the others with the reason."""
+    """Every rule that matches the name is listed once; overridden rules have the reason."""
     found = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd")
     assert found.decision.rule is not None
     assert found.decision.rule.key == "/arm/cmd"
@@ -43,8 +43,8 @@ def test_rules_that_lost_are_named_most_specific_first() -> None:
     assert found.lost[0].why == "/arm/cmd is more specific"
 
 
-def test_word_that_means_the_host_is_shown() -> None:
-    """An allowed host is told through which group or network of the value it is meant."""
+def test_the_word_that_matches_the_host_is_shown() -> None:
+    """The explanation names the group or network of the value that matches an allowed host."""
     assert explained("10.0.0.5", Category.PUBLISH, "/arm/cmd").through == ("ocu",)
     assert explained("10.0.0.7", Category.PUBLISH, "/arm/x").through == ("10.0.0.0/8",)
 
@@ -76,8 +76,8 @@ def test_text_says_decision_and_place() -> None:
     assert lines[1] == "  rule: [Commands] default (p.ini:11)"
 
 
-def test_what_depends_on_a_namespace_is_said() -> None:
-    """An exact key is the right to a value; that it is none to a namespace of that name is told with the answer."""
+def test_dependence_on_a_namespace_is_explained() -> None:
+    """An exact key grants a value, not a namespace of that name; the answer says so."""
     policy = compile_policy("[Parameters]\nread /arm = 10.0.0.5\nread /leg/** = 10.0.0.5\n", file="p.ini")
     host = ipaddress.ip_address("10.0.0.5")
     lines = list(render(explain(policy, Request(host, "/ocu", Category.READ, "/arm"))))

@@ -10,12 +10,12 @@ OLD = "[Nodes]\ndefault = *\n[Publishers]\ndefault = 10.0.0.1\n/cmd = 10.0.0.5\n
 
 
 def request(host: str, resource: str, node: str = "/n") -> Request:
-    """A request to publish."""
+    """Return a request to publish."""
     return Request(ipaddress.ip_address(host), node, Category.PUBLISH, resource)
 
 
-def test_only_what_is_decided_differently_is_listed_once_with_its_count() -> None:
-    """The same request seen often is one difference with a count; what stays the same is left out."""
+def test_each_different_decision_is_listed_once_with_its_count() -> None:
+    """A repeated request is one difference with a count; unchanged decisions are left out."""
     old = compile_policy(OLD, file="old.ini")
     new = compile_policy(OLD.replace("/cmd = 10.0.0.5", "/cmd = 10.0.0.6"), file="new.ini")
     seen = [request("10.0.0.5", "/cmd"), request("10.0.0.6", "/cmd"), request("10.0.0.1", "/x")]
@@ -36,7 +36,7 @@ def test_lost_node_name_is_a_difference() -> None:
 
 
 def test_audit_only_is_between_allowed_and_denied() -> None:
-    """A policy that goes from audit-only to force turns what passed marked into denials."""
+    """When a policy leaves audit-only mode, requests that passed with a mark become denials."""
     old = compile_policy(OLD + "[Options]\naudit-only = Publishers\n", file="old.ini")
     new = compile_policy(OLD, file="new.ini")
     found = diff(old, new, [request("10.0.0.9", "/cmd"), request("10.0.0.1", "/x")])

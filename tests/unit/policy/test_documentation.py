@@ -1,4 +1,4 @@
-"""docs/policy.md says what the program does."""
+"""docs/policy.md agrees with the program."""
 
 import re
 from pathlib import Path
@@ -15,7 +15,7 @@ PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text(encoding="ut
 
 
 def block(language: str, number: int = 0) -> str:
-    """A code block of the page."""
+    """Return a code block of the page."""
     found: list[str] = re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
     return found[number]
 
@@ -27,7 +27,7 @@ def test_first_policy_of_the_page_loads() -> None:
 
 
 def test_cases_of_the_page_are_well_formed() -> None:
-    """The example of a tests file is accepted as it stands."""
+    """The example of a tests file is accepted unchanged."""
     assert len(run_cases(compile_policy(block("ini"), file="p.ini"), block("yaml"), "docs/policy.md")) == 4
 
 

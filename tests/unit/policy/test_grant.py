@@ -1,4 +1,4 @@
-"""The smallest change that grants what was refused: it grants that, and nothing else to anybody."""
+"""The smallest change that grants a denied request grants nothing else to any host."""
 
 import ipaddress
 from itertools import product
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.policy.grant import Asked, UngrantableError, asked, grant
-from appliance.policy.judgement import Known
+from appliance.policy.grant import DecidedRequest, UngrantableError, asked, grant
+from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -18,18 +18,18 @@ from roswire.xmlrpc import Value
 POLICIES = sorted((Path(__file__).parents[3] / "policies").glob("*.ini"))
 ROBOT = ipaddress.ip_network("10.84.0.2/32")
 HOST, OTHER = ipaddress.ip_address("10.0.0.9"), ipaddress.ip_address("10.0.0.10")
-KNOWN = Known({"laptop": ipaddress.ip_address("10.0.0.77")}, [ROBOT])
+KNOWN = PolicyContext({"laptop": ipaddress.ip_address("10.0.0.77")}, [ROBOT])
 NAMES = ("/cmd_vel", "/arm", "/arm/max", "/landshark_control/base_velocity", "/a/b/c")
 CALLS = ("lookupService", "getParam", "setParam", "shutdown", "getSystemState", "getRVState")
 
 
 def request(category: Category, resource: str, host: object = HOST) -> Request:
-    """A request of the node /it."""
+    """Return a request of the node /it."""
     return Request(host, "/it", category, resource)  # type: ignore[arg-type]  # an address
 
 
 def everything(host: object) -> list[Request]:
-    """What a host may ask for."""
+    """Draw a request of a host."""
     named = [category for category in Category if category is not Category.COMMAND]
     return [request(category, name, host) for category, name in product(named, NAMES)] + [
         request(Category.COMMAND, call, host) for call in CALLS
@@ -37,16 +37,16 @@ def everything(host: object) -> list[Request]:
 
 
 def compiled(text: str) -> Policy:
-    """The policy."""
+    """Return the policy."""
     return compile_policy(text, file="p.ini", hosts=KNOWN.hosts, robot=KNOWN.robot)
 
 
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: str(file.stem))
 @pytest.mark.parametrize("wanted", everything(HOST), ids=lambda one: f"{one.category} {one.resource}")
 def test_it_grants_that_and_nothing_else(file: Path, wanted: Request) -> None:
-    """In every shipped policy: nobody loses anything, another host gains nothing, the rest of the text stays."""
+    """In every shipped policy no host loses a right, no other host gains one, and the rest of the text stays."""
     text = file.read_text(encoding="utf-8")
-    found = grant(text, "p.ini", KNOWN, Asked(wanted, rights_of(wanted)))
+    found = grant(text, "p.ini", KNOWN, DecidedRequest(wanted, rights_of(wanted)))
     before, after = compiled(text), compiled(found.text)
     assert decide(after, rights_of(wanted)).allowed
     needed = {(right.request.category, right.request.resource) for right in rights_of(wanted)}
@@ -61,7 +61,7 @@ def test_it_grants_that_and_nothing_else(file: Path, wanted: Request) -> None:
 
 
 def changed(text: str, category: str, resource: str, host: str = str(HOST), **detail: object) -> list[str]:
-    """The lines that are added or written anew."""
+    """Return the lines that are added or changed."""
     found = grant(text, "p.ini", KNOWN, asked(host, "/it", category, resource, detail))
     return [line[1:] for line in found.diff(text, "p.ini") if line[:1] == "+" and line[:3] != "+++"]
 
@@ -71,23 +71,23 @@ BASE = (
 )
 
 
-def test_the_host_is_added_to_the_very_key() -> None:
-    """As the line is written: its commas, its comment. What is said to be added is the rule alone."""
+def test_the_host_is_added_to_the_deciding_key() -> None:
+    """The line keeps its commas and its comment; the reported change is the rule alone."""
     assert changed(BASE, "publish", "/x") == ["/x = 10.0.0.1, 10.0.0.2, 10.0.0.9  # the two"]
     padded = BASE.replace("/x =", "/x      =   ")
     found = grant(padded, "p.ini", KNOWN, asked(str(HOST), "/it", "publish", "/x", {}))
     assert found.added == ("/x = 10.0.0.1, 10.0.0.2, 10.0.0.9",)
 
 
-def test_a_new_key_keeps_whom_the_deciding_rule_names() -> None:
-    """Who had it by a pattern has it still; a section without any rule gets its first."""
+def test_a_new_key_keeps_the_hosts_of_the_deciding_rule() -> None:
+    """Hosts that a pattern allowed stay allowed; a section without rules gets its first one."""
     assert changed(BASE, "publish", "/yes") == ["/yes = 10.0.0.1 10.0.0.9"]
     assert changed(BASE, "subscribe", "/z") == ["/z = 10.0.0.9"]
     assert changed("[Nodes]\ndefault = *\n", "publish", "/z") == ["", "[Publishers]", "/z = 10.0.0.9"]
 
 
-def test_a_host_is_called_what_it_is_called() -> None:
-    """By a group that is it alone, by its certificate, as the robot; else by its address."""
+def test_a_host_is_named_by_its_group_or_certificate() -> None:
+    """It is named by a group of its own, its certificate or as the robot; otherwise by its address."""
     grouped = "[Groups]\nocu = 10.0.0.9\nall = 10.0.0.9 10.0.0.1\n" + BASE
     assert changed(grouped, "subscribe", "/z") == ["/z = ocu"]
     assert changed(BASE, "subscribe", "/z", "10.0.0.77") == ["/z = host:laptop"]
@@ -95,7 +95,7 @@ def test_a_host_is_called_what_it_is_called() -> None:
 
 
 def test_a_call_about_a_parameter_needs_the_parameter_too() -> None:
-    """The command and the key; what denies below the key gets the host as well."""
+    """It needs the command and the key; rules below the key that deny get the host as well."""
     text = (
         "[Nodes]\ndefault=*\n[Commands]\nsetParam = 10.0.0.1\n"
         "[Parameters]\nwrite /arm/max = 10.0.0.1\nwrite default = 10.0.0.1\n"
@@ -134,10 +134,10 @@ PARAMETERS = [
         ("hasParam", "/", None, {"leg": {"max": 3}}),
     ],
 )
-def test_what_a_record_alone_knows_of_a_parameter_is_granted(
+def test_a_parameter_that_only_the_record_describes_is_granted(
     text: str, call: str, key: str, value: Value, tree: Tree
 ) -> None:
-    """That it held others, that its value does, that it stood in the way of another; and to nobody else."""
+    """The parameter held others, its value does, or it blocked another one; no other host gains the right."""
 
     def answer(policy: Policy, host: object, key: str = key, tree: Tree = tree) -> Decision:
         command = request(Category.COMMAND, call, host)
@@ -160,7 +160,7 @@ def test_what_a_record_alone_knows_of_a_parameter_is_granted(
         assert now is was, (other, name, there, text)
 
 
-def test_a_text_keeps_how_its_lines_end() -> None:
+def test_a_text_keeps_its_line_endings() -> None:
     """A policy that was written on another system; a new section, a new line and a longer one."""
     for resource in ("/x", "/yes", "/new"):
         found = grant(
@@ -177,20 +177,20 @@ def test_a_text_keeps_how_its_lines_end() -> None:
     ("host", "category", "resource", "why"),
     [
         (str(HOST), "command", "bogus", "not a call that the appliance knows"),
-        ("", "publish", "/x", "no record of a decision"),
-        (str(HOST), "monitor", "/x", "no record of a decision"),
+        ("", "publish", "/x", "not a record of a decision"),
+        (str(HOST), "monitor", "/x", "not a record of a decision"),
         (str(HOST), "publish", "no name", "is not a resolved ROS name"),
     ],
 )
-def test_what_no_policy_grants(host: str, category: str, resource: str, why: str) -> None:
-    """It is said, with the reason."""
+def test_a_request_that_no_policy_can_grant(host: str, category: str, resource: str, why: str) -> None:
+    """The answer has the reason."""
     with pytest.raises(UngrantableError, match=why):
         changed(BASE, category, resource, host)
 
 
-def test_cases_that_fail_are_told() -> None:
-    """A policy that says in its tests that this host may not."""
-    known = Known(
+def test_failing_cases_are_reported() -> None:
+    """The policy has a test case that denies this host."""
+    known = PolicyContext(
         cases_file="p.tests.yaml", cases="cases:\n  - {host: 10.0.0.9, node: /it, deny: [subscribe /z]}\n"
     )
     found = grant(BASE, "p.ini", known, asked(str(HOST), "/it", "subscribe", "/z", {}))

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.policy.commands import COMMANDS
-from appliance.policy.learn import Learned, Observation, learn
+from appliance.policy.learn import LearnedPolicy, Observation, learn
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -21,17 +21,17 @@ NAMES = ["/a", "/a/b", "/a/b/c", "/cmd_vel", "/a_1", "/tool_4711_1700000000000",
 def seen(
     host: str, category: Category, resource: str, *, node: str = "/n", call: str = "", key: str = ""
 ) -> Observation:
-    """One request that passed."""
+    """Return one request that passed."""
     return Observation(Request(ipaddress.ip_address(host), node, category, resource), call, key)
 
 
-def compiled(learned: Learned) -> Policy:
-    """What was learned, as a policy."""
+def compiled(learned: LearnedPolicy) -> Policy:
+    """Return the learned policy."""
     return compile_policy(learned.text, file="learned", robot=[ROBOT])
 
 
-def test_what_was_done_is_granted_and_nothing_else() -> None:
-    """The topic, the node name that goes with it, to the host that used it; not the other direction, name or host."""
+def test_only_observed_requests_are_granted() -> None:
+    """The host gets the topic and its node name, but not the other direction, name or host."""
     policy = compiled(learn([seen("10.0.0.1", Category.PUBLISH, "/cmd_vel", node="/joy")]))
     host, other = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
     assert decide(policy, rights_of(Request(host, "/joy", Category.PUBLISH, "/cmd_vel"))).allowed
@@ -50,7 +50,7 @@ def test_what_was_done_is_granted_and_nothing_else() -> None:
 
 
 def test_anonymous_names_become_patterns() -> None:
-    """The next run of a tool has another number, and is let in; a name that only looks alike is not."""
+    """The next run of a tool has another number, and is allowed; a name that only looks alike is denied."""
     listener = "/listener_1700000000123456789"
     learned = learn([
         seen("10.0.0.1", Category.SUBSCRIBE, "/chatter", node="/rostopic_4711_1700000000000"),
@@ -68,7 +68,7 @@ def test_anonymous_names_become_patterns() -> None:
 
 
 def test_a_parameter_call_needs_the_call_and_the_key() -> None:
-    """Who read a namespace may read what is below it, also where another host used a narrower key."""
+    """A host that read a namespace may read all below it, also where another host used a narrower key."""
     policy = compiled(learn([
         seen("10.0.0.1", Category.COMMAND, "getParam", call="getParam", key="/arm"),
         seen("10.0.0.2", Category.COMMAND, "getParam", call="getParam", key="/arm/max"),
@@ -87,7 +87,7 @@ def test_a_parameter_call_needs_the_call_and_the_key() -> None:
 
 
 def test_the_robot_is_called_robot() -> None:
-    """Its address stands as the group, so that the policy holds where the robot has another."""
+    """Its address is written as the group, so that the policy holds where the robot has another."""
     learned = learn(
         [seen("192.0.2.10", Category.PUBLISH, "/a"), seen("10.0.0.1", Category.PUBLISH, "/a")], [ROBOT]
     )
@@ -96,7 +96,7 @@ def test_the_robot_is_called_robot() -> None:
 
 
 def test_hosts_that_are_named_together_are_a_group() -> None:
-    """Where several lines have the same hosts; each line says how often it was used, and by which nodes."""
+    """Several lines with the same hosts use a group; each line has its number of uses and its nodes."""
     learned = learn([
         seen(host, Category.PUBLISH, topic, node="/joy")
         for host in ("10.0.0.1", "10.0.0.2") for topic in ("/a", "/b", "/a")
@@ -112,7 +112,7 @@ def test_hosts_that_are_named_together_are_a_group() -> None:
 
 
 def test_a_parameter_is_left_out_where_the_one_above_says_the_same() -> None:
-    """For the same hosts; another host's own key stays."""
+    """This holds for the same hosts; another host's own key stays."""
     learned = learn([
         seen(host, Category.COMMAND, "getParam", call="getParam", key=key)
         for host, key in (("10.0.0.1", "/arm"), ("10.0.0.1", "/arm/max"), ("10.0.0.2", "/arm/min"))
@@ -126,8 +126,8 @@ def test_a_parameter_is_left_out_where_the_one_above_says_the_same() -> None:
     [(Category.COMMAND, "noSuchCall"), (Category.COMMAND, "registerPublisher"), (Category.PUBLISH, "no slash"),
      (Category.PUBLISH, "/a\n[Commands]\ndefault = *"), (Category.PUBLISH, "/a = *  #"), (Category.NODE, "/é")],
 )  # fmt: skip
-def test_a_strangers_text_is_no_rule(category: Category, resource: str) -> None:
-    """What cannot be granted is left out and counted; nothing that was sent is written into the policy as it is."""
+def test_text_of_unknown_hosts_never_becomes_a_rule(category: Category, resource: str) -> None:
+    """Requests that cannot be granted are left out and counted; no text of a peer is copied into the policy."""
     learned = learn([seen("10.0.0.1", category, resource), seen("10.0.0.1", Category.PUBLISH, "/ok")])
     assert (learned.requests, learned.left_out) == (1, 1)
     assert resource not in learned.text
@@ -157,7 +157,7 @@ _observations = st.builds(
 
 @given(st.lists(_observations, min_size=1, max_size=40))
 def test_the_same_run_passes_under_what_was_learned(observations: list[Observation]) -> None:
-    """Whatever was observed, the learned policy is right and grants every right that was used."""
+    """The learned policy is valid and grants every right that was used."""
     policy = compiled(learn(observations, [ROBOT]))
     for observation in observations:
         rights = rights_of_call(observation.request, observation.call, observation.key or None)
@@ -168,7 +168,7 @@ def test_the_same_run_passes_under_what_was_learned(observations: list[Observati
 def test_a_host_that_did_nothing_may_do_nothing(observations: list[Observation], other: Observation) -> None:
     """Rights go to hosts that were seen only."""
     policy = compiled(learn(observations, [ROBOT]))
-    stranger = Request(
+    unknown = Request(
         ipaddress.ip_address("203.0.113.9"), "/n", other.request.category, other.request.resource
     )
-    assert not decide(policy, rights_of(stranger)).allowed
+    assert not decide(policy, rights_of(unknown)).allowed

@@ -1,10 +1,10 @@
-"""What a policy leaves to those who have it."""
+"""Subscriptions and connections that a new policy would deny."""
 
 import ipaddress
 
 import pytest
 
-from appliance.policy.live_rights import Live, endings, live_by, may_keep
+from appliance.policy.live_rights import LiveRight, endings, live_by, may_keep
 from appliance.policy.policy_compiler import compile_policy
 from roswire.parameter_tree import Tree
 
@@ -18,15 +18,15 @@ POLICY = compile_policy(
 
 @pytest.mark.parametrize(("tree", "kept"), [({}, True), ({"x": 1}, True), ({"x": {"y": 1}}, False)])
 def test_a_parameter_that_holds_others_needs_the_right_on_them(tree: Tree, kept: bool) -> None:
-    """Who subscribed to a parameter that has become a namespace is told what is in it, and must be granted that."""
+    """A subscriber to a parameter that became a namespace receives its members, and needs the right to them."""
     live = live_by("subscribeParam", HOST, "/n", "/x", tree)
-    assert may_keep(POLICY, Live.of(live.fields())).allowed == kept
+    assert may_keep(POLICY, LiveRight.of(live.fields())).allowed == kept
 
 
 def test_a_thing_that_ends_is_named_once() -> None:
-    """A subscription and the connections that came of it are one thing to an operator; what is granted is not named."""
+    """A subscription and its connections are listed once; granted ones are not listed."""
     calls = ("registerSubscriber", "requestTopic")
-    live = [Live(HOST, "/n", call, topic) for call in calls for topic in ("/secret", "/plain")]
+    live = [LiveRight(HOST, "/n", call, topic) for call in calls for topic in ("/secret", "/plain")]
     (ending,) = endings(POLICY, live)
     assert (ending.host, ending.caller_id, ending.what, ending.resource) == (
         str(HOST), "/n", "subscription", "/secret",

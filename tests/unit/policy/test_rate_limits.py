@@ -1,4 +1,4 @@
-"""`[Limits]`: what is written, what it means for whom, and what is wrong with it."""
+"""`[Limits]`: its syntax, its effect on each host, and its errors."""
 
 import ipaddress
 
@@ -9,7 +9,8 @@ from appliance.policy.diff import diff
 from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
-from appliance.policy.rate_limits import NO_LIMIT, Part, Rate
+from appliance.policy.rate_limits import NO_LIMIT, LimitScope, Rate
+from tests.unit.policy.mistakes import mistakes
 
 HEAD = """[Groups]
 guests = 10.0.0.0/24
@@ -27,79 +28,54 @@ GUEST, TABLET, ROBOT = (ipaddress.ip_address(one) for one in ("10.0.0.5", "10.0.
 
 
 def policy(*lines: str):  # type: ignore[no-untyped-def]  # what compile_policy gives
-    """A policy with these limits."""
+    """Return a policy with these limits."""
     return compile_policy(HEAD + "[Limits]\n" + "\n".join(lines), file="p.ini")
 
 
 @pytest.mark.parametrize(
     ("line", "part", "host", "rate"),
     [
-        ("/camera/** = publisher 30 Hz 10 MB/s", Part.PUBLISHER, GUEST, Rate(30, 10e6)),
-        ("/camera/** = publisher 30Hz, 10MB/s", Part.PUBLISHER, GUEST, Rate(30, 10e6)),
-        ("/camera/** = publisher 1.5 hz 2 kb/s", Part.PUBLISHER, GUEST, Rate(1.5, 2e3)),
-        ("/camera/** = publisher 30 Hz, subscriber tablet 5 Hz", Part.SUBSCRIBER, TABLET, Rate(5)),
-        ("/camera/** = publisher 30 Hz, subscriber tablet 5 Hz", Part.SUBSCRIBER, GUEST, NO_LIMIT),
-        ("/camera/** = publisher 30 Hz, subscriber tablet 5 Hz", Part.TOPIC, None, NO_LIMIT),
+        ("/camera/** = publisher 30 Hz 10 MB/s", LimitScope.PUBLISHER, GUEST, Rate(30, 10e6)),
+        ("/camera/** = publisher 30Hz, 10MB/s", LimitScope.PUBLISHER, GUEST, Rate(30, 10e6)),
+        ("/camera/** = publisher 1.5 hz 2 kb/s", LimitScope.PUBLISHER, GUEST, Rate(1.5, 2e3)),
+        ("/camera/** = publisher 30 Hz, subscriber tablet 5 Hz", LimitScope.SUBSCRIBER, TABLET, Rate(5)),
+        ("/camera/** = publisher 30 Hz, subscriber tablet 5 Hz", LimitScope.SUBSCRIBER, GUEST, NO_LIMIT),
+        ("/camera/** = publisher 30 Hz, subscriber tablet 5 Hz", LimitScope.TOPIC, None, NO_LIMIT),
         (
             "/camera/** = subscriber 10 Hz, subscriber guests 1 GB/s 20 Hz",
-            Part.SUBSCRIBER,
+            LimitScope.SUBSCRIBER,
             TABLET,
             Rate(10, 1e9),
         ),
-        ("/camera/** = publisher guests 10.1.0.1 7 Hz", Part.PUBLISHER, ROBOT, Rate(7)),
-        ("/camera/** = topic 100 B/s", Part.TOPIC, None, Rate(0, 100)),
-        ("default = topic 3 Hz", Part.TOPIC, None, Rate(3)),
-        ("/other = topic 3 Hz", Part.TOPIC, None, NO_LIMIT),
+        ("/camera/** = publisher guests 10.1.0.1 7 Hz", LimitScope.PUBLISHER, ROBOT, Rate(7)),
+        ("/camera/** = topic 100 B/s", LimitScope.TOPIC, None, Rate(0, 100)),
+        ("default = topic 3 Hz", LimitScope.TOPIC, None, Rate(3)),
+        ("/other = topic 3 Hz", LimitScope.TOPIC, None, NO_LIMIT),
     ],
 )
-def test_a_limit_is_of_a_part_on_hosts(
-    line: str, part: Part, host: ipaddress.IPv4Address, rate: Rate
+def test_a_limit_is_for_messages_or_bytes_of_hosts(
+    line: str, part: LimitScope, host: ipaddress.IPv4Address, rate: Rate
 ) -> None:
-    """Messages and bytes in a second; without hosts of all, with several clauses the strictest."""
+    """A limit counts messages or bytes a second, for all hosts if none is named; the strictest clause wins."""
     assert policy(line).limit(part, "/camera/front/image", host) == rate
 
 
-def test_the_most_specific_key_speaks_alone() -> None:
-    """As everywhere in a policy: what a wider key says of a topic does not count besides."""
+def test_the_most_specific_key_decides_alone() -> None:
+    """As everywhere in a policy, a wider key is ignored."""
     limits = policy(
         "/** = publisher 1 Hz, topic 2 Hz", "/camera/* = publisher 30 Hz", "/camera/left = topic 9 Hz"
     )
-    rates = [limits.limit(Part.PUBLISHER, name, GUEST) for name in ("/x", "/camera/right", "/camera/left")]
+    rates = [
+        limits.limit(LimitScope.PUBLISHER, name, GUEST) for name in ("/x", "/camera/right", "/camera/left")
+    ]
     assert rates == [Rate(1), Rate(30), NO_LIMIT]
-    assert limits.limit(Part.TOPIC, "/camera/right") == NO_LIMIT
-    assert policy().limit(Part.PUBLISHER, "/x", GUEST) == NO_LIMIT
+    assert limits.limit(LimitScope.TOPIC, "/camera/right") == NO_LIMIT
+    assert policy().limit(LimitScope.PUBLISHER, "/x", GUEST) == NO_LIMIT
 
 
-@pytest.mark.parametrize(
-    ("line", "place", "text"),
-    [
-        (
-            "/a = 30 Hz",
-            "13:6",
-            "a limit begins with publisher, subscriber or topic, not '30', as publisher 30 Hz",
-        ),
-        ("/a = publishers 30 Hz", "13:6", "did you mean publisher?"),
-        ("/a =", "13:1", "say whose limit it is"),
-        ("/a = publisher", "13:6", "how much may pass for each publisher?"),
-        ("/a = publisher guests", "13:6", "how much may pass for each publisher?"),
-        ("/a = publisher 30", "13:16", "30 has no unit of a limit: Hz, B/s, kB/s, MB/s or GB/s"),
-        ("/a = publisher 30 MB", "13:16", "30 MB has no unit of a limit; did you mean MB/s?"),
-        ("/a = publisher 0 Hz", "13:16", "who may send nothing is left out of [Publishers]"),
-        ("/a = publisher 1 Hz 2 Hz", "13:21", "this is limited already"),
-        ("/a = publisher 1 Hz guests", "13:21", "hosts stand before the numbers"),
-        ("/a = publisher gests 1 Hz", "13:16", "no group 'gests' is defined; did you mean guests?"),
-        ("/a = topic guests 1 Hz", "13:12", "name no hosts"),
-        ("a = topic 1 Hz", "13:1", "'a'"),
-        ("/a = topic 1 Hz\n/a = topic 2 Hz", "14:1", "stands already at line 13: put its limits there"),
-        (
-            "/*/a = topic 1 Hz\n/a*/a = topic 1 Hz\n/*/* = topic 1 Hz\n/*/a* = topic 1 Hz",
-            "15:1",
-            "equally specific",
-        ),
-    ],
-)
-def test_what_is_wrong_is_said_with_its_place(line: str, place: str, text: str) -> None:
-    """And refuses the file, as every error does."""
+@pytest.mark.parametrize(("line", "place", "text"), mistakes("limits"))
+def test_a_mistake_is_reported_with_its_place(line: str, place: str, text: str) -> None:
+    """It refuses the file, as every error does."""
     with pytest.raises(PolicyError) as refused:
         policy(line)
     found = [str(one) for one in refused.value.findings]
@@ -108,37 +84,37 @@ def test_what_is_wrong_is_said_with_its_place(line: str, place: str, text: str) 
     ), found
 
 
-def test_there_are_not_too_many() -> None:
-    """The time to read them is bounded."""
+def test_the_number_of_limits_is_bounded() -> None:
+    """So the time to read them is bounded."""
     with pytest.raises(PolicyError, match="more than 1000 limits"):
         policy(*(f"/a{number}* = topic 1 Hz" for number in range(1001)))
 
 
 def test_a_default_that_never_limits_is_a_warning() -> None:
-    """As in the sections that decide."""
+    """This holds as in the sections that decide."""
     warnings = [str(one) for one in policy("/** = topic 1 Hz", "default = topic 2 Hz").warnings]
     assert [one for one in warnings if "group" not in one] == [
         "p.ini:14:1: warning: never limits: /** at line 13 matches every name before it"
     ]
 
 
-def test_who_is_only_in_a_limit_is_a_stranger() -> None:
-    """A limit grants nothing, so it makes nobody known."""
+def test_a_host_that_only_a_limit_names_is_unknown() -> None:
+    """A limit grants nothing, so its hosts stay unknown."""
     text = "[Nodes]\n/a = 10.0.0.1\n[Limits]\n/a = publisher 10.0.0.2 1 Hz\n"
     known = compile_policy(text, file="p.ini")
     assert [known.knows(ipaddress.ip_address(f"10.0.0.{last}")) for last in (1, 2)] == [True, False]
 
 
 def test_hosts_share_as_the_policy_names_them() -> None:
-    """A host counts as itself, one of a network as that network, and all unknown hosts as one."""
+    """A named host counts alone, the hosts of a network as one, and all unknown hosts as one."""
     known = compile_policy("[Nodes]\n/a = 10.0.0.1 10.1.0.0/16\n", file="p.ini")
     addresses = ("10.0.0.1", "10.1.0.1", "10.1.0.2", "10.9.0.1", "10.9.0.2")
     shared = [known.counted_as(ipaddress.ip_address(address)) for address in addresses]
     assert shared == ["10.0.0.1/32", "10.1.0.0/16", "10.1.0.0/16", "", ""]
 
 
-def test_explain_says_the_limit_and_its_line() -> None:
-    """Of a request that is allowed, for its own part and for all together."""
+def test_explain_shows_the_limit_and_its_line() -> None:
+    """An allowed request shows the limit of its host and that of all hosts together."""
     limits = policy("/scan = publisher guests 20 Hz 1500 kB/s, topic 100 Hz, subscriber 5 Hz")
     [publish, subscribe] = [
         list(render(explain(limits, Request(GUEST, "/lidar", category, "/scan"))))
@@ -161,8 +137,8 @@ def test_explain_says_the_limit_and_its_line() -> None:
         ("/scan = publisher 5 Hz", "/scan = publisher 9 Hz", "limited less"),
     ],
 )
-def test_diff_shows_what_is_limited_otherwise(old: str, new: str, word: str) -> None:
-    """Though the answer is the same."""
+def test_diff_shows_changed_limits(old: str, new: str, word: str) -> None:
+    """The decision itself is the same."""
     request = Request(GUEST, "/lidar", Category.PUBLISH, "/scan")
     [difference] = diff(policy(old), policy(new), [request, request])
     assert (difference.word, difference.count) == (word, 2)

@@ -1,4 +1,4 @@
-"""No process runs out of descriptors before a share is spent."""
+"""No process runs out of descriptors before a quota is spent."""
 
 import resource
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.configuration.settings import Limits, Settings
+from appliance.configuration.settings import LimitsSection, Settings
 from appliance.master.calls.gate import HostLimits
 from appliance.quotas.descriptors import connections_within
 from appliance.quotas.table import (
@@ -21,17 +21,19 @@ from appliance.quotas.table import (
 from appliance.relay.process import descriptors_for
 from appliance.supervisor.roles import ROLES
 
-BESIDE = 1024  # databases, links, listeners, calls to ROSMaster, threads
+BESIDE = 1024  # databases, links, listeners, calls to rosmaster, threads
 TRUE = Path("/bin/true")
 
 
-def test_all_shares_together_fit_the_descriptors() -> None:
-    """Every connection, every node's ports and a call to every node at once: each process may open as much."""
+def test_all_quotas_together_fit_the_descriptors() -> None:
+    """Each process may open all connections, all ports of nodes and a call to every node at once."""
     files = {role.name: role.files for role in ROLES}
     ports = NODE_PORTS.bounds.whole
     nodes = ports // 2  # with one relay, which is where there are most
     connections = RVMASTER_CONNECTIONS.bounds.whole + RVMASTER_FAREWELLS.bounds.whole
-    assert connections + ports + 2 * nodes + BESIDE <= files["control"]  # a face listens on a duplicate
+    assert (
+        connections + ports + 3 * nodes + BESIDE <= files["control"]
+    )  # a proxy endpoint has a duplicate and a second socket
     assert connections <= files["control"] // 2
     assert descriptors_for(RELAY_CONNECTIONS.bounds.whole) + nodes <= files["relay"]
     assert 2 * REST_CONNECTIONS.bounds.whole + BESIDE <= files["api"]
@@ -39,7 +41,7 @@ def test_all_shares_together_fit_the_descriptors() -> None:
 
 
 def test_the_configuration_has_the_tables_bounds() -> None:
-    """What an operator finds as default is what the page says."""
+    """The defaults of the configuration equal those of the page."""
     settings = Settings()
     for given, row in (
         (settings.limits, RVMASTER_CONNECTIONS),
@@ -47,13 +49,13 @@ def test_the_configuration_has_the_tables_bounds() -> None:
         (settings.api_limits, REST_CONNECTIONS),
     ):
         assert (given.connections, given.connections_per_host) == (row.bounds.whole, row.bounds.host)
-    assert Limits().topics_per_host == HostLimits().registrations
+    assert LimitsSection().topics_per_host == HostLimits().registrations
     assert 1000 * settings.relay.budget == RELAY_MESSAGE.bounds.host
 
 
 @pytest.fixture
 def few_descriptors() -> Iterator[None]:
-    """A process that may open a thousand."""
+    """Let the process open a thousand files."""
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (1000, before[1]))
     yield
@@ -61,5 +63,5 @@ def few_descriptors() -> Iterator[None]:
 
 
 def test_where_the_system_allows_fewer_connections_have_half(few_descriptors: None) -> None:
-    """Above it one is told so, instead of a process that can open nothing any more."""
+    """A larger bound is lowered to half, so that no process runs out of descriptors."""
     assert [connections_within(wanted) for wanted in (100, 4096)] == [100, 500]

@@ -1,34 +1,34 @@
-"""A finite thing counted by host, against a naive count."""
+"""A pool that is counted by host, compared with a naive count."""
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.quotas.pool import Bounds, Pool, Standing
+from appliance.quotas.pool import Bounds, Pool, QuotaClass
 
-STRANGER, NAMED, REGISTERED = Standing
-
-
-def pool(standings: dict[str, Standing], bounds: Bounds) -> Pool[str]:
-    """A pool of connections; who is not in `standings` is a stranger."""
-    return Pool("connections", bounds, lambda host: standings.get(host, STRANGER))
+UNKNOWN, NAMED, REGISTERED = QuotaClass
 
 
-def test_strangers_have_one_share_together() -> None:
-    """Many addresses that no rule names have no more than one share, and a named host still gets its own."""
-    shared = pool({"robot": NAMED}, Bounds(whole=100, host=10, strangers=20, kept=30))
-    assert not any(shared.take(f"stranger{n}", 10) for n in range(2))
-    assert shared.take("stranger3") == (
-        "addresses that no rule of the policy names have 20 connections; their share together is 20"
+def pool(quota_classes: dict[str, QuotaClass], bounds: Bounds) -> Pool[str]:
+    """Return a pool of connections; hosts that are not in `quota_classes` are unknown."""
+    return Pool("connections", bounds, lambda host: quota_classes.get(host, UNKNOWN))
+
+
+def test_unknown_hosts_have_one_quota_together() -> None:
+    """Many addresses that no rule names have one quota together, and a named host still gets its own."""
+    shared = pool({"robot": NAMED}, Bounds(whole=100, host=10, unknown=20, kept=30))
+    assert not any(shared.take(f"unknown{n}", 10) for n in range(2))
+    assert shared.take("unknown3") == (
+        "addresses that no rule of the policy names have 20 connections; their quota together is 20"
     )
     assert shared.take("robot", 10) == ""
-    assert shared.take("robot") == "robot has 10 connections; the share of one host is 10"
+    assert shared.take("robot") == "robot has 10 connections; the quota of one host is 10"
 
 
-def test_what_is_kept_is_for_those_with_a_registration() -> None:
-    """When everybody else has come first, a registered host finds what is kept for it, up to the whole."""
-    standings = {"robot": REGISTERED} | {f"guest{n}": NAMED for n in range(9)}
-    shared = pool(standings, Bounds(whole=100, host=40, strangers=0, kept=30))
+def test_the_reserve_is_for_registered_hosts() -> None:
+    """When all others came first, a registered host still gets the reserve, up to the whole pool."""
+    quota_classes = {"robot": REGISTERED} | {f"guest{n}": NAMED for n in range(9)}
+    shared = pool(quota_classes, Bounds(whole=100, host=40, unknown=0, kept=30))
     assert [shared.take(f"guest{n}", 35) for n in range(2)] == ["", ""]
     assert (
         shared.take("guest3")
@@ -38,43 +38,44 @@ def test_what_is_kept_is_for_those_with_a_registration() -> None:
     assert shared.take("robot") == "all hosts together have 100 connections; the limit is 100"
 
 
-def test_a_host_that_registers_makes_room_for_strangers() -> None:
-    """What a host holds is counted under its standing of now, not that of the moment when it was given."""
-    standings: dict[str, Standing] = {}
-    shared = pool(standings, Bounds(whole=100, host=20, strangers=20, kept=0))
+def test_a_host_that_registers_frees_the_quota_of_unknown_hosts() -> None:
+    """A host's items are counted under its present class, not under that of the time when it took them."""
+    quota_classes: dict[str, QuotaClass] = {}
+    shared = pool(quota_classes, Bounds(whole=100, host=20, unknown=20, kept=0))
     assert shared.take("new", 20) == ""
-    standings["new"] = REGISTERED
+    quota_classes["new"] = REGISTERED
     shared.give_back("new")
     assert shared.take("other", 20) == ""
-    assert (shared.held_by(STRANGER), shared.held_by(REGISTERED)) == (20, 19)
+    assert (shared.held_by(UNKNOWN), shared.held_by(REGISTERED)) == (20, 19)
 
 
-def test_more_than_it_has_cannot_be_given_back() -> None:
-    """An error of the owner's bookkeeping is not swallowed."""
-    shared = pool({}, Bounds(whole=1, host=1, strangers=1, kept=0))
+def test_a_host_cannot_release_more_than_it_has() -> None:
+    """A mistake of the caller raises an error."""
+    shared = pool({}, Bounds(whole=1, host=1, unknown=1, kept=0))
     with pytest.raises(ValueError, match="gives back 1 connections and has 0"):
         shared.give_back("host")
 
 
 @pytest.mark.parametrize("bounds", [(10, 11, 0, 0), (10, 1, 6, 5), (10, -1, 0, 0)])
 def test_bounds_that_contradict_each_other_are_refused(bounds: tuple[int, int, int, int]) -> None:
-    """A share beyond the whole is an error of the configuration."""
+    """A quota beyond the whole is an error of the configuration."""
     with pytest.raises(ValueError, match="Bounds"):
         Bounds(*bounds)
 
 
 @given(
     steps=st.lists(
-        st.tuples(st.sampled_from("abcdef"), st.integers(-4, 4), st.sampled_from(list(Standing))), max_size=60
+        st.tuples(st.sampled_from("abcdef"), st.integers(-4, 4), st.sampled_from(list(QuotaClass))),
+        max_size=60,
     )
 )
-def test_no_order_of_events_breaks_a_bound(steps: list[tuple[str, int, Standing]]) -> None:
-    """After any takes, returns and changes of standing: totals are sums, and no take went over a bound."""
-    bounds = Bounds(whole=12, host=5, strangers=6, kept=3)
-    standings: dict[str, Standing] = {}
-    shared, held = pool(standings, bounds), dict.fromkeys("abcdef", 0)
-    for host, amount, standing in steps:
-        standings[host] = standing
+def test_no_order_of_events_breaks_a_bound(steps: list[tuple[str, int, QuotaClass]]) -> None:
+    """After any takes, releases and changes of class, totals are sums and no take exceeded a bound."""
+    bounds = Bounds(whole=12, host=5, unknown=6, kept=3)
+    quota_classes: dict[str, QuotaClass] = {}
+    shared, held = pool(quota_classes, bounds), dict.fromkeys("abcdef", 0)
+    for host, amount, quota_class in steps:
+        quota_classes[host] = quota_class
         if amount < 0:
             shared.give_back(host, given := min(-amount, held[host]))
             held[host] -= given
@@ -82,5 +83,9 @@ def test_no_order_of_events_breaks_a_bound(steps: list[tuple[str, int, Standing]
             held[host] += amount
             assert sum(held.values()) <= bounds.whole
             assert held[host] <= bounds.host
-        assert shared.total == sum(held.values()) == sum(shared.held_by(standing) for standing in Standing)
+        assert (
+            shared.total
+            == sum(held.values())
+            == sum(shared.held_by(quota_class) for quota_class in QuotaClass)
+        )
         assert dict(shared.holders()) == {name: amount for name, amount in held.items() if amount}

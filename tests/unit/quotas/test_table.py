@@ -1,24 +1,24 @@
-"""The table of shares, and the page that is made from it."""
+"""The table of quotas, and the page that is made from it."""
 
 import ast
 from pathlib import Path
 
-from appliance.quotas.table import SHARES
-from distribution.shares_page import page
+from appliance.quotas.table import QUOTA_ROWS
+from distribution.quotas_page import page
 
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 ROOT = Path(__file__).parents[3]
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
-def test_the_page_is_the_tables() -> None:
-    """docs/shares.md is what `python -m distribution.shares_page` writes."""
-    assert (ROOT / "docs/shares.md").read_text() == page()
+def test_the_page_is_up_to_date() -> None:
+    """docs/reference/quotas.md is what `python -m distribution.quotas_page` writes."""
+    assert (ROOT / "docs/reference/quotas.md").read_text() == page()
 
 
 def test_each_row_is_attacked_by_a_test_that_exists() -> None:
-    """A row without a test, or with one that is not there, is a claim that nobody checks."""
-    for row in SHARES:
+    """A row without an existing test is an unchecked claim."""
+    for row in QUOTA_ROWS:
         assert row.shown_by, row.thing
         for place in row.shown_by:
             file, _, name = place.partition("::")

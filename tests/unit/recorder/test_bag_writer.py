@@ -1,11 +1,11 @@
-"""Bags: other programs read what was written, also when the writer fell in the middle."""
+"""Bags: other programs read them, also after the writer was killed in the middle."""
 
 from pathlib import Path
 
 import pytest
 from rosbags.rosbag1 import Reader
 
-from appliance.recorder.bag_writer import BagWriter, Message
+from appliance.recorder.bag_writer import BagMessage, BagWriter
 
 HEADER = {
     "topic": "/chatter",
@@ -19,12 +19,12 @@ SECOND = 1_000_000_000
 
 
 def body(text: bytes) -> bytes:
-    """A std_msgs/String."""
+    """Return a std_msgs/String."""
     return len(text).to_bytes(4, "little") + text
 
 
 def read(path: Path) -> list[tuple[str, int, bytes]]:
-    """What the reader of `rosbags` finds, in the order of time."""
+    """Return the messages that `rosbags` reads, in the order of time."""
     with Reader(path) as reader:
         return [(connection.topic, time, bytes(data)) for connection, time, data in reader.messages()]
 
@@ -33,9 +33,9 @@ def test_read_by_rosbags(tmp_path: Path) -> None:
     """Messages of several chunks come back in the order of their times, with type and definition."""
     bag = BagWriter(tmp_path / "a.bag", {})
     chatter, other = bag.connect(HEADER), bag.connect(HEADER | {"topic": "/other"})
-    bag.write([Message(chatter, 5 * SECOND + 3, body(b"late")), Message(other, SECOND, body(b"first"))])
+    bag.write([BagMessage(chatter, 5 * SECOND + 3, body(b"late")), BagMessage(other, SECOND, body(b"first"))])
     bag.write([])
-    bag.write([Message(chatter, 2 * SECOND, memoryview(body(b"second")))])
+    bag.write([BagMessage(chatter, 2 * SECOND, memoryview(body(b"second")))])
     bag.close()
     assert read(tmp_path / "a.bag") == [
         ("/other", SECOND, body(b"first")),
@@ -45,23 +45,23 @@ def test_read_by_rosbags(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("torn", [0, 1, 50, 200])
-def test_another_writer_goes_on(tmp_path: Path, torn: int) -> None:
-    """Of a bag that was left in the middle of a chunk everything before stays, and more can be written."""
+def test_another_writer_continues_a_bag(tmp_path: Path, torn: int) -> None:
+    """A bag that ends in the middle of a chunk keeps everything before it, and more can be written."""
     path = tmp_path / "left.bag"
     bag = BagWriter(tmp_path / "a.bag", {})
-    size = bag.write([Message(bag.connect(HEADER), SECOND, body(b"one"))])
+    size = bag.write([BagMessage(bag.connect(HEADER), SECOND, body(b"one"))])
     path.write_bytes((tmp_path / "a.bag").read_bytes() + bytes(torn))
     bag.close()
     bag = BagWriter(path, {0: HEADER}, size)
     bag.write(
-        [Message(0, 2 * SECOND, body(b"two")), Message(bag.connect(HEADER), 3 * SECOND, body(b"three"))]
+        [BagMessage(0, 2 * SECOND, body(b"two")), BagMessage(bag.connect(HEADER), 3 * SECOND, body(b"three"))]
     )
     bag.close()
     assert [data for _topic, _time, data in read(path)] == [body(b"one"), body(b"two"), body(b"three")]
 
 
-def test_what_a_power_cut_took_is_left_out_and_said(tmp_path: Path) -> None:
-    """However many bytes are there of what had been written: whole chunks stay, all but the last; more can follow."""
+def test_data_lost_in_a_power_cut_is_left_out_and_reported(tmp_path: Path) -> None:
+    """After a cut at any byte all whole chunks but the last stay, and more can be written."""
     path, whole, headers = (
         tmp_path / "cut.bag",
         tmp_path / "whole.bag",
@@ -70,7 +70,7 @@ def test_what_a_power_cut_took_is_left_out_and_said(tmp_path: Path) -> None:
     bag = BagWriter(whole, {})
     numbers = [bag.connect(header) for header in headers]
     sizes = [
-        bag.write([Message(number, (2 * chunk + number) * SECOND, body(b"x")) for number in numbers])
+        bag.write([BagMessage(number, (2 * chunk + number) * SECOND, body(b"x")) for number in numbers])
         for chunk in range(3)
     ]
     bag.leave()
@@ -79,7 +79,7 @@ def test_what_a_power_cut_took_is_left_out_and_said(tmp_path: Path) -> None:
         path.write_bytes(data[:length])
         bag = BagWriter(path, dict(enumerate(headers)), sizes[-1])
         assert bag.lost is (length < len(data))
-        bag.write([Message(0, 9 * SECOND, body(b"y"))])
+        bag.write([BagMessage(0, 9 * SECOND, body(b"y"))])
         bag.close()
         times = [time // SECOND for _topic, time, _data in read(path)]
         assert times == [*range(len(times) - 1), 9]
@@ -92,11 +92,11 @@ def test_what_a_power_cut_took_is_left_out_and_said(tmp_path: Path) -> None:
 
 
 def test_stock_tools_find_beginning_and_end(tmp_path: Path) -> None:
-    """They take them from the first chunk and the last, in whatever order of times chunks were written."""
+    """They take them from the first and the last chunk, in any order of the chunks."""
     bag = BagWriter(tmp_path / "a.bag", {})
     chatter = bag.connect(HEADER)
     for times in ((5, 9), (3, 4), (7, 8)):
-        bag.write([Message(chatter, time * SECOND, body(b"x")) for time in times])
+        bag.write([BagMessage(chatter, time * SECOND, body(b"x")) for time in times])
     bag.close()
     with Reader(tmp_path / "a.bag") as reader:
         chunks = [(info.start_time, info.end_time) for info in reader.chunk_infos]
@@ -109,6 +109,6 @@ def test_stock_tools_find_beginning_and_end(tmp_path: Path) -> None:
 
 
 def test_empty_bag(tmp_path: Path) -> None:
-    """A bag without a message is a bag."""
+    """A bag without a message is valid."""
     BagWriter(tmp_path / "a.bag", {}).close()
     assert read(tmp_path / "a.bag") == []

@@ -1,4 +1,4 @@
-"""A disk that fills while recordings are made: the recorder says so and goes on, and what has a name is whole."""
+"""When the disk fills, the recorder reports it and goes on, and each named recording is whole."""
 
 import hashlib
 import subprocess
@@ -16,7 +16,7 @@ from tests.unit.recorder.test_recorder import SECOND, TEXT, Scene
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 4 MiB and a few files, in the place of the recordings."""
+    """A file system of 4 MiB and a few files, in the folder of recordings."""
     need_root()
     place = tmp_path / "recordings"
     place.mkdir()
@@ -27,13 +27,13 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("what", ["bytes", "files"])
-def test_whatever_is_being_done_when_it_is_full(disk: Path, tmp_path: Path, what: str) -> None:
-    """Filled after each step: orders are answered, nothing half is kept, and it records again when there is room."""
+def test_each_step_on_a_full_disk(disk: Path, tmp_path: Path, what: str) -> None:
+    """After each step the disk is full: orders are answered, no half recording stays, and recording resumes later."""
     scene = Scene(tmp_path, disk=8 << 20)
     order = Trigger(scene.clock.now, "order", "r", "eve")
 
-    def wanted(number: int) -> messages.RecordingWanted:
-        return messages.RecordingWanted(
+    def wanted(number: int) -> messages.RecordingRequested:
+        return messages.RecordingRequested(
             number, msgspec.structs.replace(order, time=scene.clock.now + SECOND), 5, 1
         )
 
@@ -68,7 +68,7 @@ def test_whatever_is_being_done_when_it_is_full(disk: Path, tmp_path: Path, what
 
 
 def fill(disk: Path, what: str) -> None:
-    """Leave no room for another byte, or another file."""
+    """Fill the disk to the last byte and file."""
     number = 0
     try:
         while True:

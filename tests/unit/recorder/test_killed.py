@@ -1,4 +1,4 @@
-"""A recorder that is killed at whatever it does with files: the next has whole recordings, and loses none silently."""
+"""A recorder that is killed at any file operation leaves whole recordings, and loses none silently."""
 
 import hashlib
 import os
@@ -24,16 +24,16 @@ _KILLED = 9
 
 
 def _life(scene: Scene) -> None:
-    """All that is done with recordings: made, noted, made of the memory, removed by order, and made once more."""
+    """Run all operations: make a recording, note it, record the memory, remove by order, and record again."""
 
     def order() -> Trigger:
         return Trigger(scene.clock.now + SECOND, "order", "r", "eve")
 
     orders: dict[int, Callable[[], messages.Message]] = {
-        0: lambda: messages.RecordingWanted(1, order(), 5, 1),
+        0: lambda: messages.RecordingRequested(1, order(), 5, 1),
         3: lambda: messages.MemoryWanted(2, order(), 0, 1 << 62),
         4: lambda: messages.RecordingRemovalWanted(3, kept[0], "eve"),
-        5: lambda: messages.RecordingWanted(4, order(), 5, 1),
+        5: lambda: messages.RecordingRequested(4, order(), 5, 1),
     }
     kept: list[str] = []
     noted: list[messages.Message] = []
@@ -45,7 +45,7 @@ def _life(scene: Scene) -> None:
 
 
 def _killed_at(scene: Scene, operation: int) -> bool:
-    """Whether a recorder that lives so was killed before its so many-th change of a file or folder."""
+    """Return whether a recorder was killed before this change of a file or folder."""
     child = os.fork()
     if not child:
         done = count(1)
@@ -68,7 +68,7 @@ def _killed_at(scene: Scene, operation: int) -> bool:
 
 
 def _read_both_ways(bag: Path, target: Path) -> int:
-    """How many messages on /chatter a recording has; the same as a bag and as MCAP."""
+    """Return the number of messages on /chatter; it is the same as a bag and as MCAP."""
     with Reader(bag) as reader:
         rows = [(one.topic, time, bytes(data)) for one, time, data in reader.messages()]
     target.write_bytes(b"".join(as_mcap(bag)).replace(b"ros1", b"ros2"))
@@ -81,8 +81,8 @@ def _read_both_ways(bag: Path, target: Path) -> int:
 
 
 @pytest.mark.parametrize("memory", ["same", "another"])
-def test_killed_at_each_operation_with_files(tmp_path: Path, memory: str) -> None:
-    """Each recording that has a name is whole; what was removed is told until it is noted; nothing else is left."""
+def test_killed_at_each_file_operation(tmp_path: Path, memory: str) -> None:
+    """Each named recording is whole, removals are reported until they are noted, and nothing else is left."""
     removed, kept, chatter = set[int](), set[int](), dict[str, int]()
     for operation in count(1):
         folder = tmp_path / str(operation)
@@ -100,7 +100,7 @@ def test_killed_at_each_operation_with_files(tmp_path: Path, memory: str) -> Non
             told += scene.later(seconds, messages.RecordingsAsked())
         stated = [one for one in told if isinstance(one, messages.RecordingsStated)][-1].recordings
         gone = {one.recording.id for one in told if isinstance(one, messages.RecordingRemoved)}
-        if memory == "same" and 1 not in removed:  # what happened is in a recording until that is removed
+        if memory == "same" and 1 not in removed:  # events are in a recording until it is removed
             assert gone or "drop" in {trigger.what for found in stated for trigger in found.triggers}, (
                 operation
             )

@@ -1,19 +1,19 @@
-"""MCAP: another library reads what was written, with types, senders and their hosts, and times."""
+"""MCAP: another library reads the file, with types, senders and their hosts, and times."""
 
 from pathlib import Path
 
 import pytest
 from rosbags.rosbag2.storage_mcap import McapReader
 
-from appliance.recorder.bag_writer import BagWriter, Message
+from appliance.recorder.bag_writer import BagMessage, BagWriter
 from appliance.recorder.mcap import as_mcap
 from tests.unit.recorder.test_bag_writer import HEADER, SECOND, body
 
 
 def read(path: Path, bag: Path) -> tuple[list[tuple[str, str, int]], list[tuple[str, int, bytes]]]:
-    """Connections (topic, type, messages) and messages, as `rosbags` finds them.
+    """Return connections (topic, type, messages) and messages, as `rosbags` reads them.
 
-    It takes files that say they are of ROS 2 only; all else is the same for both.
+    The reader accepts files marked as ROS 2 only; all else is the same for both.
     """
     path.write_bytes(b"".join(as_mcap(bag)).replace(b"ros1", b"ros2"))
     reader = McapReader(path)
@@ -31,12 +31,12 @@ def read(path: Path, bag: Path) -> tuple[list[tuple[str, str, int]], list[tuple[
 
 @pytest.mark.parametrize("size", [5, 600_000])
 def test_another_library_reads_it(tmp_path: Path, size: int) -> None:
-    """In the order of times, however many chunks it takes; two publishers of a topic are two channels."""
+    """Messages of all chunks are in the order of time; two publishers of a topic are two channels."""
     bag = BagWriter(tmp_path / "a.bag", {})
     first, second = bag.connect(HEADER), bag.connect(HEADER | {"callerid": "/other"})
     third = bag.connect(HEADER | {"topic": "/quiet", "type": "std_msgs/Empty", "message_definition": "\n"})
     messages = [
-        Message([first, second, third][number % 3], number * SECOND + 7, body(bytes([number]) * size))
+        BagMessage([first, second, third][number % 3], number * SECOND + 7, body(bytes([number]) * size))
         for number in range(9)
     ]
     bag.write(reversed(messages))
@@ -51,14 +51,14 @@ def test_another_library_reads_it(tmp_path: Path, size: int) -> None:
     assert found == [(topics[number % 3], one.time, one.body) for number, one in enumerate(messages)]
 
 
-def test_a_bag_without_messages_is_a_file(tmp_path: Path) -> None:
-    """That says so."""
+def test_a_bag_without_messages_is_a_valid_file(tmp_path: Path) -> None:
+    """The file has no messages."""
     BagWriter(tmp_path / "a.bag", {}).close()
     assert read(tmp_path / "a.mcap", tmp_path / "a.bag") == ([], [])
 
 
-def test_what_is_no_bag_is_an_error(tmp_path: Path) -> None:
-    """Before the first byte."""
+def test_a_file_that_is_not_a_bag_is_an_error(tmp_path: Path) -> None:
+    """The error comes before the first byte."""
     (tmp_path / "a.bag").write_text("no bag")
-    with pytest.raises(ValueError, match="no bag"):
+    with pytest.raises(ValueError, match="not a bag"):
         next(as_mcap(tmp_path / "a.bag"))

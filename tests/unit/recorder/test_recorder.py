@@ -1,4 +1,4 @@
-"""The recorder on a real log and a real ring: what begins, extends and ends a recording, and what limits it."""
+"""The recorder on a real log and a real ring: how a recording begins, is extended, ends and is limited."""
 
 import hashlib
 import json
@@ -16,12 +16,12 @@ from appliance.audit.log import AuditLog
 from appliance.channel import messages
 from appliance.channel.answers.recording_answers import Recording, Trigger
 from appliance.configuration.settings import RecorderRules
-from appliance.recorder.never import NAMED
+from appliance.recorder.excluded_topics import NAMED
 from appliance.recorder.recorder import SETTLE_SECONDS, Recorder
 from appliance.recorder.recording import RecordingInProgress
-from appliance.recorder.recording_store import MOST_LENT, Shelf
+from appliance.recorder.recording_store import MOST_TEMPORARY, RecordingStore
 from appliance.recorder.ring import LEFT_OUT, SMALLEST, RingWriter
-from appliance.relay.recorder_ring import LeftOut
+from appliance.relay.recorder_ring import ExcludedStream
 from tests.support.audit import decision, settle
 from tests.unit.recorder.test_ring import HEADER, Clock, frame, opened
 
@@ -49,16 +49,16 @@ class Scene:
         self.recorder = self.make_recorder()
 
     def begin_anew(self) -> None:
-        """Another life of the recorder."""
+        """Start the recorder again."""
         self.recorder.close()
         self.recorder = self.make_recorder()
 
     def make_recorder(self) -> Recorder:
-        """A recorder, with what it finds."""
-        shelf = Shelf(self.folder, disk=self.disk, seconds=None, clock=lambda: 0)
+        """Start a recorder on the present state."""
+        store = RecordingStore(self.folder, disk=self.disk, seconds=None, clock=lambda: 0)
         return Recorder(
             self.rules,
-            shelf,
+            store,
             self.log.path,
             [self.memory],
             memory=self.born,
@@ -67,29 +67,29 @@ class Scene:
         )
 
     def say(self, body: bytes = TEXT) -> None:
-        """A publisher says something."""
+        """Write a message of a publisher."""
         assert self.stream is not None
         self.said += 1
         self.stream.write(memoryview(frame(body)), 1, self.said)
 
     def happen(self, event: str = "message dropped", **fields: Any) -> str:
-        """Something is recorded now; its id."""
+        """Write an audit record now; return its id."""
         record = decision(self.log, event=event, decision=None, time=self.clock.now, **fields)
         self.log.record(record)
         settle(self.log)
         return record.id
 
     def later(self, seconds: float, *said: Any) -> list[messages.Message]:
-        """So many seconds later the recorder takes its next step."""
+        """Let the time pass, then let the recorder take its next step."""
         self.clock.now += int(seconds * SECOND)
         return self.recorder.step(said)
 
     def closed(self, answers: list[messages.Message]) -> list[Recording]:
-        """The recordings that control is told of."""
+        """Return the recordings that control received."""
         return [one.recording for one in answers if isinstance(one, messages.RecordingClosed)]
 
     def bag(self, recording: Recording) -> list[tuple[str, int, bytes]]:
-        """What is in its bag."""
+        """Return the messages of its bag."""
         path = self.folder / recording.id / "recording.bag"
         assert hashlib.sha256(path.read_bytes()).hexdigest() == recording.sha256
         assert path.stat().st_size == recording.size
@@ -99,7 +99,7 @@ class Scene:
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Iterator[Scene]:
-    """With a first message at its beginning."""
+    """Start with a first message."""
     scene = Scene(tmp_path)
     scene.say()
     yield scene
@@ -107,7 +107,7 @@ def scene(tmp_path: Path) -> Iterator[Scene]:
 
 
 def test_before_and_after(scene: Scene) -> None:
-    """Messages of the seconds before and after, the record as a message, and what describes it beside the bag."""
+    """The recording has the seconds before and after, the record as a message, and a description beside the bag."""
     scene.later(20)
     scene.say(TEXT.replace(b"hello", b"alarm"))
     scene.later(1)
@@ -137,8 +137,8 @@ def test_before_and_after(scene: Scene) -> None:
     assert {path.name for path in kept.iterdir()} == {"recording.bag", "recording.json", "since"}
 
 
-def test_what_is_in_memory_is_lent_and_not_kept(scene: Scene) -> None:
-    """Of the time that was asked for, as far as it goes back; for ten minutes, or until another recorder."""
+def test_a_recording_of_the_memory_is_temporary(scene: Scene) -> None:
+    """It has the requested time as far as the memory goes back, for ten minutes or until the next recorder."""
     trigger = Trigger(BEGAN, "order", "r", "eve: of what is in memory")
 
     def asked(since: int, until: int) -> messages.Message:
@@ -172,18 +172,20 @@ def test_what_is_in_memory_is_lent_and_not_kept(scene: Scene) -> None:
     scene.later(601)
     assert there() == set()
     scene.say()
-    several = {lent(0, scene.clock.now).id for _order in range(MOST_LENT)}
-    busy = asked(0, scene.clock.now)  # nobody loses what he is about to open
+    several = {lent(0, scene.clock.now).id for _order in range(MOST_TEMPORARY)}
+    busy = asked(0, scene.clock.now)  # a recording that a user is about to open stays
     assert isinstance(busy, messages.RecordingRefused)
     assert (busy.unknown, "half a minute" in busy.reason) == (False, True)
     assert there() == several
     scene.later(31)
     last = lent(scene.clock.now, scene.clock.now)
-    assert (last.id in there(), len(there() & several)) == (True, MOST_LENT - 1)
+    assert (last.id in there(), len(there() & several)) == (True, MOST_TEMPORARY - 1)
     scene.begin_anew()
     assert there() == set()
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):
-        patch.setattr(RecordingInProgress, "finish", lambda made, *_given: sys.exit(made.leave()))  # it falls
+        patch.setattr(
+            RecordingInProgress, "finish", lambda made, *_given: sys.exit(made.leave())
+        )  # it is killed
         lent(0, scene.clock.now)
     assert there()
     scene.begin_anew()
@@ -192,7 +194,7 @@ def test_what_is_in_memory_is_lent_and_not_kept(scene: Scene) -> None:
 
 
 def test_triggers_that_overlap_make_one_recording(scene: Scene) -> None:
-    """Up to its longest; what happens later begins another."""
+    """It grows to the maximum length; later triggers begin another."""
     scene.happen()
     scene.later(0.1)
     for _second in range(20):
@@ -209,8 +211,8 @@ def test_triggers_that_overlap_make_one_recording(scene: Scene) -> None:
     assert scene.closed(scene.later(11))[0].began == recording.ended
 
 
-def test_a_flood_of_triggers_fills_no_disk(tmp_path: Path) -> None:
-    """So many of a kind begin a recording in an hour, control is told once, and orders are still obeyed."""
+def test_a_flood_of_triggers_does_not_fill_the_disk(tmp_path: Path) -> None:
+    """A kind begins a limited number of recordings an hour, control gets one report, and orders still work."""
     scene = Scene(tmp_path, per_hour=3)
     told: list[messages.Message] = []
     for _minute in range(10):
@@ -221,20 +223,20 @@ def test_a_flood_of_triggers_fills_no_disk(tmp_path: Path) -> None:
     assert "recorder.per_hour" in missed.reason
     scene.happen("monitor fault")
     assert len(scene.closed(scene.later(0.1) + scene.later(10))) == 1
-    order = messages.RecordingWanted(7, Trigger(scene.clock.now, "order", "id", "somebody"), 5, 2)
-    [begun] = [answer for answer in scene.later(0, order) if isinstance(answer, messages.RecordingBegun)]
+    order = messages.RecordingRequested(7, Trigger(scene.clock.now, "order", "id", "somebody"), 5, 2)
+    [begun] = [answer for answer in scene.later(0, order) if isinstance(answer, messages.RecordingStarted)]
     assert (begun.number, begun.ends) == (7, scene.clock.now + 2 * SECOND)
     assert scene.closed(scene.later(3))[0].id == begun.id
     scene.log.close()
 
 
 def planned(scene: Scene, recording_id: str, charged_to: str) -> str:
-    """Something happens for which control has planned a recording."""
+    """Write a record for which control has planned a recording."""
     return scene.happen(detail={"recording": recording_id, "charged_to": charged_to})
 
 
-def test_what_control_planned_is_carried_out(scene: Scene) -> None:
-    """A recording has the id that the audit record promises; what follows while it is open is in it, too."""
+def test_a_planned_recording_is_made(scene: Scene) -> None:
+    """A recording has the id from the audit record, and includes later triggers while it is open."""
     first = planned(scene, "a" * 20, "10.0.0.9")
     scene.later(1)
     second = planned(scene, "a" * 20, "10.0.0.9")
@@ -248,8 +250,8 @@ def test_what_control_planned_is_carried_out(scene: Scene) -> None:
     assert missed.reason == "this hour is used up"
 
 
-def test_a_guest_neither_prolongs_nor_cuts_the_robots_recording(scene: Scene) -> None:
-    """Each has its own at the same time, over the life of a recorder, too."""
+def test_a_guest_does_not_change_the_robots_recording(scene: Scene) -> None:
+    """Each has its own recording at the same time, also over a restart of the recorder."""
     planned(scene, "a" * 20, "10.0.0.9")
     scene.later(1)
     planned(scene, "b" * 20, "robot")
@@ -266,12 +268,10 @@ def test_a_guest_neither_prolongs_nor_cuts_the_robots_recording(scene: Scene) ->
     assert (guest.id, len(guest.triggers)) == ("a" * 20, 21)
 
 
-def test_a_promise_that_cannot_be_kept_is_told_with_the_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """On a full disk control is told which recording there is not, each time."""
+def test_a_recording_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a full disk control learns of each missing recording."""
     scene = Scene(tmp_path)
-    monkeypatch.setattr(Shelf, "free", property(lambda _self: 0))
+    monkeypatch.setattr(RecordingStore, "free", property(lambda _self: 0))
     for name in ("a" * 20, "b" * 20):
         record = planned(scene, name, "robot")
         [missed] = [one for one in scene.later(1) if isinstance(one, messages.RecordingMissed)]
@@ -280,14 +280,14 @@ def test_a_promise_that_cannot_be_kept_is_told_with_the_recording(
     scene.log.close()
 
 
-def test_a_flood_of_calls_of_the_service_fills_no_disk(tmp_path: Path) -> None:
-    """Nodes have their hour as triggers have: each call is answered; control is told once that there are no more."""
+def test_a_flood_of_service_calls_does_not_fill_the_disk(tmp_path: Path) -> None:
+    """Calls have an hourly limit as triggers have: each is answered; control gets one report of the limit."""
     scene = Scene(tmp_path, per_hour=2)
     told: list[messages.Message] = []
     for number in range(6):
-        call = messages.RecordingWanted(number, Trigger(scene.clock.now, "service", "id", "/arm"), 5, 2)
+        call = messages.RecordingRequested(number, Trigger(scene.clock.now, "service", "id", "/arm"), 5, 2)
         told += scene.later(0, call) + scene.later(3)
-    begun = [answer.number for answer in told if isinstance(answer, messages.RecordingBegun)]
+    begun = [answer.number for answer in told if isinstance(answer, messages.RecordingStarted)]
     refused = [answer for answer in told if isinstance(answer, messages.RecordingRefused)]
     assert (begun, [answer.number for answer in refused]) == ([0, 1], [2, 3, 4, 5])
     [missed] = [answer for answer in told if isinstance(answer, messages.RecordingMissed)]
@@ -297,8 +297,8 @@ def test_a_flood_of_calls_of_the_service_fills_no_disk(tmp_path: Path) -> None:
     scene.log.close()
 
 
-def test_a_recording_has_an_eighth_of_the_disk(tmp_path: Path) -> None:
-    """What is beyond is counted, and the recording says why it ended."""
+def test_a_recording_has_at_most_an_eighth_of_the_disk(tmp_path: Path) -> None:
+    """Messages beyond it are counted, and the recording has the reason of its end."""
     scene = Scene(tmp_path, disk=8 * 100_000)
     scene.happen()
     for _message in range(12):
@@ -312,11 +312,11 @@ def test_a_recording_has_an_eighth_of_the_disk(tmp_path: Path) -> None:
     scene.log.close()
 
 
-def test_what_was_left_out_is_said_and_by_whose_word(scene: Scene) -> None:
+def test_excluded_topics_are_listed_with_the_reason(scene: Scene) -> None:
     """A recording without a topic that claims a type of `never` is not complete; one that names the topic is."""
     named = scene.writer.open("/camera", "10.0.0.1", HEADER | {LEFT_OUT: NAMED})
     assert named is not None
-    LeftOut(named).write(memoryview(frame(TEXT)), 1, 1)
+    ExcludedStream(named).write(memoryview(frame(TEXT)), 1, 1)
     scene.happen()
     assert not scene.closed(scene.later(1))
     [recording] = scene.closed(scene.later(10))
@@ -325,7 +325,7 @@ def test_what_was_left_out_is_said_and_by_whose_word(scene: Scene) -> None:
     claimed = scene.writer.open("/front", "10.0.0.9", HEADER | {LEFT_OUT: "its publisher says so"})
     assert claimed is not None
     for number in range(1, 4):
-        LeftOut(claimed).write(memoryview(frame(TEXT)), 1, number)
+        ExcludedStream(claimed).write(memoryview(frame(TEXT)), 1, number)
     scene.happen()
     assert not scene.closed(scene.later(1))
     scene.begin_anew()
@@ -339,8 +339,8 @@ def test_what_was_left_out_is_said_and_by_whose_word(scene: Scene) -> None:
     }
 
 
-def test_what_had_left_the_memory_is_said(scene: Scene) -> None:
-    """The oldest messages of the time asked for are gone: by topic, in words."""
+def test_messages_that_had_left_the_memory_are_reported(scene: Scene) -> None:
+    """The description lists the topics whose oldest messages are gone."""
     for _message in range(30):
         scene.say(bytes(100_000))
     scene.happen()
@@ -350,8 +350,8 @@ def test_what_had_left_the_memory_is_said(scene: Scene) -> None:
     assert "had left recorder.memory already: /chatter" in recording.why_not
 
 
-def test_a_fallen_recorder_is_followed_by_one_that_goes_on(scene: Scene) -> None:
-    """Every message once, under the same name, and the trigger once."""
+def test_the_next_recorder_continues_after_a_crash(scene: Scene) -> None:
+    """The recording keeps its name, and has each message and the trigger once."""
     scene.happen()
     scene.later(0.1)
     [part] = scene.folder.iterdir()
@@ -368,8 +368,8 @@ def test_a_fallen_recorder_is_followed_by_one_that_goes_on(scene: Scene) -> None
     assert [data for name, _time, data in scene.bag(recording) if name == "/chatter"] == [TEXT, TEXT, TEXT]
 
 
-def test_after_another_start_of_the_appliance_it_is_finished_as_it_is(scene: Scene) -> None:
-    """The memory is another: what was written is kept, and says that its end is missing; an empty part goes."""
+def test_a_restart_of_the_appliance_ends_a_recording(scene: Scene) -> None:
+    """The memory is new: the written part is kept, marked as incomplete; an empty part is removed."""
     scene.happen()
     scene.later(0.1)
     (scene.folder / f".{'a' * 20}.part").mkdir()
@@ -381,8 +381,8 @@ def test_after_another_start_of_the_appliance_it_is_finished_as_it_is(scene: Sce
     assert [path.name for path in scene.folder.iterdir()] == [recording.id]
 
 
-def test_a_recorder_that_comes_late_sees_what_happened_meanwhile(scene: Scene) -> None:
-    """Within the time that the memory has; what has a recording already begins no other."""
+def test_a_late_recorder_handles_earlier_triggers(scene: Scene) -> None:
+    """It handles triggers within the time of the memory; one with a recording begins no other."""
     scene.happen()
     scene.clock.now += 3 * SECOND
     scene.begin_anew()
@@ -394,8 +394,8 @@ def test_a_recorder_that_comes_late_sees_what_happened_meanwhile(scene: Scene) -
     assert not scene.closed(scene.later(60))
 
 
-def test_a_recording_is_told_until_it_is_noted_and_removed_by_order(scene: Scene) -> None:
-    """Removing what is not there is refused as unknown."""
+def test_a_recording_is_reported_until_it_is_noted(scene: Scene) -> None:
+    """It is removed by order; removing an unknown one is refused."""
     scene.happen()
     scene.later(0.1)
     [recording] = scene.closed(scene.later(6))
@@ -410,8 +410,8 @@ def test_a_recording_is_told_until_it_is_noted_and_removed_by_order(scene: Scene
     assert refused.unknown
 
 
-def test_revisions_are_those_that_control_said_last(scene: Scene) -> None:
-    """They are asked for when a recording begins and ends."""
+def test_revisions_are_the_last_that_control_sent(scene: Scene) -> None:
+    """They are read when a recording begins and ends."""
     scene.happen()
     assert messages.RevisionsWanted() in scene.later(0.1)
     scene.later(0, messages.RevisionsStated(4, 2))
@@ -419,7 +419,7 @@ def test_revisions_are_those_that_control_said_last(scene: Scene) -> None:
     assert (recording.policy, recording.monitors) == (4, 2)
 
 
-def test_a_header_that_is_no_text_spoils_no_recording(scene: Scene) -> None:
+def test_a_header_that_is_not_text_is_recorded(scene: Scene) -> None:
     """A definition's comments may be in Latin-1, and a field anything: the bag can be read all the same."""
     hostile = {"message_definition": "# caf\udce9\nstring data\n", "latching": "x", "type": "t" * 10_000}
     scene.stream = scene.writer.open("/cafe", "10.0.0.2", HEADER | hostile)
@@ -437,17 +437,17 @@ def test_a_header_that_is_no_text_spoils_no_recording(scene: Scene) -> None:
     assert cafe.msgdef.data == "# caf\ufffd\nstring data\n"
 
 
-def test_a_recorder_killed_after_the_last_write_has_lost_nothing(
+def test_a_recorder_killed_after_the_last_write_loses_nothing(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All is on disk but the recording's name: the next start of the appliance, whose memory is another, gives it."""
+    """All but the recording's name is on disk: the next start of the appliance, with a new memory, names it."""
     scene.happen()
     scene.later(0.1)
 
-    def killed(_shelf: Shelf, _recording: Recording) -> None:
+    def killed(_store: RecordingStore, _recording: Recording) -> None:
         raise SystemExit
 
-    monkeypatch.setattr(Shelf, "keep", killed)
+    monkeypatch.setattr(RecordingStore, "keep", killed)
     with pytest.raises(SystemExit):
         scene.later(6)
     monkeypatch.undo()
@@ -459,8 +459,8 @@ def test_a_recorder_killed_after_the_last_write_has_lost_nothing(
     assert [data for name, _time, data in scene.bag(recording) if name == "/chatter"] == [TEXT]
 
 
-def test_a_clock_that_is_set_back_ends_a_recording_and_stops_none_that_follow(scene: Scene) -> None:
-    """An hour back, to before the memory was made: the recording ends, and the next has what was said since."""
+def test_a_clock_that_is_set_back_ends_one_recording_only(scene: Scene) -> None:
+    """The clock goes back an hour, to before the memory was made: the recording ends, the next one is normal."""
     scene.happen()
     scene.later(0.1)
     scene.clock.now -= 100 * SECOND
@@ -475,10 +475,8 @@ def test_a_clock_that_is_set_back_ends_a_recording_and_stops_none_that_follow(sc
     assert recording.ended == scene.clock.now - int(1.1 * SECOND)
 
 
-def test_connections_that_always_come_with_another_header_are_bounded(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What they said is missing, and the recording says so; others are in it."""
+def test_the_number_of_headers_is_bounded(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages beyond it are missing, and the recording says so; others are in it."""
     monkeypatch.setattr("appliance.recorder.recording._MOST_HEADERS", 20_000)
     scene.happen()
     scene.later(0.1)

@@ -1,4 +1,4 @@
-"""Which recording has an act, whose it is, and what a record says where there is none."""
+"""The plan: the recording of each event, its host, and the reason where there is none."""
 
 from collections.abc import Callable
 from itertools import count
@@ -20,7 +20,7 @@ NAMES = {"127.0.0.1": ROBOT, GUEST: GUEST, "10.0.0.7": "10.0.0.7", "10.0.0.8": "
 
 
 def made(**rules: object) -> RecordingPlan:
-    """A plan, in which hosts without a name are unknown."""
+    """Return a plan in which hosts without a name are unknown."""
     ids = count(1)
     every: dict[str, Any] = {"enabled": True, "per_hour": 6, "before": 60, "after": 10} | rules
     return RecordingPlan(
@@ -32,7 +32,7 @@ def made(**rules: object) -> RecordingPlan:
 
 @pytest.fixture
 def dropped() -> Callable[..., dict[str, str]]:
-    """What the record of a dropped message says."""
+    """Return the plan for the record of a dropped message."""
 
     def say(plan: RecordingPlan, host: str | None, now: int) -> dict[str, str]:
         return plan.detail("message dropped", None, Severity.WARNING, host, now)
@@ -41,7 +41,7 @@ def dropped() -> Callable[..., dict[str, str]]:
 
 
 def test_each_host_has_its_own_hour_of_each_kind() -> None:
-    """Also over the life of a process: those that are kept count."""
+    """This holds over a restart of the process: saved recordings count."""
     limit = HourlyLimit(2, [recording(1, "drop", charged_to=GUEST)])
     now = 10 * SECOND
 
@@ -76,14 +76,14 @@ def test_unknown_hosts_are_one(dropped: Callable[..., dict[str, str]]) -> None:
 
 
 def test_a_monitor_that_keeps_dropping_prolongs_one_recording(dropped: Callable[..., dict[str, str]]) -> None:
-    """A drop each half minute for an hour quarter: the second recording follows on the first and has the rest."""
+    """A drop each half minute for a quarter of an hour: the second recording continues the first."""
     plan = made(longest=3600)
     said = [dropped(plan, GUEST, NOW + number * 30 * SECOND)["recording"] for number in range(30)]
     assert [said.count(name) for name in dict.fromkeys(said)] == [1, 29]
 
 
 def test_recordings_of_a_host_do_not_overlap() -> None:
-    """One that begins where the memory still has the last one begins where that ended."""
+    """A recording whose memory overlaps the last one begins at its end."""
     rules = RecorderRules(before=60, after=10, longest=600)
     first = span(rules, NOW, 0)
     assert (first.began, first.ends) == (NOW - 60 * SECOND, NOW + 10 * SECOND)
@@ -96,8 +96,8 @@ def test_recordings_of_a_host_do_not_overlap() -> None:
     )
 
 
-def test_a_recording_is_prolonged_no_longer_than_the_longest(dropped: Callable[..., dict[str, str]]) -> None:
-    """Then another begins, as long as the hour has any."""
+def test_a_recording_is_prolonged_to_the_maximum(dropped: Callable[..., dict[str, str]]) -> None:
+    """Then another begins, within the hourly limit."""
     plan = made(longest=100)
     said = [dropped(plan, GUEST, NOW + number * 5 * SECOND) for number in range(21)]
     assert said[0] == said[8] != said[9]
@@ -107,7 +107,7 @@ def test_a_recording_is_prolonged_no_longer_than_the_longest(dropped: Callable[.
 def test_hosts_together_have_two_open_recordings_and_the_robot_its_own(
     dropped: Callable[..., dict[str, str]],
 ) -> None:
-    """A third guest reads why it has none."""
+    """A third guest gets the reason."""
     plan = made()
     assert "recording" in dropped(plan, GUEST, NOW)
     assert "recording" in dropped(plan, "10.0.0.8", NOW)
@@ -116,8 +116,8 @@ def test_hosts_together_have_two_open_recordings_and_the_robot_its_own(
     assert "recording" in dropped(plan, None, NOW)
 
 
-def test_what_is_off_or_cannot_be_made_is_said(dropped: Callable[..., dict[str, str]]) -> None:
-    """A record says that the recorder is off, or why the last recording could not be made."""
+def test_a_record_without_a_recording_has_the_reason(dropped: Callable[..., dict[str, str]]) -> None:
+    """The recorder is off, or the last recording could not be made."""
     assert "is off" in dropped(made(enabled=False), GUEST, NOW)["not_recorded"]
     plan = made()
     found = dropped(plan, GUEST, NOW)["recording"]
@@ -131,7 +131,7 @@ def test_what_is_off_or_cannot_be_made_is_said(dropped: Callable[..., dict[str, 
 def test_recordings_of_an_order_are_prolonged_and_closed_ones_are_not(
     dropped: Callable[..., dict[str, str]],
 ) -> None:
-    """Control knows what the recorder began for a node's call, and which recordings are over."""
+    """Control knows the recordings that began for a node's call, and those that are over."""
     plan = made()
     plan.opened(ROBOT, "asked", NOW - 60 * SECOND, NOW + 10 * SECOND)
     assert dropped(plan, "127.0.0.1", NOW)["recording"] == "asked"

@@ -1,4 +1,4 @@
-"""The ring: what was written is read, also when the writer is killed, and a flood pushes out itself only."""
+"""The ring: messages are read back, also after the writer is killed, and a flood displaces only itself."""
 
 import mmap
 import os
@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from appliance.recorder import ring_reader
-from appliance.recorder.ring import DATA, SMALLEST, RingWriter, Stream, birth_at, geometry, rows, words_of
-from appliance.recorder.ring_reader import Found, RingReader
+from appliance.recorder.ring import DATA, SMALLEST, RingStream, RingWriter, birth_at, geometry, rows, words_of
+from appliance.recorder.ring_reader import RingReader, StreamFrames
 
 EVER = 0, 1 << 63
 HEADER = {
@@ -26,35 +26,35 @@ HEADER = {
 
 
 def frame(body: bytes) -> bytes:
-    """A message as it is on the wire."""
+    """Return a message as it is on the wire."""
     return struct.pack("<I", len(body)) + body
 
 
 class Clock:
-    """Nanoseconds, as the test says."""
+    """Return the nanoseconds that a test sets."""
 
     def __init__(self, now: int = 1) -> None:
         self.now = now
 
     def __call__(self, judged: int = 0) -> int:
-        """The time now."""
+        """Return the time now."""
         return judged or self.now
 
 
 def ring(memory: memoryview, clock: Clock | None = None) -> RingWriter:
-    """A writer that lets go first what is older than a microsecond."""
+    """Return a writer that first drops messages older than a microsecond."""
     return RingWriter(memory, topic_share=0.25, host_share=0.5, seconds=1e-6, clock=clock or Clock())
 
 
-def opened(writer: RingWriter, topic: str = "/a", host: str = "10.0.0.1", **header: str) -> Stream:
-    """A stream, which there is room for."""
+def opened(writer: RingWriter, topic: str = "/a", host: str = "10.0.0.1", **header: str) -> RingStream:
+    """Open a stream, for which there is room."""
     stream = writer.open(topic, host, HEADER | header)
     assert stream is not None
     return stream
 
 
-def texts(found: list[Found], topic: str = "/a") -> list[bytes]:
-    """The messages of a topic, in order."""
+def texts(found: list[StreamFrames], topic: str = "/a") -> list[bytes]:
+    """Return the messages of a topic, in order."""
     return [
         bytes(body)
         for one in found
@@ -66,7 +66,7 @@ def texts(found: list[Found], topic: str = "/a") -> list[bytes]:
 
 @pytest.fixture
 def memory() -> memoryview:
-    """Of the smallest ring."""
+    """Return memory for the smallest ring."""
     return memoryview(mmap.mmap(-1, SMALLEST))
 
 
@@ -85,8 +85,8 @@ def test_read_as_written(memory: memoryview) -> None:
     assert texts(list(reader.read(*EVER))) == [b"three"]
 
 
-def test_records_over_the_ends_of_blocks(memory: memoryview) -> None:
-    """Records of every size around a block's are read as they were, in one go and bit by bit."""
+def test_records_across_blocks(memory: memoryview) -> None:
+    """Records of every size around that of a block are read unchanged, at once and in pieces."""
     block = geometry(SMALLEST).block
     bodies = [
         bytes([size % 251]) * size for size in (*range(block - 80, block + 9), 3 * block, 0, 5 * block + 1)
@@ -102,7 +102,7 @@ def test_records_over_the_ends_of_blocks(memory: memoryview) -> None:
     assert seen + texts(list(reader.read(*EVER))) == bodies
 
 
-def test_only_the_time_that_was_asked_for(memory: memoryview) -> None:
+def test_only_the_requested_time_is_read(memory: memoryview) -> None:
     """Messages before and after the window are left out."""
     clock = Clock()
     stream = opened(ring(memory, clock))
@@ -112,8 +112,8 @@ def test_only_the_time_that_was_asked_for(memory: memoryview) -> None:
     assert texts(list(RingReader(memory).read(4, 6))) == [b"4", b"5", b"6"]
 
 
-def test_what_is_later_is_for_the_next_call(memory: memoryview) -> None:
-    """A call that asks for the time until now loses nothing that comes while it reads."""
+def test_later_messages_are_for_the_next_call(memory: memoryview) -> None:
+    """A call for the time until now loses no message that arrives while it reads."""
     clock = Clock(10)
     writer = ring(memory, clock)
     stream = opened(writer)
@@ -146,8 +146,8 @@ def test_table_that_changes_while_it_is_copied(memory: memoryview, monkeypatch: 
     assert not found[0].torn
 
 
-def test_flood_pushes_out_itself(memory: memoryview) -> None:
-    """A topic that writes a hundred rings full takes nothing from a quiet one, nor from a busy one within its share."""
+def test_a_flood_displaces_only_itself(memory: memoryview) -> None:
+    """A topic that writes a hundred rings full takes nothing from a quiet one, nor from a busy one within its quota."""
     writer = ring(memory)
     quiet, busy, flood = (
         opened(writer, "/quiet"),
@@ -170,8 +170,8 @@ def test_flood_pushes_out_itself(memory: memoryview) -> None:
     assert firsts == list(range(firsts[0], 10_001))
 
 
-def test_many_topics_of_a_host_push_out_its_own(memory: memoryview) -> None:
-    """A host with many topics within their shares keeps its part of the ring, and another host's messages stay."""
+def test_many_topics_of_a_host_displace_only_its_own(memory: memoryview) -> None:
+    """A host with many topics within their quotas keeps its part of the ring; other hosts' messages stay."""
     writer = ring(memory)
     quiet = opened(writer, "/quiet")
     quiet.write(memoryview(frame(b"here")), 1, 1)
@@ -182,16 +182,16 @@ def test_many_topics_of_a_host_push_out_its_own(memory: memoryview) -> None:
     assert texts(list(RingReader(memory).read(*EVER)), "/quiet") == [b"here"]
 
 
-def test_alone_a_topic_has_all_of_it(memory: memoryview) -> None:
-    """What nobody else needs is used: a topic alone fills the ring beyond its share."""
+def test_a_single_topic_may_fill_the_ring(memory: memoryview) -> None:
+    """A topic may use free space beyond its quota."""
     stream = opened(ring(memory))
     for number in range(1, 81):
         stream.write(memoryview(frame(bytes(10_000))), 1, number)
     assert len(texts(list(RingReader(memory).read(*EVER)))) == 80
 
 
-def test_large_messages_after_one_that_was_pushed_out_in_part(memory: memoryview) -> None:
-    """Of messages over many blocks each that is whole is read, when the beginning of the oldest is gone."""
+def test_large_messages_after_a_partly_displaced_one(memory: memoryview) -> None:
+    """All whole messages of many blocks are read after the beginning of the oldest is gone."""
     stream = opened(ring(memory))
     for number in range(1, 41):
         stream.write(memoryview(frame(bytes([number]) * 150_000)), 1, number)
@@ -204,8 +204,8 @@ def test_large_messages_after_one_that_was_pushed_out_in_part(memory: memoryview
     )
 
 
-def test_record_beyond_the_share_is_counted(memory: memoryview) -> None:
-    """A message that is larger than its topic's share is not kept, and counted; the next one is."""
+def test_a_record_beyond_the_quota_is_counted(memory: memoryview) -> None:
+    """A message larger than its topic's quota is dropped and counted; the next one is kept."""
     stream = opened(ring(memory))
     stream.write(memoryview(frame(bytes(SMALLEST // 2))), 1, 1)
     stream.write(memoryview(frame(b"small")), 1, 2)
@@ -223,7 +223,7 @@ def test_headers_of_a_host_are_bounded(memory: memoryview) -> None:
 
 
 def test_headers_end_with_their_streams(memory: memoryview) -> None:
-    """Streams that were closed and pushed out leave nothing: a thousand after each other find room."""
+    """Closed and displaced streams leave nothing: a thousand in succession find room."""
     writer = ring(memory)
     for number in range(1000):
         stream = opened(writer, f"/t{number}")
@@ -232,8 +232,8 @@ def test_headers_end_with_their_streams(memory: memoryview) -> None:
     assert RingReader(memory).not_there == (0, 0)
 
 
-def test_next_writer_goes_on(memory: memoryview) -> None:
-    """A new writer keeps what the one before wrote, and pushes it out first when there is no room."""
+def test_the_next_writer_continues(memory: memoryview) -> None:
+    """A new writer keeps the messages of the last one, and displaces them first when space is short."""
     opened(ring(memory)).write(memoryview(frame(b"before")), 1, 1)
     clock = Clock(100)
     writer = ring(memory, clock)
@@ -246,8 +246,8 @@ def test_next_writer_goes_on(memory: memoryview) -> None:
     assert b"before" not in texts(list(RingReader(memory).read(*EVER)))
 
 
-def test_what_is_too_old_goes_first(memory: memoryview) -> None:
-    """A topic that burst once leaves its room to others when that is too old; one that says little keeps it all."""
+def test_old_messages_are_dropped_first(memory: memoryview) -> None:
+    """The old burst of a topic makes room for others; a quiet topic keeps all its messages."""
     clock = Clock()
     writer = ring(memory, clock)
     burst, seldom, flood = opened(writer, "/burst"), opened(writer, "/seldom"), opened(writer, "/flood")
@@ -263,8 +263,8 @@ def test_what_is_too_old_goes_first(memory: memoryview) -> None:
     assert texts(found, "/burst") == []
 
 
-def test_stream_whose_block_was_taken_begins_another(memory: memoryview) -> None:
-    """Who has been silent too long loses the block it was filling, and writes into nobody else's."""
+def test_a_stream_that_lost_its_block_begins_another(memory: memoryview) -> None:
+    """A silent stream loses its open block, and does not write into a block of another stream."""
     clock = Clock()
     writer = ring(memory, clock)
     silent, flood = opened(writer, "/silent"), opened(writer, "/flood")
@@ -318,7 +318,7 @@ def test_killed_at_random(tmp_path: Path) -> None:
         words, wanted = words_of(memory), chance.randrange(1, 600)
         newest = max(words[birth_at(block)] for block, _row in rows(memory))
         while max(row.birth for _block, row in rows(memory)) < newest + wanted:
-            # The kill falls somewhere after so many blocks.
+            # The kill comes at a random time after this number of blocks.
             assert os.waitpid(pid, os.WNOHANG) == (0, 0), "the writer has ended by itself"
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
@@ -337,8 +337,8 @@ def test_killed_at_random(tmp_path: Path) -> None:
     os.close(descriptor)
 
 
-def test_hostile_bytes_hurt_nobody(memory: memoryview) -> None:
-    """Whatever a fallen relay leaves there, reading ends, takes no more than the ring, and a new writer can go on."""
+def test_hostile_bytes_do_no_harm(memory: memoryview) -> None:
+    """After any bytes of a compromised relay, reading ends within the ring, and a new writer can continue."""
     chance = random.Random(11)  # noqa: S311 - to find the same again
     for turn in range(60):
         stream = opened(ring(memory))

@@ -1,4 +1,4 @@
-"""The time line of a recording, and messages around a moment: read from a bag as the recorder writes it."""
+"""The time line of a recording, and messages around a point in time, read from a bag of the recorder."""
 
 import json
 from pathlib import Path
@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from appliance.channel.answers.recording_answers import Recording, Sender
-from appliance.recorder.bag_reader import BagReader, Place
-from appliance.recorder.bag_writer import BagWriter, Message
+from appliance.recorder.bag_reader import BagReader, MessagePosition
+from appliance.recorder.bag_writer import BagMessage, BagWriter
 from appliance.recorder.timeline import MOST_EVENTS, messages_around, timeline
 from tests.unit.recorder.test_bag_writer import HEADER, SECOND, body
 
@@ -23,14 +23,14 @@ RECORDS = {name: value for name, value in HEADER.items() if name != "host"} | {
 
 
 def record(number: int, **fields: Any) -> bytes:
-    """An audit record as the recorder writes it."""
+    """Return an audit record as the recorder writes it."""
     own = {"id": f"{number:020x}", "event": "decision", "severity": "info", "reason": "so", "detail": {}}
     return body(json.dumps(own | fields).encode())
 
 
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
-    """Two publishers of /chatter that say ten things a second each, in chunks that overlap; and what happened."""
+    """Write two publishers of /chatter, ten messages a second each, in overlapping chunks, and events."""
     path = tmp_path / "a.bag"
     writer = BagWriter(path, {})
     first = writer.connect(HEADER)
@@ -39,22 +39,22 @@ def bag(tmp_path: Path) -> Path:
         for number, connection in enumerate((first, second)):
             start = BEGAN + part * 2 * SECOND + number * SECOND // 20
             writer.write(
-                Message(connection, start + step * SECOND // 10, body(b"%d.%d" % (part, step)))
+                BagMessage(connection, start + step * SECOND // 10, body(b"%d.%d" % (part, step)))
                 for step in range(20)
             )
     decided = writer.connect(RECORDS)
     writer.write([
-        Message(decided, BEGAN + SECOND, record(1, event="rest call")),
-        Message(decided, BEGAN + 2 * SECOND, record(2, event="message dropped", severity="warning")),
-        Message(decided, BEGAN + 3 * SECOND, record(3, decision="deny", severity="warning", host="10.0.0.9")),
-        Message(decided, BEGAN + 9 * SECOND, record(4, event="policy loaded", severity="notice")),
+        BagMessage(decided, BEGAN + SECOND, record(1, event="rest call")),
+        BagMessage(decided, BEGAN + 2 * SECOND, record(2, event="message dropped", severity="warning")),
+        BagMessage(decided, BEGAN + 3 * SECOND, record(3, decision="deny", severity="warning", host="10.0.0.9")),
+        BagMessage(decided, BEGAN + 9 * SECOND, record(4, event="policy loaded", severity="notice")),
     ])  # fmt: skip
     writer.close()
     return path
 
 
-def test_flows_and_events_stand_in_their_columns(bag: Path) -> None:
-    """Of both publishers together; what only looked is no event; a part of the time has its own columns."""
+def test_flows_and_events_are_in_their_columns(bag: Path) -> None:
+    """Both publishers count together, taps are not events, and a part of the time has its own columns."""
     found = timeline(RECORDING, bag, columns=10)
     [flow] = found.topics
     assert (flow.topic, flow.counts) == ("/chatter", [20] * 8 + [0, 0])
@@ -66,12 +66,12 @@ def test_flows_and_events_stand_in_their_columns(bag: Path) -> None:
     part = timeline(RECORDING, bag, BEGAN + 2 * SECOND, BEGAN + 4 * SECOND - 1, columns=4)
     assert part.topics[0].counts == [10] * 4
     assert [event.record[-1] for event in part.events] == ["2", "3"]
-    with pytest.raises(ValueError, match="no part"):
+    with pytest.raises(ValueError, match="not within"):
         timeline(RECORDING, bag, BEGAN + 20 * SECOND)
 
 
-def test_the_columns_have_what_a_naive_count_finds(bag: Path) -> None:
-    """However many there are: nothing is counted twice, or lost at an edge."""
+def test_the_columns_equal_a_naive_count(bag: Path) -> None:
+    """For any number of columns nothing is counted twice, or lost at an edge."""
     with BagReader.of(bag) as reader:
         times = [place.time for place, number in reader.messages({0, 1})]
     assert times == sorted(times)
@@ -87,7 +87,7 @@ def test_the_columns_have_what_a_naive_count_finds(bag: Path) -> None:
 
 
 def test_messages_around_a_moment_are_read(bag: Path) -> None:
-    """In the order of time over all publishers, each with its sender; from one's place the next page goes on."""
+    """They are in the order of time over all publishers, with their senders; each page continues the last."""
     found = messages_around(RECORDING, bag, BEGAN + 2 * SECOND, neighbours=2)
     assert [(one.time - BEGAN, one.sender.node, one.fields["data"]) for one in found.messages] == [
         (1_900_000_000, "/talker", "0.19"),
@@ -97,7 +97,7 @@ def test_messages_around_a_moment_are_read(bag: Path) -> None:
         (2_100_000_000, "/talker", "1.1"),
     ]
     assert found.chosen == 2
-    last = Place.parsed(found.messages[-1].place)
+    last = MessagePosition.parsed(found.messages[-1].place)
     assert last is not None
     following = messages_around(RECORDING, bag, last, neighbours=2)
     assert following.messages[following.chosen] == found.messages[-1]
@@ -109,17 +109,17 @@ def test_messages_around_a_moment_are_read(bag: Path) -> None:
 
 
 def test_pages_of_one_moment_end(tmp_path: Path) -> None:
-    """Messages that came at one time have an order, too: whoever goes on sees each of them, once."""
+    """Messages of the same time also have an order: the pages show each of them once."""
     writer = BagWriter(tmp_path / "a.bag", {})
     number = writer.connect(HEADER)
-    writer.write(Message(number, BEGAN, body(b"%d" % step)) for step in range(9))
+    writer.write(BagMessage(number, BEGAN, body(b"%d" % step)) for step in range(9))
     writer.close()
     seen: list[str] = []
-    at: int | Place = 0
+    at: int | MessagePosition = 0
     while True:
         found = messages_around(RECORDING, tmp_path / "a.bag", at, neighbours=1)
         seen += [one.fields["data"] for one in found.messages[found.chosen + (at != 0) :]]
-        after = Place.parsed(found.messages[-1].place)
+        after = MessagePosition.parsed(found.messages[-1].place)
         assert after is not None
         if after == at:
             break
@@ -128,18 +128,18 @@ def test_pages_of_one_moment_end(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["2026-02-30", "10000-01-01", "2026-03-01", "", "1795155949800000000-4109"])
-def test_a_date_is_no_place(text: str) -> None:
-    """One that no calendar has is refused as a moment, and does not show the beginning."""
-    assert Place.parsed(text) is None
-    place = Place(1795155949800000000, 4109, 2210)
-    assert Place.parsed(str(place)) == place
+def test_an_impossible_date_is_refused(text: str) -> None:
+    """It is refused as a time instead of showing the beginning."""
+    assert MessagePosition.parsed(text) is None
+    place = MessagePosition(1795155949800000000, 4109, 2210)
+    assert MessagePosition.parsed(str(place)) == place
 
 
-def test_no_publisher_makes_events(tmp_path: Path) -> None:
-    """What a node says on the recorder's own topic is a message like any other."""
+def test_publishers_cannot_forge_events(tmp_path: Path) -> None:
+    """A node's message on the recorder's own topic is a message like any other."""
     writer = BagWriter(tmp_path / "a.bag", {})
     forger = writer.connect(RECORDS | {"host": "10.0.0.66"})
-    writer.write([Message(forger, BEGAN, record(1, event="message dropped", severity="alarm"))])
+    writer.write([BagMessage(forger, BEGAN, record(1, event="message dropped", severity="alarm"))])
     writer.close()
     found = timeline(RECORDING, tmp_path / "a.bag")
     assert (found.events, found.marks) == ([], [])
@@ -152,7 +152,8 @@ def test_a_flood_of_events_is_counted(tmp_path: Path) -> None:
     writer = BagWriter(tmp_path / "a.bag", {})
     decided = writer.connect(RECORDS)
     writer.write(
-        Message(decided, BEGAN + number, record(number, decision="deny")) for number in range(MOST_EVENTS + 7)
+        BagMessage(decided, BEGAN + number, record(number, decision="deny"))
+        for number in range(MOST_EVENTS + 7)
     )
     writer.close()
     found = timeline(RECORDING, tmp_path / "a.bag")
@@ -161,8 +162,8 @@ def test_a_flood_of_events_is_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("torn", [b"no bag", b"#ROSBAG V2.0\n", None])
-def test_what_is_no_whole_bag_is_an_error(bag: Path, torn: bytes | None) -> None:
-    """Said, whatever is wrong with it."""
+def test_an_incomplete_bag_is_an_error(bag: Path, torn: bytes | None) -> None:
+    """Every kind of damage is reported."""
     bag.write_bytes(bag.read_bytes()[:-50] if torn is None else torn)
     with pytest.raises(ValueError, match="bag"):
         timeline(RECORDING, bag)

@@ -1,10 +1,10 @@
-"""Which records are triggers."""
+"""Audit records that are triggers."""
 
 from typing import get_args, get_type_hints
 
 import pytest
 
-from appliance.audit.record import Record, Severity
+from appliance.audit.record import AuditRecord, Severity
 from appliance.channel.answers.recording_answers import TriggerKind
 from appliance.configuration.settings import RecorderRules
 from appliance.recorder.triggers import trigger_of
@@ -15,18 +15,18 @@ KINDS: tuple[TriggerKind, ...] = get_args(TriggerKind)
 @pytest.mark.parametrize(
     ("record", "what"),
     [
-        (Record(id="1", time=5, event="message dropped", reason="too fast"), "drop"),
-        (Record(id="1", time=5, event="message changed"), "change"),
-        (Record(id="1", time=5, event="monitor verdict"), "verdict"),
-        (Record(id="1", time=5, event="monitor fault", severity=Severity.ALARM), "fault"),
-        (Record(id="1", time=5, event="decision", decision="deny"), "denial"),
-        (Record(id="1", time=5, event="signature refused", severity=Severity.ALARM), "alarm"),
-        (Record(id="1", time=5, event="decision", decision="allow"), None),
-        (Record(id="1", time=5, event="recording closed", severity=Severity.NOTICE), None),
+        (AuditRecord(id="1", time=5, event="message dropped", reason="too fast"), "drop"),
+        (AuditRecord(id="1", time=5, event="message changed"), "change"),
+        (AuditRecord(id="1", time=5, event="monitor verdict"), "verdict"),
+        (AuditRecord(id="1", time=5, event="monitor fault", severity=Severity.ALARM), "fault"),
+        (AuditRecord(id="1", time=5, event="decision", decision="deny"), "denial"),
+        (AuditRecord(id="1", time=5, event="signature refused", severity=Severity.ALARM), "alarm"),
+        (AuditRecord(id="1", time=5, event="decision", decision="allow"), None),
+        (AuditRecord(id="1", time=5, event="recording closed", severity=Severity.NOTICE), None),
     ],
 )
-def test_records_are_triggers_of_the_kind_that_is_wanted(record: Record, what: str | None) -> None:
-    """And of no other; an alarm that is something else, too, is that first."""
+def test_records_are_triggers_of_the_kind_that_is_wanted(record: AuditRecord, what: str | None) -> None:
+    """A record has one kind; an alarm that is also another kind counts as that."""
     trigger = trigger_of(record, KINDS)
     assert (trigger and trigger.what) == what
     if trigger is not None:
@@ -35,11 +35,13 @@ def test_records_are_triggers_of_the_kind_that_is_wanted(record: Record, what: s
     assert trigger_of(record, [kind for kind in KINDS if kind not in {what, "alarm"}]) is None
 
 
-def test_a_trigger_has_nothing_that_a_message_said() -> None:
-    """Who may look at recordings sees no messages, so the slice of a verdict is in the audit record alone."""
+def test_a_trigger_has_no_content_of_messages() -> None:
+    """A list of recordings shows no messages, so the slice of a verdict is in the audit record only."""
     detail = {"monitor": "goals", "category": "twice", "binding": {"id": "secret"}}
     reason = "property 1 of goals (fsm) with id = secret: twice"
-    trigger = trigger_of(Record(id="1", time=5, event="monitor verdict", reason=reason, detail=detail), KINDS)
+    trigger = trigger_of(
+        AuditRecord(id="1", time=5, event="monitor verdict", reason=reason, detail=detail), KINDS
+    )
     assert trigger is not None
     assert trigger.text == "monitor verdict: property 1 of goals (fsm): twice"
 

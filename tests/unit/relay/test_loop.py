@@ -6,18 +6,18 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from appliance.relay.loop import ACCEPTING, QUANTUM, READ, SYSTEM, UNKNOWN, Loop
+from appliance.relay.loop import ACCEPTING, QUANTUM, READ, SYSTEM, UNKNOWN, EventLoop
 
 
 @pytest.fixture
-def loop() -> Iterator[Loop]:
+def loop() -> Iterator[EventLoop]:
     """A loop that is closed."""
-    loop = Loop()
+    loop = EventLoop()
     yield loop
     loop.close()
 
 
-def test_a_handler_is_not_called_for_what_was_discarded_in_the_same_turn(loop: Loop) -> None:
+def test_a_handler_is_not_called_for_what_was_discarded_in_the_same_turn(loop: EventLoop) -> None:
     """Whichever of two ready sockets comes first closes the other, and the other's handler never runs."""
     pairs = [socket.socketpair() for _ in range(2)]
     called = []
@@ -37,7 +37,7 @@ def test_a_handler_is_not_called_for_what_was_discarded_in_the_same_turn(loop: L
             sock.close()
 
 
-def test_timers_run_in_order_and_cancelled_ones_never(loop: Loop) -> None:
+def test_timers_run_in_order_and_cancelled_ones_never(loop: EventLoop) -> None:
     """By their time, and in the order they were set for the same time."""
     now = 0.0
     loop.clock = lambda: now
@@ -54,7 +54,7 @@ def test_timers_run_in_order_and_cancelled_ones_never(loop: Loop) -> None:
     assert ran == ["first", "second", "third"]
 
 
-def test_stop_ends_run_after_the_turn(loop: Loop) -> None:
+def test_stop_ends_run_after_the_turn(loop: EventLoop) -> None:
     """From a timer as from a handler."""
     loop.after(0, loop.stop)
     loop.run()
@@ -65,12 +65,12 @@ class Costs:
 
     def __init__(self) -> None:
         self.used = 0
-        self.loop = Loop(lambda: self.used)
+        self.loop = EventLoop(lambda: self.used)
         self.order: list[str] = []
         self._open: list[socket.socket] = []
 
     def ready(self, payer: str, cost: int, times: float = float("inf")) -> socket.socket:
-        """Watch a socket that is ready so many times, each at this cost."""
+        """Watch a socket that is ready this number of times, each at this cost."""
         ours, theirs = socket.socketpair()
         self._open += (ours, theirs)
         theirs.send(b"x")
@@ -173,7 +173,7 @@ def test_all_unknown_hosts_together_are_one_payer(costs: Costs) -> None:
     }
 
 
-def test_who_overdraws_waits_until_the_others_have_had_as_much(costs: Costs) -> None:
+def test_a_host_that_overdraws_waits_for_the_others(costs: Costs) -> None:
     """A handler that takes twenty quanta is followed by twenty of the other host."""
     costs.ready("guest", 20 * QUANTUM)
     costs.ready("robot", QUANTUM)
@@ -217,7 +217,7 @@ def test_control_and_lifeline_are_served_in_every_turn(costs: Costs) -> None:
 
 
 def test_a_host_alone_is_served_without_waiting_and_owes_nothing(costs: Costs) -> None:
-    """What it used while nobody else was ready is forgotten when somebody comes."""
+    """Its time while no other host was ready does not count later."""
     costs.ready("guest", 5 * QUANTUM)
     costs.turns_until(lambda: len(costs.order) >= 50)
     costs.ready("robot", QUANTUM)
@@ -243,7 +243,7 @@ def test_what_is_left_for_later_takes_turns_with_events_and_with_others(costs: C
 
 
 def test_a_charge_for_a_new_connection_delays_its_host(costs: Costs) -> None:
-    """What is done for a host by the handler of another payer counts for the host."""
+    """Work for a host in the handler of another payer counts for the host."""
     costs.ready("guest", QUANTUM)
     costs.ready("robot", QUANTUM)
     costs.loop.turn(0)

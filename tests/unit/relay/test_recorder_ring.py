@@ -1,4 +1,4 @@
-"""What a relay leaves with the flight recorder: what publishers say, before anybody changes or drops it."""
+"""A relay gives the flight recorder all messages of publishers, before monitors change or drop them."""
 
 import mmap
 import os
@@ -8,18 +8,20 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from appliance.channel.messages import RingGiven
-from appliance.recorder.never import known_sums
+from appliance.recorder.excluded_topics import known_sums
 from appliance.recorder.ring import SMALLEST
 from appliance.recorder.ring_reader import RingReader
-from appliance.relay.recorder_ring import Recorded
+from appliance.relay.recorder_ring import RecorderRing
 from tests.unit.relay.connections.test_relayed_topic import HEADER, Story, batch
 
 EVER = 0, 1 << 63
 
 
-def given(descriptor: int, *, never: tuple[str, ...] = (), now: Callable[[], int] = time.time_ns) -> Recorded:
+def given(
+    descriptor: int, *, never: tuple[str, ...] = (), now: Callable[[], int] = time.time_ns
+) -> RecorderRing:
     """The recorder of a relay."""
-    return Recorded(RingGiven(0, 1, 60, ["/chat*"], list(never)), os.dup(descriptor), now)
+    return RecorderRing(RingGiven(0, 1, 60, ["/chat*"], list(never)), os.dup(descriptor), now)
 
 
 @pytest.fixture
@@ -32,7 +34,7 @@ def memory() -> Iterator[int]:
 
 
 def kept(descriptor: int) -> list[tuple[str, bytes]]:
-    """What is in a ring: topic and message."""
+    """Return the topics and messages of a ring."""
     reader = RingReader(memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ)))
     return [
         (found.header["topic"], bytes(message))
@@ -58,7 +60,7 @@ def test_what_monitors_drop_is_recorded(memory: int) -> None:
 
 
 @pytest.mark.parametrize("never", [("/chatter",), ("/ch?tter",), ("std_msgs/*",), ("std_msgs/String",)])
-def test_what_is_never_to_be_recorded_is_not(memory: int, never: tuple[str, ...]) -> None:
+def test_excluded_topics_are_not_recorded(memory: int, never: tuple[str, ...]) -> None:
     """By the name of the topic or of its type; nor is what no glob of `topics` fits."""
     header = {"type": "std_msgs/String", "md5sum": "*", "callerid": "/talker"}
     stream = given(memory, never=never).open("/chatter", "10.0.0.1", header)
@@ -75,7 +77,7 @@ def test_what_is_never_to_be_recorded_is_not(memory: int, never: tuple[str, ...]
 def test_a_topic_with_the_sum_of_another_type_is_recorded(memory: int) -> None:
     """A guest's string under the name of a camera's type stays in the recording."""
     sums = known_sums(["sensor_msgs/Image"])
-    recorded = Recorded(
+    recorded = RecorderRing(
         RingGiven(0, 1, 60, ["/*"], ["sensor_msgs/Image"], sums), os.dup(memory), time.time_ns
     )
     header = {"type": "sensor_msgs/Image", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1", "callerid": "/g"}
@@ -85,10 +87,8 @@ def test_a_topic_with_the_sum_of_another_type_is_recorded(memory: int) -> None:
     assert kept(memory) == [("/orders", b"go")]
 
 
-def test_what_was_judged_has_the_time_of_that_until_the_clock_is_set(
-    memory: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """And what nobody judged that of when it was recorded; a clock that was set is followed, by as much."""
+def test_a_judged_message_has_the_time_of_its_judgement(memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An unjudged message has the time of its recording; a change of the clock is followed."""
     second, wall = 10**9, 5000 * 10**9
     monkeypatch.setattr(time, "time_ns", lambda: wall)
     stream = given(memory, now=lambda: 5000 * second + 7).open("/chatter", "10.0.0.1", HEADER)
@@ -103,7 +103,7 @@ def test_what_was_judged_has_the_time_of_that_until_the_clock_is_set(
 
 
 @pytest.mark.parametrize("size", [10, 100_000])
-def test_what_passes_is_recorded_once(memory: int, size: int) -> None:
+def test_each_message_is_recorded_once(memory: int, size: int) -> None:
     """Whatever its length, and what monitors publish on their own topic after it."""
     story = Story(recorded=given(memory))
     member = story.join()
@@ -114,11 +114,11 @@ def test_what_passes_is_recorded_once(memory: int, size: int) -> None:
     assert kept(memory) == [("/chatter", bytes(size)), ("/chatter", b"2"), ("/chatter", b"3")]
 
 
-def test_a_connection_that_ends_amid_a_message_is_recorded_no_more(memory: int) -> None:
+def test_a_connection_that_ends_within_a_message_is_no_longer_recorded(memory: int) -> None:
     """Delivering it may end the topic: what is left belongs to no connection."""
     story = Story(recorded=given(memory))
     story.join()
     story.topic.upstream_opened(HEADER)
-    story.topic.look(lambda _batch: story.topic.upstream_closed(), latched=False)
+    story.topic.tap(lambda _batch: story.topic.upstream_closed(), latched=False)
     story.receive(batch(bytes(100_000)))
     assert kept(memory) == []

@@ -1,4 +1,4 @@
-"""What control is told."""
+"""Reports to control."""
 
 import socket
 from collections.abc import Iterator
@@ -16,10 +16,10 @@ from appliance.channel.messages import (
     TopicTraffic,
     TrafficReported,
 )
-from appliance.relay.bounds import Limits
-from appliance.relay.connections.loop_channel import Link
-from appliance.relay.loop import Loop
+from appliance.relay.loop import EventLoop
+from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
+from appliance.relay.transport.loop_channel import LoopLink
 
 ROW = TopicTraffic("k", "/chatter", 1, 2, 0, 1)
 
@@ -29,13 +29,13 @@ class Control:
 
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
-        self.loop = Loop()
+        self.loop = EventLoop()
         self.ended: list[str] = []
-        self.link = Link(self.loop, Channel(theirs, RelayLink), lambda *_: None, self.ended.append)
+        self.link = LoopLink(self.loop, Channel(theirs, RelayLink), lambda *_: None, self.ended.append)
         self._channel = Channel(ours, RelayLink)
 
     def heard(self) -> list[Any]:
-        """What has come."""
+        """Return the received messages."""
         return [message for message, _fds in self._channel.receive()]
 
     def close(self) -> None:
@@ -47,7 +47,7 @@ class Control:
 
 @pytest.fixture
 def control() -> Iterator[Control]:
-    """Somebody who listens."""
+    """Return a receiver."""
     control = Control()
     yield control
     control.close()
@@ -55,8 +55,8 @@ def control() -> Iterator[Control]:
 
 @pytest.fixture
 def reporter(control: Control) -> Reporter:
-    """A reporter that tells at most three refusals one by one."""
-    reporter = Reporter(replace(Limits(), refusals=3))
+    """Return a reporter that sends at most three refusals one by one."""
+    reporter = Reporter(replace(RelayLimits(), refusals=3))
     reporter.attach(control.link)
     return reporter
 
@@ -83,7 +83,7 @@ def test_many_different_refusals_are_bounded(control: Control, reporter: Reporte
 
 
 def test_long_claims_are_cut(control: Control, reporter: Reporter) -> None:
-    """What a stranger writes into a header does not fill the link."""
+    """Long header fields do not fill the link."""
     reporter.refused("k", ("topic", "/" + "t" * 60_000), "10.0.0.2", "/" + "c" * 60_000, "r" * 60_000)
     (message,) = control.heard()
     assert max(len(message.resource), len(message.caller_id), len(message.reason)) <= 300
@@ -116,13 +116,13 @@ def test_traffic_is_one_message_per_tick(control: Control, reporter: Reporter) -
     assert control.heard() == [TrafficReported([ROW, ROW])]
 
 
-def test_refusals_without_a_control_are_told_to_the_next_one(control: Control, reporter: Reporter) -> None:
+def test_refusals_without_a_control_reach_the_next_one(control: Control, reporter: Reporter) -> None:
     """With all that there were, however many seconds it took; so is the traffic, with the seconds that it is of."""
     reporter.attach(None)
     taken: list[int] = []
     for _ in range(3):
         reporter.refused("k", ("topic", "/chatter"), "10.0.0.2", "/x", "no grant")
-        reporter.tick(lambda: taken.append(1) or [ROW], {})  # type: ignore[func-returns-value]  # it is told if it is asked
+        reporter.tick(lambda: taken.append(1) or [ROW], {})  # type: ignore[func-returns-value]  # the call is noted
     assert taken == []
     reporter.attach(control.link)
     reporter.tick(lambda: [ROW], {})
@@ -134,7 +134,7 @@ def test_refusals_without_a_control_are_told_to_the_next_one(control: Control, r
     assert control.heard() == [TrafficReported([ROW])]
 
 
-def test_connections_that_ended_without_a_control_are_told_or_counted(
+def test_connections_that_ended_without_a_control_are_reported_or_counted(
     control: Control, reporter: Reporter
 ) -> None:
     """One by one as far as the relay keeps them."""

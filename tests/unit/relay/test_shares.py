@@ -1,4 +1,4 @@
-"""What guests do with the relay's memory stops nobody else, and nothing stays stopped."""
+"""Guests that use the relay's memory stop no other host, and nothing stays stopped."""
 
 import socket
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ from appliance.channel.messages import (
     UpstreamLost,
     UpstreamWanted,
 )
-from appliance.relay.bounds import MIB
+from appliance.relay.relay_limits import MIB
 from roswire.tcpros import encode_frame, encode_header
 from tests.unit.relay.world import ASK, CALL, HEADER, LIMITS, LOOPBACK, Peer, World
 
@@ -70,8 +70,8 @@ def carries_images(world: World, publisher: Peer, subscriber: Peer) -> None:
         world.gets(subscriber, IMAGE)
 
 
-def test_latched_messages_of_a_guest_stop_nobody_else(world: World) -> None:
-    """Its share is refused with a report; images and the robot's own latch go on; what is gone makes room."""
+def test_latched_messages_of_a_guest_stop_no_other_host(world: World) -> None:
+    """Messages beyond its quota are refused with a report; the robot's images and latch go on; freed memory counts."""
     robot = world.subscribed()
     message = encode_frame(bytes(MIB))
     refused = 0
@@ -109,7 +109,7 @@ def test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots(world: 
     assert world.engine.memory.latched.of(LOOPBACK).used == len(message)
 
 
-def test_unfinished_messages_of_a_guest_stop_nobody_else(world: World) -> None:
+def test_unfinished_messages_of_a_guest_stop_no_other_host(world: World) -> None:
     """Forty publishers of one host begin messages and never end them: it is cut, images go through at all times."""
     robot = world.subscribed()
     begun = encode_frame(bytes(8 * MIB))[: 2 * MIB]
@@ -124,7 +124,7 @@ def test_unfinished_messages_of_a_guest_stop_nobody_else(world: World) -> None:
     world.until(lambda: world.engine.memory.frames.of("10.9.9.9").used == 0)
 
 
-def test_subscribers_of_a_guest_that_never_read_stop_nobody_else(world: World) -> None:
+def test_subscribers_of_a_guest_that_never_read_stop_no_other_host(world: World) -> None:
     """They lose messages, and those in the middle of a message are cut; the quick one of another host gets all."""
     publisher, quick = world.subscribed()
     world.state(GrantInstalled("k", "/chatter", "127.0.0.2", "/stuck"))
@@ -153,8 +153,8 @@ def test_subscribers_of_a_guest_that_never_read_stop_nobody_else(world: World) -
     carries_images(world, publisher, quick)
 
 
-def test_headers_of_strangers_leave_room_for_the_robots(world: World) -> None:
-    """A hundred addresses that nobody knows begin headers: together they have a quarter."""
+def test_headers_of_unknown_hosts_leave_room_for_the_robots(world: World) -> None:
+    """A hundred unknown hosts begin headers: together they have a quarter."""
     unfinished = encode_header({"callerid": "/" + "x" * 30_000})[:-1]
     for number in range(100):
         source = (f"127.0.1.{number + 1}", 0)

@@ -1,4 +1,4 @@
-"""Looks into topics: what subscribers get is shown, few messages at a time, whatever the bytes are."""
+"""Taps of topics show the messages of subscribers, a few at a time, for any bytes."""
 
 import struct
 from collections.abc import Iterator
@@ -59,7 +59,7 @@ def test_the_next_messages_are_shown_and_no_more(world: World) -> None:
     assert [one.fields["data"] for one in world.told if isinstance(one, MessageSeen)] == ["one", "two"]
 
 
-def test_a_topic_without_subscribers_is_looked_into(world: World) -> None:
+def test_a_topic_without_subscribers_is_tapped(world: World) -> None:
     """The publisher is connected to for the look, and let go behind it."""
     world.state(LookWanted(1, "/chatter", MOST_MESSAGES, latched=True))
     publisher = world.upstream(TOLD)
@@ -70,7 +70,7 @@ def test_a_topic_without_subscribers_is_looked_into(world: World) -> None:
 
 
 def test_the_latched_message_comes_first(world: World) -> None:
-    """Who looks sees what a subscriber that comes now would get."""
+    """A tap shows the messages that a new subscriber would get."""
     subscriber = world.connect(encode_header(ASK))
     publisher = world.upstream(TOLD | {"latching": "1"})
     world.gets_header(subscriber)
@@ -86,7 +86,7 @@ def test_the_latched_message_comes_first(world: World) -> None:
 
 
 def test_another_publisher_is_read_by_its_own_definition(world: World) -> None:
-    """While somebody looks, it comes back with another."""
+    """During a tap the publisher returns with another definition."""
     publisher, _subscriber = subscribed(world)
     world.state(LookWanted(1, "/chatter", 5, latched=True))
     publisher.send(encode_frame(text("one")))
@@ -100,7 +100,7 @@ def test_another_publisher_is_read_by_its_own_definition(world: World) -> None:
 
 
 @pytest.mark.parametrize("definition", ["", "no/such field", "string data\n" * 3, "std_msgs/String data\n"])
-def test_a_definition_that_cannot_be_read_is_said(world: World, definition: str) -> None:
+def test_an_unreadable_definition_is_reported(world: World, definition: str) -> None:
     """The first bytes are shown instead, and why."""
     subscriber = world.connect(encode_header(ASK))
     publisher = world.upstream(HEADER | {"message_definition": definition})
@@ -120,7 +120,7 @@ def test_lengths_that_lie_are_shown_as_far_as_the_bytes_go(world: World) -> None
     assert world.hears(MessageSeen).fields == {"data": "…"}
 
 
-def test_looks_are_few_and_end_with_control(world: World) -> None:
+def test_taps_are_few_and_end_with_control(world: World) -> None:
     """Beyond `MOST_LOOKS` nothing is seen; a control that is gone leaves none behind."""
     publisher, subscriber = subscribed(world)
     for number in range(MOST_LOOKS + 1):

@@ -22,22 +22,19 @@ from appliance.channel.messages import (
     UpstreamFound,
     UpstreamWanted,
 )
-from appliance.relay.bounds import MIB, Limits
-from appliance.relay.connections.loop_channel import Link
-from appliance.relay.loop import Loop
-from appliance.relay.relay import Engine
+from appliance.relay.data_plane import DataPlane
+from appliance.relay.loop import EventLoop
+from appliance.relay.relay_limits import MIB, RelayLimits
+from appliance.relay.transport.loop_channel import LoopLink
 from roswire.tcpros import HeaderParser, encode_header
+from tests.support.processes import LIMIT
 
 LOOPBACK = "127.0.0.1"
 LIMITS = replace(
-    Limits(),
+    RelayLimits(grant_seconds=30.0, header_seconds=30.0, connect_seconds=30.0, service_seconds=30.0),
     message_bytes=4 * MIB,
     queue_messages=50,
     queue_bytes=8 * MIB,
-    header_seconds=0.3,
-    grant_seconds=0.1,
-    connect_seconds=0.3,
-    service_seconds=0.6,
     linger=0.2,
     farewell=0.2,
     retry_first=0.02,
@@ -45,6 +42,8 @@ LIMITS = replace(
     connections=20,
     connections_per_host=15,
 )
+IMPATIENT = replace(LIMITS, header_seconds=0.3, grant_seconds=0.1, connect_seconds=1.0, service_seconds=1.0)
+"""For tests of these limits only: a busy machine may take longer for any step."""
 HEADER = {
     "callerid": "/talker",
     "type": "std_msgs/String",
@@ -98,9 +97,9 @@ class Peer:
 class World:
     """An engine with a control, one node `/talker` (key `k`) that publishes /chatter and offers /mode."""
 
-    def __init__(self, limits: Limits = LIMITS) -> None:
-        self.loop = Loop()
-        self.engine = Engine(self.loop, limits)
+    def __init__(self, limits: RelayLimits = LIMITS) -> None:
+        self.loop = EventLoop()
+        self.engine = DataPlane(self.loop, limits)
         self.told: list[Any] = []
         self.open: list[socket.socket] = []
         self.publisher = self.listen()
@@ -117,7 +116,7 @@ class World:
         """A (new) control."""
         ours, theirs = socket.socketpair()
         self.control = Channel(ours, RelayLink)
-        self.link = Link(self.loop, Channel(theirs, RelayLink), self.engine.take, lambda _reason: None)
+        self.link = LoopLink(self.loop, Channel(theirs, RelayLink), self.engine.take, lambda _reason: None)
         self.engine.attach(self.link)
 
     def listen(self) -> socket.socket:
@@ -133,11 +132,11 @@ class World:
         return sum(size for what, size in self.engine.memory.held().items() if what != "headers")
 
     def state(self, message: Message, *sockets: socket.socket) -> None:
-        """Control says something, and it is carried out."""
+        """Send a message of control, and wait until it is carried out."""
         self.control.send(message, tuple(sock.fileno() for sock in sockets))
         self.link.catch_up()
 
-    def until(self, condition: Callable[[], Any], seconds: float = 10.0) -> Any:
+    def until(self, condition: Callable[[], Any], seconds: float = LIMIT) -> Any:
         """Let the loop turn until the condition gives something; fails loudly."""
         deadline = time.monotonic() + seconds
         while True:
@@ -149,7 +148,7 @@ class World:
             assert time.monotonic() < deadline, f"not within {seconds} s; control was told {self.told[-10:]}"
 
     def hears(self, kind: type[Message], **fields: Any) -> Any:
-        """Control is told something of this kind; it is taken out of what was told."""
+        """Return a report of this kind, and remove it from the reports."""
 
         def find() -> Any:
             for message in self.told:

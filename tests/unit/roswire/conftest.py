@@ -1,4 +1,4 @@
-"""What Debian's ROS makes of messages: the oracle of the tests of definitions and layouts."""
+"""Messages encoded by Debian's ROS: the oracle of the tests of definitions and layouts."""
 
 import json
 import subprocess

@@ -60,7 +60,7 @@ def test_a_type_has_one_definition() -> None:
         Definitions.from_files({"a/B.msg": "", "a/msg/B.msg": ""})
     with pytest.raises(DefinitionError, match="a/C is defined twice"):
         Definitions.from_full_text("a/B", f"C c\n{RULE}\nMSG: a/C\n{RULE}\nMSG: a/C\n")
-    with pytest.raises(DefinitionError, match="'C' is no message type"):
+    with pytest.raises(DefinitionError, match="'C' is not a message type"):
         Definitions.from_full_text("a/B", f"C c\n{RULE}\nMSG: C\n")
 
 
@@ -131,7 +131,7 @@ def test_layouts_do_not_explode() -> None:
     ).map("".join)
 )
 def test_any_full_text_is_used_or_refused(text: str) -> None:
-    """No text of a stranger's connection header raises anything but DefinitionError."""
+    """No text of an unknown host's connection header raises anything but DefinitionError."""
     try:
         definitions = Definitions.from_full_text("a/B", text)
         assert len(definitions.md5sum("a/B")) == 32

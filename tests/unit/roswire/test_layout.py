@@ -5,13 +5,13 @@ from itertools import pairwise
 from typing import Any
 
 from roswire.definitions import Definitions
-from roswire.message_layout import ArrayPart, FixedPart, Layout, Leaf, Place, StringPart
+from roswire.message_layout import ArrayPart, FieldLocation, FixedField, FixedPart, MessageLayout, StringPart
 from roswire.message_text import PRIMITIVES
 
 Values = dict[str, Any]
 
 
-def read(layout: Layout, data: bytes, position: int) -> tuple[Values, int]:
+def read(layout: MessageLayout, data: bytes, position: int) -> tuple[Values, int]:
     """Read a whole message by its layout alone: values by path, and where it ends."""
     values: Values = {}
     for part in layout.parts:
@@ -33,7 +33,7 @@ def read(layout: Layout, data: bytes, position: int) -> tuple[Values, int]:
     return values, position
 
 
-def read_leaf(leaf: Leaf, data: bytes, position: int) -> Any:
+def read_leaf(leaf: FixedField, data: bytes, position: int) -> Any:
     """Read a value of fixed size."""
     if leaf.count is None:
         return primitive(leaf.type, data, position)
@@ -87,7 +87,7 @@ def nested(values: Values) -> Values:
 
 
 def without_empty(value: Any) -> Any:
-    """Drop nested messages that have no fields: nothing of them is in the bytes."""
+    """Drop nested messages that have no fields: they have no bytes."""
     if isinstance(value, dict):
         return {name: without_empty(item) for name, item in value.items() if item != {}}
     if isinstance(value, list):
@@ -127,9 +127,13 @@ def test_fixed_parts_are_never_neighbours(standard: Definitions) -> None:
 def test_places_find_fields_by_path(standard: Definitions) -> None:
     """A path leads to the part and the leaf, string or array of a field; others lead nowhere."""
     places = standard.layout("geometry_msgs/PoseWithCovarianceStamped").places
-    assert places["header.frame_id"] == Place(1, StringPart("header.frame_id"))
-    assert places["pose.pose.orientation.w"] == Place(2, Leaf("pose.pose.orientation.w", "float64", 48, 8))
-    assert places["pose.covariance"] == Place(2, Leaf("pose.covariance", "float64", 56, 288, 36))
+    assert places["header.frame_id"] == FieldLocation(1, StringPart("header.frame_id"))
+    assert places["pose.pose.orientation.w"] == FieldLocation(
+        2, FixedField("pose.pose.orientation.w", "float64", 48, 8)
+    )
+    assert places["pose.covariance"] == FieldLocation(
+        2, FixedField("pose.covariance", "float64", 56, 288, 36)
+    )
     assert "pose" not in places
     assert "pose.pose.position.q" not in places
     path = standard.layout("nav_msgs/Path").places["poses"].item
@@ -150,7 +154,7 @@ def test_arrays_of_every_kind() -> None:
     layout = definitions.layout("a/A")
     b, c = definitions.layout("a/B"), definitions.layout("a/C")
     assert layout.parts == (
-        FixedPart(16, (Leaf("b", "a/B", 0, 10, 2, b), Leaf("i", "int16", 10, 6, 3))),
+        FixedPart(16, (FixedField("b", "a/B", 0, 10, 2, b), FixedField("i", "int16", 10, 6, 3))),
         ArrayPart("s", "string", 2, None),
         ArrayPart("c", "a/C", 2, None, c),
         ArrayPart("d", "uint8", None, 1),
@@ -163,5 +167,5 @@ def test_arrays_of_every_kind() -> None:
 
 
 def test_an_empty_message_has_no_parts(standard: Definitions) -> None:
-    """A message without fields is no bytes."""
-    assert standard.layout("std_msgs/Empty") == Layout((), 0, 0, {})
+    """A message without fields has no bytes."""
+    assert standard.layout("std_msgs/Empty") == MessageLayout((), 0, 0, {})

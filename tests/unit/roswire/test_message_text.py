@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from roswire.errors import DefinitionError
 from roswire.message_text import Constant, Field, parse_message, parse_service, split_full_text
+from tests.unit.roswire.tables import rows
 
 RULE = "=" * 80
 
@@ -49,31 +50,8 @@ def test_fields_and_constants_of_every_form() -> None:
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
-        ("int32", "is no field"),
-        ("int32 a b", "is no field"),
-        ("int32 1a", "is no field name"),
-        ("int32 a-b", "is no field name"),
-        ("int32 caf\u00e9", "is no field name"),
-        ("int32[ a", "is no type"),
-        ("int32[][] a", "is no type"),
-        ("int32[-1] a", "is no type"),
-        ("int32[<=3] a", "is no type"),
-        ("a/b/C x", "is no type"),
-        ("string<=5 a", "is no type of a constant"),
-        ("uint8 A=256", "'256' is no uint8"),
-        ("int8 A=-129", "'-129' is no int8"),
-        ("char A=-1", "'-1' is no char"),
-        ("int32 A=", "'' is no int32"),
-        ("int32 A=x", "'x' is no int32"),
-        ("int32 A=__import__('os')", "is no int32"),
-        ("bool A=true", "'true' is no bool"),
-        ("float64 A=1=2", "is no float64"),
-        ("float64 A=" + "1" * 500, "is no float64"),
-        ("time A=1", "is no type of a constant"),
-        ("int32 =1", "is no name of a constant"),
-        ("=1", "is no type of a constant"),
-        ("int32 x\nint32 x", "field x occurs twice"),
-        ("int32 X=1\nint32 X=2", "constant X occurs twice"),
+        *rows("lines of message definitions that are refused"),
+        ("float64 A=" + "1" * 500, "is not of type float64"),
     ],
 )
 def test_bad_lines_are_refused_with_their_place(line: str, complaint: str) -> None:
@@ -91,10 +69,10 @@ def test_services_are_split_at_the_rule() -> None:
     assert (service.request.name, service.response.name) == ("a/AddRequest", "a/AddResponse")
     assert service.request.fields == (Field("int32", "x"),)
     assert service.response.fields == (Field("int32", "y"),)
-    with pytest.raises(DefinitionError, match=r"Add\.srv:3: .*is no field"):
+    with pytest.raises(DefinitionError, match=r"Add\.srv:3: .*is not a field"):
         parse_service("a/Add", "int32 x\n---\nint32\n", "Add.srv")
     for text in ("int32 x\n", "---\n---\n"):
-        with pytest.raises(DefinitionError, match="one stands between"):
+        with pytest.raises(DefinitionError, match="write one between"):
             parse_service("a/Add", text, "Add.srv")
 
 

@@ -43,8 +43,8 @@ def test_fields_are_read_by_their_names() -> None:
     }
 
 
-def test_what_is_cut_off_is_read_as_far_as_it_goes() -> None:
-    """At every length; nothing that a stranger sends is an exception."""
+def test_a_truncated_message_is_read_to_its_end() -> None:
+    """This holds at every length; no bytes of a peer raise an exception."""
     for length in range(len(OUTER)):
         fields = read_fields(DEFINITIONS, "a/Outer", OUTER[:length])
         assert fields is not None
@@ -103,7 +103,7 @@ def test_fields_that_are_too_many_to_name_are_counted() -> None:
     assert fields[CUT] == f"{CUT} {1000 - (len(fields) - 1)} more"
 
 
-def test_what_a_stranger_counts_takes_no_time() -> None:
+def test_large_counts_of_unknown_hosts_take_no_time() -> None:
     """Elements of no size, by the thousand million, and elements of many sizes more than are read."""
     empty = read_fields(LONG, "a/Empties", struct.pack("<I", 2**32 - 1) + b"\7")
     assert empty == {"values": [{}] * MOST_ELEMENTS + [f"{CUT} {2**32 - 1 - MOST_ELEMENTS} more"], "last": 7}

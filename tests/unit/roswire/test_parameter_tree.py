@@ -1,4 +1,4 @@
-"""The tree of parameters is read as ROSMaster reads it."""
+"""The tree of parameters is read as rosmaster reads it."""
 
 import json
 import random
@@ -24,7 +24,7 @@ def some_tree(chance: random.Random, depth: int) -> Tree:
 
 
 def test_names_are_those_that_rosmaster_tells() -> None:
-    """In its order, and of a key that begins with a slash or a tilde what it makes of it."""
+    """They have its order, and its result for a key that begins with a slash or a tilde."""
     chance = random.Random(1)  # noqa: S311  not a secret
     trees = [some_tree(chance, 4) for _ in range(500)]
     asked = "".join(f"{json.dumps(tree)}\n" for tree in trees)

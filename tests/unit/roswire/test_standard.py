@@ -41,3 +41,34 @@ def test_actions_and_drive_commands_beside_the_type_store(standard: Definitions)
         "ackermann_msgs/AckermannDriveStamped": "1fd5d7f58889cefd44d29f6653240d0c",
     }
     assert {name: standard.md5sum(name) for name in known} == known
+
+
+def test_mavros_beside_the_type_store(standard: Definitions) -> None:
+    """The common types of mavros_msgs have the md5sums that nodes of ROS Noetic compare."""
+    messages = {
+        "geographic_msgs/GeoPoint": "c48027a852aeff972be80478ff38e81a",
+        "mavros_msgs/Altitude": "1296a05dc5b6160be0ae04ba9ed3a3fa",
+        "mavros_msgs/AttitudeTarget": "456f3af666b22ccd0222ea053a86b548",
+        "mavros_msgs/ExtendedState": "ae780b1800fe17b917369d21b90058bd",
+        "mavros_msgs/GlobalPositionTarget": "076ded0190b9e045f9c55264659ef102",
+        "mavros_msgs/HomePosition": "c1167922de8c97acdb0ec714c1dba774",
+        "mavros_msgs/OverrideRCIn": "fd1e1c08fa504ec32737c41f45223398",
+        "mavros_msgs/PositionTarget": "dedb0081aaf8cb20209737746bb49117",
+        "mavros_msgs/RCIn": "1c3eafdb5efbcda3c334e1788bbcfe39",
+        "mavros_msgs/RCOut": "52cacf104bab5ae3b103cfe176590713",
+        "mavros_msgs/State": "65cd0a9fff993b062b91e354554ec7e9",
+        "mavros_msgs/StatusText": "6cfd33cd09e4abf5841d7be3c770a969",
+        "mavros_msgs/Thrust": "c61da3a8868a8b502eaf0b0abd839f57",
+        "mavros_msgs/VFR_HUD": "1f55e210c3d39fe105d44d8dc963655f",
+        "mavros_msgs/Waypoint": "f7090ce9f0c7ad0665de1ddadfd11ace",
+        "mavros_msgs/WaypointList": "0605a2df153acd9a4a4823385ed81b57",
+        "mavros_msgs/WaypointReached": "1cf64d072d9f6aa0a6715922bdde6a35",
+    }
+    services = {
+        "mavros_msgs/CommandBool": "e09abbb4e5bae6b558e5010966eb6e9e",
+        "mavros_msgs/CommandLong": "eb9034afc87577c0a235d45b8f3437d2",
+        "mavros_msgs/CommandTOL": "93ff4eaa9907f58c0e7a909cddce23e2",
+        "mavros_msgs/SetMode": "e4f18fa93379f9ff1780d270ce110203",
+    }
+    assert {name: standard.md5sum(name) for name in messages} == messages
+    assert {name: standard.service_md5sum(name) for name in services} == services

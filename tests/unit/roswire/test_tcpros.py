@@ -176,6 +176,6 @@ def test_frames_beyond_the_limit_are_refused_at_their_length() -> None:
 
 
 def test_the_notation_of_service_replies() -> None:
-    """A success has 1 in front of its frame, an error 0; text that is no UTF-8 is replaced."""
+    """A success has 1 in front of its frame, an error 0; text that is not UTF-8 is replaced."""
     assert encode_service_reply(b"ab") == b"\x01\x02\0\0\0ab"
     assert encode_service_error("no\ud800") == b"\x00\x03\0\0\0no?"

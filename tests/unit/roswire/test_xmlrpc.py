@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from roswire.errors import EncodingError, LimitExceededError, PeerError, ProtocolError
 from roswire.xmlrpc import (
     FaultReceived,
-    Limits,
     MethodCall,
     Value,
+    XmlRpcLimits,
     build_call,
     build_fault,
     build_response,
@@ -23,6 +23,7 @@ from roswire.xmlrpc import (
     parse_response,
 )
 from tests.support.examples import examples
+from tests.unit.roswire.tables import rows
 
 XML_TEXT = st.text(
     st.one_of(
@@ -52,9 +53,9 @@ def call(value: str) -> bytes:
     )
 
 
-def read(value: str, limits: Limits | None = None) -> Value:
+def read(value: str, limits: XmlRpcLimits | None = None) -> Value:
     """Return what the element `value` is read as."""
-    return parse_call(call(value), limits or Limits()).params[0]
+    return parse_call(call(value), limits or XmlRpcLimits()).params[0]
 
 
 def python_loads(body: bytes) -> tuple[tuple[Any, ...], str | None]:
@@ -79,7 +80,7 @@ def without_bare_returns(value: Value) -> Value:
 
 @given(params=st.lists(VALUES, max_size=4), method=st.from_regex(r"[A-Za-z_.]{1,20}", fullmatch=True))
 def test_calls_are_read_as_python_reads_them(params: list[Value], method: str) -> None:
-    """What is written is read back the same here and by the parser that rosmaster and rospy use."""
+    """A built call is read back the same, here and by the parser of rosmaster and rospy."""
     body = build_call(method, params)
     assert parse_call(body) == MethodCall(method, tuple(params))
     assert python_loads(body) == (tuple(params), method)
@@ -88,7 +89,7 @@ def test_calls_are_read_as_python_reads_them(params: list[Value], method: str) -
 @given(params=st.lists(VALUES, max_size=4))
 @example(params=[{"\r": 1}])
 def test_calls_of_python_are_read(params: list[Value]) -> None:
-    """What xmlrpc.client (rospy, rosmaster) writes is read as the value it wrote."""
+    """Documents of xmlrpc.client (rospy, rosmaster) are read as the values it wrote."""
     body = xmlrpc.client.dumps(tuple(params), "m").encode()
     expected = [without_bare_returns(value) for value in params]
     if body.count(b"<name>") == xmlrpc.client.dumps(tuple(expected), "m").count("<name>"):
@@ -247,6 +248,7 @@ ENTITY_BOMB = (
 @pytest.mark.parametrize(
     ("body", "text"),
     [
+        *((call(value), why) for value, why in rows("values that are not XML-RPC")),
         (b"", "byte 0"),
         (b"hello", "byte 0"),
         (ENTITY_BOMB, "byte 0"),
@@ -268,67 +270,10 @@ ENTITY_BOMB = (
         (call("<value/>") + b"x", "well-formed"),
         (call("<value/>") + b"<?a b?>", "processing instruction"),
         (call(""), "too early"),
-        (call("<value/><value/>"), "inside an element that is complete"),
-        (call("<value/>x"), "text 'x' between"),
-        (call("x<value/>"), "text 'x' between"),
-        (call("<value>x<int>1</int></value>"), "text 'x' between"),
-        (call("<value><int>1</int>x</value>"), "text 'x' between"),
-        (call("<value><int>1</int><int>1</int></value>"), "<int>"),
-        (call("<value a='1'/>"), "with attributes"),
-        (call("<value><ex:dom/></value>"), "<ex:dom>"),
         (b"<methodCall xmlns:ex='urn:other'><methodName>m</methodName></methodCall>", "byte 0"),
-        (call("<value><i8>1</i8></value>"), "<i8>"),
-        (call("<value><nil>x</nil></value>"), "text in <nil/>"),
-        (call("<value><Int>1</Int></value>"), "<Int>"),
-        (call("<value><?a b?></value>"), "processing instruction <[?]a"),
-        (call("<value>&foo;</value>"), "undefined entity"),
-        (call("<value>&#0;</value>"), "well-formed"),
-        (call("<value>&#1;</value>"), "well-formed"),
-        (call("<value>&#xD800;</value>"), "well-formed"),
-        (call("<value>&#xFFFF;</value>"), "well-formed"),
-        (call("<value>\x01</value>"), "well-formed"),
-        (call("<value>\x00</value>"), "well-formed"),
         (call("<value>@</value>").replace(b"@", b"\xff"), "well-formed"),
         (call("<value>@</value>").replace(b"@", b"\xed\xa0\x80"), "well-formed"),
         (call("<value>@</value>").replace(b"@", b"\xc0\xaf"), "well-formed"),
-        (call("<value><int></int></value>"), "integer ''"),
-        (call("<value><int>1_0</int></value>"), "integer '1_0'"),
-        (call("<value><int>0x10</int></value>"), "integer"),
-        (call("<value><int>1.0</int></value>"), "integer"),
-        (call("<value><int>\u0661</int></value>"), "integer"),
-        (call("<value><int>2147483648</int></value>"), "32 bits"),
-        (call("<value><i4>-2147483649</i4></value>"), "32 bits"),
-        (call("<value><boolean>true</boolean></value>"), "0 or 1"),
-        (call("<value><boolean>2</boolean></value>"), "0 or 1"),
-        (call("<value><double></double></value>"), "double ''"),
-        (call("<value><double>1_0.0</double></value>"), "double"),
-        (call("<value><double>0x1p3</double></value>"), "double"),
-        (call("<value><double>1 2</double></value>"), "double"),
-        (call("<value><double>.</double></value>"), "double"),
-        (call("<value><base64>A</base64></value>"), "base64"),
-        (call("<value><base64>AA=A</base64></value>"), "base64"),
-        (call("<value><base64>A-_A</base64></value>"), "base64"),
-        (
-            call("<value><dateTime.iso8601>2025-01-31T23:59:59</dateTime.iso8601></value>"),
-            "20250131T23:59:59",
-        ),
-        (call("<value><dateTime.iso8601>20250231T23:59:59</dateTime.iso8601></value>"), "20250131T23:59:59"),
-        (call("<value><array/></value>"), "too early"),
-        (call("<value><array><value/></array></value>"), "<value> inside array"),
-        (call("<value><array><data/><data/></array></value>"), "<data>"),
-        (call("<value><struct><member/></struct></value>"), "too early"),
-        (call("<value><struct><member><name>a</name></member></struct></value>"), "too early"),
-        (
-            call("<value><struct><member><value/><name>a</name></member></struct></value>"),
-            "<value> inside member",
-        ),
-        (
-            call(
-                "<value><struct><member><name>a</name><value>1</value></member>"
-                "<member><name>a</name><value>2</value></member></struct></value>"
-            ),
-            "two members 'a'",
-        ),
     ],
 )
 def test_what_is_not_xml_rpc_is_refused(body: bytes, text: str) -> None:
@@ -359,7 +304,7 @@ def test_answers_that_are_refused(body: bytes) -> None:
 
 def test_limits_hold() -> None:
     """Size, count, depth, length of strings and parts are bounded, and the bound itself is allowed."""
-    limits = Limits(body=2000, elements=4, depth=2, string=5, parts=2)
+    limits = XmlRpcLimits(body=2000, elements=4, depth=2, string=5, parts=2)
     array = "<value><array><data>{}</data></array></value>".format
     assert read(array(array("<value/>")), limits) == [[""]]
     assert read("<value>12345</value>", limits) == "12345"
@@ -378,10 +323,10 @@ def test_limits_hold() -> None:
 def test_parts_of_a_multicall_are_bounded() -> None:
     """A multicall has a bound of its own on its parts; other calls do not."""
     body = build_call("system.multicall", [["a"] * 3])
-    assert len(parse_call(body, Limits(parts=3)).params) == 1
+    assert len(parse_call(body, XmlRpcLimits(parts=3)).params) == 1
     with pytest.raises(LimitExceededError, match="3 calls; at most 2"):
-        parse_call(body, Limits(parts=2))
-    assert parse_call(build_call("setParam", [["a"] * 3]), Limits(parts=2)).params == (["a"] * 3,)
+        parse_call(body, XmlRpcLimits(parts=2))
+    assert parse_call(build_call("setParam", [["a"] * 3]), XmlRpcLimits(parts=2)).params == (["a"] * 3,)
 
 
 PREFIX = b"<methodCall><methodName>m</methodName><params><param>"
@@ -414,8 +359,8 @@ def test_large_values_in_pieces() -> None:
     ids=["digits", "fraction", "space behind", "space before"],
 )
 @pytest.mark.parametrize("tag", ["double", "int", "base64", "dateTime.iso8601"])
-def test_a_long_number_that_is_none_costs_no_more_than_its_length(tag: str, number: str) -> None:
-    """What turns out to be no number in its last byte is refused at once: no pattern tries the digits over and over."""
+def test_an_invalid_long_number_takes_linear_time(tag: str, number: str) -> None:
+    """A number that is invalid in its last byte is rejected in linear time."""
     begun = time.process_time()
     with pytest.raises(ProtocolError):
         read(f"<value><{tag}>{number}</{tag}></value>")
@@ -425,53 +370,16 @@ def test_a_long_number_that_is_none_costs_no_more_than_its_length(tag: str, numb
 # --- fuzz -------------------------------------------------------------------------------------------------
 
 TAGS = [
-    "methodCall",
-    "methodResponse",
-    "methodName",
-    "params",
-    "param",
-    "fault",
-    "value",
-    "int",
-    "i4",
-    "boolean",
-    "double",
-    "string",
-    "dateTime.iso8601",
-    "base64",
-    "nil",
-    "array",
-    "data",
-    "struct",
-    "member",
-    "name",
-]
+    "methodCall", "methodResponse", "methodName", "params", "param", "fault", "value", "int", "i4", "boolean", "double",
+    "string", "dateTime.iso8601", "base64", "nil", "array", "data", "struct", "member", "name",
+]  # fmt: skip
 SCRAPS = st.one_of(
     st.sampled_from([form.format(tag) for tag in TAGS for form in ("<{}>", "</{}>", "<{}/>", "<{} a='b'>")]),
-    st.sampled_from(
-        [
-            "<![CDATA[",
-            "]]>",
-            "<!--",
-            "-->",
-            "<?a?>",
-            "<!DOCTYPE",
-            "&amp;",
-            "&#1;",
-            "&a;",
-            "1",
-            "-5",
-            "1e9",
-            "AAAA",
-            "\x00",
-            "é",
-            "<",
-            ">",
-            "&",
-            "'",
-        ]
-    ),
-)
+    st.sampled_from([
+        "<![CDATA[", "]]>", "<!--", "-->", "<?a?>", "<!DOCTYPE", "&amp;", "&#1;", "&a;", "1",
+        "-5", "1e9", "AAAA", "\x00", "é", "<", ">", "&", "'",
+    ]),
+)  # fmt: skip
 
 
 @settings(max_examples=examples(500))
@@ -510,7 +418,7 @@ def test_damaged_calls_raise_only_the_error_for_the_peer(data: st.DataObject) ->
 
 @given(data=st.binary(max_size=200))
 def test_random_bytes_are_refused(data: bytes) -> None:
-    """Bytes that are no document at all are refused as the peer's fault."""
+    """Bytes that are not a document are refused as the peer's fault."""
     with pytest.raises(PeerError):
         parse_call(data)
 
@@ -535,9 +443,9 @@ def test_random_bytes_are_refused(data: bytes) -> None:
     ],
 )
 def test_values_without_a_notation_are_errors(value: object, text: str) -> None:
-    """What ROS's XML-RPC cannot say is an error of the program that wants to send it, never bad XML."""
+    """A value without a notation is an error of the sending program, never bad XML."""
     with pytest.raises(EncodingError, match=text):
-        build_response(value)  # type: ignore[arg-type]  # what is no value of its type is the test
+        build_response(value)  # type: ignore[arg-type]  # the test is a value of a wrong type
     with pytest.raises(EncodingError, match=text):
         build_call("m", [value])  # type: ignore[list-item]  # as above
 
@@ -558,6 +466,6 @@ def test_texts_of_faults_are_always_sent() -> None:
 
 def test_what_is_read_can_be_written() -> None:
     """The deepest value that is read can be written."""
-    depth = Limits().depth
+    depth = XmlRpcLimits().depth
     body = call("<value><array><data>" * depth + "</data></array></value>" * depth)
     assert parse_call(build_call("m", parse_call(body).params)) == parse_call(body)

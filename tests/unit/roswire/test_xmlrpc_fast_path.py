@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from roswire.errors import PeerError
-from roswire.xmlrpc import Limits, Value, build_response, parse_call
-from roswire.xmlrpc.common_documents import usual_answer, usual_call
-from roswire.xmlrpc.xmlrpc_reader import Document
+from roswire.xmlrpc import Value, XmlRpcLimits, build_response, parse_call
+from roswire.xmlrpc.common_documents import read_common_answer, read_common_call
+from roswire.xmlrpc.xmlrpc_reader import XmlRpcDocument
 from tests.support.examples import examples
 
 NAMES = st.one_of(
@@ -25,10 +25,10 @@ ROSCPP = (
 )
 
 
-def walked(body: bytes, root: str, limits: Limits) -> tuple[str, list[Value]] | None:
-    """What the walk makes of a document; None where it refuses it."""
+def walked(body: bytes, root: str, limits: XmlRpcLimits) -> tuple[str, list[Value]] | None:
+    """Return the result of the general parser; None if it rejects the document."""
     try:
-        document = Document(body, limits, root)
+        document = XmlRpcDocument(body, limits, root)
     except PeerError:
         return None
     return document.method, document.values
@@ -63,41 +63,46 @@ def test_what_the_pattern_reads_the_walk_reads_alike(values: list[Value], data: 
             st.sampled_from([b"", b"<", b">", b"&", b"\r", b"]]>", b"/", b" ", b"<value>", b"\x00", b"9"])
         )
         body[at : at + data.draw(st.integers(0, 2))] = piece
-    limits = Limits(
+    limits = XmlRpcLimits(
         elements=data.draw(st.sampled_from([3, 10**6])), string=data.draw(st.sampled_from([5, 10**6]))
     )
-    call = usual_call(bytes(body), limits)
+    call = read_common_call(bytes(body), limits)
     assert call is None or call == walked(bytes(body), "methodCall", limits)
-    answer = usual_answer(bytes(body), limits)
+    answer = read_common_answer(bytes(body), limits)
     assert answer is None or ("", [answer]) == walked(bytes(body), "methodResponse", limits)
 
 
 @pytest.mark.parametrize("quote", [b"'", b'"'])
 def test_calls_of_ros_clients_and_answers_of_rosmaster_are_usual(quote: bytes) -> None:
-    """The pattern knows what registrations look like, whoever writes them, and what rosmaster answers."""
+    """The pattern matches registrations of all clients, and the answers of rosmaster."""
     told: list[Value] = ["/talker", "/chatter", "std_msgs/String", "http://10.0.0.5:40001/"]
     python = dumped(told, "registerPublisher").replace(b"version='1.0'", b"version=%b1.0%b" % (quote, quote))
-    assert usual_call(python, Limits()) == ("registerPublisher", told)
-    assert usual_call(ROSCPP, Limits()) == ("registerPublisher", ["/talker", -7])
+    assert read_common_call(python, XmlRpcLimits()) == ("registerPublisher", told)
+    assert read_common_call(ROSCPP, XmlRpcLimits()) == ("registerPublisher", ["/talker", -7])
     last: list[Value] = [0, "", ["http://10.0.0.5:40001/", "http://10.0.0.5:40002/"], []]
     for value in last:
         answer: list[Value] = [1, "Registered [/talker] as publisher of [/chatter]", value]
-        assert usual_answer(dumped(answer, None), Limits()) == answer
-        assert usual_answer(build_response(answer), Limits()) == answer
+        assert read_common_answer(dumped(answer, None), XmlRpcLimits()) == answer
+        assert read_common_answer(build_response(answer), XmlRpcLimits()) == answer
     several: list[Value] = [
         [[1, f"parameter /a/{place} set", value]] for place, value in enumerate(last * 16)
     ]
-    assert usual_answer(dumped(several, None), Limits()) == several
+    assert read_common_answer(dumped(several, None), XmlRpcLimits()) == several
 
 
 @pytest.mark.parametrize("value", [7, True, False, -0.5, 1e-05, "", "a b", [1.5, 2.0], []])
 def test_a_multicall_of_roslaunch_is_usual_however_long(value: Value) -> None:
-    """What sets scalars, or lists of them, is read part by part; limits hold for it as for the walk."""
+    """Parts with scalars, or lists of them, are read one by one; the same limits hold."""
     params: list[Value] = ["/roslaunch", "/start/part/value", value]
     several = parts(*[params] * 2000)
     body = dumped(several, "system.multicall")
-    assert usual_call(body, Limits()) == ("system.multicall", several)
-    for limits in (Limits(parts=1999), Limits(elements=2000), Limits(body=1000), Limits(depth=1)):
+    assert read_common_call(body, XmlRpcLimits()) == ("system.multicall", several)
+    for limits in (
+        XmlRpcLimits(parts=1999),
+        XmlRpcLimits(elements=2000),
+        XmlRpcLimits(body=1000),
+        XmlRpcLimits(depth=1),
+    ):
         with pytest.raises(PeerError):
             parse_call(body, limits)
 
@@ -109,29 +114,29 @@ def test_a_part_that_is_not_plain_is_left_to_the_walk_alone(value: Value) -> Non
     """A struct is none of the pattern's, nor is a text with a mark-up, nor what is longer than one pattern may take."""
     several = parts(["/a", "/b", 1], ["/a", "/c", value], ["/a", "/d", 2])
     body = dumped(several, "system.multicall")
-    assert usual_call(body, Limits()) == ("system.multicall", several)
+    assert read_common_call(body, XmlRpcLimits()) == ("system.multicall", several)
     for depth in range(1, 8):
-        read = usual_call(body, Limits(depth=depth))
-        assert read is None or read == walked(body, "methodCall", Limits(depth=depth))
+        read = read_common_call(body, XmlRpcLimits(depth=depth))
+        assert read is None or read == walked(body, "methodCall", XmlRpcLimits(depth=depth))
 
 
 def test_two_values_are_not_taken_for_one_struct() -> None:
-    """What balances by the tags in comments only, and goes out of its array, is refused as the walk refuses it."""
+    """Tags that balance only with those in comments are rejected, as by the general parser."""
     first, second = (b"<value><struct><!--<%bstruct>--></struct></value>" % slash for slash in (b"", b"/"))
     within = first + b"</param><param>" + second
     body = dumped(parts(["/a"]), "system.multicall")
     body = body.replace(b"<data>\n<value>", b"<data>\n" + within + b"<value>", 1)
     assert within in body
-    assert usual_call(body, Limits()) is None
-    assert walked(body, "methodCall", Limits()) is None
+    assert read_common_call(body, XmlRpcLimits()) is None
+    assert walked(body, "methodCall", XmlRpcLimits()) is None
 
 
 def test_few_parts_are_walked_alone() -> None:
-    """Where most are, one walk takes less time."""
+    """With mostly complex parts, the general parser takes less time."""
     params: list[Value] = ["/a", "/b", {}]
     several = parts(*[params] * 256)
     body = dumped(several, "system.multicall")
-    assert usual_call(body, Limits()) is None
+    assert read_common_call(body, XmlRpcLimits()) is None
     assert parse_call(body).params == tuple(several)
 
 
@@ -165,14 +170,14 @@ def test_no_struct_hides_what_is_around_it(data: st.DataObject) -> None:
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.sampled_from(places)) + data.draw(st.integers(0, 1))
         body = body[:at] + data.draw(st.sampled_from(PIECES)) + body[at:]
-    call = usual_call(body, Limits())
-    assert call is None or call == walked(body, "methodCall", Limits())
+    call = read_common_call(body, XmlRpcLimits())
+    assert call is None or call == walked(body, "methodCall", XmlRpcLimits())
 
 
 @pytest.mark.parametrize("piece", [b" ", b"\n", b"<value>a</value>", b"<value>a</value> \n", b"1"])
 @pytest.mark.parametrize("before", [b"", b"<value>", b"<value><int>", LIST, LIST[:20]])
-def test_a_document_that_is_none_costs_no_more_than_its_length(piece: bytes, before: bytes) -> None:
-    """What does not fit the pattern in its last byte is left to the walk at once: nothing is tried over and over."""
+def test_an_invalid_document_takes_linear_time(piece: bytes, before: bytes) -> None:
+    """A document that does not match in its last byte is left to the general parser in linear time."""
     short, long = (spoilt(before, piece, 1_000_000 // shorter) for shorter in (16, 1))
     of_short, of_long = (min(seconds_to_leave(texts) for _ in range(3)) for texts in (short, long))
     assert of_long < 64 * (of_short + 0.0005)  # 16 times as long; a quadratic pattern takes 256 times as long
@@ -196,13 +201,13 @@ def seconds_to_leave(texts: list[bytes]) -> float:
     """The processor time until each is known to be unusual."""
     begun = time.thread_time()
     answer, *calls = texts
-    assert usual_answer(answer, Limits()) is None
-    assert [usual_call(call, Limits()) for call in calls] == [None] * len(calls)
+    assert read_common_answer(answer, XmlRpcLimits()) is None
+    assert [read_common_call(call, XmlRpcLimits()) for call in calls] == [None] * len(calls)
     return time.thread_time() - begun
 
 
 def test_one_value_too_many_is_refused_however_short() -> None:
-    """The limits hold for what is short, too."""
+    """The limits hold for short documents also."""
     body = dumped(["a"] * 4, "m")
     with pytest.raises(PeerError, match="more than 3 values"):
-        parse_call(body, Limits(elements=3))
+        parse_call(body, XmlRpcLimits(elements=3))

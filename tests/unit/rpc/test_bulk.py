@@ -1,4 +1,4 @@
-"""Room for what is large: one request of a host, two in all, given back whatever happens."""
+"""Large requests: one of a host and two in all at a time, released in every case."""
 
 import asyncio
 import datetime
@@ -11,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.master.parameter_charges import measure
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from appliance.rpc.bulk import AT_ONCE, Bulk, LargeWrites, bulk_turns, weigh
 from appliance.rpc.processor_time import ProcessorTime
 from roswire.xmlrpc import Value, build_response
+
+pytestmark = pytest.mark.anyio
 
 TIME = ProcessorTime(lambda host: host)
 HOSTS = [ipaddress.ip_address(f"10.0.0.{number}") for number in range(1, 5)]
@@ -27,54 +29,46 @@ VALUES: st.SearchStrategy[Value] = st.recursive(
 )
 
 
-def test_room_for_one_of_a_host_and_two_in_all() -> None:
-    """Who has room keeps it; another host's waits for a free one only, and a host waits for its own."""
+async def test_room_for_one_of_a_host_and_two_in_all() -> None:
+    """A host with a place keeps it; another host waits for a free place only, and each host for its own."""
+    turns = bulk_turns(lambda _host: QuotaClass.REGISTERED)
+    inside: list[Any] = []
+    go = asyncio.Event()
 
-    async def scene() -> None:
-        turns = bulk_turns(lambda _host: Standing.REGISTERED)
-        inside: list[Any] = []
-        go = asyncio.Event()
+    async def request(host: Any) -> None:
+        with Bulk(turns, host, TIME) as bulk:
+            await bulk.take()
+            await bulk.take()  # again is nothing more
+            inside.append(host)
+            await go.wait()
+            inside.remove(host)
 
-        async def request(host: Any) -> None:
-            with Bulk(turns, host, TIME) as bulk:
-                await bulk.take()
-                await bulk.take()  # again is nothing more
-                inside.append(host)
-                await go.wait()
-                inside.remove(host)
-
-        tasks = [asyncio.create_task(request(host)) for host in [HOSTS[0]] * 3 + HOSTS[1:]]
-        for _ in range(10):
-            await asyncio.sleep(0)
-        assert inside == HOSTS[:AT_ONCE]
-        go.set()
-        await asyncio.gather(*tasks)
-        assert not inside
-
-    asyncio.run(scene())
+    tasks = [asyncio.create_task(request(host)) for host in [HOSTS[0]] * 3 + HOSTS[1:]]
+    for _ in range(10):
+        await asyncio.sleep(0)
+    assert inside == HOSTS[:AT_ONCE]
+    go.set()
+    await asyncio.gather(*tasks)
+    assert not inside
 
 
-def test_room_comes_back_after_a_failure() -> None:
+async def test_room_comes_back_after_a_failure() -> None:
     """A request that fails or is cancelled gives back what it took; one that took nothing gives back nothing."""
-
-    async def scene() -> None:
-        turns = bulk_turns(lambda _host: Standing.REGISTERED)
-        for _ in range(3):
-            with pytest.raises(KeyError), Bulk(turns, HOSTS[0], TIME) as bulk:
-                await bulk.take()
-                raise KeyError
-            with Bulk(turns, HOSTS[0], TIME):
-                pass
-        with Bulk(turns, HOSTS[0], TIME) as bulk:
-            async with asyncio.timeout(20):
-                await bulk.take()
-            assert bulk.taken
-
-    asyncio.run(scene())
+    turns = bulk_turns(lambda _host: QuotaClass.REGISTERED)
+    for _ in range(3):
+        with pytest.raises(KeyError), Bulk(turns, HOSTS[0], TIME) as bulk:
+            await bulk.take()
+            raise KeyError
+        with Bulk(turns, HOSTS[0], TIME):
+            pass
+    with Bulk(turns, HOSTS[0], TIME) as bulk:
+        async with asyncio.timeout(20):
+            await bulk.take()
+        assert bulk.taken
 
 
 @given(value=VALUES)
-def test_weight_is_that_of_the_mirror(value: Value) -> None:
+def test_a_value_has_the_same_weight_as_in_the_mirror(value: Value) -> None:
     """A value weighs what it counts for in the bound of all parameters."""
     assert weigh(value, 1 << 30) == measure(value)[0]
 
@@ -89,7 +83,7 @@ def test_counting_ends_when_it_is_enough() -> None:
 
 @pytest.mark.parametrize("letter", ["x", "&", "<", ">", "\u00e9", "\U00010348"], ids=ascii)
 def test_weight_is_about_what_is_written(letter: str) -> None:
-    """Within a factor of two of the bytes on the wire: else parameters within their bounds could not be told."""
+    """The weight is within a factor of two of the bytes on the wire: otherwise bounded parameters could not be sent."""
     value: Value = {"a": [1, 2.5, "text", {"b": True}] * 100, "c": letter * 5000, letter * 5000: 1}
     texts: list[Value] = [letter * 5000] * 9
     for one in (value, texts):
@@ -97,51 +91,38 @@ def test_weight_is_about_what_is_written(letter: str) -> None:
         assert measure(one)[0] == weigh(one, 1 << 30)
 
 
-def test_large_values_of_a_host_go_one_at_a_time() -> None:
+async def test_large_values_of_a_host_go_one_at_a_time() -> None:
     """A guest's second large value waits for its first; its small one and another host's large one do not."""
+    large = LargeWrites(1000, lambda _host: QuotaClass.REGISTERED)
+    inside: list[str] = []
+    go = asyncio.Event()
 
-    async def scene() -> None:
-        large = LargeWrites(1000, lambda _host: Standing.REGISTERED)
-        inside: list[str] = []
-        go = asyncio.Event()
+    async def write(name: str, host: Any, size: int) -> None:
+        async with large.turn(host, ["x" * size]):
+            inside.append(name)
+            await go.wait()
+            inside.remove(name)
 
-        async def write(name: str, host: Any, size: int) -> None:
-            async with large.turn(host, ["x" * size]):
-                inside.append(name)
-                await go.wait()
-                inside.remove(name)
-
-        guest, robot = HOSTS[:2]
-        wanted = (
-            ("first", guest, 2000),
-            ("second", guest, 2000),
-            ("small", guest, 10),
-            ("robot", robot, 2000),
-        )
-        tasks = [asyncio.create_task(write(*one)) for one in wanted]
-        for _ in range(10):
-            await asyncio.sleep(0)
-        assert inside == ["first", "small", "robot"]
-        go.set()
-        await asyncio.gather(*tasks)
-        assert not inside
-
-    asyncio.run(scene())
+    guest, robot = HOSTS[:2]
+    wanted = (("first", guest, 2000), ("second", guest, 2000), ("small", guest, 10), ("robot", robot, 2000))
+    tasks = [asyncio.create_task(write(*one)) for one in wanted]
+    for _ in range(10):
+        await asyncio.sleep(0)
+    assert inside == ["first", "small", "robot"]
+    go.set()
+    await asyncio.gather(*tasks)
+    assert not inside
 
 
-def test_what_a_thread_does_for_a_host_is_charged_to_it() -> None:
+async def test_the_work_of_a_thread_is_charged_to_its_host() -> None:
     """A host whose large document was read in a thread is next after the others, as if the loop had read it."""
-
-    async def scene() -> None:
-        time, order = ProcessorTime(lambda host: host, lambda: 0.0), list[Any]()
-        bulk = Bulk(bulk_turns(lambda _host: Standing.REGISTERED), HOSTS[0], time)
-        with pytest.raises(ZeroDivisionError):
-            await bulk.in_thread(lambda: sum(range(200_000)) / 0)
-        time.charge(HOSTS[2], 10.0)  # the turn is over
-        for host in (HOSTS[0], HOSTS[1]):
-            time.run(host, partial(order.append, host))
-        while time.waiting:
-            await asyncio.sleep(0)
-        assert order == [HOSTS[1], HOSTS[0]]
-
-    asyncio.run(scene())
+    time, order = ProcessorTime(lambda host: host, lambda: 0.0), list[Any]()
+    bulk = Bulk(bulk_turns(lambda _host: QuotaClass.REGISTERED), HOSTS[0], time)
+    with pytest.raises(ZeroDivisionError):
+        await bulk.in_thread(lambda: sum(range(200_000)) / 0)
+    time.charge(HOSTS[2], 10.0)  # the turn is over
+    for host in (HOSTS[0], HOSTS[1]):
+        time.run(host, partial(order.append, host))
+    while time.waiting:
+        await asyncio.sleep(0)
+    assert order == [HOSTS[1], HOSTS[0]]

@@ -4,8 +4,12 @@ import asyncio
 import ipaddress
 from typing import Any
 
-from appliance.quotas.pool import Bounds, Standing
+import pytest
+
+from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.rpc.fair_queue import Turns
+
+pytestmark = pytest.mark.anyio
 
 HOST = ipaddress.ip_address("10.0.0.1")
 OTHER = ipaddress.ip_address("10.0.0.2")
@@ -14,179 +18,150 @@ WAIT = 20.0
 
 def slots(whole: int, host: int) -> Turns:
     """Turns of hosts that are all known alike."""
-    return Turns(Bounds(whole, host, 0, 0), lambda _host: Standing.REGISTERED)
+    return Turns(Bounds(whole, host, 0, 0), lambda _host: QuotaClass.REGISTERED)
 
 
-def test_turns_go_round() -> None:
+async def test_turns_go_round() -> None:
     """When all slots are taken, hosts get the next ones in turn, however many requests one of them has waiting."""
+    turns, order = slots(1, 1), []
 
-    async def test() -> None:
-        turns, order = slots(1, 1), []
-
-        async def request(host: Any) -> None:
-            await turns.enter(host)
-            order.append(host)
-            await asyncio.sleep(0)
-            turns.leave(host)
-
-        await turns.enter(HOST)
-        tasks = [asyncio.create_task(request(HOST)) for _ in range(5)]
+    async def request(host: Any) -> None:
+        await turns.enter(host)
+        order.append(host)
         await asyncio.sleep(0)
-        tasks += [asyncio.create_task(request(OTHER)) for _ in range(2)]
-        await asyncio.sleep(0)
-        turns.leave(HOST)
-        await asyncio.gather(*tasks)
-        assert order == [HOST, OTHER, HOST, OTHER, HOST, HOST, HOST]
+        turns.leave(host)
 
-    asyncio.run(test())
-
-
-def test_one_host_never_has_all_slots() -> None:
-    """A host whose requests take for ever leaves slots for everybody else."""
-
-    async def test() -> None:
-        turns = slots(4, 2)
-        stuck = [asyncio.create_task(turns.enter(HOST)) for _ in range(10)]
-        await asyncio.sleep(0)
-        for _ in range(100):
-            async with asyncio.timeout(WAIT):
-                await turns.enter(OTHER)
-            turns.leave(OTHER)
-        for task in stuck:
-            task.cancel()
-        await asyncio.gather(*stuck, return_exceptions=True)
-        assert sum(not task.cancelled() for task in stuck) == 2
-        assert not turns.waiting
-
-    asyncio.run(test())
+    await turns.enter(HOST)
+    tasks = [asyncio.create_task(request(HOST)) for _ in range(5)]
+    await asyncio.sleep(0)
+    tasks += [asyncio.create_task(request(OTHER)) for _ in range(2)]
+    await asyncio.sleep(0)
+    turns.leave(HOST)
+    await asyncio.gather(*tasks)
+    assert order == [HOST, OTHER, HOST, OTHER, HOST, HOST, HOST]
 
 
-def test_turns_balance() -> None:
+async def test_one_host_never_has_all_slots() -> None:
+    """A host whose requests never end leaves slots for all others."""
+    turns = slots(4, 2)
+    stuck = [asyncio.create_task(turns.enter(HOST)) for _ in range(10)]
+    await asyncio.sleep(0)
+    for _ in range(100):
+        async with asyncio.timeout(WAIT):
+            await turns.enter(OTHER)
+        turns.leave(OTHER)
+    for task in stuck:
+        task.cancel()
+    await asyncio.gather(*stuck, return_exceptions=True)
+    assert sum(not task.cancelled() for task in stuck) == 2
+    assert not turns.waiting
+
+
+async def test_turns_balance() -> None:
     """Whatever is entered, left and given up: no slot is lost and none is made."""
+    turns = slots(3, 2)
 
-    async def test() -> None:
-        turns = slots(3, 2)
-
-        async def request(host: Any, number: int) -> None:
-            await turns.enter(host)
-            try:
-                for _ in range(number % 4):
-                    await asyncio.sleep(0)
-            finally:
-                turns.leave(host)
-
-        tasks = [asyncio.create_task(request((HOST, OTHER)[i % 3 == 0], i)) for i in range(200)]
-        for i in range(0, 200, 7):
-            await asyncio.sleep(0)
-            tasks[i].cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        assert (turns.slots.total, dict(turns.waiting)) == (0, {})
-
-    asyncio.run(test())
-
-
-def test_who_was_cancelled_and_has_not_run_since_gets_no_turn() -> None:
-    """A peer goes in the very moment in which a slot is free: the slot goes to the next, and is not lost."""
-
-    async def test() -> None:
-        turns = slots(1, 1)
-        await turns.enter(HOST)
-        gone, following = (asyncio.create_task(turns.enter(HOST)) for _ in range(2))
-        await asyncio.sleep(0)
-        gone.cancel()
-        turns.leave(HOST)
-        async with asyncio.timeout(WAIT):
-            await following
-        turns.leave(HOST)
-        assert gone.cancelled()
-        assert (turns.slots.total, dict(turns.waiting)) == (0, {})
-
-    asyncio.run(test())
-
-
-def test_requests_of_many_guests_leave_slots_for_the_robot() -> None:
-    """Hosts without a registration, however many, never have the slots that are kept; nor strangers the others'."""
-
-    async def test() -> None:
-        standings = {HOST: Standing.REGISTERED}
-        turns = Turns(Bounds(8, 4, 2, 4), lambda host: standings.get(host, Standing.NAMED))
-        guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(200)]
-        stuck = [asyncio.create_task(turns.enter(guest)) for guest in guests]
-        await asyncio.sleep(0)
-        assert sum(task.done() for task in stuck) == 4
-        async with asyncio.timeout(WAIT):
-            for _ in range(4):
-                await turns.enter(HOST)
-        turns.leave(guests[0])
-        await asyncio.sleep(0)
-        assert sum(task.done() for task in stuck) == 5
-        for task in stuck:
-            task.cancel()
-        await asyncio.gather(*stuck, return_exceptions=True)
-
-    asyncio.run(test())
-
-
-def test_many_addresses_of_one_network_take_turns_as_one() -> None:
-    """A hundred guests with a hundred requests each have half of the slots, and every second turn."""
-
-    async def test() -> None:
-        guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(100)]
-        turns = Turns(
-            Bounds(8, 4, 0, 0),
-            lambda _host: Standing.REGISTERED,
-            lambda host: "guests" if host in guests else host,
-        )
-        order: list[bool] = []
-
-        async def request(host: Any) -> None:
-            await turns.enter(host)
-            order.append(host in guests)
-            await asyncio.sleep(0)
+    async def request(host: Any, number: int) -> None:
+        await turns.enter(host)
+        try:
+            for _ in range(number % 4):
+                await asyncio.sleep(0)
+        finally:
             turns.leave(host)
 
-        stuck = [asyncio.create_task(turns.enter(guest)) for guest in guests]
+    tasks = [asyncio.create_task(request((HOST, OTHER)[i % 3 == 0], i)) for i in range(200)]
+    for i in range(0, 200, 7):
         await asyncio.sleep(0)
-        assert sum(task.done() for task in stuck) == 4
+        tasks[i].cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    assert (turns.slots.total, dict(turns.waiting)) == (0, {})
+
+
+async def test_a_cancelled_request_gets_no_turn() -> None:
+    """If a peer leaves just when a slot is free, the slot goes to the next request, and is not lost."""
+    turns = slots(1, 1)
+    await turns.enter(HOST)
+    gone, following = (asyncio.create_task(turns.enter(HOST)) for _ in range(2))
+    await asyncio.sleep(0)
+    gone.cancel()
+    turns.leave(HOST)
+    async with asyncio.timeout(WAIT):
+        await following
+    turns.leave(HOST)
+    assert gone.cancelled()
+    assert (turns.slots.total, dict(turns.waiting)) == (0, {})
+
+
+async def test_requests_of_many_guests_leave_slots_for_the_robot() -> None:
+    """Hosts without a registration never get the reserved slots, and unknown hosts never get those of others."""
+    quota_classes = {HOST: QuotaClass.REGISTERED}
+    turns = Turns(Bounds(8, 4, 2, 4), lambda host: quota_classes.get(host, QuotaClass.NAMED))
+    guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(200)]
+    stuck = [asyncio.create_task(turns.enter(guest)) for guest in guests]
+    await asyncio.sleep(0)
+    assert sum(task.done() for task in stuck) == 4
+    async with asyncio.timeout(WAIT):
         for _ in range(4):
             await turns.enter(HOST)
-        tasks = [asyncio.create_task(request(host)) for host in [*guests, *[HOST] * 20]]
+    turns.leave(guests[0])
+    await asyncio.sleep(0)
+    assert sum(task.done() for task in stuck) == 5
+    for task in stuck:
+        task.cancel()
+    await asyncio.gather(*stuck, return_exceptions=True)
+
+
+async def test_many_addresses_of_one_network_take_turns_as_one() -> None:
+    """A hundred guests with a hundred requests each have half of the slots, and every second turn."""
+    guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(100)]
+    turns = Turns(
+        Bounds(8, 4, 0, 0),
+        lambda _host: QuotaClass.REGISTERED,
+        lambda host: "guests" if host in guests else host,
+    )
+    order: list[bool] = []
+
+    async def request(host: Any) -> None:
+        await turns.enter(host)
+        order.append(host in guests)
         await asyncio.sleep(0)
-        turns.leave(HOST)
-        while len(order) < 20:
-            await asyncio.sleep(0)
-        assert not any(order), "the guests had their half"
-        for task in [*stuck, *tasks]:
-            task.cancel()
-        await asyncio.gather(*stuck, *tasks, return_exceptions=True)
+        turns.leave(host)
 
-    asyncio.run(test())
+    stuck = [asyncio.create_task(turns.enter(guest)) for guest in guests]
+    await asyncio.sleep(0)
+    assert sum(task.done() for task in stuck) == 4
+    for _ in range(4):
+        await turns.enter(HOST)
+    tasks = [asyncio.create_task(request(host)) for host in [*guests, *[HOST] * 20]]
+    await asyncio.sleep(0)
+    turns.leave(HOST)
+    while len(order) < 20:
+        await asyncio.sleep(0)
+    assert not any(order), "the guests had their half"
+    for task in [*stuck, *tasks]:
+        task.cancel()
+    await asyncio.gather(*stuck, *tasks, return_exceptions=True)
 
 
-def test_who_owes_waits_outside_the_slots() -> None:
+async def test_a_host_in_debt_waits_outside_the_slots() -> None:
     """However many requests of a host in debt wait, every slot is free for others; paid, they are served."""
-
     debtor, payer = ipaddress.ip_address("10.0.0.66"), ipaddress.ip_address("10.0.0.1")
-
-    async def test() -> None:
-        debts = {str(debtor): 0.01}
-        bounds = Bounds(1, 1, 0, 0)
-        turns = Turns(bounds, lambda _host: Standing.REGISTERED, pause=lambda host: debts.get(host, 0.0))
-        waiting = [asyncio.create_task(turns.enter(debtor)) for _ in range(50)]
-        for _ in range(100):
-            async with asyncio.timeout(20.0):
-                await turns.enter(payer)
-            turns.leave(payer)
-            await asyncio.sleep(0)
-        assert not any(task.done() for task in waiting)
-        debts.clear()
-        for _ in waiting:
-            async with asyncio.timeout(20.0):
-                await asyncio.wait(
-                    [task for task in waiting if not task.done()] or waiting, return_when="FIRST_COMPLETED"
-                )
-            turns.leave(debtor)
+    debts = {str(debtor): 0.01}
+    bounds = Bounds(1, 1, 0, 0)
+    turns = Turns(bounds, lambda _host: QuotaClass.REGISTERED, pause=lambda host: debts.get(host, 0.0))
+    waiting = [asyncio.create_task(turns.enter(debtor)) for _ in range(50)]
+    for _ in range(100):
         async with asyncio.timeout(20.0):
-            await asyncio.gather(*waiting)
-
-    asyncio.run(test())
+            await turns.enter(payer)
+        turns.leave(payer)
+        await asyncio.sleep(0)
+    assert not any(task.done() for task in waiting)
+    debts.clear()
+    for _ in waiting:
+        async with asyncio.timeout(20.0):
+            await asyncio.wait(
+                [task for task in waiting if not task.done()] or waiting, return_when="FIRST_COMPLETED"
+            )
+        turns.leave(debtor)
+    async with asyncio.timeout(20.0):
+        await asyncio.gather(*waiting)

@@ -2,13 +2,14 @@
 
 import asyncio
 import ipaddress
-from collections.abc import Callable, Coroutine
-from typing import Any
+from collections.abc import Callable
 
 import pytest
 
 from appliance.policy.model import Address
 from appliance.rpc.processor_time import TURN_SECONDS, Line, ProcessorTime
+
+pytestmark = pytest.mark.anyio
 
 ROBOT, GUEST = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.66")
 UNKNOWN = [ipaddress.ip_address(f"10.9.0.{number}") for number in range(200)]
@@ -41,70 +42,55 @@ class Loop:
             self.turns.append(self.now - before)
 
 
-def run(test: Callable[[Loop], Coroutine[Any, Any, None]]) -> None:
-    """Run a test on a new loop."""
-    asyncio.run(test(Loop()))
+@pytest.fixture
+def loop() -> Loop:
+    """Return a loop that has done nothing."""
+    return Loop()
 
 
-def test_a_turn_of_the_loop_is_bounded() -> None:
+async def test_a_turn_of_the_loop_is_bounded(loop: Loop) -> None:
     """However much waits, a turn runs work for its length and one piece more; between turns the loop does the rest."""
-
-    async def test(loop: Loop) -> None:
-        ran = [loop.time.run(GUEST, loop.work(GUEST)) for _ in range(500)]
-        assert sum(ran) == 4
-        await loop.all()
-        assert len(loop.order) == 500
-        assert max(loop.turns) <= TURN_SECONDS + PIECE
-
-    run(test)
+    ran = [loop.time.run(GUEST, loop.work(GUEST)) for _ in range(500)]
+    assert sum(ran) == 4
+    await loop.all()
+    assert len(loop.order) == 500
+    assert max(loop.turns) <= TURN_SECONDS + PIECE
 
 
-def test_the_robot_waits_for_one_piece_of_a_flood() -> None:
+async def test_the_robot_waits_for_one_piece_of_a_flood(loop: Loop) -> None:
     """500 requests of a guest wait, and one of the robot comes last: it is next."""
-
-    async def test(loop: Loop) -> None:
-        for _ in range(500):
-            loop.time.run(GUEST, loop.work(GUEST))
-        loop.time.run(ROBOT, loop.work(ROBOT))
-        await loop.all()
-        assert loop.order.index(ROBOT) <= 5
-
-    run(test)
+    for _ in range(500):
+        loop.time.run(GUEST, loop.work(GUEST))
+    loop.time.run(ROBOT, loop.work(ROBOT))
+    await loop.all()
+    assert loop.order.index(ROBOT) <= 5
 
 
-def test_two_hundred_unknown_hosts_are_one() -> None:
+async def test_two_hundred_unknown_hosts_are_one(loop: Loop) -> None:
     """Unknown hosts have together what one named host has, and take turns among themselves."""
-
-    async def test(loop: Loop) -> None:
-        for host in UNKNOWN * 2:
-            loop.time.run(host, loop.work(host))
-        for _ in range(100):
-            loop.time.run(ROBOT, loop.work(ROBOT))
-        await loop.all()
-        while_the_robot_had_work = loop.order[: len(loop.order) - loop.order[::-1].index(ROBOT)]
-        assert sum(host in UNKNOWN for host in while_the_robot_had_work) <= 100 + 6
-        assert len(set(loop.order[:210]) & set(UNKNOWN)) >= 90, "one unknown host had the others' turns"
-
-    run(test)
+    for host in UNKNOWN * 2:
+        loop.time.run(host, loop.work(host))
+    for _ in range(100):
+        loop.time.run(ROBOT, loop.work(ROBOT))
+    await loop.all()
+    while_the_robot_had_work = loop.order[: len(loop.order) - loop.order[::-1].index(ROBOT)]
+    assert sum(host in UNKNOWN for host in while_the_robot_had_work) <= 100 + 6
+    assert len(set(loop.order[:210]) & set(UNKNOWN)) >= 90, "one unknown host had the others' turns"
 
 
 @pytest.mark.parametrize("factor", [0.1, 10.0])
-def test_time_counts_and_not_the_number_of_requests(factor: float) -> None:
+async def test_time_counts_and_not_the_number_of_requests(factor: float, loop: Loop) -> None:
     """Two hosts whose requests cost differently have the same processor time, not the same number of requests."""
-
-    async def test(loop: Loop) -> None:
-        for _ in range(2000):
-            loop.time.run(GUEST, loop.work(GUEST, PIECE))
-            loop.time.run(ROBOT, loop.work(ROBOT, PIECE * factor))
-        while all(loop.order.count(host) < 2000 for host in (GUEST, ROBOT)):
-            await asyncio.sleep(0)
-        used = {GUEST: loop.order.count(GUEST) * PIECE, ROBOT: loop.order.count(ROBOT) * PIECE * factor}
-        assert abs(used[GUEST] - used[ROBOT]) <= 3 * PIECE * max(factor, 1.0) + TURN_SECONDS
-
-    run(test)
+    for _ in range(2000):
+        loop.time.run(GUEST, loop.work(GUEST, PIECE))
+        loop.time.run(ROBOT, loop.work(ROBOT, PIECE * factor))
+    while all(loop.order.count(host) < 2000 for host in (GUEST, ROBOT)):
+        await asyncio.sleep(0)
+    used = {GUEST: loop.order.count(GUEST) * PIECE, ROBOT: loop.order.count(ROBOT) * PIECE * factor}
+    assert abs(used[GUEST] - used[ROBOT]) <= 3 * PIECE * max(factor, 1.0) + TURN_SECONDS
 
 
-def test_nobody_saves_up_and_a_debt_stays() -> None:
+def test_no_host_saves_time_and_debts_stay() -> None:
     """A host that did nothing for long begins where the others are; one that took a long piece waits for it."""
     line: Line[str, int] = Line()
     for number in range(100):
@@ -123,85 +109,74 @@ def test_nobody_saves_up_and_a_debt_stays() -> None:
     assert order[0] == "guest"
 
 
-def test_steps_of_coroutines_are_charged_and_wait() -> None:
+async def test_steps_of_coroutines_are_charged_and_wait(loop: Loop) -> None:
     """A long handler that gives way between its pieces delays another host's by a piece or two, not by its length."""
 
-    async def test(loop: Loop) -> None:
-        async def handler(host: Address, pieces: int) -> Address:
-            for _ in range(pieces):
-                loop.work(host)()
-                await asyncio.sleep(0)
-            return host
+    async def handler(host: Address, pieces: int) -> Address:
+        for _ in range(pieces):
+            loop.work(host)()
+            await asyncio.sleep(0)
+        return host
 
-        guests = [asyncio.create_task(loop.time.spend(GUEST, handler(GUEST, 50))) for _ in range(20)]
-        await asyncio.sleep(0)
-        begun = len(loop.order)
-        assert await loop.time.spend(ROBOT, handler(ROBOT, 10)) == ROBOT
-        between = loop.order[begun:]
-        assert between.count(GUEST) <= 3 * 10, (
-            "of 20 guests' handlers two at most ran for each step of the robot's"
-        )
-        assert await asyncio.gather(*guests) == [GUEST] * 20
-        assert (loop.time.waiting, loop.order.count(GUEST)) == (0, 1000)
-
-    run(test)
+    guests = [asyncio.create_task(loop.time.spend(GUEST, handler(GUEST, 50))) for _ in range(20)]
+    await asyncio.sleep(0)
+    begun = len(loop.order)
+    assert await loop.time.spend(ROBOT, handler(ROBOT, 10)) == ROBOT
+    between = loop.order[begun:]
+    assert between.count(GUEST) <= 3 * 10, (
+        "of 20 guests' handlers two at most ran for each step of the robot's"
+    )
+    assert await asyncio.gather(*guests) == [GUEST] * 20
+    assert (loop.time.waiting, loop.order.count(GUEST)) == (0, 1000)
 
 
-def test_cancelled_and_failed_work_takes_no_turn_of_others() -> None:
+async def test_cancelled_and_failed_work_takes_no_turn_of_others(loop: Loop) -> None:
     """Whatever is cancelled or raises, waiting or running, ends its coroutine, and the others go on."""
+    ended: list[int] = []
 
-    async def test(loop: Loop) -> None:
-        ended: list[int] = []
+    async def handler(number: int) -> int:
+        try:
+            for _ in range(5):
+                loop.work(GUEST)()
+                await asyncio.sleep(0)
+            if number % 5 == 0:
+                raise ValueError(number)
+        finally:
+            ended.append(number)
+        return number
 
-        async def handler(number: int) -> int:
-            try:
-                for _ in range(5):
-                    loop.work(GUEST)()
-                    await asyncio.sleep(0)
-                if number % 5 == 0:
-                    raise ValueError(number)
-            finally:
-                ended.append(number)
-            return number
-
-        tasks = [asyncio.create_task(loop.time.spend(GUEST, handler(number))) for number in range(50)]
-        for _ in range(20):
-            await asyncio.sleep(0)
-        begun = set(ended)
-        for task in tasks[::3]:
-            task.cancel()
-            await asyncio.sleep(0)
-        done = await asyncio.gather(*tasks, return_exceptions=True)
-        for number, outcome in enumerate(done):
-            if number % 3 == 0 and number not in begun:
-                assert isinstance(outcome, asyncio.CancelledError)
-            elif number % 5 == 0:
-                assert isinstance(outcome, ValueError)
-            else:
-                assert outcome == number
-        assert loop.time.waiting == 0
-        assert loop.time.run(ROBOT, loop.work(ROBOT)) or loop.time.waiting
-
-    run(test)
+    tasks = [asyncio.create_task(loop.time.spend(GUEST, handler(number))) for number in range(50)]
+    for _ in range(20):
+        await asyncio.sleep(0)
+    begun = set(ended)
+    for task in tasks[::3]:
+        task.cancel()
+        await asyncio.sleep(0)
+    done = await asyncio.gather(*tasks, return_exceptions=True)
+    for number, outcome in enumerate(done):
+        if number % 3 == 0 and number not in begun:
+            assert isinstance(outcome, asyncio.CancelledError)
+        elif number % 5 == 0:
+            assert isinstance(outcome, ValueError)
+        else:
+            assert outcome == number
+    assert loop.time.waiting == 0
+    assert loop.time.run(ROBOT, loop.work(ROBOT)) or loop.time.waiting
 
 
-def test_a_defect_in_work_is_reported_and_stops_nobody() -> None:
+async def test_a_defect_in_work_is_reported_and_stops_no_other(loop: Loop) -> None:
     """Work that raises is reported to the loop; what waits behind it runs."""
+    reports: list[str] = []
+    asyncio.get_running_loop().set_exception_handler(
+        lambda _loop, context: reports.append(context["message"])
+    )
 
-    async def test(loop: Loop) -> None:
-        reports: list[str] = []
-        asyncio.get_running_loop().set_exception_handler(
-            lambda _loop, context: reports.append(context["message"])
-        )
+    def defect() -> None:
+        loop.work(GUEST, TURN_SECONDS)()
+        raise RuntimeError("defect")
 
-        def defect() -> None:
-            loop.work(GUEST, TURN_SECONDS)()
-            raise RuntimeError("defect")
-
-        loop.time.run(GUEST, defect)
-        loop.time.run(GUEST, defect)
-        loop.time.run(ROBOT, loop.work(ROBOT))
-        await loop.all()
-        assert (len(reports), loop.order.count(ROBOT)) == (2, 1)
-
-    run(test)
+    loop.time.run(GUEST, defect)
+    loop.time.run(GUEST, defect)
+    loop.time.run(ROBOT, loop.work(ROBOT))
+    await loop.all()
+    assert (len(reports), loop.order.count(ROBOT)) == (2, 1)

@@ -8,14 +8,16 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.endpoints.node_api import ANSWER, NodeApi
+from appliance.master.endpoints.node_api import ANSWER, NodeApiClient
 from appliance.rpc.xmlrpc_client import CallFailedError, UnansweredError, XmlRpcClient
 from roswire.uris import NodeUri
 from roswire.xmlrpc import build_response
 
+pytestmark = [pytest.mark.anyio, pytest.mark.timeout(20)]
 
-def test_a_kept_connection_that_does_not_answer_is_given_up_in_time() -> None:
-    """The call's time counts on a kept connection, too; it is closed then, and the next call has another."""
+
+async def test_a_kept_connection_that_does_not_answer_is_given_up_in_time() -> None:
+    """The time limit of a call also holds on a kept connection; it is closed, and the next call opens another."""
     asked = 0
     ended: asyncio.Queue[None] = asyncio.Queue()
 
@@ -32,24 +34,21 @@ def test_a_kept_connection_that_does_not_answer_is_given_up_in_time() -> None:
         ended.put_nowait(None)
         writer.close()
 
-    async def scene() -> None:
-        server = await asyncio.start_server(serve, "127.0.0.1", 0)
-        port = server.sockets[0].getsockname()[1]
-        client = XmlRpcClient(NodeUri("http", "127.0.0.1", port, "/"), timeout=0.2, pool=1)
-        assert await client.call("getPid", "/me") == [1, "", 1]
-        with pytest.raises(UnansweredError, match=r"did not answer getPid within 0\.2 s"):
-            await client.call("getPid", "/me")
-        await ended.get()
-        assert await client.call("getPid", "/me") == [1, "", 3]
-        client.close()
-        await ended.get()
-        server.close()
-
-    asyncio.run(asyncio.wait_for(scene(), 20))
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    client = XmlRpcClient(NodeUri("http", "127.0.0.1", port, "/"), timeout=0.2, pool=1)
+    assert await client.call("getPid", "/me") == [1, "", 1]
+    with pytest.raises(UnansweredError, match=r"did not answer getPid within 0\.2 s"):
+        await client.call("getPid", "/me")
+    await ended.get()
+    assert await client.call("getPid", "/me") == [1, "", 3]
+    client.close()
+    await ended.get()
+    server.close()
 
 
-def test_what_is_large_has_more_time() -> None:
-    """Else a ROSMaster would never have all parameters again: it is told them in one call, and reads for a while."""
+async def test_a_large_call_has_more_time() -> None:
+    """Otherwise a new ROS master, which reads all parameters in one long call, would never have them."""
     small_failed = asyncio.Event()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -61,19 +60,16 @@ def test_what_is_large_has_more_time() -> None:
         writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body))
         writer.close()
 
-    async def scene() -> None:
-        server = await asyncio.start_server(serve, "127.0.0.1", 0)
-        port = server.sockets[0].getsockname()[1]
-        client = XmlRpcClient(NodeUri("http", "127.0.0.1", port, "/"), timeout=0.2)
-        large = asyncio.create_task(client.call("setParam", "/me", "/", "x" * (9 << 20)))
-        with pytest.raises(UnansweredError):
-            await client.call("setParam", "/me", "/", "x")
-        small_failed.set()
-        assert await large == [1, "", 0]
-        client.close()
-        server.close()
-
-    asyncio.run(asyncio.wait_for(scene(), 20))
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    client = XmlRpcClient(NodeUri("http", "127.0.0.1", port, "/"), timeout=1.0)
+    large = asyncio.create_task(client.call("setParam", "/me", "/", "x" * (9 << 20)))
+    with pytest.raises(UnansweredError):
+        await client.call("setParam", "/me", "/", "x")
+    small_failed.set()
+    assert await large == [1, "", 0]
+    client.close()
+    server.close()
 
 
 @pytest.mark.parametrize(
@@ -99,7 +95,7 @@ def test_an_answer_without_end_is_read_to_its_limit(chunk: bytes) -> None:
         server = await asyncio.start_server(serve, "127.0.0.1", 0)
         port = server.sockets[0].getsockname()[1]
         node = SimpleNamespace(call_uri=NodeUri("http", "127.0.0.1", port, "/"))
-        client = NodeApi(cast(Any, None), timeout=20).client(cast(Any, node))
+        client = NodeApiClient(cast(Any, None), timeout=20).client(cast(Any, node))
         with pytest.raises(CallFailedError, match=f"the answer is larger than {ANSWER.body} bytes"):
             await client.call("getPid", "/me")
         server.close()
@@ -114,7 +110,7 @@ def test_an_answer_without_end_is_read_to_its_limit(chunk: bytes) -> None:
         tracemalloc.stop()
 
 
-def test_a_deep_answer_of_a_node_is_refused() -> None:
+async def test_a_deep_answer_of_a_node_is_refused() -> None:
     """An answer that is deeper than what nodes are asked for is nonsense, and costs the call alone."""
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -123,13 +119,10 @@ def test_a_deep_answer_of_a_node_is_refused() -> None:
         writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body))
         writer.close()
 
-    async def scene() -> None:
-        server = await asyncio.start_server(serve, "127.0.0.1", 0)
-        port = server.sockets[0].getsockname()[1]
-        node = SimpleNamespace(call_uri=NodeUri("http", "127.0.0.1", port, "/"))
-        client = NodeApi(cast(Any, None), timeout=20).client(cast(Any, node))
-        with pytest.raises(CallFailedError, match="nonsense"):
-            await client.call("getPid", "/me")
-        server.close()
-
-    asyncio.run(asyncio.wait_for(scene(), 20))
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    node = SimpleNamespace(call_uri=NodeUri("http", "127.0.0.1", port, "/"))
+    client = NodeApiClient(cast(Any, None), timeout=20).client(cast(Any, node))
+    with pytest.raises(CallFailedError, match="nonsense"):
+        await client.call("getPid", "/me")
+    server.close()

@@ -1,4 +1,4 @@
-"""Tests of `appliance.signing.request_signing`: the vectors of `docs/rest.md`; a proof fits one request."""
+"""Tests of `appliance.signing.request_signing`: the vectors of `docs/reference/rest.md`; a proof fits one request."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from appliance.signing.request_signing import (
 )
 
 # Made with OpenSSL 3 (`openssl dgst -hmac`, `openssl pkeyutl -sign -rawin`), not with the code that is tested.
-TOKEN = "rosrv_5c0f3d2b9a11_AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"  # noqa: S105  of nobody
+TOKEN = "rosrv_5c0f3d2b9a11_AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"  # noqa: S105  an example
 READING = "rosrv-read_5c0f3d2b9a11_AwwrT78sKKQ79xXtfC8OnQf5VEjcIKUbLcfJ4UooWjU"
 VERIFYING = "fe8e3dde8844937a82f36c38d3ffbe4d3deb3ebaa84abe88709aa8d246e0463f"
 STATED = (
@@ -70,8 +70,8 @@ def test_a_proof_is_of_one_request(parts: dict[str, object]) -> None:
     assert not is_signed(bytes.fromhex(VERIFYING), stated(**parts), signature)  # type: ignore[arg-type]  # as above
 
 
-def test_neither_the_reading_key_nor_what_is_kept_is_the_token() -> None:
-    """What the api sees and what the state has are not the secret, and differ from token to token."""
+def test_neither_the_reading_key_nor_the_saved_key_is_the_token() -> None:
+    """The reading key and the saved key are not the secret, and differ for each token."""
     other = "rosrv_5c0f3d2b9a12_AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"
     secret = TOKEN.rpartition("_")[2]
     assert secret not in reading_key(TOKEN)
@@ -107,15 +107,15 @@ def test_different_requests_have_different_statements(one: list[str], two: list[
 @pytest.mark.parametrize(
     "header", ["", "x", "a b", f"{'c' * 201} {'A' * 86}", f"c {'A' * 85}", f"c {'A' * 87}", f"c\n {'A' * 86}"]
 )
-def test_what_is_no_proof_is_told(header: str) -> None:
-    """A header of another form is refused before anything is computed."""
+def test_a_malformed_proof_is_rejected(header: str) -> None:
+    """A header of another form is rejected before anything is computed."""
     with pytest.raises(BadProofError, match="CHALLENGE SIGNATURE"):
         parse_proof(header)
 
 
 def test_the_page_shows_what_a_script_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The example of docs/rest.md makes the reading key and the proof of the vectors."""
-    page = (Path(__file__).parents[3] / "docs" / "rest.md").read_text()
+    """The example of docs/reference/rest.md makes the reading key and the proof of the vectors."""
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "rest.md").read_text()
     [example] = [block.partition("```")[0] for block in page.split("```python\n")[1:]]
     monkeypatch.setenv("ROSRV_TOKEN", TOKEN)
     names: dict[str, Any] = {}

@@ -8,7 +8,7 @@ from appliance.signing.site_keys import UnsignedError, checked_key, name_of, rea
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
 
 TEXT = "a policy ä\n"
-# What `ssh-keygen -Y sign -n rosrv -f KEY` made of TEXT with the key of LINE, then with `-O hashalg=sha256`, then for
+# Output of `ssh-keygen -Y sign -n rosrv -f KEY` for TEXT and the key of LINE, then with `-O hashalg=sha256`, then for
 # `-n file`; the last is of another kind of key.
 BEGIN, END = "-----BEGIN SSH SIGNATURE-----\n", "-----END SSH SIGNATURE-----\n"
 _PUBLIC = "U1NIU0lHAAAAAQAAADMAAAALc3NoLWVkMjU1MTkAAAAgA6EHv/POEL4dcN0Y50vAmWfk1j\n"
@@ -70,7 +70,7 @@ def test_anything_else_is_refused_with_what_to_do(text: str, signature: str, why
 
 
 def test_every_bit_of_a_signature_counts() -> None:
-    """Whichever character of it is another, it is no signature of this text any more."""
+    """With any one character changed, it is not a signature of this text."""
     body = OPENSSH.removeprefix(BEGIN).removesuffix(END)
     taken = []
     for place, character in enumerate(body):
@@ -84,8 +84,8 @@ def test_every_bit_of_a_signature_counts() -> None:
     assert taken == []
 
 
-def test_without_keys_nothing_is_asked_for() -> None:
-    """And no signature is looked at."""
+def test_without_keys_no_signature_is_needed() -> None:
+    """Signatures are ignored."""
     assert signer([], TEXT, "") == signer([], TEXT, "nonsense") == ""
 
 
@@ -100,15 +100,15 @@ def test_without_keys_nothing_is_asked_for() -> None:
         LINE.replace("I", "", 1),
     ],
 )
-def test_what_is_no_key_is_said(line: str) -> None:
-    """The configuration is refused, and says what a key looks like."""
+def test_an_invalid_key_is_an_error(line: str) -> None:
+    """The configuration is refused, and the error shows the form of a key."""
     with pytest.raises(ValueError, match="ssh-keygen -t ed25519"):
         checked_key(line)
     assert checked_key(LINE) == LINE
 
 
 def test_a_signature_beside_a_file_is_read_up_to_a_bound(tmp_path: Path) -> None:
-    """One that is missing, a folder, or longer than any signature is none."""
+    """A missing or too long file, or a folder, is not a signature."""
     file = tmp_path / "p.ini"
     assert read_signature(file) == ""
     (tmp_path / "p.ini.sig").write_text(OPENSSH)

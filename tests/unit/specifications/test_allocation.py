@@ -1,4 +1,4 @@
-"""Topics, services and specifications are spread over relay processes; what is connected stays together."""
+"""Topics, services and specifications are spread over relay processes; connected ones stay together."""
 
 import json
 
@@ -7,7 +7,7 @@ import pytest
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, groups_of
 from appliance.specifications.checking import check
 from appliance.specifications.specification_files import (
-    Checked,
+    CheckedSpecifications,
     Sources,
 )
 
@@ -21,8 +21,8 @@ def spec(name: str, *topics: str, body: str = "", variables: str = "") -> str:
     return f"{name}() {{ {variables} {events} }}"
 
 
-def checked(**files: str) -> Checked:
-    """What files of these names have."""
+def checked(**files: str) -> CheckedSpecifications:
+    """Return the specifications of these files."""
     return check(Sources({f"{name}.rv": text for name, text in files.items()}), ())
 
 
@@ -46,15 +46,15 @@ def test_specifications_without_anything_in_common_are_apart() -> None:
     ],
     ids=["topic", "variable", "publishes onto the other's topic"],
 )
-def test_what_is_in_common_joins(other: str) -> None:
-    """Across a third one, too."""
+def test_common_topics_join_specifications(other: str) -> None:
+    """This holds across a third one also."""
     a = spec("a", "/a", variables="int n;")
     assert together(a=a, b=other) == [{"a", "b"}]
     assert together(a=a, b=other, c=spec("c", "/c", "/b")) == [{"a", "b", "c"}]
 
 
 def test_a_service_joins_but_a_topic_of_the_same_name_does_not() -> None:
-    """They have nothing to do with each other."""
+    """A topic and a service are unrelated."""
     service = "NAME() { event e() service /x std_srvs/SetBool request '{}' { } }"
     topic = spec("t", "/x")
     joined = together(a=service.replace("NAME", "a"), b=service.replace("NAME", "b"), t=topic)
@@ -62,7 +62,7 @@ def test_a_service_joins_but_a_topic_of_the_same_name_does_not() -> None:
 
 
 def test_a_fresh_start_is_balanced_and_kept() -> None:
-    """Over the monitors; another life of control finds the same, another number of relays begins anew."""
+    """A restarted control finds the same allocation; another number of relays makes a new one."""
     kept: list[str] = []
     first = Allocation(2, kept.append)
     names = "abcd"
@@ -91,9 +91,9 @@ def test_a_specification_comes_to_the_topics_that_are_carried() -> None:
     plan = allocation.plan(checked(a=spec("a", *on[0][:2], on[1][0])), carried)
     assert plan.moves == (Move(TOPIC, on[1][0], 1, 0),)
     allocation.adopt(plan)
-    after = allocation.plan(Checked(), carried)
+    after = allocation.plan(CheckedSpecifications(), carried)
     assert after.moves == ()
-    assert allocation.plan(Checked(), set()).resources == {}
+    assert allocation.plan(CheckedSpecifications(), set()).resources == {}
 
 
 def test_monitors_that_run_move_only_when_they_must_and_the_fewest() -> None:
@@ -111,7 +111,7 @@ def test_monitors_that_run_move_only_when_they_must_and_the_fewest() -> None:
     assert allocation.plan(checked(**first), carried).moved_files == frozenset()
 
 
-def test_what_moves_moves_one_way() -> None:
+def test_topics_move_in_one_direction() -> None:
     """A relay that gets topics can try their monitors first, because it gives up none of its own."""
     allocation = Allocation(2)
     first = {name: spec(name, f"/{name}") for name in "abcd"}

@@ -67,7 +67,7 @@ def dies(channel: Channel, _wanted: messages.ContentsWanted) -> None:
     channel.close()
 
 
-async def test_it_is_called_when_there_is_something_to_read() -> None:
+async def test_the_compiler_is_started_for_the_first_question() -> None:
     """Once for all questions, and not for no files."""
     scene = Scene(finds, refuses, finds)
     assert (await scene.compiler.check(Sources(), ())).monitors == {}
@@ -80,7 +80,7 @@ async def test_it_is_called_when_there_is_something_to_read() -> None:
     scene.close()
 
 
-async def test_one_that_has_just_ended_is_followed_by_another() -> None:
+async def test_a_compiler_that_just_ended_is_replaced() -> None:
     """The next is asked the same."""
     scene = Scene(dies, finds)
     assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
@@ -88,7 +88,7 @@ async def test_one_that_has_just_ended_is_followed_by_another() -> None:
     scene.close()
 
 
-async def test_texts_that_end_it_are_refused_and_no_others() -> None:
+async def test_only_texts_that_crash_it_are_refused() -> None:
     """Nothing is in force that could not be read."""
     scene = Scene(dies, dies, finds)
     with pytest.raises(SpecificationsRefusedError, match="the compiler ended while it read them"):
@@ -97,10 +97,10 @@ async def test_texts_that_end_it_are_refused_and_no_others() -> None:
     scene.close()
 
 
-async def test_one_that_says_nothing_or_does_not_come_is_not_waited_for(
+async def test_a_silent_or_missing_compiler_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """That is an answer, too; the next time it is called again."""
+    """The answer is a refusal; the next time the compiler is started again."""
     monkeypatch.setattr(module, "_WORK_SECONDS", 0.05)
     monkeypatch.setattr(module, "_START_SECONDS", 0.05)
     scene = Scene(lambda _channel, _wanted: None)

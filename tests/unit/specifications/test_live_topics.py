@@ -1,13 +1,14 @@
-"""What specifications would mean for the topics that are published now."""
+"""The effects of specifications on topics that are published now."""
 
 from collections.abc import Collection
 
+import msgspec
 import pytest
 
 from appliance.specifications.checking import check
-from appliance.specifications.live_topics import judge_topics
+from appliance.specifications.live_topics import LiveType, judge_topics
 from appliance.specifications.specification_files import (
-    Checked,
+    CheckedSpecifications,
     Sources,
 )
 
@@ -17,26 +18,26 @@ a() {
 }
 """
 CODE = check(Sources({"a.rv": TEXT}), ())
-LIVE: dict[str, dict[str, str]] = {"/chatter": {"/talker": "std_msgs/String"}}
+LIVE: dict[str, dict[str, LiveType]] = {"/chatter": {"/talker": LiveType("std_msgs/String")}}
 
 
 def judged(
-    live: dict[str, dict[str, str]], *, shadow: Collection[str] = (), forced: bool = False
+    live: dict[str, dict[str, LiveType]], *, shadow: Collection[str] = (), forced: bool = False
 ) -> tuple[list[str], list[str]]:
-    """What is said of the specification, which is new."""
-    found = judge_topics(CODE, Checked(), live, shadow=shadow, forced=forced)
+    """Return the findings on a new specification."""
+    found = judge_topics(CODE, CheckedSpecifications(), live, shadow=shadow, forced=forced)
     return found.conflicts, found.warnings
 
 
-def test_what_fits_the_robot_is_not_mentioned() -> None:
-    """A topic with the publisher's type, or with one that its publisher leaves open, is no finding."""
+def test_a_fitting_type_is_not_a_finding() -> None:
+    """A topic with the publisher's type, or with one that its publisher leaves open, is not reported."""
     assert judged(LIVE) == ([], [])
-    assert judged({"/chatter": {"/talker": "*"}}) == ([], [])
+    assert judged({"/chatter": {"/talker": LiveType("*")}}) == ([], [])
 
 
 def test_a_topic_that_monitors_publish_has_one_type() -> None:
     """A monitor that would publish another type than a node does is a conflict at the statement, unless forced."""
-    live = LIVE | {"/alarm": {"/siren": "std_msgs/Bool"}}
+    live = LIVE | {"/alarm": {"/siren": LiveType("std_msgs/Bool")}}
     conflicts, warnings = judged(live)
     assert warnings == []
     (conflict,) = conflicts
@@ -50,8 +51,38 @@ def test_a_topic_that_monitors_publish_has_one_type() -> None:
 
 
 @pytest.mark.parametrize(
-    ("live", "hint"), [({"/chater": {"/t": "std_msgs/String"}}, "; did you mean /chater?"), ({}, "")]
+    ("live", "hint"),
+    [({"/chater": {"/t": LiveType("std_msgs/String")}}, "; did you mean /chater?"), ({}, "")],
 )
-def test_a_topic_without_a_publisher_is_a_warning(live: dict[str, dict[str, str]], hint: str) -> None:
+def test_a_topic_without_a_publisher_is_a_warning(live: dict[str, dict[str, LiveType]], hint: str) -> None:
     """The nearest live name is named where there is one; what monitors publish themselves needs no publisher."""
     assert judged(live) == ([], [f"a.rv:2:5: warning: no node publishes /chatter now{hint}"])
+
+
+STRING, OTHER = "992ce8a1687cec8c8bd883ec73ca41d1", "0" * 32
+
+
+@pytest.mark.parametrize("theirs", [STRING, "*", ""])
+def test_a_definition_that_fits_or_is_not_known(theirs: str) -> None:
+    """As in ROS: the md5sum decides, and a `*` fits all."""
+    assert judged({"/chatter": {"/talker": LiveType("std_msgs/String", theirs)}}) == ([], [])
+
+
+def test_a_type_of_the_same_name_with_another_definition() -> None:
+    """It is a conflict before the load, as another name is; a warning if it is forced."""
+    live = {"/chatter": {"/talker": LiveType("std_msgs/String", OTHER)}}
+    ((conflict,), warnings) = judged(live)
+    assert warnings == []
+    assert (
+        f"/talker publishes /chatter as std_msgs/String with md5sum {OTHER}, not {STRING} (give" in conflict
+    )
+    assert [len(found) for found in judged(live, forced=True)] == [0, 1]
+    assert judged(live, shadow=("a",))[0] == []
+
+
+def test_another_definition_of_a_topic_in_force_is_judged_again() -> None:
+    """The same type with a new definition may no longer fit its publisher."""
+    live = {"/chatter": {"/talker": LiveType("std_msgs/String", OTHER)}}
+    before = msgspec.structs.replace(CODE, texts={"std_msgs/String": "string data\nstring more\n"})
+    assert judge_topics(CODE, CODE, live, shadow=(), forced=False).conflicts == []
+    assert len(judge_topics(CODE, before, live, shadow=(), forced=False).conflicts) == 1

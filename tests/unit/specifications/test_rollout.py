@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from appliance.audit.log import AuditLog
+from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import messages
 from appliance.specifications.allocation import TOPIC, Allocation, Move, Resource
 from appliance.specifications.checking import check
@@ -17,7 +18,7 @@ from appliance.specifications.specification_files import (
     SpecificationsRefusedError,
 )
 from appliance.telemetry.audit_trail import AuditTrail
-from tests.support.audit import HeardTrail
+from tests.support.audit import RecordingTrail
 from tests.support.stated import parts_here
 
 pytestmark = pytest.mark.anyio
@@ -38,12 +39,12 @@ def revision(number: int, **files: str) -> Revision:
 
 
 def taken(statement: messages.SpecificationsStated) -> messages.SpecificationsTaken:
-    """A relay's answer."""
+    """Return a relay's answer."""
     return messages.SpecificationsTaken(statement.revision, [], [], statement.statement)
 
 
 def files_of(message: messages.SpecificationsStated) -> list[str]:
-    """The files of the monitors that a relay is told to have."""
+    """Return the files of the monitors that a statement gives to a relay."""
     return list(dict.fromkeys(f"{name[0]}.rv" for name in message.enabled))
 
 
@@ -105,7 +106,7 @@ class World:
 
     def __init__(self, home: Path) -> None:
         self.log = AuditLog(home / "audit.db")
-        self.trail = HeardTrail(self.log)
+        self.trail = RecordingTrail(self.log)
         self.fleet = Fleet(self.trail)
         self.rollout = self.fleet.rollout
         self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
@@ -131,8 +132,8 @@ async def test_a_relay_whose_specifications_are_the_same_is_given_the_same(world
     assert after[1 - other] != before[1 - other]
 
 
-async def test_each_relay_is_told_its_own(world: World) -> None:
-    """And of a change, before anything comes into force. What a relay is told first goes ahead of all else."""
+async def test_each_relay_receives_its_own_specifications(world: World) -> None:
+    """It receives a change before anything comes into force; its first statement precedes all else."""
     assert world.rollout.statement(0).ahead
     assert files_of(world.rollout.statement(0)) == ["a.rv"]
     assert files_of(world.rollout.statement(1)) == ["b.rv"]
@@ -141,8 +142,8 @@ async def test_each_relay_is_told_its_own(world: World) -> None:
     assert world.fleet.story[:2] == [("stated", 0, 2, ["a.rv"], ()), ("stated", 1, 2, ["b.rv", "c.rv"], ())]
 
 
-async def test_what_one_refuses_none_has(world: World) -> None:
-    """The other, which had taken it, is told what is in force again."""
+async def test_a_refusal_of_one_relay_stops_all(world: World) -> None:
+    """The other relay, which had accepted it, receives the specifications in force again."""
 
     def answer(relay: int, statement: messages.SpecificationsStated) -> messages.Message:
         if relay == 1 and statement.revision == 2:
@@ -158,8 +159,8 @@ async def test_what_one_refuses_none_has(world: World) -> None:
     assert world.rollout.relay_of("b") == 1
 
 
-async def test_a_relay_that_dies_of_it_refuses_it(world: World) -> None:
-    """One that is away is told when it comes, and does not keep the others from it."""
+async def test_a_relay_that_dies_counts_as_a_refusal(world: World) -> None:
+    """An absent relay receives the change when it returns, and does not stop the others."""
     world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
     taking = asyncio.ensure_future(world.rollout.take(revision(2, **world.files, c=spec("c", "/b"))))
     while len(world.fleet.story) < 2:
@@ -173,7 +174,7 @@ async def test_a_relay_that_dies_of_it_refuses_it(world: World) -> None:
 
 
 async def test_a_topic_moves_only_between_monitors(world: World) -> None:
-    """The new relay has them before, the old one until the topic is withdrawn; what began anew holds and is told."""
+    """The new relay has them first, the old one until the topic is withdrawn; restarted ones hold and are reported."""
     moved = await world.rollout.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
     assert moved == ["b"]
     assert world.fleet.story == [
@@ -188,16 +189,16 @@ async def test_a_topic_moves_only_between_monitors(world: World) -> None:
     ]
 
 
-async def test_what_would_cross_goes_one_way_and_is_tried_first(world: World) -> None:
+async def test_crossing_moves_go_one_way_and_are_tried_first(world: World) -> None:
     """Two loads in one that join monitors of both relays: every topic is placed where its monitors are already."""
     files = {name: spec(name, f"/{name}") for name in "abcd"}
     await world.rollout.take(revision(2, **files))
     world.fleet.carried = {(TOPIC, f"/{name}") for name in "abcd"}
     world.fleet.story.clear()
     await world.rollout.take(revision(3, **files, x=spec("x", "/a", "/b"), y=spec("y", "/c", "/d")))
-    tried = world.fleet.story[0]
-    assert tried[:2] == ("stated", 0)
-    assert {"a.rv", "b.rv", "c.rv", "d.rv", "x.rv", "y.rv"} == set(tried[3])
+    shadowed = world.fleet.story[0]
+    assert shadowed[:2] == ("stated", 0)
+    assert {"a.rv", "b.rv", "c.rv", "d.rv", "x.rv", "y.rv"} == set(shadowed[3])
     assert {one[2] for one in world.fleet.story if one[0] == "placed"} == {0}
 
 
@@ -220,7 +221,7 @@ async def test_a_relay_that_comes_while_a_load_is_tried_has_it_before_anything_i
 
 
 async def test_a_load_is_over_when_those_that_gave_something_up_have_it(world: World) -> None:
-    """One that does not say so within the time is told of as one that has other specifications in force."""
+    """A relay that does not confirm in time is reported as having other specifications in force."""
     world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
     await world.rollout.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
     over = asyncio.ensure_future(world.rollout.all_taken())
@@ -268,8 +269,8 @@ async def test_an_answer_to_the_try_before_is_none_to_this_one(
     await again
 
 
-async def test_who_began_in_the_initial_state_is_said(world: World) -> None:
-    """What the relays that were asked say; what one says of an earlier statement is of no change."""
+async def test_monitors_in_their_initial_state_are_reported(world: World) -> None:
+    """Only answers to the present statement count."""
     world.fleet.answer = lambda relay, statement: messages.SpecificationsTaken(
         statement.revision, ["c", "b"] if relay else [], [], statement.statement
     )
@@ -295,8 +296,8 @@ async def test_held_monitors_and_rows_of_both(world: World) -> None:
     assert rollout.held == {"a"}
 
 
-async def test_a_relay_that_does_not_take_what_is_in_force_is_told_of_until_it_does(world: World) -> None:
-    """Whatever the other one says."""
+async def test_a_relay_with_other_specifications_is_reported_until_it_agrees(world: World) -> None:
+    """The answer of the other relay does not change that."""
     rollout = world.rollout
     rollout.received(messages.SpecificationsRefused(1, ["no memory"]), 1)
     rollout.received(messages.SpecificationsTaken(1, ["a"], []), 0)
@@ -306,7 +307,7 @@ async def test_a_relay_that_does_not_take_what_is_in_force_is_told_of_until_it_d
 
 
 async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) -> None:
-    """The next one has the allocation that was kept; a relay's first answer to it is no restart."""
+    """The next control has the saved allocation; a relay's first answer to it does not count as a restart."""
     kept: list[str] = []
     allocation = Allocation(2, kept.append)
     files = {"b": spec("b", "/b"), "z": spec("z", "/z")}
@@ -336,3 +337,12 @@ async def test_a_crash_of_control_in_the_middle_of_a_change_leaves_no_topic_with
     await after.start(before, restarted=True, kept=kept[-1])
     for number, name in enumerate(names):
         assert after.relay_of(f"x{number}") == after.allocation.of(TOPIC, name)
+
+
+async def test_a_withdrawn_load_leaves_nothing_in_memory(world: World) -> None:
+    """However many clients load large sets and do not wait for the answer."""
+    before = dict(world.rollout.compiled_parts)
+    with awaited(lambda: True), pytest.raises(WithdrawnError):
+        await world.rollout.take(revision(2, **world.files, c=spec("c", "/c")))
+    assert world.rollout.compiled_parts == before
+    assert not world.fleet.stated

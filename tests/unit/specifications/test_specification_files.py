@@ -1,5 +1,6 @@
-"""Files of specifications: reading the folder, and what checking says."""
+"""Files of specifications: reading the folder, and the findings of checks."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from appliance.specifications.checking import check
 from appliance.specifications.specification_files import (
     Sources,
+    SpecificationFolder,
     SpecificationsRefusedError,
     read_folder,
 )
@@ -43,15 +45,15 @@ def test_a_folder_is_read_with_its_definitions(tmp_path: Path) -> None:
         (Sources({"a.rv": SPEC, "c.rv": SPEC}), "there is another specification"),
     ],
 )
-def test_what_is_wrong_is_said_with_its_place(sources: Sources, said: str) -> None:
-    """Nothing is taken in part."""
+def test_a_mistake_in_a_file_is_reported_with_its_place(sources: Sources, said: str) -> None:
+    """No file is loaded in part."""
     with pytest.raises(SpecificationsRefusedError) as error:
         check(sources, ())
     assert said in str(error.value)
 
 
 def test_a_folder_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    """One that is not there, a definition that is in no package, a file that is no text."""
+    """A missing folder, a definition outside of a package or a file that is not text is refused."""
     with pytest.raises(SpecificationsRefusedError, match="no such folder"):
         read_folder(tmp_path / "nowhere")
     (tmp_path / "a.rv").write_bytes(b"\xff\xfe")
@@ -62,3 +64,43 @@ def test_a_folder_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
     (tmp_path / "msg" / "Trigger.msg").write_text("int32 data\n")
     with pytest.raises(SpecificationsRefusedError, match="folder of its package"):
         read_folder(tmp_path)
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """The folders that were read, in order."""
+    done: list[Path] = []
+
+    def noted(folder: Path) -> Sources:
+        done.append(folder)
+        return read_folder(folder)
+
+    monkeypatch.setattr("appliance.specifications.specification_files.read_folder", noted)
+    return done
+
+
+def test_the_folder_is_read_again_only_after_a_change(tmp_path: Path, reads: list[Path]) -> None:
+    """A new file, another text with the date of the one before, a definition and a removal are changes."""
+    folder = SpecificationFolder(tmp_path)
+    assert folder.looked_at() == folder.looked_at() == Sources()
+    assert len(reads) == 1
+    (tmp_path / "a.rv").write_text("a")
+    assert folder.looked_at() == folder.looked_at() == Sources({"a.rv": "a"})
+    before = (tmp_path / "a.rv").stat()
+    (tmp_path / "a.rv").write_text("bb")
+    os.utime(tmp_path / "a.rv", ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert folder.looked_at() == Sources({"a.rv": "bb"})
+    (tmp_path / "msg" / "own").mkdir(parents=True)
+    (tmp_path / "msg" / "own" / "T.msg").write_text("int32 x")
+    assert folder.looked_at() == Sources({"a.rv": "bb"}, {"own/T.msg": "int32 x"})
+    (tmp_path / "a.rv").unlink()
+    assert folder.looked_at() == folder.looked_at() == Sources({}, {"own/T.msg": "int32 x"})
+    assert len(reads) == 5
+
+
+def test_an_unusable_folder_has_no_files(tmp_path: Path) -> None:
+    """The folder is missing or has a file that is not text."""
+    (tmp_path / "a.rv").write_bytes(b"\xff")
+    assert SpecificationFolder(tmp_path).looked_at() is None
+    assert SpecificationFolder(tmp_path / "gone").looked_at() is None
+    assert SpecificationFolder(None).looked_at() == Sources()

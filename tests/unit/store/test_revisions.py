@@ -127,7 +127,7 @@ class Returning(Keeper):
 async def test_a_change_that_cannot_go_back_is_tried_again_until_it_has(
     keeper: Keeper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An error of the disk before the change is no return; one after the change ends the attempts."""
+    """A disk error before the change is tried again; one after the change ends the attempts."""
     monkeypatch.setattr(revisions, "_AGAIN_SECONDS", 0.0)
     again = Returning(keeper.store)
     again.started(restarted=True)

@@ -191,7 +191,7 @@ def test_the_whole_tree_takes_the_place_of_its_changes(tmp_path: Path) -> None:
 
 
 def test_a_large_value_is_kept_with_the_tree(tmp_path: Path) -> None:
-    """A value that would take long to write is no change of its own."""
+    """A value that takes long to write is not saved as a change."""
     store = reopened(tmp_path)
     store.note_parameter("/map", "x" * LARGEST_CHANGE)
     store.close()

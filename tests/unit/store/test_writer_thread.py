@@ -21,6 +21,8 @@ from appliance.store.ahead import Statement, WriteAhead, WriteAheadClosedError
 from appliance.store.writer_thread import Database, StoreError
 from tests.support.requirements import need_root
 
+pytestmark = pytest.mark.anyio
+
 KILLED = """
 import os, signal, sys
 from pathlib import Path
@@ -40,7 +42,7 @@ SCHEMA = "CREATE TABLE IF NOT EXISTS thing (name TEXT PRIMARY KEY, size INTEGER)
 
 @pytest.fixture
 def failures() -> list[str]:
-    """What the database complained about."""
+    """Return the complaints of the database."""
     return []
 
 
@@ -52,15 +54,11 @@ def database(tmp_path: Path, failures: list[str]) -> Iterator[Database]:
     database.close()
 
 
-def test_what_was_queued_is_in_the_file_once_settled(database: Database, tmp_path: Path) -> None:
+async def test_what_was_queued_is_in_the_file_once_settled(database: Database, tmp_path: Path) -> None:
     """After `settled` another connection sees every statement, in order."""
-
-    async def scene() -> None:
-        for size in range(500):
-            database.submit("INSERT OR REPLACE INTO thing VALUES ('a', ?)", (size,))
-        await database.settled()
-
-    asyncio.run(scene())
+    for size in range(500):
+        database.submit("INSERT OR REPLACE INTO thing VALUES ('a', ?)", (size,))
+    await database.settled()
     with sqlite3.connect(tmp_path / "state.db") as other:
         assert other.execute("SELECT size FROM thing").fetchall() == [(499,)]
 
@@ -76,29 +74,25 @@ def test_closing_writes_what_is_left(tmp_path: Path) -> None:
     again.close()
 
 
-def test_a_write_that_fails_is_tried_again_until_it_succeeds(
+async def test_a_write_that_fails_is_tried_again_until_it_succeeds(
     database: Database, failures: list[str], tmp_path: Path
 ) -> None:
-    """While another process holds the file, the failure is told; afterwards the row is there."""
+    """While another process locks the file, the failure is reported; afterwards the row is saved."""
     blocker = sqlite3.connect(tmp_path / "state.db", isolation_level=None)
     database.query("SELECT 1")
     blocker.execute("BEGIN EXCLUSIVE")
-
-    async def scene() -> None:
-        database.submit("INSERT INTO thing VALUES ('late', 1)")
-        async with asyncio.timeout(60):
-            while not failures:
-                await asyncio.sleep(0.05)
-            blocker.execute("COMMIT")
-            await database.settled()
-
-    asyncio.run(scene())
+    database.submit("INSERT INTO thing VALUES ('late', 1)")
+    async with asyncio.timeout(60):
+        while not failures:
+            await asyncio.sleep(0.05)
+        blocker.execute("COMMIT")
+        await database.settled()
     blocker.close()
     assert "locked" in failures[0]
     assert database.query("SELECT name FROM thing") == [("late",)]
 
 
-def test_what_cannot_be_written_does_not_hold_up_the_end(tmp_path: Path, failures: list[str]) -> None:
+def test_a_failing_write_does_not_delay_the_end(tmp_path: Path, failures: list[str]) -> None:
     """While another process holds the file, closing takes as long as it may, says what is left, and loses nothing."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append)
     database.query("SELECT 1")
@@ -115,7 +109,9 @@ def test_what_cannot_be_written_does_not_hold_up_the_end(tmp_path: Path, failure
     again.close()
 
 
-def test_who_waits_is_told_that_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_waiting_caller_learns_that_the_disk_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """An operator is not kept waiting without a word; with room again all that was queued is written."""
     need_root()
     monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 0.05)
@@ -145,7 +141,7 @@ def test_who_waits_is_told_that_the_disk_is_full(tmp_path: Path, monkeypatch: py
         subprocess.run(["umount", "--lazy", place], check=True)
 
 
-def test_what_was_awaited_outlasts_the_machines_power(
+async def test_what_was_awaited_outlasts_the_machines_power(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before `settled` returns the disk has the database's log, and the file of what is on its way as it is then."""
@@ -157,17 +153,13 @@ def test_what_was_awaited_outlasts_the_machines_power(
         synced.append((str(Path(f"/proc/self/fd/{descriptor}").readlink()), os.fstat(descriptor).st_size))
 
     monkeypatch.setattr(os, "fsync", noted)
-
-    async def scene() -> None:
-        database.submit("INSERT INTO thing VALUES ('revoked', 1)")
-        await database.settled()
-
-    asyncio.run(scene())
+    database.submit("INSERT INTO thing VALUES ('revoked', 1)")
+    await database.settled()
     log, ahead = tmp_path / "state.db-wal", tmp_path / "state.ahead"
     assert synced == [(str(log), log.stat().st_size), (str(ahead), 0)]
 
 
-def test_a_file_that_is_no_database_is_named_with_what_to_do(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_database_is_an_error_with_a_remedy(tmp_path: Path) -> None:
     """Garbage in the place of the state is an error with the file's name, and stays untouched."""
     file = tmp_path / "state.db"
     file.write_bytes(b"this is not a database" * 100)
@@ -190,8 +182,8 @@ def test_a_file_that_lost_all_it_had_is_not_taken_for_a_new_one(tmp_path: Path) 
     Database(path, SCHEMA, failed=print).close()
 
 
-def test_a_place_that_cannot_be_written_is_not_taken_for_a_bad_file(tmp_path: Path) -> None:
-    """Where the place is at fault (a full disk, a folder that is not there), nobody is told to move the state away."""
+def test_an_unwritable_folder_is_not_taken_for_a_bad_file(tmp_path: Path) -> None:
+    """With a full disk or a missing folder, the message does not ask to move the state away."""
     with pytest.raises(StoreError, match=r"state\.db.*make room") as caught:
         Database(tmp_path / "missing" / "state.db", SCHEMA, failed=pytest.fail)
     assert "move" not in str(caught.value)
@@ -224,7 +216,7 @@ def test_rows_of_one_table_are_one_statement(
             database.put("thing", f"row {size % 70}", size)
         database.delete("thing", name="row 1")
         database.put("thing", "row 2", 1)
-    assert numbers == [4]  # rows of one statement are limited: SQLite takes so many values
+    assert numbers == [4]  # rows of one statement are limited: SQLite limits the number of values
     asyncio.run(database.settled())
     with sqlite3.connect(tmp_path / "state.db") as other:
         rows = dict(other.execute("SELECT name, size FROM thing"))
@@ -261,17 +253,13 @@ def test_what_is_submitted_together_is_kept_by_one_write_and_holds_up_no_other_t
     assert len(database.query("SELECT name FROM thing")) == 4
 
 
-def test_the_file_of_statements_on_their_way_is_empty_once_all_are_in(
+async def test_the_file_of_statements_on_their_way_is_empty_once_all_are_in(
     database: Database, tmp_path: Path
 ) -> None:
     """It does not grow with the number of statements that were ever made."""
-
-    async def scene() -> None:
-        for number in range(100):
-            database.submit("INSERT INTO thing VALUES (?, 1)", (str(number),))
-        await database.settled()
-
-    asyncio.run(scene())
+    for number in range(100):
+        database.submit("INSERT INTO thing VALUES (?, 1)", (str(number),))
+    await database.settled()
     assert (tmp_path / "state.ahead").stat().st_size == 0
 
 
@@ -289,7 +277,7 @@ def test_a_statement_torn_by_the_crash_is_left_out(tmp_path: Path) -> None:
 
 
 class _Gate:
-    """What is done to one file, and its lock: a write waits until another thread closes the file, or waits to."""
+    """The operations on one file, and its lock: a write waits until another thread closes the file, or waits to."""
 
     def __init__(self) -> None:
         self.writing, self.closing = threading.Event(), threading.Event()

@@ -1,4 +1,4 @@
-"""Tests of what the kernel says of the machine's clock."""
+"""Tests of the kernel's report on the machine's clock."""
 
 import ctypes
 from types import SimpleNamespace
@@ -14,10 +14,10 @@ from appliance.supervisor.clock_sync import clock_is_synchronised
     ("status", "answer", "expected"),
     [(0x0041, 5, False), (0x2001, 0, True), (0, 5, True), (0, -1, None), (0x0040, -1, None)],
 )
-def test_what_the_kernel_says(
+def test_the_kernels_flag_decides(
     monkeypatch: pytest.MonkeyPatch, status: int, answer: int, expected: bool | None
 ) -> None:
-    """Its flag counts, not other trouble it tells; where the call is forbidden, nothing is known. Nothing is set."""
+    """Other trouble is ignored; if the call is forbidden, nothing is known. The clock is never set."""
     asked = []
 
     def adjtimex(given: Any) -> int:
@@ -31,13 +31,13 @@ def test_what_the_kernel_says(
 
 
 def test_the_structure_is_the_kernels() -> None:
-    """The flags stand where the 64-bit kernel has them (adjtimex(2)), and it has room for all it writes."""
+    """The flags have the offset of the 64-bit kernel (adjtimex(2)), and the structure is large enough."""
     assert clock_sync.Timex.status.offset == 40
     assert ctypes.sizeof(clock_sync.Timex) >= 208
 
 
 def test_this_kernel_is_asked() -> None:
-    """The real call writes what it should: maximum errors are positive where it answers."""
+    """The real call fills the structure: an answer has a positive maximum error."""
     timex = clock_sync.Timex()
     answer = ctypes.CDLL(None).adjtimex(ctypes.pointer(timex))
     assert answer == -1 or timex.maxerror > 0

@@ -1,4 +1,4 @@
-"""Tests of what the supervisor does with processes that keep the audit log locked."""
+"""Tests of ending processes that keep the audit log locked."""
 
 import socket
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import cast
 import pytest
 
 from appliance.channel.messages import LogHeld
-from appliance.supervisor.process_handle import Life
+from appliance.supervisor.process_handle import ProcessHandle
 from appliance.supervisor.roles import Facts, roles_of
 from appliance.supervisor.supervisor import Supervisor
 
@@ -20,7 +20,7 @@ class _Life:
         self.killed = False
 
     def kill(self) -> None:
-        """Note it."""
+        """Note the signal."""
         self.killed = True
 
 
@@ -36,17 +36,17 @@ class _Life:
     ],
 )
 def test_only_readers_of_the_log_are_ended(tmp_path: Path, holding: list[str | int], ended: set[str]) -> None:
-    """The one that is named, all where the kernel does not know who or names a stranger; nobody else by any name."""
+    """The named reader is ended, or all readers if the kernel names none of them; no other process is."""
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "c", rosmaster_port=1)
     supervisor = Supervisor(roles_of(syslog=True), facts, admin=admin, ready=lambda _said: None)
     try:
-        lives = {}
-        for number, post in enumerate(supervisor.posts):
-            lives[post.role.name] = _Life(1000 + number)
-            post.life = cast(Life, lives[post.role.name])
-        named = [one if isinstance(one, int) else lives[one].pid for one in holding]
-        supervisor.control_said(cast(Life, lives["control"]), LogHeld(named), ())
-        assert {role for role, life in lives.items() if life.killed} == ended
+        starts = {}
+        for number, slot in enumerate(supervisor.slots):
+            starts[slot.role.name] = _Life(1000 + number)
+            slot.process = cast(ProcessHandle, starts[slot.role.name])
+        named = [one if isinstance(one, int) else starts[one].pid for one in holding]
+        supervisor.control_said(cast(ProcessHandle, starts["control"]), LogHeld(named), ())
+        assert {role for role, process in starts.items() if process.killed} == ended
     finally:
         supervisor.kept.close()

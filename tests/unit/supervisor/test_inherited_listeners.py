@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.supervisor.inherited_listeners import KeptSockets, RefusedSocketError
+from appliance.supervisor.inherited_listeners import InheritedListeners, ListenerRejectedError
 
 
 @pytest.fixture
-def kept() -> Iterator[KeptSockets]:
-    """Room for two sockets."""
-    sockets = KeptSockets(limit=2)
+def kept() -> Iterator[InheritedListeners]:
+    """Return a store for two sockets."""
+    sockets = InheritedListeners(limit=2)
     yield sockets
     sockets.close()
 
@@ -29,8 +29,8 @@ def _is_open(descriptor: int) -> bool:
     return True
 
 
-def test_a_kept_socket_is_there_until_it_is_dropped(kept: KeptSockets) -> None:
-    """What is kept is given back under its name; what is dropped is closed."""
+def test_a_kept_socket_is_there_until_it_is_dropped(kept: InheritedListeners) -> None:
+    """A kept socket is returned under its name; a dropped one is closed."""
     descriptor = _listening()
     kept.keep("outer:a1", descriptor)
     assert list(kept) == [("outer:a1", descriptor)]
@@ -39,7 +39,7 @@ def test_a_kept_socket_is_there_until_it_is_dropped(kept: KeptSockets) -> None:
     assert not _is_open(descriptor)
 
 
-def test_a_name_stands_for_one_socket(kept: KeptSockets) -> None:
+def test_a_name_stands_for_one_socket(kept: InheritedListeners) -> None:
     """Keeping another socket under the same name closes the first, also when there is no more room."""
     first, second, other = _listening(), _listening(), _listening()
     kept.keep("other", other)
@@ -49,34 +49,34 @@ def test_a_name_stands_for_one_socket(kept: KeptSockets) -> None:
     assert not _is_open(first)
 
 
-def test_there_is_a_bound(kept: KeptSockets) -> None:
+def test_there_is_a_bound(kept: InheritedListeners) -> None:
     """One socket too many is refused and closed; the others stay."""
     kept.keep("one", _listening())
     kept.keep("two", _listening())
     third = _listening()
-    with pytest.raises(RefusedSocketError, match="one too many"):
+    with pytest.raises(ListenerRejectedError, match="one too many"):
         kept.keep("three", third)
     assert len(kept) == 2
     assert not _is_open(third)
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a\n", "-a", "x" * 201, "\u00e4", "a\0"])
-def test_only_plain_names_are_accepted(kept: KeptSockets, name: str) -> None:
+def test_only_plain_names_are_accepted(kept: InheritedListeners, name: str) -> None:
     """A name is a short word of letters, digits and a few marks."""
     descriptor = _listening()
-    with pytest.raises(RefusedSocketError, match="not a name"):
+    with pytest.raises(ListenerRejectedError, match="not a name"):
         kept.keep(name, descriptor)
     assert not _is_open(descriptor)
 
 
-def test_only_listening_sockets_are_kept(kept: KeptSockets) -> None:
+def test_only_listening_sockets_are_kept(kept: InheritedListeners) -> None:
     """Neither a file nor a socket that does not listen is worth keeping, and neither stays open."""
     read_end, write_end = os.pipe()
     os.close(write_end)
-    with pytest.raises(RefusedSocketError, match="not a socket"):
+    with pytest.raises(ListenerRejectedError, match="not a socket"):
         kept.keep("pipe", read_end)
     idle = socket.socket().detach()
-    with pytest.raises(RefusedSocketError, match="does not listen"):
+    with pytest.raises(ListenerRejectedError, match="does not listen"):
         kept.keep("idle", idle)
     assert not _is_open(read_end)
     assert not _is_open(idle)

@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.isolation_watchdog`, with surroundings that do what a test says."""
+"""Tests of `appliance.supervisor.isolation_watchdog`, with an enclosure that a test controls."""
 
 import asyncio
 import errno
@@ -10,12 +10,14 @@ from appliance.channel.answers.status import FirewallState
 from appliance.channel.messages import EndpointFound, FirewallReported, Message, ProbeFailed, ProbePassed
 from appliance.network.esp import Esp
 from appliance.network.namespaces import NetworkError
-from appliance.supervisor.isolation_lifecycle import Enclosure
-from appliance.supervisor.isolation_watchdog import Guard
+from appliance.supervisor.isolation_lifecycle import NoIsolation
+from appliance.supervisor.isolation_watchdog import IsolationWatchdog
+
+pytestmark = pytest.mark.anyio
 
 
-class Surroundings(Enclosure):
-    """An enclosure of which a test decides what a probe finds."""
+class Surroundings(NoIsolation):
+    """An enclosure where a test chooses the findings of a probe."""
 
     kind = "container"
     probes = True
@@ -26,11 +28,11 @@ class Surroundings(Enclosure):
         self.looked = threading.Event()
 
     def report(self) -> FirewallState:
-        """A report that can be recognised."""
+        """Return a report that can be recognised."""
         return FirewallState(backend="nft")
 
     def probe(self) -> str | None:
-        """The next finding."""
+        """Return the next finding."""
         self.looked.set()
         finding = self.found.pop(0)
         if isinstance(finding, Exception):
@@ -38,7 +40,7 @@ class Surroundings(Enclosure):
         return finding
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
-        """Fails for port 0 and 1."""
+        """Fail for port 0 and 1."""
         if inner_port == 0:
             raise NetworkError("the kernel says no")
         if inner_port == 1:
@@ -46,83 +48,63 @@ class Surroundings(Enclosure):
         self.closed.append(inner_port)
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """Fails as a machine does that has no process left."""
+        """Fail as a machine does that has no process left."""
         raise OSError(errno.EAGAIN, "no process can be made")
 
 
 @pytest.fixture
 def surroundings() -> Surroundings:
-    """Surroundings without a finding yet."""
+    """Return an enclosure without a finding yet."""
     return Surroundings()
 
 
-def test_control_is_told_when_something_opens_and_closes(surroundings: Surroundings) -> None:
-    """A finding is told with its reason, its end as well; the report goes with both."""
+async def test_control_learns_of_each_opening_and_closing(surroundings: Surroundings) -> None:
+    """A finding is sent with its reason, and so is its end, both with the report."""
     told: list[Message] = []
     surroundings.found = ["reached", None]
-
-    async def scene() -> None:
-        guard = Guard(surroundings, told.append)
-        assert await guard.look() == "reached"
-        assert await guard.look() is None
-
-    asyncio.run(scene())
+    watchdog = IsolationWatchdog(surroundings, told.append)
+    assert await watchdog.look() == "reached"
+    assert await watchdog.look() is None
     report = FirewallReported("container", FirewallState(backend="nft"))
     assert told == [report, ProbeFailed("reached"), report, ProbePassed()]
 
 
-def test_a_probe_that_cannot_be_made_counts_as_open(surroundings: Surroundings) -> None:
-    """What cannot be told is not assumed to be right."""
+async def test_a_probe_that_cannot_be_made_counts_as_open(surroundings: Surroundings) -> None:
+    """An unknown state does not count as closed."""
     told: list[Message] = []
     surroundings.found = [NetworkError("no child")]
-
-    async def scene() -> None:
-        assert "no child" in str(await Guard(surroundings, told.append).look())
-
-    asyncio.run(scene())
+    assert "no child" in str(await IsolationWatchdog(surroundings, told.append).look())
     assert isinstance(told[-1], ProbeFailed)
 
 
-def test_a_new_control_learns_how_things_stand(surroundings: Surroundings) -> None:
-    """The last finding is repeated to a control that was not there when it was made."""
+async def test_a_new_control_receives_the_last_finding(surroundings: Surroundings) -> None:
+    """A control that started after the finding receives it also."""
     surroundings.found = ["reached"]
-
-    async def scene() -> list[Message]:
-        guard = Guard(surroundings, lambda _message: None)
-        assert guard.news() == [FirewallReported("container", FirewallState())]
-        await guard.look()
-        return guard.news()
-
-    assert asyncio.run(scene())[-1] == ProbeFailed("reached")
+    watchdog = IsolationWatchdog(surroundings, lambda _message: None)
+    assert watchdog.news() == [FirewallReported("container", FirewallState())]
+    await watchdog.look()
+    assert watchdog.news()[-1] == ProbeFailed("reached")
 
 
-def test_the_inner_face_is_closed_and_then_probed(surroundings: Surroundings) -> None:
+async def test_the_master_side_port_is_closed_and_then_probed(surroundings: Surroundings) -> None:
     """The port is closed to others before it is probed; a failure to close it is a finding."""
     surroundings.found = [None]
-
-    async def scene() -> None:
-        guard = Guard(surroundings, lambda _message: None)
-        assert await guard.control_ready(4711, 4712) is None
-        assert "the kernel says no" in str(await guard.control_ready(0, 4712))
-
-    asyncio.run(scene())
+    watchdog = IsolationWatchdog(surroundings, lambda _message: None)
+    assert await watchdog.control_ready(4711, 4712) is None
+    assert "the kernel says no" in str(await watchdog.control_ready(0, 4712))
     assert surroundings.closed == [4711]
     assert surroundings.found == []
 
 
 @pytest.mark.parametrize("port", [0, 1])
-def test_an_inner_face_that_cannot_be_closed_is_told_to_control(
+async def test_a_master_side_port_that_cannot_be_closed_is_reported(
     surroundings: Surroundings, port: int
 ) -> None:
-    """Whatever stood in the way: control hears that it must not serve, and so does the next one."""
+    """For any reason, control learns that it must not serve, and so does the next control."""
     told: list[Message] = []
-
-    async def scene() -> list[Message]:
-        guard = Guard(surroundings, told.append)
-        assert "cannot be closed to others" in str(await guard.control_ready(port, 4712))
-        return guard.news()
-
-    news = asyncio.run(scene())
+    watchdog = IsolationWatchdog(surroundings, told.append)
+    assert "cannot be closed to others" in str(await watchdog.control_ready(port, 4712))
+    news = watchdog.news()
     assert isinstance(told[-1], ProbeFailed)
     assert news[-1] == told[-1]
 
@@ -130,72 +112,62 @@ def test_an_inner_face_that_cannot_be_closed_is_told_to_control(
 @pytest.mark.parametrize(
     "broken", [OSError(errno.EMFILE, "too many open files"), ValueError("no JSON"), KeyError("chain")]
 )
-def test_whatever_breaks_a_probe_is_a_finding_and_the_next_one_is_made(
+async def test_a_failing_probe_is_a_finding_and_probes_go_on(
     surroundings: Surroundings, broken: Exception
 ) -> None:
-    """A machine without files or processes for a moment: told as a fault, then looked at again and told as over."""
+    """A short lack of files or processes is reported as a fault, and its end after the next probe."""
     told: list[Message] = []
     surroundings.found = [broken, *[None] * 100_000]
-
-    async def scene() -> None:
-        running = asyncio.create_task(Guard(surroundings, told.append, every=0.001).run())
-        async with asyncio.timeout(20):
-            while len(told) < 4 and not running.done():
-                await asyncio.sleep(0)
-        running.cancel()
-
-    asyncio.run(scene())
+    running = asyncio.create_task(IsolationWatchdog(surroundings, told.append, every=0.001).run())
+    async with asyncio.timeout(20):
+        while len(told) < 4 and not running.done():
+            await asyncio.sleep(0)
+    running.cancel()
     assert [type(one) for one in told[1:4:2]] == [ProbeFailed, ProbePassed]
     (failed,) = [one for one in told if isinstance(one, ProbeFailed)]
     assert str(broken) in failed.reason
 
 
 def test_tunnels_that_cannot_be_opened_are_answered(surroundings: Surroundings) -> None:
-    """Control waits for the answer: also an error that nobody thought of is one."""
-    answer = asyncio.run(Guard(surroundings, lambda _message: None).open_tunnels("10.9.0.0/24", "10.9.0.1"))
+    """Control waits for the answer, so an unexpected error is answered also."""
+    answer = asyncio.run(
+        IsolationWatchdog(surroundings, lambda _message: None).open_tunnels("10.9.0.0/24", "10.9.0.1")
+    )
     assert answer.esp is None
     assert "no process can be made" in str(answer.reason)
 
 
-def test_it_looks_again_and_again(surroundings: Surroundings) -> None:
-    """While the appliance runs the surroundings are looked at in turn, also after a finding."""
+async def test_probes_are_repeated(surroundings: Surroundings) -> None:
+    """While the appliance runs the enclosure is probed in turn, also after a finding."""
     told: list[Message] = []
     surroundings.found = [None, "reached", None]
-
-    async def scene() -> None:
-        running = asyncio.create_task(Guard(surroundings, told.append, every=0.001).run())
-        async with asyncio.timeout(20):
-            while len(told) < 6:
-                await asyncio.sleep(0)
-        running.cancel()
-
     surroundings.found += [None] * 100_000
-    asyncio.run(scene())
+    running = asyncio.create_task(IsolationWatchdog(surroundings, told.append, every=0.001).run())
+    async with asyncio.timeout(20):
+        while len(told) < 6:
+            await asyncio.sleep(0)
+    running.cancel()
     assert [type(one) for one in told[1:6:2]] == [ProbePassed, ProbeFailed, ProbePassed]
 
 
-def test_without_isolation_nothing_is_probed() -> None:
-    """Isolation `none` has nothing to prove, and does not claim to have proven it."""
+async def test_without_isolation_nothing_is_probed() -> None:
+    """Isolation `none` has nothing to probe, and does not claim a proof."""
     told: list[Message] = []
-
-    async def scene() -> None:
-        assert await Guard(Enclosure(), told.append).look() is None
-
-    asyncio.run(scene())
+    assert await IsolationWatchdog(NoIsolation(), told.append).look() is None
     assert told == [FirewallReported("none", FirewallState())]
 
 
 def test_without_isolation_there_is_no_address_for_hosts(surroundings: Surroundings) -> None:
-    """Why is handed on instead; nothing is raised in the supervisor."""
-    assert asyncio.run(Guard(surroundings, lambda _message: None).endpoint()) == EndpointFound(
+    """Control receives the reason; the supervisor raises nothing."""
+    assert asyncio.run(IsolationWatchdog(surroundings, lambda _message: None).endpoint()) == EndpointFound(
         None, "isolation container has no tunnels: use isolation netns or container"
     )
 
 
-def test_a_crowd_of_new_hosts_costs_a_few_threads(
+async def test_a_crowd_of_new_hosts_costs_a_few_threads(
     surroundings: Surroundings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However many routes are asked for at once, a bounded number is looked up at a time, and all are answered."""
+    """Many requests for routes are all answered, a bounded number at a time."""
     lock, entered, most = threading.Lock(), [0], [0]
     release = threading.Event()
 
@@ -209,17 +181,13 @@ def test_a_crowd_of_new_hosts_costs_a_few_threads(
         return f"way to {host}"
 
     monkeypatch.setattr(surroundings, "route_to", route_to)
-
-    async def scene() -> list[str | None]:
-        guard = Guard(surroundings, lambda _message: None)
-        asked = [asyncio.create_task(guard.route_to(str(number))) for number in range(200)]
-        async with asyncio.timeout(30):
-            while most[0] == 0:
-                await asyncio.sleep(0)
-        for _ in range(200):
+    watchdog = IsolationWatchdog(surroundings, lambda _message: None)
+    asked = [asyncio.create_task(watchdog.route_to(str(number))) for number in range(200)]
+    async with asyncio.timeout(30):
+        while most[0] == 0:
             await asyncio.sleep(0)
-        release.set()
-        return await asyncio.gather(*asked)
-
-    assert asyncio.run(scene()) == [f"way to {number}" for number in range(200)]
+    for _ in range(200):
+        await asyncio.sleep(0)
+    release.set()
+    assert (await asyncio.gather(*asked)) == [f"way to {number}" for number in range(200)]
     assert most[0] <= 8

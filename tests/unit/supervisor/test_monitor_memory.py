@@ -1,4 +1,4 @@
-"""The files with the state of monitors: of this life, of the one before, and what an orderly end leaves."""
+"""The files with the state of monitors: of this run, of the last one, and after an orderly end."""
 
 import os
 from pathlib import Path
@@ -12,22 +12,22 @@ WRITTEN = b"rosrvMS1\x01"
 
 
 def given(memory: MonitorMemory, index: int) -> list[tuple[StateGiven, bytes]]:
-    """What a relay gets, and the first bytes of each."""
-    found = memory.given_to("relay", index)
+    """Return the files of a relay, and the first bytes of each."""
+    found = memory.messages_for("relay", index)
     return [(message, os.pread(descriptor, 16, 0)) for message, descriptor in found]
 
 
 def write(memory: MonitorMemory, index: int, more: bytes = b"") -> None:
-    """A relay writes its state."""
-    [*_, (message, descriptor)] = memory.given_to("relay", index)
+    """Write the state of a relay."""
+    [*_, (message, descriptor)] = memory.messages_for("relay", index)
     assert message.own
     os.pwrite(descriptor, WRITTEN + more, 0)
 
 
-def test_each_relay_has_a_file_of_its_own_and_no_other_process_any(tmp_path: Path) -> None:
-    """It is there in full from the start, so that no write fails later; nobody but root reads the folder."""
+def test_only_relays_have_files_each_its_own(tmp_path: Path) -> None:
+    """The file has its full size from the start, so no write fails later; only root reads the folder."""
     memory = MonitorMemory(tmp_path, 2)
-    assert [*memory.given_to("control", 0)] == []
+    assert [*memory.messages_for("control", 0)] == []
     for index in range(2):
         [(message, first)] = given(memory, index)
         assert message.own
@@ -40,8 +40,8 @@ def test_each_relay_has_a_file_of_its_own_and_no_other_process_any(tmp_path: Pat
     memory.close()
 
 
-def test_every_relay_reads_what_all_wrote_in_the_life_before(tmp_path: Path) -> None:
-    """Without an orderly end, too: only then nothing says that it outlived the machine."""
+def test_every_relay_reads_the_state_of_the_last_run(tmp_path: Path) -> None:
+    """This holds also without an orderly end, but then no mark says that the state outlived the machine."""
     first = MonitorMemory(tmp_path, 2)
     write(first, 0, b"a")
     write(first, 1, b"b")
@@ -52,11 +52,11 @@ def test_every_relay_reads_what_all_wrote_in_the_life_before(tmp_path: Path) -> 
         assert not any(message.own for message, _ in earlier)
         assert (own.ended_boot, empty) == ("", bytes(16))
     with pytest.raises(OSError):
-        os.pwrite(next(second.given_to("relay", 0))[1], b"x", 0)
+        os.pwrite(next(second.messages_for("relay", 0))[1], b"x", 0)
 
 
-def test_a_life_that_is_killed_while_it_starts_loses_nothing(tmp_path: Path) -> None:
-    """What the life before left stays until each relay has written its own."""
+def test_a_run_that_is_killed_at_its_start_loses_nothing(tmp_path: Path) -> None:
+    """The state of the last run stays until each relay has written its own."""
     write(MonitorMemory(tmp_path, 1), 0, b"a")
     for _ in range(3):
         memory = MonitorMemory(tmp_path, 2)
@@ -69,15 +69,15 @@ def test_a_life_that_is_killed_while_it_starts_loses_nothing(tmp_path: Path) -> 
     assert [data[9:10] for _, data in given(MonitorMemory(tmp_path, 1), 0)] == [b"d", b"e", b"\0"]
 
 
-def test_the_files_of_lives_that_never_came_far_are_bounded(tmp_path: Path) -> None:
-    """However often the appliance is killed while it starts."""
+def test_the_files_of_short_runs_are_bounded(tmp_path: Path) -> None:
+    """This holds however often the appliance is killed at its start."""
     for _ in range(10):
         write(MonitorMemory(tmp_path, 2), 0)
     assert len([*(tmp_path / FOLDER).iterdir()]) <= 5
 
 
-def test_fewer_relays_forget_what_was_of_the_others(tmp_path: Path) -> None:
-    """Once all that are left have written: it is not revived in a later life."""
+def test_fewer_relays_drop_the_state_of_the_others(tmp_path: Path) -> None:
+    """After all present relays have written, the other state does not return in a later run."""
     first = MonitorMemory(tmp_path, 2)
     write(first, 0, b"a")
     write(first, 1, b"b")
@@ -85,8 +85,8 @@ def test_fewer_relays_forget_what_was_of_the_others(tmp_path: Path) -> None:
     assert [data[9:10] for _, data in given(MonitorMemory(tmp_path, 1), 0)] == [b"c", b"\0"]
 
 
-def test_an_orderly_end_is_said_once(tmp_path: Path) -> None:
-    """With the start of the machine that it was in, and the time; a life that begins takes it away."""
+def test_an_orderly_end_is_reported_once(tmp_path: Path) -> None:
+    """The mark has the boot of the machine and the time; the next run removes it."""
     first = MonitorMemory(tmp_path, 1)
     write(first, 0)
     boot = given(first, 0)[0][0].boot
@@ -98,10 +98,10 @@ def test_an_orderly_end_is_said_once(tmp_path: Path) -> None:
     assert given(MonitorMemory(tmp_path, 1), 0)[-1][0].ended_boot == ""
 
 
-def test_a_disk_without_room_keeps_the_state_over_relays_alone(
+def test_on_a_full_disk_the_state_survives_relays_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The appliance starts, and says what that means."""
+    """The appliance starts, and reports the consequence."""
 
     def full(_descriptor: int, _offset: int, _size: int) -> None:
         raise OSError(28, "No space left on device")
@@ -112,3 +112,13 @@ def test_a_disk_without_room_keeps_the_state_over_relays_alone(
     assert given(memory, 1)[-1][1][9:10] == b"a"
     assert "do not keep their state when the appliance ends" in capsys.readouterr().out
     memory.close()
+
+
+def test_a_foreign_folder_does_not_stop_the_start(tmp_path: Path) -> None:
+    """A folder that is not of an earlier run, such as a user's copy, is ignored and stays."""
+    MonitorMemory(tmp_path, 1).close()
+    copy = tmp_path / FOLDER / "copy"
+    copy.mkdir()
+    (copy / "relay-0").write_bytes(b"x" * 20)
+    MonitorMemory(tmp_path, 1).close()
+    assert (copy / "relay-0").exists()

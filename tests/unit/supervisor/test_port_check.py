@@ -10,12 +10,12 @@ from appliance.supervisor.port_check import first_free, free_port, require_free,
 
 
 def test_a_free_port_is_free() -> None:
-    """The port that is chosen can be listened on."""
+    """The appliance can listen on the chosen port."""
     require_free("127.0.0.1", free_port())
 
 
-def test_a_taken_port_is_told_with_its_owner() -> None:
-    """The message names the port and the process that has it."""
+def test_a_taken_port_is_reported_with_its_owner() -> None:
+    """The message names the port and its process."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(StartError, match=rf"port {port} .* in use by process {os.getpid()} \("):
@@ -34,13 +34,13 @@ def test_a_port_is_free_again_when_only_old_connections_linger() -> None:
 
 
 def test_an_address_of_another_machine_is_an_error() -> None:
-    """Listening where this machine has no address is refused in words."""
+    """Listening where this machine has no address is refused with a clear message."""
     with pytest.raises(StartError, match=r"cannot listen on 192\.0\.2\.1:1"):
         require_free("192.0.2.1", 1)
 
 
-def test_the_first_port_that_nobody_keeps() -> None:
-    """A port that is listened on, or that connections of its last owner still keep, is passed over."""
+def test_the_first_free_port() -> None:
+    """A port with a listener, or with connections of its last owner, is skipped."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
         assert first_free(range(port, port + 20)) > port
@@ -54,7 +54,7 @@ def test_the_first_port_that_nobody_keeps() -> None:
 
 
 def test_spare_ports_overlap_none_that_are_taken() -> None:
-    """They are neighbours, outside of every range that is somebody's, or the policy's range is too large."""
+    """They are adjacent, outside of every used range; otherwise the policy's range is too large."""
     within = range(1024, 65_536)
     assert spare_ports(64, [range(32_768, 61_000)], within) == range(65_472, 65_536)
     assert spare_ports(64, [range(65_500, 65_501), range(60_000, 65_490)], within) == range(59_936, 60_000)

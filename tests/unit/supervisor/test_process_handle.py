@@ -1,13 +1,26 @@
 """Tests of `appliance.supervisor.process_handle`: which process hangs, and which is only slow."""
 
+import errno
+import os
+import signal
+import socket
+import subprocess
+
 import pytest
 
+from appliance.supervisor.child_entry import LaunchPlan
 from appliance.supervisor.process_handle import (
     ANSWER_SECONDS,
     FIRST_ANSWER_SECONDS,
     LONGEST_START_SECONDS,
-    hangs,
+    ProcessCallbacks,
+    ProcessHandle,
+    is_hanging,
 )
+from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
+from appliance.supervisor.users import Account
+
+pytestmark = pytest.mark.anyio
 
 
 @pytest.mark.parametrize(
@@ -24,5 +37,28 @@ from appliance.supervisor.process_handle import (
 def test_a_slow_start_is_waited_for_and_a_hang_is_not(
     silent: float, starting: bool, still: float, hanging: bool
 ) -> None:
-    """A process that serves must answer within seconds; one that starts must only get on."""
-    assert hangs(silent, starting=starting, still=still) is hanging
+    """A process that serves must answer within seconds; one that starts must only make progress."""
+    assert is_hanging(silent, starting=starting, still=still) is hanging
+
+
+async def test_a_process_that_cannot_be_watched_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With too many open files the start fails, and no process is left that holds the port of the next one."""
+    started: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def start(*_arguments: object, **_options: object) -> subprocess.Popen[bytes]:
+        started.append(popen(["sleep", "60"]))
+        return started[-1]
+
+    def refuse(_pid: int) -> int:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    monkeypatch.setattr(os, "pidfd_open", refuse)
+    here, there = socket.socketpair()
+    account = Account("rosrv", os.geteuid(), os.getegid())
+    plan = LaunchPlan(os.getpid(), there.fileno(), account, "/", True, 64, SandboxPlan())
+    callbacks = ProcessCallbacks(*[lambda *_: None] * 3)
+    with here, there, pytest.raises(OSError, match="Too many"):
+        ProcessHandle("relay", 0, plan, here, callbacks)
+    assert [one.returncode for one in started] == [-signal.SIGKILL]

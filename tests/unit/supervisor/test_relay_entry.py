@@ -6,7 +6,7 @@ from pathlib import Path
 
 from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Relay, Settings
-from appliance.relay.bounds import Limits
+from appliance.relay.relay_limits import RelayLimits
 from appliance.supervisor.relay_entry import limits_of
 
 
@@ -14,9 +14,9 @@ def test_every_key_reaches_the_relay(tmp_path: Path) -> None:
     """Each key of the section `relay` is a limit of the relay, with the same default, and changes it."""
     written = tmp_path / "config.json"
     keys = {field.name for field in fields(Relay)}
-    assert keys <= {field.name for field in fields(Limits)}
+    assert keys <= {field.name for field in fields(RelayLimits)}
     written.write_text(json.dumps(plain(Settings())))
-    assert limits_of(written) == Limits()
+    assert limits_of(written) == RelayLimits()
     for name in keys:
         written.write_text(json.dumps(plain(Settings(relay=Relay(**{name: 7 << 20})))))
         assert getattr(limits_of(written), name) == 7 << 20

@@ -1,4 +1,4 @@
-"""Tests of the mark of a restore that did not come to its end."""
+"""Tests of the mark of an unfinished restore."""
 
 from pathlib import Path
 
@@ -8,11 +8,11 @@ from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored, set_mark
 
 
-def test_what_is_marked_is_refused(tmp_path: Path) -> None:
-    """From the first moment to the last, in words that say what to do; a second restore cannot mark it, too."""
+def test_a_marked_directory_is_refused(tmp_path: Path) -> None:
+    """It is refused until the restore ends, with the way to continue; a second restore cannot mark it also."""
     refuse_half_restored(tmp_path)
     mark = set_mark(tmp_path)
-    with pytest.raises(StartError, match="remove it, and `rosrv restore` once more"):
+    with pytest.raises(StartError, match="remove this folder, and run `rosrv restore` again"):
         refuse_half_restored(tmp_path)
     with pytest.raises(FileExistsError):
         set_mark(tmp_path)
@@ -20,6 +20,6 @@ def test_what_is_marked_is_refused(tmp_path: Path) -> None:
     refuse_half_restored(tmp_path)
 
 
-def test_a_place_that_is_not_there_is_not_marked(tmp_path: Path) -> None:
-    """Whoever starts an appliance on a new directory is not held up."""
+def test_a_missing_directory_is_not_marked(tmp_path: Path) -> None:
+    """An appliance starts on a new directory."""
     refuse_half_restored(tmp_path / "new")

@@ -14,8 +14,8 @@ HERE = Path("/bin/true")
 BY_NAME = {role.name: role for role in ROLES}
 
 
-def test_rosmaster_is_told_to_hide() -> None:
-    """The real master is started so that it binds loopback only, on the port it was given."""
+def test_rosmaster_binds_loopback_only() -> None:
+    """It is started on loopback, on the given port."""
     role = BY_NAME["rosmaster"]
     assert role.program is not None
     program = role.program(FACTS)
@@ -23,15 +23,15 @@ def test_rosmaster_is_told_to_hide() -> None:
     assert program.argv[-2:] == ("-p", "12311")
 
 
-def test_rosmaster_runs_nothing_of_its_home() -> None:
-    """The folder that the state keeps for it is no place from which Python takes code."""
+def test_rosmaster_runs_no_code_of_its_home() -> None:
+    """Python does not import from its folder in the state directory."""
     role = BY_NAME["rosmaster"]
     assert role.program is not None
     assert role.program(FACTS).argv[:2] == ("/usr/bin/python3", "-s")
 
 
 def test_rosmaster_logs_warnings_and_no_calls(tmp_path: Path) -> None:
-    """A line for each call would cost it half of its time; what goes wrong in it is still written."""
+    """A line for each call would cost it half of its time; its warnings are still written."""
     role = BY_NAME["rosmaster"]
     assert role.program is not None
     says = (
@@ -51,7 +51,7 @@ def test_rosmaster_logs_warnings_and_no_calls(tmp_path: Path) -> None:
 
 
 def test_rosout_writes_no_files() -> None:
-    """What nodes say fills no disk."""
+    """Log messages of nodes cannot fill the disk."""
     role = BY_NAME["rosout"]
     assert role.program is not None
     assert role.program(FACTS).environment["ROSOUT_DISABLE_FILE_LOGGING"] == "1"
@@ -65,14 +65,14 @@ def test_a_missing_rosmaster_is_an_error_that_says_what_to_install(tmp_path: Pat
 
 
 def test_links_are_between_roles_and_go_both_ways() -> None:
-    """If one end of a link is new, the row of that end says so: a restart of either renews it."""
+    """A restart of either end renews the link, so both rows name it."""
     for role in ROLES:
         for other in role.links:
             assert role.name in BY_NAME[other].links
 
 
-def test_the_forwarder_is_there_when_it_has_something_to_do() -> None:
-    """It has a user of its own, in the group that may read the audit log; the others do without it."""
+def test_the_forwarder_runs_only_if_configured() -> None:
+    """It has a user of its own, in the group that may read the audit log; the other processes do not depend on it."""
     forwarder = BY_NAME["syslog"]
     assert forwarder in roles_of(syslog=True)
     assert forwarder not in roles_of()
@@ -82,8 +82,8 @@ def test_the_forwarder_is_there_when_it_has_something_to_do() -> None:
     assert not forwarder.capabilities
 
 
-def test_the_recorder_is_there_when_it_is_wanted() -> None:
-    """It has a user of its own and no network, reads the audit log, and its recordings are for the api to read."""
+def test_the_recorder_runs_only_if_configured() -> None:
+    """It has a user of its own and no network, reads the audit log, and the api reads its recordings."""
     recorder = BY_NAME["recorder"]
     assert recorder in roles_of(recorder=True)
     assert recorder not in roles_of()
@@ -92,14 +92,14 @@ def test_the_recorder_is_there_when_it_is_wanted() -> None:
     assert (recorder.dispensable, recorder.network, recorder.capabilities) == (True, False, ())
 
 
-def test_the_compiler_has_nothing_but_its_link() -> None:
-    """What reads specifications has a user of its own, no network, no file and no right, and is there on demand."""
+def test_the_compiler_has_only_its_link() -> None:
+    """The compiler has its own user, no network, file or right, and starts on demand."""
     compiler = BY_NAME["compiler"]
     assert compiler in roles_of()
     assert compiler.user not in {role.user for role in ROLES if role is not compiler}
     assert (compiler.path, compiler.network, compiler.capabilities) == (None, False, ())
     assert (compiler.dispensable, compiler.on_demand, compiler.links) == (True, True, ("control",))
-    assert compiler.walls(FACTS).reads == compiler.walls(FACTS).writes == ()
+    assert compiler.sandbox(FACTS).reads == compiler.sandbox(FACTS).writes == ()
 
 
 def test_rows_are_consistent() -> None:
@@ -111,7 +111,7 @@ def test_rows_are_consistent() -> None:
 
 
 def test_rest_can_be_left_out() -> None:
-    """Without REST there is no such role; it is the one that the others do without."""
+    """Without REST there is no such role; the other processes do not depend on it."""
     api, control = BY_NAME["api"], BY_NAME["control"]
     assert [role for role in roles_of() if role not in roles_of(api=False)] == [api]
     assert api.dispensable

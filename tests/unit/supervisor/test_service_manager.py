@@ -1,4 +1,4 @@
-"""What systemd hears of the appliance."""
+"""Messages of the appliance to systemd."""
 
 import asyncio
 import os
@@ -9,15 +9,15 @@ from appliance.supervisor.service_manager import ServiceManager
 
 
 def listening(path: Path) -> socket.socket:
-    """A socket as systemd gives to a service."""
+    """Return a socket as systemd gives to a service."""
     heard = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     heard.bind(str(path))
     heard.settimeout(10)
     return heard
 
 
-def test_it_hears_of_the_start_of_ready_and_of_the_end(tmp_path: Path) -> None:
-    """What a start does, and for how long; `READY=1` when nodes may connect, `STOPPING=1` when it ends in order."""
+def test_start_ready_and_stop_are_reported(tmp_path: Path) -> None:
+    """A start reports its steps and time; `READY=1` when nodes may connect, `STOPPING=1` at an orderly end."""
     with listening(tmp_path / "notify") as heard:
         manager = ServiceManager.of({"NOTIFY_SOCKET": str(tmp_path / "notify")})
         manager.starting("builds its firewall")
@@ -28,8 +28,8 @@ def test_it_hears_of_the_start_of_ready_and_of_the_end(tmp_path: Path) -> None:
         assert heard.recv(4096).startswith(b"STOPPING=1\n")
 
 
-def test_the_watchdog_hears_twice_in_its_time(tmp_path: Path) -> None:
-    """While the loop runs the watchdog is told so, each half of the time that it grants; a start gets more time."""
+def test_the_watchdog_is_fed_twice_in_its_time(tmp_path: Path) -> None:
+    """While the loop runs the watchdog is fed at each half of its time; a start gets more time."""
     environment = {
         "NOTIFY_SOCKET": str(tmp_path / "notify"),
         "WATCHDOG_USEC": "20000",
@@ -53,13 +53,13 @@ def test_the_watchdog_hears_twice_in_its_time(tmp_path: Path) -> None:
     assert environment == {}, "a child must not speak in its place"
 
 
-def test_without_a_service_manager_nothing_is_said() -> None:
-    """Started by hand, or with a watchdog that is meant for another process, there is nobody to tell."""
+def test_without_a_service_manager_nothing_is_sent() -> None:
+    """There is no receiver after a start by hand, or if the watchdog is for another process."""
     manager = ServiceManager.of({"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"})
     manager.ready("nobody hears it")
     assert manager.watchdog_seconds is None
 
 
 def test_a_service_manager_that_has_gone_stops_nothing(tmp_path: Path) -> None:
-    """A socket that is not there any more is no reason to end."""
+    """A missing socket does not end the appliance."""
     ServiceManager(str(tmp_path / "gone"), None).ready("nobody hears it")

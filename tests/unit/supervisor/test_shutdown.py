@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.shutdown`, with processes that end by what a test says."""
+"""Tests of `appliance.supervisor.shutdown`, with processes whose end a test chooses."""
 
 import asyncio
 import signal
@@ -7,73 +7,75 @@ from typing import cast
 import pytest
 
 from appliance.supervisor import shutdown
-from appliance.supervisor.process_handle import Life
-from appliance.supervisor.process_slot import Post
+from appliance.supervisor.process_handle import ProcessHandle
+from appliance.supervisor.process_slot import ProcessSlot
 from appliance.supervisor.roles import Role
+
+pytestmark = pytest.mark.anyio
 
 
 class Crowd:
-    """Processes, and everything that was done to end them, in its order."""
+    """Processes, and the actions to end them, in order."""
 
     def __init__(self) -> None:
-        self.posts: list[Post] = []
+        self.slots: list[ProcessSlot] = []
         self.died = asyncio.Event()
         self.done: list[tuple[str, str]] = []
 
     def add(self, name: str, ends_by: str, *, is_program: bool = False, last: bool = False) -> None:
-        """One more, which ends by `Stop`, a signal's name, or nothing."""
+        """Add a process that ends by `Stop`, by a signal's name, or not at all."""
         role = Role(name=name, user="rosrv", part=name, outlives_control=last)
-        post = Post(role, 0)
-        post.life = cast(Life, Process(self, post, ends_by, is_program=is_program))
-        self.posts.append(post)
+        slot = ProcessSlot(role, 0)
+        slot.process = cast(ProcessHandle, Process(self, slot, ends_by, is_program=is_program))
+        self.slots.append(slot)
 
     def end(self) -> list[tuple[str, str]]:
-        """What was done."""
-        asyncio.run(shutdown.end_all(self.posts, self.died))
+        """Return the actions."""
+        asyncio.run(shutdown.end_all(self.slots, self.died))
         return self.done
 
 
 class Process:
-    """A life of the crowd."""
+    """A process of the crowd."""
 
     pid = 1
 
-    def __init__(self, crowd: Crowd, post: Post, ends_by: str, *, is_program: bool) -> None:
-        self.crowd, self.post, self.ends_by, self.is_program = crowd, post, ends_by, is_program
+    def __init__(self, crowd: Crowd, slot: ProcessSlot, ends_by: str, *, is_program: bool) -> None:
+        self.crowd, self.slot, self.ends_by, self.is_program = crowd, slot, ends_by, is_program
 
     def send(self, message: object) -> None:
-        """Told to stop."""
+        """Note the request to stop."""
         self._suffer(type(message).__name__)
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
-        """A signal."""
+        """Note a signal."""
         self._suffer(number.name)
 
     def _suffer(self, what: str) -> None:
-        self.crowd.done.append((self.post.role.name, what))
+        self.crowd.done.append((self.slot.role.name, what))
         if what == self.ends_by:
-            self.post.life = None
+            self.slot.process = None
             self.crowd.died.set()
 
 
 @pytest.fixture
 def crowd(monkeypatch: pytest.MonkeyPatch) -> Crowd:
-    """Nobody yet; patience is short."""
+    """Return a crowd without processes and with short time limits."""
     for name in ("_STOP_SECONDS", "_TERMINATE_SECONDS", "_LAST_SECONDS"):
         monkeypatch.setattr(shutdown, name, 0.05)
     return Crowd()
 
 
 def test_each_is_asked_first_and_rosmaster_last(crowd: Crowd) -> None:
-    """Ours by a message, programs by SIGTERM; who outlives control is asked when all others are gone."""
+    """Our processes get a message, programs SIGTERM; processes that outlive control come last."""
     crowd.add("rosmaster", "SIGTERM", is_program=True, last=True)
     crowd.add("control", "Stop")
     crowd.add("rosout", "SIGTERM", is_program=True)
     assert crowd.end() == [("control", "Stop"), ("rosout", "SIGTERM"), ("rosmaster", "SIGTERM")]
 
 
-def test_who_does_not_end_is_made_to(crowd: Crowd) -> None:
-    """SIGTERM, then SIGKILL, and those only who are still there."""
+def test_a_process_that_does_not_end_is_killed(crowd: Crowd) -> None:
+    """SIGTERM and then SIGKILL go only to processes that still run."""
     crowd.add("relay", "SIGKILL")
     crowd.add("api", "SIGTERM")
     crowd.add("control", "Stop")
@@ -82,10 +84,10 @@ def test_who_does_not_end_is_made_to(crowd: Crowd) -> None:
         *((name, "SIGTERM") for name in ("relay", "api")),
         ("relay", "SIGKILL"),
     ]
-    assert all(post.life is None for post in crowd.posts)
+    assert all(slot.process is None for slot in crowd.slots)
 
 
-def test_what_nothing_ends_does_not_hold_up_the_end(crowd: Crowd) -> None:
+def test_an_unkillable_process_does_not_delay_the_end(crowd: Crowd) -> None:
     """A process that the kernel itself cannot end (a broken disk) is left, and the others are ended."""
     crowd.add("control", "never")
     crowd.add("rosmaster", "Stop", last=True)
@@ -94,15 +96,11 @@ def test_what_nothing_ends_does_not_hold_up_the_end(crowd: Crowd) -> None:
     assert done.index(("rosmaster", "Stop")) > done.index(("control", "SIGKILL"))
 
 
-def test_a_life_that_was_due_does_not_begin(crowd: Crowd) -> None:
-    """A restart that waits for its time is taken back."""
-
-    async def scene() -> bool:
-        crowd.add("relay", "Stop")
-        post = crowd.posts[0]
-        post.life = None
-        post.due = asyncio.get_running_loop().call_later(60, lambda: None)
-        await shutdown.end_all(crowd.posts, crowd.died)
-        return post.due.cancelled()
-
-    assert asyncio.run(scene())
+async def test_a_pending_restart_is_cancelled(crowd: Crowd) -> None:
+    """A restart that waits for its time does not happen."""
+    crowd.add("relay", "Stop")
+    slot = crowd.slots[0]
+    slot.process = None
+    slot.due = asyncio.get_running_loop().call_later(60, lambda: None)
+    await shutdown.end_all(crowd.slots, crowd.died)
+    assert slot.due.cancelled()

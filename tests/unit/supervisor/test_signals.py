@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.signals`: what is sent while nothing may be left half done.
+"""Tests of `appliance.supervisor.signals`: signals during operations that must be completed.
 
 Each runs in a process of its own: a signal that a thread of the test runner takes would end it.
 """
@@ -58,11 +58,11 @@ def by_itself(script: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_what_is_sent_while_they_are_held_is_heard_when_somebody_listens() -> None:
-    """Nothing happens at first, then each arrives; what comes later is forgotten, and all is as before."""
+def test_held_signals_arrive_when_a_handler_is_set() -> None:
+    """At first nothing happens, then each arrives; later ones are dropped, and the handlers are restored."""
     by_itself(_HELD)
 
 
 def test_a_thread_does_not_take_them() -> None:
-    """The kernel gives a signal to any thread that takes it: one that blocks them leaves it to wait."""
+    """The kernel gives a signal to any thread that accepts it; if all block it, it waits."""
     by_itself(_THREAD)

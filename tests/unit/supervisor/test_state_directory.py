@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.state_directory`, as the user who runs them."""
+"""Tests of `appliance.supervisor.state_directory`, as the user who runs the tests."""
 
 import os
 import socket
@@ -20,7 +20,7 @@ ROLES = (
 
 
 def test_parts_are_made_and_closed_to_others(tmp_path: Path) -> None:
-    """Every role gets its folder, for its user only; the directory itself can be passed but not listed."""
+    """Every role gets its folder, for its user only; others can traverse the directory but not list it."""
     state = StateDirectory(tmp_path / "deep" / "state")
     state.prepare(ROLES)
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in state.path.iterdir()}
@@ -29,8 +29,8 @@ def test_parts_are_made_and_closed_to_others(tmp_path: Path) -> None:
     state.close()
 
 
-def test_what_a_killed_process_left_is_gone_at_the_next_start(tmp_path: Path) -> None:
-    """A file without its name yet, in the part of a role; the operator's own beside it stays."""
+def test_leftovers_of_a_killed_process_are_removed_at_the_next_start(tmp_path: Path) -> None:
+    """A temporary file in the folder of a role is removed; the operator's own file beside it stays."""
     killed = StateDirectory(tmp_path)
     killed.prepare(ROLES)
     own = name_to_make(tmp_path / "kit.tgz")
@@ -54,16 +54,16 @@ def test_a_second_user_of_the_directory_is_refused_by_name(tmp_path: Path) -> No
 
 
 def test_a_stale_admin_socket_is_replaced(tmp_path: Path) -> None:
-    """What a crash left behind does not keep the next start from listening."""
+    """A socket left by a crash does not stop the next start from listening."""
     state = StateDirectory(tmp_path)
-    state.open_admin_socket().close()  # as after a crash: the file is there, nobody listens
+    state.open_admin_socket().close()  # as after a crash: a file without a listener
     with state.open_admin_socket(), socket.socket(socket.AF_UNIX) as client:
         client.connect(str(tmp_path / "admin.sock"))
     state.close()
     assert not (tmp_path / "admin.sock").exists()
 
 
-def test_a_path_too_long_for_a_socket_is_an_error_in_words(tmp_path: Path) -> None:
+def test_a_path_too_long_for_a_socket_is_a_clear_error(tmp_path: Path) -> None:
     """The kernel takes 107 bytes; the message says to name a shorter path."""
     state = StateDirectory(tmp_path / ("x" * 120))
     with pytest.raises(StartError, match="shorter path"):
@@ -72,7 +72,7 @@ def test_a_path_too_long_for_a_socket_is_an_error_in_words(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("kind", ["file", "link"])
-def test_a_part_that_is_no_folder_is_refused(tmp_path: Path, kind: str) -> None:
+def test_a_part_that_is_not_a_folder_is_refused(tmp_path: Path, kind: str) -> None:
     """Neither a file nor a symbolic link is taken for a role's folder, nor changed."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir(mode=0o755)
@@ -88,16 +88,16 @@ def test_a_part_that_is_no_folder_is_refused(tmp_path: Path, kind: str) -> None:
     state.close()
 
 
-def test_a_directory_that_cannot_be_made_is_an_error_in_words(tmp_path: Path) -> None:
+def test_a_directory_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> None:
     """The message names the directory and the flag."""
     (tmp_path / "file").write_text("")
     with pytest.raises(StartError, match=r"file/state cannot be used: .*--state DIR"):
         StateDirectory(tmp_path / "file" / "state")
 
 
-def test_a_part_that_a_group_may_pass(tmp_path: Path) -> None:
-    """As root: the folder is in the reader's group, which new files get; also where it was made otherwise before.
-    As anybody else there is one user, and the folder is his alone."""
+def test_a_part_that_a_group_may_traverse(tmp_path: Path) -> None:
+    """As root: the folder is in the reader's group, which new files get, also if the folder existed before.
+    Without root there is one user, who owns the folder alone."""
     shared = (Role(name="control", user="rosrv", part="control", readable_by="rosrv-api"),)
     for roles in (ROLES[:1], shared, shared):
         state = StateDirectory(tmp_path)
@@ -112,7 +112,7 @@ def test_a_part_that_a_group_may_pass(tmp_path: Path) -> None:
 
 
 def folder(path: Path, *files: str) -> Path:
-    """A directory of mode 0755 with these files."""
+    """Return a directory of mode 0755 with these files."""
     path.mkdir()
     path.chmod(0o755)
     for name in files:
@@ -121,11 +121,11 @@ def folder(path: Path, *files: str) -> Path:
     return path
 
 
-def test_a_directory_of_others_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
+def test_a_directory_of_others_is_refused_and_unchanged(tmp_path: Path) -> None:
     """`--state /tmp` must not close /tmp: the message says what is in it and what to name; its mode stays."""
     theirs = folder(tmp_path / "theirs", "notes.txt", "a", "b", "c", "d")
     with pytest.raises(
-        StartError, match=r"theirs is no state directory.* has a, b, c ….* name another"
+        StartError, match=r"theirs is not the state directory.* has a, b, c ….* name another"
     ) as said:
         StateDirectory(theirs)
     assert "--state DIR" in str(said.value)
@@ -134,36 +134,36 @@ def test_a_directory_of_others_is_refused_and_left_as_it_is(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("files", [(), ("lost+found/x",), ("lock",), ("control/state.db",)])
-def test_a_directory_that_is_the_appliances_is_taken(tmp_path: Path, files: tuple[str, ...]) -> None:
-    """An empty one, the root of a disk, one of an earlier life, and one that a backup was restored to."""
+def test_a_directory_of_the_appliance_is_accepted(tmp_path: Path, files: tuple[str, ...]) -> None:
+    """An empty one, the root of a disk, one of an earlier run, and one with a restored backup."""
     state = StateDirectory(folder(tmp_path / "state", *files))
     assert stat.S_IMODE(state.path.stat().st_mode) == 0o711
     state.close()
 
 
-def test_a_lock_that_leads_elsewhere_is_not_followed(tmp_path: Path) -> None:
-    """Somebody who may write there could have any file of root's cut to nothing."""
+def test_a_lock_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
+    """Otherwise a user with write access could have any file of root truncated."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.write_text("kept")
     state = folder(tmp_path / "state")
     (state / "lock").symlink_to(elsewhere)
-    with pytest.raises(StartError, match="is no state directory"):
+    with pytest.raises(StartError, match="is not the state directory"):
         StateDirectory(state)
     assert elsewhere.read_text() == "kept"
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can make files of others")
-def test_a_lock_of_somebody_else_makes_no_state_directory(tmp_path: Path) -> None:
-    """In a directory where everybody may write, a file of that name says nothing."""
+def test_a_foreign_lock_makes_no_state_directory(tmp_path: Path) -> None:
+    """In a world-writable directory a file of that name proves nothing."""
     theirs = folder(tmp_path / "theirs", "lock")
     os.chown(theirs / "lock", 61099, 61099)
-    with pytest.raises(StartError, match="is no state directory"):
+    with pytest.raises(StartError, match="is not the state directory"):
         StateDirectory(theirs)
     assert stat.S_IMODE(theirs.stat().st_mode) == 0o755
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives folders to other users")
-def test_a_start_that_was_killed_in_its_middle_is_taken_up(tmp_path: Path) -> None:
+def test_a_start_that_was_killed_is_completed(tmp_path: Path) -> None:
     """A folder that was made and not yet given to its user is given at the next start."""
     (tmp_path / "lock").touch()
     (tmp_path / "control").mkdir()

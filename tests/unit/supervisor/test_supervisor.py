@@ -1,9 +1,9 @@
-"""Tests of `appliance.supervisor.supervisor` where a moment matters that real processes hit seldom."""
+"""Tests of `appliance.supervisor.supervisor` in races that real processes seldom hit."""
 
 import asyncio
 import errno
 import socket
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,9 +13,11 @@ from structlog.testing import capture_logs
 from appliance.channel.messages import CompilerWanted, RouteWanted
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.process_handle import Life
+from appliance.supervisor.process_handle import ProcessHandle
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.supervisor import ControlReady, Supervisor
+
+pytestmark = pytest.mark.anyio
 
 READY = ControlReady("http://127.0.0.1:11311", 1, "http://127.0.0.1:2", 3, 4, "secret")
 CONTROL = Role(name="control", user="rosrv", part="control", entry="m:f")
@@ -23,7 +25,7 @@ ROSMASTER = Role(name="rosmaster", user="rosmaster", part="rosmaster", entry="m:
 
 
 class StandIn:
-    """A life that only counts how often it was heard."""
+    """A process that only counts its messages."""
 
     alive = True
     role = "control"
@@ -37,105 +39,94 @@ class StandIn:
         self.reason = ""
         self.output: tuple[str, ...] = ()
         self.ready = False
-        self.still_seconds = 0.0
+        self.stalled_seconds = 0.0
 
     def kill(self) -> None:
-        """Noted."""
+        """Note the call."""
         self.killed = True
 
     def send(self, message: object, _descriptors: tuple[int, ...] = ()) -> None:
-        """Noted by its kind."""
+        """Note the kind of the call."""
         self.told.append(type(message).__name__)
 
-    def heard(self) -> None:
-        """Counted."""
+    def note_answer(self) -> None:
+        """Count the call."""
         self.heard_of += 1
 
 
 def made(
     tmp_path: Path, role: Role, ready: Callable[[ControlReady], None] = lambda _said: None
 ) -> Supervisor:
-    """A supervisor of one process, not started."""
+    """Return a supervisor of one process, not started."""
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "config.json", rosmaster_port=1)
     return Supervisor((role,), facts, admin=admin, ready=ready)
 
 
-def test_a_master_that_dies_while_it_is_asked_is_asked_again(
+async def test_a_master_that_dies_during_a_check_is_checked_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The answer came from a life that is over: the start waits for the next one, and does not break."""
+    """The answer came from an ended process: the start waits for the next one, and does not fail."""
+    supervisor = made(tmp_path, ROSMASTER)
+    slot = supervisor.slots[0]
+    first, second = StandIn(), StandIn()
+    asked = asyncio.Event()
 
-    async def scene() -> tuple[StandIn, StandIn]:
-        supervisor = made(tmp_path, ROSMASTER)
-        post = supervisor.posts[0]
-        first, second = StandIn(), StandIn()
-        asked = asyncio.Event()
+    async def answers(_seconds: float) -> bool:
+        if not asked.is_set():
+            slot.process = None  # it died during the check
+            asked.set()
+        return True
 
-        async def answers(_seconds: float) -> bool:
-            if not asked.is_set():
-                post.life = None  # it died while it was asked
-                asked.set()
-            return True
-
-        monkeypatch.setattr(supervisor, "answers", answers)
-        post.life = cast(Life, first)
-        waiting = asyncio.create_task(supervisor.until_answering(post))
-        async with asyncio.timeout(20):
-            await asked.wait()
-            post.life = cast(Life, second)
-            await waiting
-        return first, second
-
-    first, second = asyncio.run(scene())
+    monkeypatch.setattr(supervisor, "answers", answers)
+    slot.process = cast(ProcessHandle, first)
+    waiting = asyncio.create_task(supervisor.until_answering(slot))
+    async with asyncio.timeout(20):
+        await asked.wait()
+        slot.process = cast(ProcessHandle, second)
+        await waiting
     assert (first.heard_of, second.heard_of) == (0, 1)
 
 
-def test_a_first_token_that_cannot_be_kept_ends_the_start_in_words(tmp_path: Path) -> None:
-    """Control is not told that it was announced, so the next start makes another; nobody waits for a ready line."""
+async def test_a_first_token_that_cannot_be_saved_ends_the_start(tmp_path: Path) -> None:
+    """Control gets no confirmation, so the next start creates another token; no ready line is printed."""
 
     def ready(_said: ControlReady) -> None:
         raise StartError("the first access token cannot be written")
 
-    async def scene() -> StandIn:
-        supervisor, control = made(tmp_path, CONTROL, ready), StandIn()
-        await supervisor.control_ready(cast(Life, control), READY)
-        assert supervisor.failure == "the first access token cannot be written"
-        assert not supervisor.is_ready
-        return control
-
-    assert "Announced" not in asyncio.run(scene()).told
+    supervisor, control = made(tmp_path, CONTROL, ready), StandIn()
+    await supervisor.control_ready(cast(ProcessHandle, control), READY)
+    assert supervisor.failure == "the first access token cannot be written"
+    assert not supervisor.is_ready
+    assert "Announced" not in control.told
 
 
-def test_a_machine_without_processes_is_not_asked_in_a_tight_loop(
+async def test_a_machine_without_processes_causes_no_tight_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A process that cannot even be made is tried again as one that dies at once is: slower each time."""
+    """A process that cannot be started is retried like one that dies at once: slower each time."""
 
-    def none_left(*_arguments: object) -> Life:
+    def none_left(*_arguments: object) -> ProcessHandle:
         raise OSError(errno.EAGAIN, "no process can be made")
 
-    async def scene() -> list[float]:
-        supervisor = made(tmp_path, CONTROL)
-        monkeypatch.setattr(module, "Life", none_left)
-        (post,), delays = supervisor.posts, []
-        for _ in range(5):
-            supervisor.fill(post)
-            assert post.due is not None
-            delays.append(round(post.due.when() - asyncio.get_running_loop().time(), 1))
-            post.due.cancel()
-        return delays
-
-    assert asyncio.run(scene()) == [0.0, 0.2, 0.5, 1.0, 1.0]
+    supervisor = made(tmp_path, CONTROL)
+    monkeypatch.setattr(module, "ProcessHandle", none_left)
+    (slot,), delays = supervisor.slots, []
+    for _ in range(5):
+        supervisor.start(slot)
+        assert slot.due is not None
+        delays.append(round(slot.due.when() - asyncio.get_running_loop().time(), 1))
+        slot.due.cancel()
+    assert delays == [0.0, 0.2, 0.5, 1.0, 1.0]
 
 
 def test_a_control_that_asks_for_too_much_at_once_is_replaced(tmp_path: Path) -> None:
-    """What is not answered yet has a bound; what was asked before it is answered."""
+    """Unanswered requests are bounded; earlier ones are answered."""
 
     async def scene() -> tuple[StandIn, int]:
         supervisor, control = made(tmp_path, CONTROL), StandIn()
         for number in range(10_000):
-            supervisor.control_said(cast(Life, control), RouteWanted(f"10.0.0.{number}"), ())
+            supervisor.control_said(cast(ProcessHandle, control), RouteWanted(f"10.0.0.{number}"), ())
             if control.killed:
                 return control, number
         return control, -1
@@ -145,31 +136,28 @@ def test_a_control_that_asks_for_too_much_at_once_is_replaced(tmp_path: Path) ->
     assert 1000 < asked < 5000
 
 
-def test_a_slow_start_is_waited_for_with_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While a process gets on, the log says what is waited for; when nothing gets on, the end names it."""
+async def test_a_slow_start_is_waited_for_and_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While a process makes progress the log names it; without progress the error names it."""
     monkeypatch.setattr(module, "_START_SECONDS", 0.0)
     monkeypatch.setattr(module, "_LOOK_SECONDS", 0.01)
+    supervisor, slow, reasons = made(tmp_path, CONTROL), StandIn(), list[str]()
+    supervisor.slots[0].process = cast(ProcessHandle, slow)
 
-    async def scene() -> tuple[list[str], list[MutableMapping[str, Any]]]:
-        supervisor, slow, reasons = made(tmp_path, CONTROL), StandIn(), list[str]()
-        supervisor.posts[0].life = cast(Life, slow)
+    def stop(reason: str) -> None:
+        reasons.append(reason)
+        supervisor.stopping.set()
 
-        def stop(reason: str) -> None:
-            reasons.append(reason)
-            supervisor.stopping.set()
-
-        monkeypatch.setattr(supervisor, "stop", stop)
-        with capture_logs() as said:
-            waiting = asyncio.create_task(supervisor.until_ready())
-            async with asyncio.timeout(20):
-                while len(said) < 2:
-                    await asyncio.sleep(0)
-                assert reasons == []
-                slow.still_seconds = 1000.0
-                await waiting
-        return reasons, said
-
-    reasons, said = asyncio.run(scene())
+    monkeypatch.setattr(supervisor, "stop", stop)
+    with capture_logs() as said:
+        waiting = asyncio.create_task(supervisor.until_ready())
+        async with asyncio.timeout(20):
+            while len(said) < 2:
+                await asyncio.sleep(0)
+            assert reasons == []
+            slow.stalled_seconds = 1000.0
+            await waiting
     assert {**said[0], "seconds": 0} == {
         "event": "still starting", "waits_for": "control", "seconds": 0, "log_level": "info",
     }  # fmt: skip
@@ -178,32 +166,30 @@ def test_a_slow_start_is_waited_for_with_words(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("wanted", [False, True])
-def test_who_is_there_on_demand_ends_by_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wanted: bool
-) -> None:
-    """Its end is no death: nobody follows but where one was asked for meanwhile, and it is counted as no restart."""
+def test_a_process_on_demand_may_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wanted: bool) -> None:
+    """Its end counts as no failure or restart; a new one starts only if requested meanwhile."""
     role = Role(name="compiler", user="rosrv-compiler", part="compiler", entry="m:f", on_demand=True)
     asyncio.run(_end_by_themselves(made(tmp_path, role), monkeypatch, wanted))
 
 
 async def _end_by_themselves(supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch, wanted: bool) -> None:
-    [post] = supervisor.posts
+    [slot] = supervisor.slots
     filled: list[int] = []
-    monkeypatch.setattr(supervisor, "fill", lambda post: filled.append(post.lives))
-    control = cast(Life, StandIn())
+    monkeypatch.setattr(supervisor, "start", lambda slot: filled.append(slot.starts))
+    control = cast(ProcessHandle, StandIn())
     supervisor.control_said(control, CompilerWanted(), ())
     assert filled == [0]
-    post.life, post.lives = cast(Life, StandIn()), 1
-    cast(Any, post.life).started = 0.0
+    slot.process, slot.starts = cast(ProcessHandle, StandIn()), 1
+    cast(Any, slot.process).started = 0.0
     if wanted:
         supervisor.control_said(control, CompilerWanted(), ())
-    supervisor.died(post.life, 0)
+    supervisor.died(slot.process, 0)
     assert filled == [0] + [0] * wanted
-    assert post.is_vacant
-    assert post.lives == 0
-    post.life, post.lives = cast(Life, StandIn()), 1
-    cast(Any, post.life).started = 0.0
-    supervisor.died(post.life, -9)
-    assert post.due is not None  # a death is followed by a life
-    post.due.cancel()
+    assert slot.is_free
+    assert slot.starts == 0
+    slot.process, slot.starts = cast(ProcessHandle, StandIn()), 1
+    cast(Any, slot.process).started = 0.0
+    supervisor.died(slot.process, -9)
+    assert slot.due is not None  # a death is followed by a life
+    slot.due.cancel()
     supervisor.kept.close()

@@ -11,7 +11,7 @@ https://packages.example/tool nodistro main Somebody
 """
 
 
-def test_the_suite_and_its_updates_are_taken_and_nobody_elses() -> None:
+def test_only_the_suite_and_its_updates_are_used() -> None:
     """The suite itself comes first; other suites and other people's packages are left out."""
     assert debian_sources(TARGETS, "bookworm") == [
         "deb http://mirror.example/debian/ bookworm contrib main",
@@ -25,7 +25,7 @@ def test_a_machine_without_the_suite_has_no_lines_for_it() -> None:
 
 
 def test_apt_fetches_through_the_machines_proxy() -> None:
-    """A proxy that apt is told of is kept; else the one of the environment is used."""
+    """The proxy in apt's configuration is kept; otherwise that of the environment is used."""
     told = (
         'Acquire::http::Proxy "http://apt-proxy.example:3142";\nAcquire::Languages "none";\nAPT::Color "1";\n'
     )
@@ -38,7 +38,7 @@ def test_apt_fetches_through_the_machines_proxy() -> None:
     )
 
 
-def test_pip_is_told_of_indexes_that_can_be_reached_from_the_tree() -> None:
+def test_pip_gets_only_indexes_that_the_tree_can_reach() -> None:
     """Indexes on the network are kept; folders of this machine are not in the tree and are left out."""
     listed = (
         "global.extra-index-url='file:///srv/simple https://pypi.example/simple'\n"

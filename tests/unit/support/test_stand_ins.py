@@ -1,4 +1,4 @@
-"""How tests look at the product: by what it shows; stand-ins are typed and refuse what they do not stand for."""
+"""Tests use only public names of the product; stand-ins are typed and accept no other calls."""
 
 import ast
 import re
@@ -18,7 +18,7 @@ PUBLISHED = {
 
 
 def test_private_attributes_are_not_read() -> None:
-    """Whoever has to see a thing gives it a public name, or looks at what shows instead."""
+    """A test that needs a value uses a public name, or a visible effect."""
     assert [file for file, tree in trees(r"(?<!\bself)(?<!\bcls)\._(?!_)") if any(private(tree))] == []
 
 
@@ -43,7 +43,7 @@ def test_the_rule_finds_what_it_forbids() -> None:
 
 
 def trees(words: str) -> Iterator[tuple[str, ast.Module]]:
-    """Every file of the tests that has what is looked for in its text, by its name in tests/, and its syntax tree."""
+    """Yield each file of the tests that matches the text, by its name in tests/, with its syntax tree."""
     for path in files_of_tests():
         text = path.read_text(encoding="utf-8")
         if re.search(words, text):

@@ -1,4 +1,4 @@
-"""What a checker is told to overlook has its reason beside it, in every language of the tree."""
+"""Each suppression of a checker has its reason beside it, in every language of the tree."""
 
 import re
 from collections.abc import Iterator
@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.outside import TESTS
-
-ROOT = TESTS.parent
+ROOT = Path(__file__).resolve().parents[3]
 FOLDERS = ("appliance", "rosmop", "roswire", "benchmarks", "distribution", "examples", "scripts", "tests")
 LANGUAGES = {".py", ".js", ".mjs", ".sh", ".cpp", ".hpp", ".css", ""}
 SUPPRESSION = re.compile(
@@ -19,7 +17,7 @@ NO_REASON = {"", "when needed", "needed", "for mypy", "for ruff", "a test"}
 
 
 def test_each_suppression_has_its_reason() -> None:
-    """Why it is right here, on the same line; not only that somebody wants it."""
+    """The reason is on the same line, and says why the suppression is correct here."""
     reasons = [
         (path, reason) for path in sources() for reason in reasons_in(path.read_text(encoding="utf-8"))
     ]
@@ -48,7 +46,7 @@ def test_the_reason_is_what_follows(line: str, reason: str) -> None:
 
 
 def reasons_in(text: str) -> Iterator[str]:
-    """The reason in each line that tells a checker to overlook something; empty where there is none."""
+    """Return the reason of each suppression; empty if there is none."""
     for line in text.splitlines():
         _code, *after = SUPPRESSION.split(line)
         if after:
@@ -56,7 +54,7 @@ def reasons_in(text: str) -> Iterator[str]:
 
 
 def sources() -> Iterator[Path]:
-    """Every file of ours that a checker reads, but for this one, which is full of examples."""
+    """Return each checked file except this one, which is full of examples."""
     for folder in FOLDERS:
         for path in (ROOT / folder).rglob("*"):
             ours = path != Path(__file__) and not {"vendor", "__pycache__"} & set(path.parts)

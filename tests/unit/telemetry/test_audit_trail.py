@@ -1,4 +1,4 @@
-"""Tests of what callers are told, and not told, while nothing can be recorded."""
+"""Tests of the errors that callers receive while nothing can be recorded."""
 
 import asyncio
 import time
@@ -10,12 +10,12 @@ from appliance.audit.budget import Budget
 from appliance.audit.ids import IdSource
 from appliance.audit.record import Severity
 from appliance.configuration.settings import RecorderRules
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_BYTES
 from appliance.recorder.recording_plan import RecordingPlan
 from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail, Recordings
 
-GUEST, STRANGER = "10.0.0.66", "10.9.9.9"
+GUEST, UNKNOWN = "10.0.0.66", "10.9.9.9"
 
 
 class Log:
@@ -25,7 +25,7 @@ class Log:
         self.ids = IdSource(clock=time.time_ns)
         self.failed: str | None = "/var/lib/rosrv/control/audit.db: database or disk is full"
         self.records: list[Any] = []
-        self.budget = Budget(lambda host: Standing.STRANGER if host == STRANGER else Standing.NAMED)
+        self.budget = Budget(lambda host: QuotaClass.UNKNOWN if host == UNKNOWN else QuotaClass.NAMED)
 
     def record(self, record: Any) -> str:
         """Take it."""
@@ -48,8 +48,8 @@ def trail(log: Log, *, deny: bool, recordings: Recordings = lambda *_: {}) -> Au
     )
 
 
-def test_nobody_is_told_where_the_log_is() -> None:
-    """While the log cannot be written requests are denied; where it is and what is wrong is not for a node."""
+def test_errors_do_not_reveal_the_path_of_the_log() -> None:
+    """While the log cannot be written requests are denied; a node does not learn its path or the cause."""
     one = trail(Log(), deny=True)
     assert one.obstacle == NOT_RECORDED
     assert "/" not in NOT_RECORDED
@@ -66,16 +66,16 @@ def test_when_it_is_to_go_on_without(failed: str | None) -> None:
         assert asyncio.run(trail(log, deny=False).durable()) is None
 
 
-def test_what_is_refused_to_a_stranger_says_so() -> None:
+def test_refusals_of_unknown_hosts_are_marked() -> None:
     """A refusal of an address that no rule names is marked; what others get wrong, or are granted, is not."""
     log = Log()
     one = trail(log, deny=True)
-    one.happened("limit exceeded", "too much", decision="deny", host=STRANGER)
+    one.happened("limit exceeded", "too much", decision="deny", host=UNKNOWN)
     one.happened("limit exceeded", "too much", decision="deny", host=GUEST)
-    one.happened("rest call", "", decision="allow", host=STRANGER)
-    one.happened("connection closed", "", host=STRANGER)
-    assert [record.stranger for record in log.records] == [True, False, False, False]
-    assert [record.detail.get("stranger", False) for record in log.records] == [True, False, False, False]
+    one.happened("rest call", "", decision="allow", host=UNKNOWN)
+    one.happened("connection closed", "", host=UNKNOWN)
+    assert [record.unknown for record in log.records] == [True, False, False, False]
+    assert [record.detail.get("unknown_host", False) for record in log.records] == [True, False, False, False]
 
 
 def test_an_event_has_the_severity_of_the_registry() -> None:
@@ -88,8 +88,8 @@ def test_an_event_has_the_severity_of_the_registry() -> None:
     assert [record.severity for record in log.records] == [Severity.WARNING, Severity.ALARM, Severity.INFO]
 
 
-def test_what_a_host_beyond_its_share_causes_is_counted() -> None:
-    """Once a host owes more than its share, what it causes without a call is marked to be folded; decisions are not."""
+def test_events_of_a_host_beyond_its_quota_are_counted() -> None:
+    """The events of a host beyond its quota are marked to be folded, but decisions on its calls are not."""
     log = Log()
     one = trail(log, deny=True)
     one.happened("connection opened", "", host=GUEST)
@@ -102,7 +102,7 @@ def test_what_a_host_beyond_its_share_causes_is_counted() -> None:
 
 
 def test_the_record_of_a_drop_says_which_recording_has_it() -> None:
-    """Whatever a specification names its values; so does an alarm; what is no trigger says nothing."""
+    """This holds for any names of values, and for an alarm; a record that is not a trigger names none."""
     log = Log()
     rules = RecorderRules(enabled=True, per_hour=1, triggers=["drop", "alarm", "denial"])
     plan = RecordingPlan(rules, lambda host: host, IdSource().next)
@@ -134,7 +134,7 @@ def test_records_that_the_log_has_yet_to_count_are_not_owed() -> None:
 
 
 def test_records_that_are_written_are_owed() -> None:
-    """A host that owes for what is on the disk owes for it after the log has caught up, too."""
+    """A host owes for its records on the disk also after the log has caught up."""
     log = Log()
     one = trail(log, deny=True)
     while not one.owing(GUEST):

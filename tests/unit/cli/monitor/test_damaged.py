@@ -1,4 +1,4 @@
-"""Damaged recordings: whatever the reader raises for one, who gives it is told that it is damaged."""
+"""Damaged recordings: any exception of the reader becomes an error that says so."""
 
 import random
 from pathlib import Path
@@ -6,12 +6,12 @@ from pathlib import Path
 import typer
 
 from appliance.cli.monitor.monitor_program import MONITOR
-from rosmop.tool.bag import Recorded
-from tests.unit.cli.monitor.test_verbs import make_bag, number
+from rosmop.tool.bag import RecordedBag
+from tests.support.bags import make_bag, number
 
 
 def test_a_damaged_bag_ends_with_the_reason(tmp_path: Path) -> None:
-    """Bytes changed anywhere: the messages are read, or it is a mistake of the command line."""
+    """With changed bytes the messages are read, or the command ends with a usage error."""
     rows = [(f"/t{at % 2}", "std_msgs/Int32", 1000.0 + at, number(at)) for at in range(20)]
     whole = make_bag(tmp_path / "whole.bag", rows).read_bytes()
     place, chance, ended = tmp_path / "damaged.bag", random.Random(5), 0  # noqa: S311  the same each time
@@ -21,7 +21,7 @@ def test_a_damaged_bag_ends_with_the_reason(tmp_path: Path) -> None:
             data[chance.randrange(4100, len(data))] = chance.randrange(256)
         place.write_bytes(data)
         try:
-            list(Recorded(MONITOR, place, ["*"]).messages())
+            list(RecordedBag(MONITOR, place, ["*"]).messages())
         except typer.Exit as end:
             assert end.exit_code == 2
             ended += 1

@@ -1,86 +1,70 @@
-"""`rosrv monitor learn`: what is written, what a script reads, what is refused."""
+"""`rosrv monitor learn` and `coverage` on a drive of the simulated robot; `learn.txt` has the errors."""
 
 import json
 from pathlib import Path
 
+import pytest
 from rosbags.rosbag1 import Writer
 
 from examples.landshark.drive import Simulation, record
 from examples.landshark.messages import MONITORS
-from tests.unit.cli.monitor.test_verbs import invoke, make_bag, number
+from tests.support.command import rosrv
 
 
-def test_what_is_learnt_is_right_and_finds_nothing_in_its_own_recording(tmp_path: Path) -> None:
-    """The file passes `check` without a warning, with the robot's own definitions beside it, and drops nothing."""
-    bag, out = tmp_path / "drive.bag", tmp_path / "learnt.rv"
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a recording of a drive."""
+    bag = tmp_path_factory.mktemp("drive") / "drive.bag"
     record(Simulation().run(), bag)
-    assert invoke("learn", "--bag", bag, "--out", out).exit_code == 0
-    checked = invoke("check", out)
-    assert checked.exit_code == 0
-    assert "specifications right\n" in checked.output and "warning" not in checked.output
-    ran = invoke("run", out, "--bag", bag)
-    assert " 0 changed, 0 dropped" in ran.output and "0 faults" in ran.output
-    assert invoke("learn", "--bag", bag, "--out", out).exit_code == 2  # nothing is written over
+    return str(bag)
 
 
-def test_a_script_reads_what_it_stands_on(tmp_path: Path) -> None:
+def test_a_learned_specification_accepts_its_recording(drive: str, tmp_path: Path) -> None:
+    """The file passes `check` without a warning, beside the robot's own definitions, and drops no message."""
+    out = str(tmp_path / "learnt.rv")
+    assert rosrv("monitor", "learn", "--bag", drive, "--out", out).returncode == 0
+    checked = rosrv("monitor", "check", out)
+    assert checked.returncode == 0
+    assert "specifications OK\n" in checked.stdout
+    assert "warning" not in checked.stdout + checked.stderr
+    ran = rosrv("monitor", "run", out, "--bag", drive).stdout
+    assert " 0 changed, 0 dropped" in ran
+    assert "0 faults" in ran
+    again = rosrv("monitor", "learn", "--bag", drive, "--out", out)
+    assert again.returncode == 2, "existing files are not overwritten"
+
+
+def test_json_lists_the_evidence(drive: str) -> None:
     """One object for each condition, of the chosen topics only."""
-    bag = tmp_path / "drive.bag"
-    record(Simulation().run(), bag)
-    rows = [
-        json.loads(line)
-        for line in invoke("learn", "--bag", bag, "--topic", "*/odom", "--json").output.splitlines()
-    ]
+    learnt = rosrv("monitor", "learn", "--bag", drive, "--topic", "*/odom", "--json").stdout
+    rows = [json.loads(line) for line in learnt.splitlines()]
     assert {row["topic"] for row in rows} == {"/landshark/odom"}
     assert {"range", "rate", "late", "often", "constant"} <= {row["kind"] for row in rows}
     assert all(row["support"]["messages"] > 500 and row["support"]["recordings"] == 1 for row in rows)
 
 
-def test_a_bad_bag_is_refused_with_its_name(tmp_path: Path) -> None:
-    """A file that is no bag, one that is not there, and one given twice."""
-    bad = tmp_path / "bad.bag"
-    bad.write_bytes(b"no bag at all")
-    empty = make_bag(tmp_path / "empty.bag", [])
-    for arguments, said in (
-        (["--bag", empty], "empty.bag has no messages"),
-        (["--bag", bad], "bad.bag"),
-        (["--bag", tmp_path / "none.bag"], "none.bag"),
-        (["--bag", bad, "--bag", bad], "given twice"),
-    ):
-        result = invoke("learn", *arguments)
-        assert result.exit_code == 2
-        assert said in result.output
-
-
-def test_coverage_says_what_never_happened(tmp_path: Path) -> None:
-    """A table, the lines of what never happened, an object each for scripts, an exit status for pipelines."""
-    bag = tmp_path / "drive.bag"
-    record(Simulation().run(), bag)
-    text = MONITORS / "logging.rv"
-    result = invoke("coverage", text, "--bag", bag, "--fail-under", "80")
-    assert result.exit_code == 0
-    assert f"{text}:12: never: branch if of logging" in result.output
-    assert "logging" in result.output.splitlines()[1] and "4/4" in result.output.splitlines()[1]
-    assert invoke("coverage", text, "--bag", bag, "--fail-under", "100").exit_code == 1
-    rows = [json.loads(line) for line in invoke("coverage", text, "--bag", bag, "--json").output.splitlines()]
+def test_coverage_lists_what_never_happened(drive: str) -> None:
+    """Output is a table with missing events, one object each with `--json`, and an exit status for pipelines."""
+    file = str(MONITORS / "logging.rv")
+    result = rosrv("monitor", "coverage", file, "--bag", drive, "--fail-under", "80")
+    assert result.returncode == 0
+    assert f"{file}:12: never: branch if of logging" in result.stdout
+    assert "logging" in result.stdout.splitlines()[1]
+    assert "4/4" in result.stdout.splitlines()[1]
+    assert rosrv("monitor", "coverage", file, "--bag", drive, "--fail-under", "100").returncode == 1
+    found = rosrv("monitor", "coverage", file, "--bag", drive, "--json").stdout
+    rows = [json.loads(line) for line in found.splitlines()]
     assert {(row["kind"], row["what"]): row["count"] > 0 for row in rows}["event", "shot"]
 
 
-def test_coverage_refuses_a_recording_of_another_type(tmp_path: Path) -> None:
-    """Messages that the monitors would not see are no coverage."""
-    bag = make_bag(tmp_path / "a.bag", [("/landshark/gps", "std_msgs/Int32", 1.0, number(1))])
-    result = invoke("coverage", MONITORS / "logging.rv", "--bag", bag)
-    assert result.exit_code == 2
-    assert "/landshark/gps carries std_msgs/Int32" in result.output
-
-
-def test_a_type_that_recordings_define_differently_is_refused(tmp_path: Path) -> None:
-    """Read by another definition, messages would teach nonsense."""
-    for name, text in (("a", "int32 data"), ("b", "int32 other")):
-        with Writer(tmp_path / f"{name}.bag") as writer:
+def test_a_type_with_several_definitions_is_rejected(tmp_path: Path) -> None:
+    """Messages read by another definition would give wrong conditions."""
+    bags = [tmp_path / "a.bag", tmp_path / "b.bag"]
+    for bag, text in zip(bags, ("int32 data", "int32 other"), strict=True):
+        with Writer(bag) as writer:
             connection = writer.add_connection("/t", "robot_msgs/msg/Count", msgdef=text, md5sum="*")
             for place in range(3):
                 writer.write(connection, place, bytes(4))
-    result = invoke("learn", "--bag", tmp_path / "a.bag", "--bag", tmp_path / "b.bag")
-    assert result.exit_code == 2
-    assert "b.bag has another definition of robot_msgs/Count" in result.output
+    result = rosrv("monitor", "learn", *(word for bag in bags for word in ("--bag", str(bag))))
+    assert result.returncode == 2
+    assert "b.bag has a different definition of robot_msgs/Count" in result.stderr

@@ -1,4 +1,4 @@
-"""The way back to the folder's specifications, while the appliance does not run."""
+"""Return to the folder's specifications while the appliance does not run."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from appliance.supervisor.state_directory import StateDirectory
 
 
 def state_with(tmp_path: Path, who: str) -> Path:
-    """A state directory whose last specifications came from `who`."""
+    """Return a state directory whose last specifications were loaded by `who`."""
     home = tmp_path / "control"
     home.mkdir()
     store = StateStore(home, failed=print)
@@ -22,7 +22,7 @@ def state_with(tmp_path: Path, who: str) -> Path:
 
 
 def reset(state: Path, *options: str) -> tuple[int, str]:
-    """Exit status and output."""
+    """Return the exit status and output."""
     result = CliRunner().invoke(app, ["monitor", "reset", "--state", str(state), *options])
     if isinstance(result.exception, StartError):
         return 1, str(result.exception)
@@ -30,7 +30,7 @@ def reset(state: Path, *options: str) -> tuple[int, str]:
 
 
 def last(state: Path) -> MonitorRevisionRow | None:
-    """The last revision."""
+    """Return the last revision."""
     store = StateStore(state / "control", failed=print)
     try:
         return next(iter(store.monitor_revisions(1)), None)
@@ -38,8 +38,8 @@ def last(state: Path) -> MonitorRevisionRow | None:
         store.close()
 
 
-def test_what_was_loaded_by_command_is_given_up(tmp_path: Path) -> None:
-    """The next start reads the folder; the revision before is kept, and a second time there is nothing to do."""
+def test_specifications_loaded_by_command_are_dropped(tmp_path: Path) -> None:
+    """The next start reads the folder; the old revision is stored, and a second reset does nothing."""
     state = state_with(tmp_path, "operator")
     assert json.loads(reset(state, "--json")[1]) == {"given_up": 7}
     row = last(state)
@@ -47,11 +47,11 @@ def test_what_was_loaded_by_command_is_given_up(tmp_path: Path) -> None:
     assert (row.revision, row.who) == (8, "disk")
     status, said = reset(state)
     assert status == 0
-    assert "nothing to give up" in said
+    assert "nothing to discard" in said
 
 
 def test_a_running_appliance_is_left_alone(tmp_path: Path) -> None:
-    """It has a verb for that."""
+    """The error names the verb for a running appliance."""
     state = state_with(tmp_path, "operator")
     running = StateDirectory(state)
     status, said = reset(state)
@@ -61,8 +61,8 @@ def test_a_running_appliance_is_left_alone(tmp_path: Path) -> None:
     assert last(state) == MonitorRevisionRow(7, '{"files": {"a.rv": "old"}}', 0.0, "operator", "")
 
 
-def test_a_directory_without_a_state(tmp_path: Path) -> None:
-    """Exit status 2, and nothing is made."""
+def test_a_directory_without_a_state_is_an_error(tmp_path: Path) -> None:
+    """Exit status 2, and nothing is created."""
     status, said = reset(tmp_path / "nowhere")
     assert status == 2
     assert "--state" in said

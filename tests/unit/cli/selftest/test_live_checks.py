@@ -1,4 +1,4 @@
-"""Tests of how `rosrv selftest` looks for its own call in the audit log, with a clock that a test moves."""
+"""Tests of how `rosrv selftest` finds its own call in the audit log, with a clock that the test moves."""
 
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -6,9 +6,9 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.cli.admin_client import NotRunningError
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.target import Appliance
 from appliance.cli.selftest import live_checks as selftest_running
-from appliance.cli.target import Appliance
 
 OURS = SimpleNamespace(
     sequence=7, record=SimpleNamespace(caller_id="/rosrv_selftest_00c0ffee", id="0192-ours", host="10.0.0.1")
@@ -17,22 +17,22 @@ NOT_OURS = SimpleNamespace(sequence=6, record=SimpleNamespace(caller_id="/joy", 
 
 
 class Log:
-    """An audit log that answers one search after the other with what a test says."""
+    """An audit log that answers searches in turn as the test says."""
 
     def __init__(self) -> None:
         self.answers: list[Any] = []
         self.searches = 0
 
     def audit(self) -> "Log":
-        """Where an appliance has it."""
+        """Return the log as an appliance has it."""
         return self
 
     def last(self) -> int:
-        """Before the call."""
+        """Return the last record before the call."""
         return 5
 
     def search(self, *_arguments: object, newest_first: bool) -> Any:
-        """The next answer; the last one again and again."""
+        """Return the next answer; the last one is repeated."""
         assert newest_first
         self.searches += 1
         answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
@@ -43,7 +43,7 @@ class Log:
 
 @pytest.fixture
 def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[Log]:
-    """A log; every second that is waited passes at once."""
+    """Return a log; waiting takes no time."""
     now = [100.0]
 
     def sleep(seconds: float) -> None:
@@ -51,7 +51,7 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[Log]:
         now[0] += seconds
 
     def monotonic() -> float:
-        now[0] += 0.001  # a search takes a moment
+        now[0] += 0.001  # a search takes time
         return now[0]
 
     monkeypatch.setattr(selftest_running, "time", SimpleNamespace(monotonic=monotonic, sleep=sleep))
@@ -61,13 +61,13 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[Log]:
 
 
 def outcome(log: Log) -> tuple[str, str]:
-    """What the check of RVMaster says."""
+    """Return the result of the check."""
     (found,) = selftest_running.check_call(cast(Appliance, log), "http://127.0.0.1:11311")
     return found.outcome, found.text
 
 
-def test_a_call_that_is_recorded_a_moment_later_is_found(log: Log) -> None:
-    """The log is written in batches: it is looked at again."""
+def test_a_delayed_record_is_found(log: Log) -> None:
+    """The log is written in batches, so the search is repeated."""
     log.answers = [[NOT_OURS], [NOT_OURS], [OURS, NOT_OURS]]
     found, text = outcome(log)
     assert found == "ok"
@@ -75,8 +75,8 @@ def test_a_call_that_is_recorded_a_moment_later_is_found(log: Log) -> None:
     assert log.searches == 3
 
 
-def test_a_call_that_is_not_recorded_is_looked_for_a_few_times_only(log: Log) -> None:
-    """Five seconds: over REST each look is a request, and many at once are refused (429)."""
+def test_a_missing_record_is_searched_for_five_seconds(log: Log) -> None:
+    """Over REST each search is a request, and too many at once are refused (429)."""
     log.answers = [[NOT_OURS]]
     found, text = outcome(log)
     assert found == "fail"
@@ -84,14 +84,14 @@ def test_a_call_that_is_not_recorded_is_looked_for_a_few_times_only(log: Log) ->
     assert log.searches <= 15
 
 
-def test_a_look_that_is_refused_is_made_again(log: Log) -> None:
-    """Too many requests, a process that is started again: it passes."""
+def test_a_refused_search_is_repeated(log: Log) -> None:
+    """Too many requests, or a restarting process, is temporary."""
     log.answers = [NotRunningError("https://h: too many requests"), [OURS]]
     assert outcome(log)[0] == "ok"
 
 
-def test_a_log_that_cannot_be_seen_is_no_defect(log: Log) -> None:
-    """Whether the call was recorded is not known then, and why is told."""
+def test_an_unreadable_log_is_not_a_defect(log: Log) -> None:
+    """The result says that the record could not be checked, and why."""
     log.answers = [NotRunningError("https://h: too many requests")]
     found, text = outcome(log)
     assert found == "skip"

@@ -1,55 +1,53 @@
-"""Registering calls under one name wait for each other; other names do not."""
+"""Registering calls under one name wait for each other; other names do not, also not those below it."""
 
 import asyncio
 
-from appliance.master.calls.call_order import Claims
+import pytest
+
+from appliance.master.calls.call_order import KeyTurns
+
+pytestmark = pytest.mark.anyio
 
 
-def test_one_after_the_other_by_name() -> None:
-    """Under one name they go in the order they came; nothing is kept of a name that is not in use."""
+async def test_one_after_the_other_by_name() -> None:
+    """Calls under one name are served in order of arrival; unused names take no memory."""
     order: list[str] = []
 
-    async def register(claims: Claims, name: str, mark: str, go: asyncio.Event) -> None:
-        async with claims.alone(name):
+    async def register(names: KeyTurns, name: str, mark: str, go: asyncio.Event) -> None:
+        async with names.of_name(name):
             order.append(f"{mark} in")
             await go.wait()
             order.append(f"{mark} out")
 
-    async def scene() -> None:
-        claims, first, second, other = Claims(), asyncio.Event(), asyncio.Event(), asyncio.Event()
-        tasks = [
-            asyncio.create_task(register(claims, "/a", "first", first)),
-            asyncio.create_task(register(claims, "/a", "second", second)),
-            asyncio.create_task(register(claims, "/b", "other", other)),
-        ]
-        second.set()
-        other.set()
-        await tasks[2]
-        assert order == ["first in", "other in", "other out"]
-        first.set()
-        await asyncio.gather(*tasks)
-        assert order[3:] == ["first out", "second in", "second out"]
-        assert len(claims) == 0
-
-    asyncio.run(scene())
+    names, first, second, other = KeyTurns(), asyncio.Event(), asyncio.Event(), asyncio.Event()
+    tasks = [
+        asyncio.create_task(register(names, "/a", "first", first)),
+        asyncio.create_task(register(names, "/a", "second", second)),
+        asyncio.create_task(register(names, "/a/b", "other", other)),
+    ]
+    second.set()
+    other.set()
+    await tasks[2]
+    assert order == ["first in", "other in", "other out"]
+    first.set()
+    await asyncio.gather(*tasks)
+    assert order[3:] == ["first out", "second in", "second out"]
+    assert len(names) == 0
 
 
-def test_a_failure_and_a_cancellation_let_the_next_one_in() -> None:
-    """Whoever fails, or stops waiting, leaves no lock behind."""
+async def test_a_failure_and_a_cancellation_let_the_next_one_in() -> None:
+    """A call that fails or is cancelled leaves no lock behind."""
 
-    async def fail(claims: Claims) -> None:
-        async with claims.alone("/a"):
+    async def fail(names: KeyTurns) -> None:
+        async with names.of_name("/a"):
             await asyncio.sleep(0)
             raise ValueError
 
-    async def scene() -> None:
-        claims = Claims()
-        failing, waiting = asyncio.create_task(fail(claims)), asyncio.create_task(fail(claims))
-        await asyncio.sleep(0)
-        waiting.cancel()
-        await asyncio.gather(failing, waiting, return_exceptions=True)
-        async with claims.alone("/a"):
-            assert len(claims) == 1
-        assert len(claims) == 0
-
-    asyncio.run(scene())
+    names = KeyTurns()
+    failing, waiting = asyncio.create_task(fail(names)), asyncio.create_task(fail(names))
+    await asyncio.sleep(0)
+    waiting.cancel()
+    await asyncio.gather(failing, waiting, return_exceptions=True)
+    async with names.of_name("/a"):
+        assert len(names) == 1
+    assert len(names) == 0

@@ -1,4 +1,4 @@
-"""What the gate decides on parameters (the key, what is below it, what a write replaces) and on names that are held."""
+"""The gate decides on parameters (the key, all below it, replaced values) and on names in use."""
 
 import ipaddress
 from typing import Any
@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 
 from appliance.master.caller import ApiUri, Caller
-from appliance.master.calls.call import CALLER_API, SERVICE_API, Attempt, Call, Identity
+from appliance.master.calls.call import CALLER_API, SERVICE_API, Attempt, Identity, RosCall
 from appliance.master.calls.call_table import MASTER_CALLS
-from appliance.master.calls.gate import Contest, Gate, HostLimits, contested
+from appliance.master.calls.gate import CallGate, HostLimits, NameConflict, contested
 from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, Registry
 from appliance.master.reconcile.liveness import Presence, Probe
@@ -43,25 +43,25 @@ write default  = adm
 """
 
 
-def gate(rules: str) -> Gate:
-    """The gate under a policy with these rules for parameters, and nobody registered."""
+def gate(rules: str) -> CallGate:
+    """Return the gate under a policy with these rules for parameters, without registrations."""
     policy = compile_policy(BASE + rules, file="test.ini")
-    return Gate(lambda: policy, Registry(), HostLimits())
+    return CallGate(lambda: policy, Registry(), HostLimits())
 
 
 def ask(rules: str, host: str, method: str, *arguments: Any, tree: Any = None) -> Decision:
-    """The decision on a call, while ROSMaster has the parameters `tree`."""
+    """Return the decision on a call while the ROS master has the parameters `tree`."""
     peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
     decision = gate(rules).decide(
         Attempt(Caller(peer, "/me", 0), MASTER_CALLS[method], arguments), tree or {}
     )
-    assert not isinstance(decision, Contest)
+    assert not isinstance(decision, NameConflict)
     return decision
 
 
 @pytest.mark.parametrize("key", ["/arm/max/x", "/arm/max/x/y"])
 def test_a_value_that_may_not_be_written_is_not_replaced_from_below(key: str) -> None:
-    """ROSMaster makes a namespace of a value when something below it is set: that is a write of the value."""
+    """Setting a key below a value turns the value into a namespace: that is a write of the value."""
     tree = {"arm": {"max": 5, "speed": 1}}
     denied = ask(LIMITED, OPERATOR, "setParam", key, 0, tree=tree)
     assert not denied.allowed
@@ -72,8 +72,8 @@ def test_a_value_that_may_not_be_written_is_not_replaced_from_below(key: str) ->
     assert ask(LIMITED, OPERATOR, "setParam", "/arm/speed/x", 0, tree=tree).allowed
 
 
-def test_what_is_no_value_is_in_nobodys_way() -> None:
-    """Below a namespace, or where nothing is, the key itself decides."""
+def test_only_a_value_blocks_a_write_below_it() -> None:
+    """Below a namespace, or an unset key, the key itself decides."""
     trees: list[Tree] = [{}, {"arm": {}}, {"arm": {"max": {"y": 1}}}]
     for tree in trees:
         assert ask(LIMITED, OPERATOR, "setParam", "/arm/max/x", 0, tree=tree).allowed
@@ -81,15 +81,10 @@ def test_what_is_no_value_is_in_nobodys_way() -> None:
 
 @pytest.mark.parametrize(
     ("method", "arguments"),
-    [
-        ("getParam", ("/arm",)),
-        ("hasParam", ("/arm",)),
-        ("setParam", ("/arm", 0)),
-        ("deleteParam", ("/arm",)),
-    ],
+    [("getParam", ("/arm",)), ("hasParam", ("/arm",)), ("setParam", ("/arm", 0)), ("deleteParam", ("/arm",))],
 )
 def test_an_exact_key_is_no_right_to_a_namespace(method: str, arguments: tuple[Any, ...]) -> None:
-    """While /arm is a value, `/arm = ocu` is for it; what is in a namespace /arm is decided by `default`."""
+    """While /arm is a value, `/arm = ocu` applies; members of a namespace /arm are decided by `default`."""
     assert ask(EXACT, OPERATOR, method, *arguments, tree={"arm": 7}).allowed
     assert ask(EXACT, OPERATOR, method, *arguments, tree={}).allowed
     denied = ask(EXACT, OPERATOR, method, *arguments, tree={"arm": {"speed": 7}})
@@ -99,20 +94,20 @@ def test_an_exact_key_is_no_right_to_a_namespace(method: str, arguments: tuple[A
 
 
 def test_a_dictionary_is_a_namespace_before_it_is_there() -> None:
-    """Who sets a dictionary sets all that is in it, and needs the right to all of it."""
+    """A host that sets a dictionary needs the right to each of its members."""
     assert not ask(EXACT, OPERATOR, "setParam", "/arm", {"speed": 1}).allowed
     assert ask(EXACT + "write /arm/** = ocu\n", OPERATOR, "setParam", "/arm", {"speed": 1}).allowed
     assert ask(EXACT, OPERATOR, "setParam", "/arm", [{"speed": 1}]).allowed
 
 
-def test_without_the_section_everything_is_as_it_was() -> None:
+def test_without_the_section_commands_decide() -> None:
     """A policy that has no [Parameters] decides by [Commands] alone."""
     rules = "[Clients]\ndefault = *\n"
     tree: Tree = {"arm": {"max": 5}}
     text = BASE.replace("[Parameters]\n", "") + rules
     policy = compile_policy(text, file="test.ini")
     peer = Peer(ipaddress.ip_address(OPERATOR), OPERATOR, "10.0.0.1")
-    here = Gate(lambda: policy, Registry(), HostLimits())
+    here = CallGate(lambda: policy, Registry(), HostLimits())
     decision = here.decide(Attempt(Caller(peer, "/me", 0), MASTER_CALLS["setParam"], ("/arm/max/x", 0)), tree)
     assert isinstance(decision, Decision)
     assert decision.allowed
@@ -142,9 +137,9 @@ def held(name: str, host: str, *, own: bool) -> Registry:
 def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
     method: str, arguments: tuple[Any, ...], does: bool
 ) -> None:
-    """Without isolation the robot's nodes and the appliance's come from one address: the listener tells them apart.
+    """Without isolation the robot's nodes and the appliance's have the same address: the listener tells them apart.
 
-    At that listener the policy is not asked: what the appliance's node does is known (`does`).
+    The policy does not apply at that listener: the actions of the appliance's node are known (`does`).
     """
     policy = compile_policy(
         "[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n[Commands]\ndefault = *\n", file="test.ini"
@@ -154,7 +149,7 @@ def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
     given = tuple(ApiUri(API, parse_node_uri(API)) if one == API else one for one in arguments)
     for own in (True, False):
         registry = held("/rosout", "127.0.0.1", own=own)
-        here = Gate(lambda: policy, registry, HostLimits())
+        here = CallGate(lambda: policy, registry, HostLimits())
         decision = here.decide(Attempt(Caller(loopback, "/rosout", 0), call, given), {})
         assert isinstance(decision, Decision)
         assert decision.allowed is not own
@@ -168,8 +163,8 @@ def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
     [one for one in (*MASTER_CALLS.values(), *NODE_CALLS.values()) if one.identity is not Identity.NOBODY],
     ids=lambda one: one.name,
 )
-def test_no_call_is_made_in_the_name_of_another_hosts_node(call: Call[Any]) -> None:
-    """Whatever the policy grants; what registers waits for whether the holder is still there."""
+def test_no_call_is_made_under_the_name_of_another_hosts_node(call: RosCall[Any]) -> None:
+    """No policy grants such a call; a registration waits for the probe of the present holder."""
     sections = ("Nodes", "Publishers", "Subscribers", "Services", "Clients", "Commands")
     text = "".join(f"[{name}]\ndefault = *\n" for name in sections)
     policy = compile_policy(f"{text}getRVState = *\nshutdownMaster = *\n", file="test.ini")
@@ -178,14 +173,14 @@ def test_no_call_is_made_in_the_name_of_another_hosts_node(call: Call[Any]) -> N
     given = tuple(own if one in {CALLER_API, SERVICE_API} else "/thing" for one in call.method.parameters)
     caller = Caller(Peer(ipaddress.ip_address(OPERATOR), OPERATOR, "10.0.0.1"), "/me", 0)
     for host, may in ((OPERATOR, True), (ADMIN, False)):
-        here = Gate(lambda: policy, held("/me", host, own=False), HostLimits())
+        here = CallGate(lambda: policy, held("/me", host, own=False), HostLimits())
         decision = here.decide(Attempt(caller, call, given), {})
         assert (isinstance(decision, Decision) and decision.allowed) is may
 
 
 @pytest.mark.parametrize(("path", "allowed"), [(PUBLISHER_PATH, False), ("/", True)])
-def test_nobody_takes_a_service_from_the_appliance(path: str, allowed: bool) -> None:
-    """The last who registers a service has it, as in plain ROS, but of what the appliance offers."""
+def test_no_node_replaces_a_service_of_the_appliance(path: str, allowed: bool) -> None:
+    """The last registration of a service wins, as in plain ROS, except for the appliance's services."""
     policy = compile_policy("[Nodes]\ndefault = *\n", file="test.ini")
     registry = Registry()
     uri, robot = f"http://127.0.0.1:4000{path}", ipaddress.ip_address("10.0.0.5")
@@ -203,7 +198,7 @@ def test_nobody_takes_a_service_from_the_appliance(path: str, allowed: bool) -> 
         api,
     )
     attempt = Attempt(caller, MASTER_CALLS["registerService"], given)
-    decision = Gate(lambda: policy, registry, HostLimits()).decide(attempt, {})
+    decision = CallGate(lambda: policy, registry, HostLimits()).decide(attempt, {})
     assert isinstance(decision, Decision)
     assert decision.allowed is allowed
     if not allowed:
@@ -211,9 +206,9 @@ def test_nobody_takes_a_service_from_the_appliance(path: str, allowed: bool) -> 
 
 
 def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
-    """The rosout aggregator subscribes at other nodes' outer faces, whatever the policy says of this machine.
+    """The rosout aggregator subscribes at other nodes' proxy endpoints, whatever the policy says of this machine.
 
-    From another machine nobody does in its name; and on this one nobody asks in its name for anything else.
+    Other machines may not use its name, and on this machine its name allows nothing else.
     """
     policy = compile_policy(
         f"[Nodes]\ndefault = {OPERATOR}\n[Subscribers]\ndefault = {OPERATOR}\n", file="p.ini"
@@ -222,7 +217,7 @@ def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
     aggregator = registry.holder("/rosout")
     assert aggregator is not None
     registry.register(aggregator, Kind.SUBSCRIPTION, "/rosout", "rosgraph_msgs/Log")
-    here = Gate(lambda: policy, registry, HostLimits())
+    here = CallGate(lambda: policy, registry, HostLimits())
     uri = parse_node_uri(API)
     other = Incarnation("other", "/voice", ipaddress.ip_address(OPERATOR), uri, API, OPERATOR, 19003, 19004)
     for host, local, topic, allowed in (
@@ -249,9 +244,9 @@ def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
     ],
 )
 def test_a_contest_ends_as_the_probe_found_the_holder(presence: Presence, words: str | None) -> None:
-    """Gone: the name is given over. Silent: the refusal says when to ask again. Of another holder nothing is known."""
+    """If the holder is gone, the name is free; if it is silent, the refusal says when to retry."""
     holder, other = (next(iter(held(name, "10.0.0.9", own=False).live())) for name in ("/voice", "/other"))
-    contest = Contest(holder, Decision(True, None, "granted"))
+    contest = NameConflict(holder, Decision(True, None, "granted"))
     decision = contested(contest, Probe(holder, presence, 7.2))
     assert (decision.allowed, words is None or words in decision.reason) == (words is None, True)
     assert not contested(contest, Probe(other, presence, 7.2)).allowed
@@ -259,11 +254,11 @@ def test_a_contest_ends_as_the_probe_found_the_holder(presence: Presence, words:
 
 
 def test_a_host_has_as_many_registrations_as_are_left() -> None:
-    """Three times as many: however many hosts register all they can, the next finds room."""
+    """Every host that registers as many as it can leaves enough for the next one."""
     policy = compile_policy(BASE + LIMITED + "[Publishers]\ndefault = *\n", file="test.ini")
     registry = Registry()
     limits = HostLimits(nodes=500, registrations=60, registrations_in_all=100)
-    gate = Gate(lambda: policy, registry, limits)
+    gate = CallGate(lambda: policy, registry, limits)
     counts = []
     for number in range(4):
         host, uri = f"10.1.0.{number}", f"http://10.1.0.{number}:4000/"

@@ -1,4 +1,4 @@
-"""What tools ask about connections costs as much as there are, however many topics a host has besides."""
+"""Requests about connections take time in proportion to the connections, not to the topics of a host."""
 
 import ipaddress
 from types import SimpleNamespace
@@ -10,7 +10,7 @@ from appliance.channel.messages import ConnectionOpened
 from appliance.control.overview import graph_of
 from appliance.master.caller import Caller
 from appliance.master.calls.node_calls import NodeCalls
-from appliance.master.endpoints.traffic import Carried
+from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.uris import parse_node_uri
@@ -21,26 +21,26 @@ TOPICS, CONNECTIONS = 200, 300
 
 
 class Counted(dict[Any, Any]):
-    """Connections that count how often one of them is looked at."""
+    """Connections that count how often one of them is read."""
 
     looks = 0
 
     def values(self) -> Any:
-        """Each look counts."""
+        """Count each access."""
         for connection in super().values():
             self.looks += 1
             yield connection
 
 
-async def test_connections_are_looked_at_once() -> None:
-    """`getBusStats` and the graph have a row for each topic and each connection; none is multiplied by the other."""
+async def test_each_connection_is_read_once() -> None:
+    """`getBusStats` and the graph have a row for each topic and each connection; their numbers are not multiplied."""
     registry, uri, host = Registry(), "http://10.0.0.5:4000/", ipaddress.ip_address("10.0.0.5")
     node = Incarnation("key", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
     registry.add(node)
     for number in range(TOPICS):
         for kind in (Kind.PUBLICATION, Kind.SUBSCRIPTION, Kind.SERVICE):
             registry.register(node, kind, f"/{kind}_{number}", "std_msgs/String")
-    carried = Carried(idle(AuditTrail), registry, 1)
+    carried = RelayTraffic(idle(AuditTrail), registry, 1)
     topic = f"/{Kind.PUBLICATION}_7"
     carried.connections = connections = Counted(
         {
@@ -58,7 +58,8 @@ async def test_connections_are_looked_at_once() -> None:
     assert (len(sent), len(received)) == (TOPICS, TOPICS)
     assert [name for name, _bytes, rows in sent if len(rows) == CONNECTIONS] == [topic]
     assert connections.looks == CONNECTIONS
-    graph = graph_of(cast(Any, SimpleNamespace(registry=registry, relay=relay, mediation=mediation)))
+    core, endpoints = SimpleNamespace(registry=registry, mediation=mediation), SimpleNamespace(relay=relay)
+    graph = graph_of(cast(Any, SimpleNamespace(core=core, endpoints=endpoints)))
     assert {row.name: len(row.connections) for row in graph.topics if row.connections} == {topic: CONNECTIONS}
     assert len(graph.services) == TOPICS
     assert connections.looks <= 3 * CONNECTIONS

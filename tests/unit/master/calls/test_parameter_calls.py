@@ -1,4 +1,4 @@
-"""The mirror of the parameters is ROSMaster's tree, step by step: compared with rosmaster's own code."""
+"""The mirror of the parameters equals the tree of rosmaster's own code after every step."""
 
 import asyncio
 import copy
@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.master.caller import Caller
-from appliance.master.calls.parameter_calls import ParameterCalls, Write
+from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
 from appliance.master.parameter_charges import LimitReachedError, measure
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.rpc.server import Peer
@@ -22,6 +22,8 @@ from roswire.errors import EncodingError, ProtocolError
 from tests.support.examples import examples
 from tests.support.nodes import PYTHON
 from tests.support.parameters import mirror, put
+
+pytestmark = pytest.mark.anyio
 
 HOST = ipaddress.ip_address("10.0.0.1")
 ORACLE = """
@@ -68,7 +70,7 @@ def oracle() -> Any:
 
 @settings(max_examples=examples(300), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=st.lists(STEP, max_size=12))
-def test_the_mirror_is_what_rosmaster_has(oracle: Any, steps: list[Any]) -> None:
+def test_the_mirror_equals_the_tree_of_rosmaster(oracle: Any, steps: list[Any]) -> None:
     """After any sequence of settings and deletions both trees are equal, and the weight is that of the tree."""
     oracle.stdin.write(json.dumps(steps) + "\n")
     oracle.stdin.flush()
@@ -82,18 +84,18 @@ def test_the_mirror_is_what_rosmaster_has(oracle: Any, steps: list[Any]) -> None
     assert there.weight == measure(there.tree)[0]
 
 
-def test_what_would_be_too_much_is_refused_before_it_is_set() -> None:
-    """All parameters together are bounded; what is deleted makes room."""
+def test_a_value_beyond_the_bound_is_refused_before_it_is_set() -> None:
+    """All parameters together are bounded; deleting one makes room."""
     there = mirror(whole=1000)
     put(there, "/a", "x" * 500, HOST)
-    with pytest.raises(LimitReachedError, match="the share of one host is 1000"):
+    with pytest.raises(LimitReachedError, match="the quota of one host is 1000"):
         put(there, "/b", "x" * 500, HOST)
     there.delete("/a")
     put(there, "/b", "x" * 500, HOST)
 
 
 def test_key_and_value_together_are_bounded_in_depth() -> None:
-    """ROSMaster answers recursively: what it could not tell any more never gets there."""
+    """The ROS master answers recursively: values too deep for its answers are refused."""
     there = mirror(depth_limit=5)
     there.check("/a/b/c", measure({"d": [1]})[1])
     with pytest.raises(ProtocolError, match="nest deeper"):
@@ -103,7 +105,7 @@ def test_key_and_value_together_are_bounded_in_depth() -> None:
 
 
 class OrderedServer:
-    """ROSMaster's parameters, and how the calls reached it."""
+    """The parameters of the ROS master, and the requests that reached it."""
 
     def __init__(self, there: ParameterMirror) -> None:
         self.tree = mirror()
@@ -126,11 +128,11 @@ class OrderedServer:
         self.told.append((key, None))
 
     async def call(self, method: str, *params: Any) -> Any:
-        """One call by itself."""
+        """Carry out one call."""
         return (await self.call_in_order([(method, params)]))[0]
 
     async def call_in_order(self, calls: Any) -> list[Any]:
-        """Several as one."""
+        """Carry out several calls as one request."""
         if any(value == "unwritable" for _method, params in calls for value in params[2:]):
             raise EncodingError("cannot be written")
         self.requests.append([f"{method} {params[1]}" for method, params in calls])
@@ -150,22 +152,17 @@ class OrderedServer:
 
 
 def ordered(server: OrderedServer, *calls: tuple[Any, ...]) -> list[Any]:
-    """Carry them out in order."""
+    """Carry out the calls in order."""
     peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
     caller = Caller(peer, "/me", 0)
-    writes = [Write(caller, key, value[0] if value else None) for _method, key, *value in calls]
+    writes = [ParameterWrite(caller, key, value[0] if value else None) for _method, key, *value in calls]
     return asyncio.run(server.calls.write(writes))
 
 
 def test_a_run_is_one_request_in_its_order() -> None:
-    """Calls of one run travel as one, in their order, and the mirror has what ROSMaster has."""
+    """Calls of one run are sent as one request, in order, and the mirror equals the tree of the ROS master."""
     server = OrderedServer(mirror())
-    answers = ordered(
-        server,
-        ("setParam", "/a", {"b": 1}),
-        ("deleteParam", "/a/b"),
-        ("setParam", "/c", 2),
-    )
+    answers = ordered(server, ("setParam", "/a", {"b": 1}), ("deleteParam", "/a/b"), ("setParam", "/c", 2))
     assert server.requests == [["setParam /a", "deleteParam /a/b", "setParam /c"]]
     assert [one[1] for one in answers] == ["setParam", "deleteParam", "setParam"]
     assert server.parameters.tree == server.tree.tree == {"a": {}, "c": 2}
@@ -174,8 +171,8 @@ def test_a_run_is_one_request_in_its_order() -> None:
 
 @settings(max_examples=examples(100))
 @given(st.lists(STEP, max_size=12))
-def test_a_run_leaves_what_single_calls_leave(steps: list[tuple[str, str, Any]]) -> None:
-    """Whatever the calls, together they leave the tree that they leave one by one."""
+def test_a_run_has_the_effect_of_single_calls(steps: list[tuple[str, str, Any]]) -> None:
+    """Any calls give the same tree together and one by one."""
     calls = [("setParam", key, value) if do == "set" else ("deleteParam", key) for do, key, value in steps]
     together, single = (OrderedServer(mirror()) for _ in range(2))
     ordered(together, *copy.deepcopy(calls))
@@ -185,8 +182,8 @@ def test_a_run_leaves_what_single_calls_leave(steps: list[tuple[str, str, Any]])
     assert together.parameters.weight == single.parameters.weight
 
 
-def test_a_value_that_cannot_be_written_holds_up_no_other() -> None:
-    """The one that no request can carry fails by itself; those before and after it are carried out in order."""
+def test_an_unserializable_value_delays_no_other_call() -> None:
+    """Only the value that no request can carry fails; calls before and after it are carried out in order."""
     server = OrderedServer(mirror())
     answers = ordered(server, ("setParam", "/a", 1), ("setParam", "/b", "unwritable"), ("setParam", "/c", 3))
     assert isinstance(answers[1], EncodingError)
@@ -194,8 +191,8 @@ def test_a_value_that_cannot_be_written_holds_up_no_other() -> None:
     assert server.requests == [["setParam /a"], ["setParam /c"]]
 
 
-def test_a_value_that_is_too_much() -> None:
-    """The limit holds for the sum of a run; what takes the place of something else is no addition."""
+def test_a_run_beyond_the_bound() -> None:
+    """The limit holds for the sum of a run; a replaced value is not counted twice."""
     server = OrderedServer(mirror(whole=1100))
     big = "x" * 400
     answers = ordered(
@@ -210,8 +207,8 @@ def test_a_value_that_is_too_much() -> None:
     assert server.parameters.weight <= 1100
 
 
-def test_a_part_that_fails_and_a_master_that_is_gone() -> None:
-    """A fault of one part is that part's; without an answer each part has the failure, and the mirror stays."""
+def test_a_failing_part_and_a_lost_master() -> None:
+    """A fault fails one part only; without an answer every part fails, and the mirror is unchanged."""
     server = OrderedServer(mirror())
     answers = ordered(server, ("deleteParam", "/fault"), ("setParam", "/a", 1))
     assert isinstance(answers[0], CallFailedError)
@@ -225,10 +222,8 @@ def test_a_part_that_fails_and_a_master_that_is_gone() -> None:
 
 @settings(max_examples=examples(200))
 @given(st.lists(STEP, max_size=14), st.data())
-def test_changes_made_once_more_leave_the_same_tree(
-    steps: list[tuple[str, str, Any]], data: st.DataObject
-) -> None:
-    """A tree kept at any moment, with the changes from then or from any moment before it on, is the last tree."""
+def test_repeated_changes_give_the_same_tree(steps: list[tuple[str, str, Any]], data: st.DataObject) -> None:
+    """A stored tree, with the changes since then or since any earlier time, gives the last tree."""
     noted: list[tuple[str, Any]] = []
     there = mirror(note=lambda key, value: noted.append((key, copy.deepcopy(value))))
     kept = []
@@ -246,8 +241,8 @@ def test_changes_made_once_more_leave_the_same_tree(
 
 
 @pytest.mark.parametrize("together", [False, True], ids=["alone", "in a run"])
-def test_what_rosmaster_has_in_spite_of_its_error(together: bool) -> None:
-    """ROSMaster keeps a value before it finds that it cannot tell those who subscribed: the mirror has it, too."""
+def test_a_value_that_rosmaster_keeps_despite_its_error(together: bool) -> None:
+    """The ROS master keeps a value even if notifying subscribers then fails: the mirror has it also."""
     steps: list[Any] = [["/q", {"b": 1, "b/c": 2}], ["/", 7], ["/r", 3]]
     answered = subprocess.run(
         [PYTHON, "-c", WHOLE, json.dumps(steps)], capture_output=True, text=True, check=True, timeout=60
@@ -256,7 +251,7 @@ def test_what_rosmaster_has_in_spite_of_its_error(together: bool) -> None:
     assert codes[:2] == [-1, -1]
 
     class Failing(OrderedServer):
-        """ROSMaster with the answers that the real one gave."""
+        """A ROS master with the answers that the real one gave."""
 
         async def call_in_order(self, calls: Any) -> list[Any]:
             keys = [key for key, _ in steps]
@@ -274,8 +269,8 @@ def test_what_rosmaster_has_in_spite_of_its_error(together: bool) -> None:
     assert server.parameters.weight == measure(server.parameters.tree)[0]
 
 
-def test_others_have_their_turns_while_thousands_of_names_are_decided() -> None:
-    """`getParamNames` asks the policy for each name: the loop turns meanwhile, and the answer has what may be found."""
+async def test_the_loop_runs_while_thousands_of_names_are_decided() -> None:
+    """`getParamNames` checks each name: the loop runs meanwhile, and the answer has the readable names."""
     there = mirror(tree={"mine": {f"p{number}": 1 for number in range(5000)}, "hidden": {"key": 1}})
     none: Any = None
     master = SimpleNamespace(reachable=True)
@@ -289,11 +284,8 @@ def test_others_have_their_turns_while_thousands_of_names_are_decided() -> None:
             turns += 1
             await asyncio.sleep(0)
 
-    async def scene() -> None:
-        other = asyncio.create_task(others())
-        answer = await calls.get_param_names(Caller(Peer(HOST, str(HOST), "10.0.0.2"), "/me", 0))
-        assert answer[2] == [f"/mine/p{number}" for number in range(5000)]
-        assert turns >= 5
-        other.cancel()
-
-    asyncio.run(scene())
+    other = asyncio.create_task(others())
+    answer = await calls.get_param_names(Caller(Peer(HOST, str(HOST), "10.0.0.2"), "/me", 0))
+    assert answer[2] == [f"/mine/p{number}" for number in range(5000)]
+    assert turns >= 5
+    other.cancel()

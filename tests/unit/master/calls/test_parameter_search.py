@@ -1,4 +1,4 @@
-"""searchParam: what may be read is found as ROSMaster finds it; of the rest the answer tells nothing."""
+"""searchParam finds readable keys as the ROS master does, and reveals no others."""
 
 import asyncio
 import ipaddress
@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 
 from appliance.master.caller import Answer, Caller
-from appliance.master.calls.parameter_calls import ParameterSearch
+from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
@@ -20,13 +20,14 @@ RULES = "[Parameters]\nread default = 10.0.0.5\nread /secret/** = 10.0.0.9\nread
 
 
 class Site:
-    """ROSMaster with these parameters, and what was recorded: (name, decision)."""
+    """A ROS master with these parameters, and the records: (name, decision)."""
 
     def __init__(self, tree: Any, rules: str = RULES) -> None:
         policy = compile_policy(rules, file="test.ini")
         self.parameters = mirror(tree)
         rights = ParameterRights(lambda: policy, cast(Any, self))
-        self.calls = ParameterSearch(cast(Any, self), self.parameters, rights)
+        nothing = cast(Any, None)  # a search changes nothing
+        self.calls = ParameterCalls(cast(Any, self), self.parameters, nothing, nothing, rights, 0)
         self.asked: list[str] = []
         self.records: list[tuple[str, Decision]] = []
 
@@ -37,7 +38,7 @@ class Site:
         return f"id{len(self.records)}"
 
     async def call(self, _method: str, caller_id: Any, key: Any) -> Answer:
-        """ROSMaster's search."""
+        """Search as the ROS master does."""
         self.asked.append(key)
         first = key.strip("/").split("/")[0]
         namespace = [] if key.startswith("/") else caller_id.strip("/").split("/")
@@ -49,7 +50,7 @@ class Site:
         return [-1, f"Cannot find parameter [{key}] in an upwards search", ""]
 
     def search(self, caller_id: str, key: str, *, own: bool = False) -> Answer:
-        """One search."""
+        """Make one search."""
         peer = Peer(ipaddress.ip_address(HOST), HOST, "10.0.0.1")
         caller = Caller(peer, caller_id, 0, own=own)
         return asyncio.run(self.calls.search_param(caller, key))
@@ -65,8 +66,8 @@ class Site:
         ("/secret", "key"),
     ],
 )
-def test_whether_it_is_there_makes_no_difference(caller_id: str, key: str) -> None:
-    """What may not be read is answered alike whether or not it exists: with the rule, and the id of the record."""
+def test_the_answer_does_not_reveal_whether_a_key_exists(caller_id: str, key: str) -> None:
+    """An unreadable key has the same answer whether or not it exists: the rule, and the id of the record."""
     answers = [Site(tree).search(caller_id, key) for tree in ({"secret": {"key": 1}, "open": 1}, {"open": 1})]
     assert answers[0] == answers[1]
     assert answers[0][0] != 1
@@ -75,7 +76,7 @@ def test_whether_it_is_there_makes_no_difference(caller_id: str, key: str) -> No
 
 
 def test_a_denial_is_recorded_with_its_name() -> None:
-    """A global key is decided before anybody looks for it; a search upwards is recorded by its first hidden place."""
+    """A global key is decided before the search; a search upwards is recorded with its first hidden key."""
     site = Site({"secret": {"key": 1}})
     site.search("/me", "/secret/key")
     assert not site.asked
@@ -86,8 +87,8 @@ def test_a_denial_is_recorded_with_its_name() -> None:
     ]
 
 
-def test_a_hidden_name_is_in_nobodys_way() -> None:
-    """The search goes on above a place that may not be read, as if nothing were there."""
+def test_a_search_goes_on_above_a_hidden_name() -> None:
+    """A search treats an unreadable key as if it did not exist."""
     for tree in ({"arm": {"key": 1}, "key": 2}, {"arm": {}, "key": 2}):
         site = Site(tree)
         assert site.search("/arm/node", "key")[::2] == [1, "/key"]
@@ -95,8 +96,8 @@ def test_a_hidden_name_is_in_nobodys_way() -> None:
         assert not site.records
 
 
-def test_what_may_be_read_is_found_as_ever() -> None:
-    """ROSMaster's own answer, also that there is none, where the policy hides nothing."""
+def test_readable_keys_are_found_as_in_plain_ros() -> None:
+    """Where the policy hides nothing, the answer is that of the ROS master, also if it finds nothing."""
     site = Site({"arm": {"gain": 1}, "top": 2})
     assert site.search("/arm/node", "gain") == [1, "Found [/arm/gain]", "/arm/gain"]
     assert site.search("/arm/node", "/top") == [1, "Found [/top]", "/top"]
@@ -105,7 +106,7 @@ def test_what_may_be_read_is_found_as_ever() -> None:
     assert not site.records
 
 
-def test_audit_only_records_what_it_lets_pass() -> None:
+def test_audit_only_records_the_names_that_pass() -> None:
     """In audit-only mode the name is found, and the record says that it would have been denied."""
     site = Site({"secret": {"key": 1}}, RULES + "[Options]\naudit-only = parameters\n")
     assert site.search("/secret/inside", "key")[2] == "/secret/key"

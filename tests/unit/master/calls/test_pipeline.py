@@ -1,11 +1,11 @@
-"""The way of a request through the pipeline, with stand-ins for ROSMaster and the audit log."""
+"""The pipeline of a request, with stand-ins for the ROS master and the audit log."""
 
 import asyncio
 import copy
 import ipaddress
 import random
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from functools import partial
 from typing import Any, cast
 
@@ -13,7 +13,7 @@ import pytest
 
 from appliance.master.calls import pipeline
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.graph.graph import Graph
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile.enactor import Enactor
 from appliance.policy.model import Decision
@@ -27,6 +27,8 @@ from tests.support.examples import examples
 from tests.support.idle import idle
 from tests.support.parameters import mirror, put
 from tests.support.serving import serving
+
+pytestmark = [pytest.mark.anyio, pytest.mark.timeout(20)]
 
 HOST = ipaddress.ip_address("10.0.0.9")
 
@@ -88,7 +90,7 @@ class Records:
 
 
 class Site:
-    """A pipeline that serves, the ROSMaster behind it (whose calls wait for `go`), and what is recorded."""
+    """A running pipeline, its ROS master (whose calls wait for `go`), and the records."""
 
     def __init__(self, rules: str = LIMITED, tree: Any = None, *, bytes_limit: int = 64 << 20) -> None:
         self.policy_text = POLICY + rules
@@ -105,7 +107,7 @@ class Site:
         self.serve = serving(
             policy=lambda: self.policy,
             registry=self.registry,
-            graph=idle(Graph),
+            graph=idle(RosGraph),
             enactor=idle(Enactor),
             rosmaster=self,
             mirror=self.parameters,
@@ -120,19 +122,19 @@ class Site:
 
     @property
     def reachable(self) -> bool:
-        """ROSMaster is not: a test's calls get to it, or wait for it."""
+        """Report that the ROS master is not being rebuilt: calls reach it."""
         return False
 
     async def call(self, method: str, *params: Any) -> Any:
-        """ROSMaster: one call."""
+        """Answer one call as the ROS master."""
         return (await self.call_in_order([(method, params)]))[0]
 
     async def call_in_order(self, calls: Any) -> list[Any]:
-        """ROSMaster: several calls as one."""
+        """Answer several calls as one, as the ROS master."""
         self.arrived += [f"{method} {params[1]}" for method, params in calls]
         await self.go.wait()
         if self.dies_at in [params[1] for _method, params in calls]:
-            raise CallFailedError("the ROS Master did not come back")
+            raise CallFailedError("the ROS master did not come back")
         return [
             CallFailedError("a fault") if params[1] in self.faults else self._done(method, *params[1:])
             for method, params in calls
@@ -153,99 +155,85 @@ class Site:
         return [-1, "not there", 0] if node is None else [1, "there", copy.deepcopy(node)]
 
     async def ask(self, host: str, method: str, *params: Value) -> Any:
-        """One call of a host, as it is answered."""
+        """Return the answer to one call of a host."""
         peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
         return parse_response(await self.serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
 
+@pytest.fixture
+def site() -> Site:
+    """Return a pipeline under the limited policy, without parameters."""
+    return Site()
+
+
 def part(method: str, *params: Value) -> Value:
-    """A part of a multicall."""
+    """Return a part of a multicall."""
     return {"methodName": method, "params": ["/me", *params]}
 
 
-def play(scene: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """Run a scene, which may not take for ever."""
-    asyncio.run(asyncio.wait_for(scene(), 20))
-
-
 async def others() -> None:
-    """Let all others go as far as they can."""
+    """Let all other tasks run until they wait."""
     for _ in range(20):
         await asyncio.sleep(0)
 
 
 @pytest.mark.parametrize("together", [False, True], ids=["alone", "in a multicall"])
-def test_a_value_that_is_being_set_is_not_replaced_from_below(together: bool) -> None:
-    """Who writes below a key that is on its way to ROSMaster is decided when it is there."""
-
-    async def scene() -> None:
-        site = Site()
-        site.go.clear()
-        setting = asyncio.create_task(site.ask(ADMIN, "setParam", "/admin", "/arm/max", 5))
-        await others()
-        wanted: list[Value] = [part("hasParam", "/arm/max"), part("setParam", "/arm/max/x", 0)]
-        below = asyncio.create_task(
-            site.ask(OPERATOR, "system.multicall", wanted)
-            if together
-            else site.ask(OPERATOR, "setParam", "/me", "/arm/max/x", 0)
-        )
-        elsewhere = asyncio.create_task(site.ask(OPERATOR, "setParam", "/me", "/arm/min", 1))
-        await others()
-        assert site.arrived == ["setParam /arm/max", "setParam /arm/min"]
-        site.go.set()
-        answer = await below
-        assert (answer[1][0] if together else answer)[0] == 0
-        assert (await setting)[0] == (await elsewhere)[0] == 1
-        assert site.there.tree == site.parameters.tree == {"arm": {"max": 5, "min": 1}}
-        assert [one.allowed for _, _, one in site.trail.decisions].count(False) == 1
-
-    play(scene)
+async def test_a_pending_value_is_not_replaced_from_below(together: bool, site: Site) -> None:
+    """A write below a key that is being set is decided after the key is set."""
+    site.go.clear()
+    setting = asyncio.create_task(site.ask(ADMIN, "setParam", "/admin", "/arm/max", 5))
+    await others()
+    wanted: list[Value] = [part("hasParam", "/arm/max"), part("setParam", "/arm/max/x", 0)]
+    below = asyncio.create_task(
+        site.ask(OPERATOR, "system.multicall", wanted)
+        if together
+        else site.ask(OPERATOR, "setParam", "/me", "/arm/max/x", 0)
+    )
+    elsewhere = asyncio.create_task(site.ask(OPERATOR, "setParam", "/me", "/arm/min", 1))
+    await others()
+    assert site.arrived == ["setParam /arm/max", "setParam /arm/min"]
+    site.go.set()
+    answer = await below
+    assert (answer[1][0] if together else answer)[0] == 0
+    assert (await setting)[0] == (await elsewhere)[0] == 1
+    assert site.there.tree == site.parameters.tree == {"arm": {"max": 5, "min": 1}}
+    assert [one.allowed for _, _, one in site.trail.decisions].count(False) == 1
 
 
-def test_what_is_denied_anyway_waits_for_nobody() -> None:
-    """A write that its host may not make is answered at once, and holds up no other write."""
-
-    async def scene() -> None:
-        site = Site()
-        site.go.clear()
-        setting = asyncio.create_task(site.ask(ADMIN, "setParam", "/admin", "/arm/max", 5))
-        await others()
-        assert (await site.ask(OPERATOR, "deleteParam", "/me", "/"))[0] == 0
-        [answer] = await site.ask(OPERATOR, "system.multicall", [part("setParam", "/", {"a": 1})])
-        assert answer[0][0] == 0
-        assert len(site.trail.decisions) == 3
-        site.go.set()
-        assert (await setting)[0] == 1
-
-    play(scene)
+async def test_a_denied_write_does_not_wait(site: Site) -> None:
+    """A denied write is answered at once, and delays no other write."""
+    site.go.clear()
+    setting = asyncio.create_task(site.ask(ADMIN, "setParam", "/admin", "/arm/max", 5))
+    await others()
+    assert (await site.ask(OPERATOR, "deleteParam", "/me", "/"))[0] == 0
+    [answer] = await site.ask(OPERATOR, "system.multicall", [part("setParam", "/", {"a": 1})])
+    assert answer[0][0] == 0
+    assert len(site.trail.decisions) == 3
+    site.go.set()
+    assert (await setting)[0] == 1
 
 
-def test_parts_are_decided_and_answered_in_their_places() -> None:
-    """Of a run of parameter calls each part has its answer, whether it was carried out, denied or not understood."""
-
-    async def scene() -> None:
-        site = Site()
-        answers = await site.ask(
-            OPERATOR,
-            "system.multicall",
-            [
-                part("setParam", "/arm/a", 1),
-                part("setParam", "/leg", 1),
-                part("setParam", "bad key!?", 1),
-                part("hasParam", "/arm/a"),
-                part("deleteParam", "/arm/a"),
-            ],
-        )
-        assert [one[0][0] for one in answers] == [1, 0, -1, 1, 1]
-        assert "[Parameters] write default" in answers[1][0][1]
-        assert site.there.tree == site.parameters.tree == {"arm": {}}
-        assert [resource.allowed for _, _, resource in site.trail.decisions] == [True, False, True, True]
-
-    play(scene)
+async def test_parts_are_decided_and_answered_in_their_places(site: Site) -> None:
+    """Each part of a run has its answer, whether it was carried out, denied or rejected."""
+    answers = await site.ask(
+        OPERATOR,
+        "system.multicall",
+        [
+            part("setParam", "/arm/a", 1),
+            part("setParam", "/leg", 1),
+            part("setParam", "bad key!?", 1),
+            part("hasParam", "/arm/a"),
+            part("deleteParam", "/arm/a"),
+        ],
+    )
+    assert [one[0][0] for one in answers] == [1, 0, -1, 1, 1]
+    assert "[Parameters] write default" in answers[1][0][1]
+    assert site.there.tree == site.parameters.tree == {"arm": {}}
+    assert [resource.allowed for _, _, resource in site.trail.decisions] == [True, False, True, True]
 
 
 def sets(*keys: str) -> list[Value]:
-    """Parts of a multicall that set these."""
+    """Return parts of a multicall that set these."""
     return [part("setParam", key, 1) for key in keys]
 
 
@@ -253,33 +241,28 @@ RUNS = [[f"/arm/{run}_{place}" for place in range(64)] for run in range(3)]
 
 
 def told(answers: list[Any]) -> list[int]:
-    """The code of each part's answer."""
+    """Return the code of each part's answer."""
     return [one[0][0] for one in answers]
 
 
 async def held(site: Site, parts: list[Value]) -> "asyncio.Task[Any]":
-    """An operator's multicall whose first run is at ROSMaster, which waits for `site.go`."""
+    """Start an operator's multicall; the ROS master answers its first run after `site.go`."""
     site.go.clear()
     asked = asyncio.create_task(site.ask(OPERATOR, "system.multicall", parts))
     await others()
     return asked
 
 
-def test_a_long_multicall_gives_way_after_a_few_parts() -> None:
-    """Of 9,000 reads in one multicall a few are decided and answered in one go; between them others have their turn."""
-
-    async def scene() -> None:
-        site = Site()
-        reads: list[Value] = [part("hasParam", f"/arm/{number}") for number in range(9000)]
-        asked = asyncio.create_task(site.ask(OPERATOR, "system.multicall", reads))
-        most = before = 0
-        while not asked.done():
-            await asyncio.sleep(0)
-            most, before = max(most, len(site.trail.decisions) - before), len(site.trail.decisions)
-        assert told(await asked) == [1] * 9000
-        assert most <= 16
-
-    play(scene)
+async def test_a_long_multicall_yields_after_a_few_parts(site: Site) -> None:
+    """A multicall of 9,000 reads yields to other requests after every few parts."""
+    reads: list[Value] = [part("hasParam", f"/arm/{number}") for number in range(9000)]
+    asked = asyncio.create_task(site.ask(OPERATOR, "system.multicall", reads))
+    most = before = 0
+    while not asked.done():
+        await asyncio.sleep(0)
+        most, before = max(most, len(site.trail.decisions) - before), len(site.trail.decisions)
+    assert told(await asked) == [1] * 9000
+    assert most <= 16
 
 
 @pytest.mark.parametrize(
@@ -293,22 +276,17 @@ def test_a_long_multicall_gives_way_after_a_few_parts() -> None:
     ],
     ids=["a write elsewhere", "a write below", "a write above", "a read", "another call"],
 )
-def test_what_follows_a_run_waits_for_it(following: Value) -> None:
-    """It is decided and answered by what ROSMaster made of that."""
-
-    async def scene() -> None:
-        site = Site()
-        asked = await held(site, [*sets(*RUNS[0]), following, *sets(*RUNS[1])])
-        assert len(site.trail.decisions) == len(RUNS[0])
-        site.go.set()
-        assert len(await asked) == 2 * len(RUNS[0]) + 1
-        assert site.there.tree == site.parameters.tree
-
-    play(scene)
+async def test_calls_after_a_run_wait_for_it(following: Value, site: Site) -> None:
+    """They are decided and answered with the state after the run."""
+    asked = await held(site, [*sets(*RUNS[0]), following, *sets(*RUNS[1])])
+    assert len(site.trail.decisions) == len(RUNS[0])
+    site.go.set()
+    assert len(await asked) == 2 * len(RUNS[0]) + 1
+    assert site.there.tree == site.parameters.tree
 
 
-def test_writes_behind_a_read_that_waited_are_decided_again() -> None:
-    """A policy that came into force meanwhile, a log that cannot be written, who holds the name, has its say."""
+async def test_writes_after_a_waiting_read_are_decided_again() -> None:
+    """A new policy, a broken log or a new holder of the name counts for them."""
 
     async def scene(change: Callable[[Site], None], *, denied: bool = True) -> None:
         site, keys = Site(), RUNS[0][:7]
@@ -329,33 +307,27 @@ def test_writes_behind_a_read_that_waited_are_decided_again() -> None:
         site.registry.register(node, Kind.PUBLICATION, "/chatter", "std_msgs/String")
 
     stricter = compile_policy(f"{POLICY}write default = adm\n", file="test.ini")
-    play(lambda: scene(partial(registers, host=THIRD)))
-    play(lambda: scene(partial(registers, host=OPERATOR), denied=False))
-    play(lambda: scene(lambda site: setattr(site, "policy", stricter)))
-    play(lambda: scene(lambda site: setattr(site.trail, "obstacle", "the log is full")))
+    await scene(partial(registers, host=THIRD))
+    await scene(partial(registers, host=OPERATOR), denied=False)
+    await scene(lambda site: setattr(site, "policy", stricter))
+    await scene(lambda site: setattr(site.trail, "obstacle", "the log is full"))
 
 
-def test_what_fails_in_a_run_holds_up_no_other() -> None:
-    """A denial, a fault and a part that is none have their places; a ROSMaster that dies takes one run with it."""
-
-    async def scene() -> None:
-        site = Site()
-        site.faults, site.dies_at = {RUNS[0][5]}, RUNS[1][30]
-        keys = [*RUNS[0][:63], "/leg", *RUNS[1][:62], "bad key!?", "/leg", *RUNS[2]]
-        answers = told(await site.ask(OPERATOR, "system.multicall", sets(*keys)))
-        assert answers == [1] * 5 + [0] + [1] * 57 + [0] + [0] * 62 + [-1, 0] + [1] * 64
-        assert site.there.tree == {"arm": {key[5:]: 1 for key in RUNS[0][:63] + RUNS[2] if key != RUNS[0][5]}}
-        assert site.there.tree == site.parameters.tree
-        again = await site.ask(
-            OPERATOR, "system.multicall", sets(*RUNS[0], *RUNS[2])
-        )  # nobody's turn is left over
-        assert told(again).count(1) == 127
-
-    play(scene)
+async def test_a_failure_in_a_run_stops_no_other_part(site: Site) -> None:
+    """A denial, a fault and an invalid part are answered in place; a dying ROS master fails one run only."""
+    site.faults, site.dies_at = {RUNS[0][5]}, RUNS[1][30]
+    keys = [*RUNS[0][:63], "/leg", *RUNS[1][:62], "bad key!?", "/leg", *RUNS[2]]
+    answers = told(await site.ask(OPERATOR, "system.multicall", sets(*keys)))
+    assert answers == [1] * 5 + [0] + [1] * 57 + [0] + [0] * 62 + [-1, 0] + [1] * 64
+    assert site.there.tree == {"arm": {key[5:]: 1 for key in RUNS[0][:63] + RUNS[2] if key != RUNS[0][5]}}
+    assert site.there.tree == site.parameters.tree
+    again = await site.ask(OPERATOR, "system.multicall", sets(*RUNS[0], *RUNS[2]))  # no turn is left over
+    assert told(again).count(1) == 127
 
 
-def test_a_multicall_is_as_its_parts_one_by_one() -> None:
-    """Whatever is carried out together: answers, decisions and their order, what ROSMaster has, and the mirror."""
+@pytest.mark.timeout(300)
+async def test_a_multicall_equals_its_parts_one_by_one() -> None:
+    """Answers, decisions with their order, the tree of the ROS master and the mirror are the same."""
 
     async def scene(dice: random.Random) -> None:
         keys = ["/arm", "/arm/a", "/arm/a/b", "/arm/max", "/leg", "/leg/x", *RUNS[0]]
@@ -376,74 +348,62 @@ def test_a_multicall_is_as_its_parts_one_by_one() -> None:
         assert together.there.tree == together.parameters.tree == alone.there.tree
 
     for seed in range(examples(24)):
-        play(partial(scene, random.Random(seed)))  # noqa: S311  the same calls in every run
+        await asyncio.wait_for(scene(random.Random(seed)), 20)  # noqa: S311  the same calls in every run
 
 
-def test_a_namespace_is_hidden_that_was_none_when_it_was_decided() -> None:
-    """ROSMaster answers with what it has by then: a namespace is told only to who may read all of it."""
-
-    async def scene() -> None:
-        site = Site("read /arm = ocu adm\nread default = adm\nwrite default = adm\n")
-        put(site.there, "/arm", {"speed": 4711}, HOST)  # and the mirror does not know yet
-        answer = await site.ask(OPERATOR, "getParam", "/me", "/arm")
-        assert answer[0] == 0
-        assert "4711" not in str(answer)
-        assert answer[1].endswith("[id]")
-        assert site.trail.decisions[-1][1:2] == ("/arm",)
-        assert (await site.ask(ADMIN, "getParam", "/admin", "/arm"))[2] == {"speed": 4711}
-
-    play(scene)
+async def test_a_namespace_that_appears_after_the_decision_is_hidden() -> None:
+    """A host receives a new namespace only if it may read all of it."""
+    site = Site("read /arm = ocu adm\nread default = adm\nwrite default = adm\n")
+    put(site.there, "/arm", {"speed": 4711}, HOST)  # and the mirror does not know yet
+    answer = await site.ask(OPERATOR, "getParam", "/me", "/arm")
+    assert answer[0] == 0
+    assert "4711" not in str(answer)
+    assert answer[1].endswith("[id]")
+    assert site.trail.decisions[-1][1:2] == ("/arm",)
+    assert (await site.ask(ADMIN, "getParam", "/admin", "/arm"))[2] == {"speed": 4711}
 
 
-def test_answers_to_a_multicall_are_bounded_together() -> None:
-    """A small request cannot have the appliance hold many large answers: the rest is refused, and recorded once."""
-
-    async def scene() -> None:
-        site = Site(tree={"arm": {"model": "x" * 100_000, "speed": 1}}, bytes_limit=1_000_000)
-        wanted: list[Value] = [part("getParam", "/arm/model")] * 100
-        answers = await site.ask(OPERATOR, "system.multicall", wanted)
-        assert len(answers) == 100
-        assert [one[0][0] for one in answers[:10]] == [1] * 10
-        assert all("more than 1000000 bytes; 90 more parts" in one["faultString"] for one in answers[10:])
-        assert len(site.arrived) == 10
-        assert site.trail.events == ["limit exceeded"]
-        usual = await site.ask(OPERATOR, "system.multicall", [part("getParam", "/arm/speed")] * 100)
-        assert [one[0][0] for one in usual] == [1] * 100
-
-    play(scene)
+async def test_the_answers_of_a_multicall_are_bounded_together() -> None:
+    """A small request cannot make the appliance hold many large answers: the rest is refused and recorded once."""
+    site = Site(tree={"arm": {"model": "x" * 100_000, "speed": 1}}, bytes_limit=1_000_000)
+    wanted: list[Value] = [part("getParam", "/arm/model")] * 100
+    answers = await site.ask(OPERATOR, "system.multicall", wanted)
+    assert len(answers) == 100
+    assert [one[0][0] for one in answers[:10]] == [1] * 10
+    assert all("more than 1000000 bytes; 90 more parts" in one["faultString"] for one in answers[10:])
+    assert len(site.arrived) == 10
+    assert site.trail.events == ["limit exceeded"]
+    usual = await site.ask(OPERATOR, "system.multicall", [part("getParam", "/arm/speed")] * 100)
+    assert [one[0][0] for one in usual] == [1] * 100
 
 
 @pytest.mark.parametrize("together", [False, True], ids=["alone", "in a multicall"])
-def test_large_answers_are_made_a_few_at_a_time(together: bool) -> None:
-    """However often a host asks for all parameters, it is one large answer at a time; others are not held up by it."""
+async def test_large_answers_are_made_a_few_at_a_time(together: bool) -> None:
+    """A host gets one large answer at a time, and delays no other host."""
+    site = Site(tree={"arm": {"model": "x" * OFFLOAD}, "leg": 1})
 
-    async def scene() -> None:
-        site = Site(tree={"arm": {"model": "x" * OFFLOAD}, "leg": 1})
+    async def dump(host: str) -> None:
+        if together:
+            [answer] = await site.ask(host, "system.multicall", [part("getParam", "/arm")])
+        else:
+            answer = [await site.ask(host, "getParam", "/me", "arm/")]
+        assert answer[0][0] == 1
 
-        async def dump(host: str) -> None:
-            if together:
-                [answer] = await site.ask(host, "system.multicall", [part("getParam", "/arm")])
-            else:
-                answer = [await site.ask(host, "getParam", "/me", "arm/")]
-            assert answer[0][0] == 1
-
-        site.go.clear()
-        dumps = [asyncio.create_task(dump(host)) for host in [OPERATOR] * 5 + [ADMIN, THIRD]]
-        small = asyncio.create_task(site.ask(OPERATOR, "getParam", "/me", "/leg"))
-        await others()
-        assert site.arrived == ["getParam /arm", "getParam /arm", "getParam /leg"]
-        site.go.set()
-        assert (await small)[2] == 1
-        await asyncio.gather(*dumps)
-        assert site.arrived.count("getParam /arm") == 7
-
-    play(scene)
+    site.go.clear()
+    dumps = [asyncio.create_task(dump(host)) for host in [OPERATOR] * 5 + [ADMIN, THIRD]]
+    small = asyncio.create_task(site.ask(OPERATOR, "getParam", "/me", "/leg"))
+    await others()
+    assert site.arrived == ["getParam /arm", "getParam /arm", "getParam /leg"]
+    site.go.set()
+    assert (await small)[2] == 1
+    await asyncio.gather(*dumps)
+    assert site.arrived.count("getParam /arm") == 7
 
 
-def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
+async def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The event loop goes on meanwhile; what is small is not worth a thread."""
+    """The event loop runs meanwhile; small bodies and answers use no thread."""
     threads: list[tuple[str, bool]] = []
 
     def observed(name: str) -> None:
@@ -455,17 +415,14 @@ def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
 
         monkeypatch.setattr(pipeline, name, observe)
 
-    async def scene() -> None:
-        observed("parse_call")
-        observed("build_response")
-        site = Site(tree={"arm": {"gains": list(range(20_000))}})
-        await site.ask(OPERATOR, "getParam", "/me", "/arm")
-        assert threads == [("parse_call", True), ("build_response", False)]
-        threads.clear()
-        await site.ask(OPERATOR, "setParam", "/me", "/arm/model", "x" * OFFLOAD)
-        assert threads == [("parse_call", False), ("build_response", True)]
-
-    play(scene)
+    observed("parse_call")
+    observed("build_response")
+    site = Site(tree={"arm": {"gains": list(range(20_000))}})
+    await site.ask(OPERATOR, "getParam", "/me", "/arm")
+    assert threads == [("parse_call", True), ("build_response", False)]
+    threads.clear()
+    await site.ask(OPERATOR, "setParam", "/me", "/arm/model", "x" * OFFLOAD)
+    assert threads == [("parse_call", False), ("build_response", True)]
 
 
 @pytest.mark.parametrize(
@@ -479,18 +436,14 @@ def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
             "full",
             "10.0.0.5 is not among the hosts that may write the parameter /arm/max: only adm (10.0.0.9) may, by",
         ),
-        ("id", "refused [id]"),
+        ("id", "denied [id]"),
     ],
 )
-def test_a_denied_host_is_told_as_much_as_the_policy_says(tell: str, told: str) -> None:
-    """The answer has what `[Options] tell` lets be told, and the record; the record has the whole reason each time."""
-
-    async def scene() -> None:
-        site = Site(LIMITED + (f"[Options]\ntell = {tell}\n" if tell else ""))
-        answer = await site.ask(OPERATOR, "setParam", "/n", "/arm/max", 1)
-        assert answer[0] == 0
-        assert answer[1].startswith(told), answer
-        assert answer[1].endswith("[id]")
-        assert "only adm (10.0.0.9) may" in site.trail.decisions[-1][2].reason
-
-    play(scene)
+async def test_the_answer_to_a_denied_host_follows_the_policy(tell: str, told: str) -> None:
+    """The answer has the id of the record and the details that `[Options] tell` allows; the record has all."""
+    site = Site(LIMITED + (f"[Options]\ntell = {tell}\n" if tell else ""))
+    answer = await site.ask(OPERATOR, "setParam", "/n", "/arm/max", 1)
+    assert answer[0] == 0
+    assert answer[1].startswith(told), answer
+    assert answer[1].endswith("[id]")
+    assert "only adm (10.0.0.9) may" in site.trail.decisions[-1][2].reason

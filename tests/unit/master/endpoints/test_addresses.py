@@ -1,16 +1,16 @@
-"""Which of the appliance's addresses a peer is told."""
+"""The address of the appliance in answers to a peer."""
 
 import asyncio
 import ipaddress
 
 import pytest
 
-from appliance.master.endpoints.endpoint_addresses import Addresses
+from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.rpc.server import Peer
 
 
 def peer(host: str, local: str) -> Peer:
-    """Somebody who reached the appliance at `local`."""
+    """Return a caller that reached the appliance at `local`."""
     return Peer(ipaddress.ip_address(host), host, local)
 
 
@@ -25,19 +25,19 @@ def peer(host: str, local: str) -> Peer:
         ("127.0.0.1", "127.0.0.1", "127.0.0.1"),
     ],
 )
-def test_what_is_told_is_listened_on(listen: str, local: str, told: str) -> None:
-    """The address he came to; the appliance's own nodes come on loopback, where faces and relay may not listen."""
-    assert Addresses([], None, listen).told_to(peer("127.0.0.1", local)) == told
+def test_the_appliance_listens_on_the_address_in_answers(listen: str, local: str, told: str) -> None:
+    """It is the address the peer connected to, but not loopback, where proxy endpoints and relay may not listen."""
+    assert AdvertisedAddresses([], None, listen).told_to(peer("127.0.0.1", local)) == told
 
 
-def test_what_is_configured_or_translated_comes_first() -> None:
+def test_configured_and_translated_addresses_come_first() -> None:
     """`advertise` for a network, then the address that the supervisor knows for this peer."""
 
     async def route(host: str) -> str | None:
         return "192.168.1.7" if host == "10.0.0.5" else None
 
     advertised = [(ipaddress.ip_network("172.16.0.0/12"), ipaddress.ip_address("172.16.0.9"))]
-    addresses = Addresses(advertised, route, "0.0.0.0")
+    addresses = AdvertisedAddresses(advertised, route, "0.0.0.0")
     for host in ("10.0.0.5", "10.0.0.6", "172.16.0.1"):
         asyncio.run(addresses.learn(peer(host, "10.0.0.1")))
     assert addresses.told_to(peer("10.0.0.5", "10.0.0.1")) == "192.168.1.7"

@@ -1,4 +1,4 @@
-"""The queues of calls to nodes: their bounds, and what becomes of a call that does not arrive."""
+"""The queues of calls to nodes: their bounds, and the fate of an undelivered call."""
 
 import asyncio
 import ipaddress
@@ -9,7 +9,7 @@ import pytest
 from appliance.master.endpoints.delivery import Delivery
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
-from appliance.quotas.pool import Bounds, Standing
+from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.quotas.table import NODE_CALLS_UNDER_WAY
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.xmlrpc import FaultReceived, Value
@@ -37,7 +37,7 @@ class Node:
 
 
 class Post:
-    """A delivery to one node, and what could not be delivered."""
+    """A delivery to one node, and its undelivered calls."""
 
     def __init__(self, **bounds: Any) -> None:
         self.node, self.lost = Node(), list[tuple[str, Value]]()
@@ -45,7 +45,7 @@ class Post:
         self.delivery = Delivery(
             self.world.nodes,
             troubled=self._troubled,
-            standing=lambda _host: Standing.REGISTERED,
+            quota_class=lambda _host: QuotaClass.REGISTERED,
             **bounds,
         )
         cast(Any, self.world.nodes).client = lambda _incarnation: self.node
@@ -55,19 +55,19 @@ class Post:
         self.lost.append((incarnation.name, call.parameters[0]))
 
     def node_on(self, host: str, name: str) -> Incarnation:
-        """A node of another host."""
+        """Return a node of another host."""
         node = self.world.node(name)
         node.host = ipaddress.ip_address(host)
         return node
 
     def push(self, *topics: str, publishers: list[str]) -> None:
-        """A list of publishers for each of these topics."""
+        """Return a list of publishers for each of these topics."""
         for topic in topics:
             self.delivery.push(self.incarnation, NodeCall("publisherUpdate", (topic, list(publishers))))
 
 
 async def test_lists_of_publishers_are_bounded_in_bytes() -> None:
-    """What waits for a node that stands still has a bound, whatever it is made of; it is told what was dropped."""
+    """The queue of a hanging node is bounded in bytes; the node later receives what was dropped."""
     post = Post(queued=Bounds(100_000, 100_000, 0, 0))
     post.push(*(f"/t{number}" for number in range(50)), publishers=LONG)
     assert post.delivery.waiting < 8
@@ -79,8 +79,8 @@ async def test_lists_of_publishers_are_bounded_in_bytes() -> None:
     assert post.delivery.weight == 0
 
 
-async def test_a_queue_that_is_dropped_frees_its_room() -> None:
-    """The node is gone: nothing of its queue counts any more."""
+async def test_a_dropped_queue_frees_its_bytes() -> None:
+    """After the node is gone, its queue no longer counts."""
     post = Post()
     post.push("/a", "/b", publishers=LONG)
     assert post.delivery.weight > 20_000
@@ -91,7 +91,7 @@ async def test_a_queue_that_is_dropped_frees_its_room() -> None:
 
 
 async def test_a_call_that_stays_undelivered_is_reported() -> None:
-    """After the last try whoever looks after the node hears which call is lost."""
+    """After the last attempt the lost call is reported."""
     post = Post(tries=2)
     post.node.fails = True
     post.node.answers.set()
@@ -101,7 +101,7 @@ async def test_a_call_that_stays_undelivered_is_reported() -> None:
 
 
 async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
-    """It is not told the same for ever: saying it again later would get the same answer."""
+    """The call is not repeated, because the answer would be the same."""
     post = Post(tries=2)
     post.node.fails, post.node.fault = True, FaultReceived(1, "not for me")
     post.node.answers.set()
@@ -110,8 +110,8 @@ async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
     assert post.lost == []
 
 
-async def test_a_host_loses_only_calls_of_its_own() -> None:
-    """Many queues of a guest fill the whole: none of the robot's calls goes, though its queue is the longest of all."""
+async def test_a_host_loses_only_its_own_calls() -> None:
+    """Queues of a guest fill all memory: the robot loses no call, though its queue is the longest."""
     post = Post(queued=Bounds(400_000, 400_000, 0, 0))
     post.push("/a", "/b", publishers=LONG)
     for number in range(200):
@@ -125,8 +125,8 @@ async def test_a_host_loses_only_calls_of_its_own() -> None:
     assert {"/a", "/b"} <= set(post.node.heard)
 
 
-async def test_silent_nodes_of_a_host_delay_no_call_to_anothers() -> None:
-    """All that a guest may have under way waits for its nodes; the robot's node hears what it is told at once."""
+async def test_silent_nodes_delay_no_call_to_other_hosts() -> None:
+    """All of a guest's calls wait for its nodes; the robot's node is called at once."""
     post = Post()
     robot = Node()
     robot.answers.set()

@@ -1,11 +1,11 @@
-"""The inner face: what ROSMaster tells a node is acknowledged, and nothing follows from it."""
+"""The master-side endpoint acknowledges calls of the ROS master to a node and does nothing else."""
 
 import ipaddress
 from typing import Any
 
 import pytest
 
-from appliance.master.endpoints.proxy_endpoints import InnerFace
+from appliance.master.endpoints.proxy_endpoints import MasterSideApi
 from appliance.master.graph.registry import PUBLISHER_PATH, Kind
 from appliance.rpc.server import HttpRequest, Peer
 from roswire.xmlrpc import FaultReceived, Value, build_call, parse_response
@@ -21,31 +21,31 @@ CALLS: list[tuple[str, tuple[Value, ...]]] = [
 ]
 
 
-async def call(face: InnerFace, path: str, method: str, params: tuple[Value, ...]) -> Any:
-    """A call of ROSMaster."""
+async def call(face: MasterSideApi, path: str, method: str, params: tuple[Value, ...]) -> Any:
+    """Make a call of the ROS master."""
     request = HttpRequest(Peer(MASTER, "127.0.0.1", "127.0.0.1"), path, build_call(method, params), 0)
     return parse_response(await face.handle(request))
 
 
 @pytest.mark.anyio
 @pytest.mark.parametrize(("method", "params"), CALLS)
-async def test_what_rosmaster_says_is_told_to_nobody(method: str, params: tuple[Value, ...]) -> None:
-    """A key, a value, a publisher or an order that ROSMaster sends reaches no node; ROSMaster is content."""
+async def test_calls_of_rosmaster_reach_no_node(method: str, params: tuple[Value, ...]) -> None:
+    """A key, value, publisher or order from the ROS master reaches no node, but is acknowledged."""
     world = await ControlParts.begun()
     node = world.node("/robot")
     await world.register(node, Kind.PARAMETER, "/limits/speed", "")
     await world.register(node, Kind.SUBSCRIPTION, "/topic")
     world.deliveries.told.clear()
-    face = InnerFace(world.registry)
+    face = MasterSideApi(world.registry)
     for path in (f"/{node.key}/", PUBLISHER_PATH):
         assert await call(face, path, method, params) == [1, "", 0]
     assert not world.deliveries.told
 
 
 @pytest.mark.anyio
-async def test_nobody() -> None:
-    """A path that stands for nobody is a fault."""
+async def test_a_path_without_a_node() -> None:
+    """A path without a node is answered with a fault."""
     with pytest.raises(FaultReceived, match="nobody is here"):
         await call(
-            InnerFace((await ControlParts.begun()).registry), "/other/", "shutdown", ("/master", "reason")
+            MasterSideApi((await ControlParts.begun()).registry), "/other/", "shutdown", ("/master", "reason")
         )

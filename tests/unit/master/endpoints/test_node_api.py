@@ -1,4 +1,4 @@
-"""A node was killed and another has its port: the other is not ended in its place, nor counts as its life."""
+"""A process that reuses the port of a killed node is not taken for that node."""
 
 from typing import Any, cast
 
@@ -7,7 +7,7 @@ import pytest
 from appliance.master.endpoints.delivery import Delivery
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation, Kind, Life
-from appliance.quotas.pool import Standing
+from appliance.quotas.pool import QuotaClass
 from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.anyio
 
 
 class Street(ControlParts):
-    """Control, with the queues of calls to nodes; who is called at which port: the process that has it answers."""
+    """Control, with the queues of calls to nodes; the process that owns a port answers there."""
 
     def surround(self) -> None:
         """As `ControlParts`."""
@@ -25,7 +25,7 @@ class Street(ControlParts):
         self.delivery = Delivery(
             self.nodes,
             troubled=self.watchlist.could_not_tell,
-            standing=lambda _host: Standing.REGISTERED,
+            quota_class=lambda _host: QuotaClass.REGISTERED,
             tries=1,
         )
         self.deliveries = cast(Any, self.delivery)
@@ -49,8 +49,8 @@ class _Door:
         return [1, "", self._street.process]
 
 
-async def test_the_name_of_the_dead_is_registered_anew() -> None:
-    """The order to shut down for the earlier life is not carried out on the node that has its port."""
+async def test_the_name_of_a_dead_node_is_registered_again() -> None:
+    """The shutdown order for the earlier incarnation does not end the node that reuses its port."""
     street = Street()
     dead, heir = await street.two_at_one_address()
     await street.register(street.node("/first", 2), Kind.SUBSCRIPTION, "/t")
@@ -60,8 +60,8 @@ async def test_the_name_of_the_dead_is_registered_anew() -> None:
     assert heir.life is Life.LIVE
 
 
-async def test_the_earlier_life_is_told_to_shut_down() -> None:
-    """Where nobody else has its address."""
+async def test_the_earlier_incarnation_is_shut_down() -> None:
+    """This holds if no other node has its address."""
     street = Street()
     await street.round()
     await street.register(street.node("/first", 1), Kind.SUBSCRIPTION, "/t")
@@ -70,8 +70,8 @@ async def test_the_earlier_life_is_told_to_shut_down() -> None:
     assert (4001, "shutdown") in street.heard
 
 
-async def test_the_answer_of_another_process_is_no_life_of_the_dead() -> None:
-    """The dead is lost at the next look, does not return by the other's answers, and returns when it registers."""
+async def test_the_answer_of_another_process_does_not_revive_a_node() -> None:
+    """The dead node is lost at the next check; only a registration brings it back."""
     street = Street()
     dead, heir = await street.two_at_one_address()
     street.process = 2
@@ -84,8 +84,8 @@ async def test_the_answer_of_another_process_is_no_life_of_the_dead() -> None:
     assert dead.life is Life.LIVE
 
 
-async def test_a_node_that_was_started_again_at_its_address() -> None:
-    """It registers, and is there: another process than before is the node now."""
+async def test_a_node_that_restarts_at_its_address() -> None:
+    """It registers, and the new process is the node."""
     street = Street()
     node, _other = await street.two_at_one_address()
     street.process = 2
@@ -99,7 +99,7 @@ async def test_a_node_that_was_started_again_at_its_address() -> None:
     "telling", [NodeCall("publisherUpdate", ("/t", [])), NodeCall("shutdown", ("by hand",))]
 )
 async def test_programs_that_serve_two_nodes_with_one_api(telling: NodeCall) -> None:
-    """Both live, and both are told what is theirs."""
+    """Both nodes are live, and each receives its own calls."""
     street = Street()
     nodes = await street.two_at_one_address()
     for node in nodes:

@@ -1,31 +1,31 @@
-"""The faces of incarnations."""
+"""The proxy endpoints of incarnations."""
 
 import ipaddress
 from typing import Any, cast
 
-from appliance.master.endpoints.proxy_endpoints import Faces
+from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.graph.registry import Incarnation
 from roswire.uris import parse_node_uri
 
 
 class Told:
-    """Stands for whatever a face uses; remembers what it was told."""
+    """Stands for the parts that a proxy endpoint uses; remembers its calls."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[str, Any]] = []
 
     def close(self, *given: Any) -> None:
-        """As a server's, and as the places'."""
+        """As a server, and as `Places`."""
         self.calls.append(("close", given))
 
 
 def test_ports_are_closed_once() -> None:
-    """A replaced node is closed when it is replaced and again when it is forgotten: its ports only the first time.
+    """A node is closed when it is replaced and again when it is forgotten: its ports only the first time.
 
     In between the ports may have become another node's.
     """
     places, server = Told(), Told()
-    faces = Faces(cast(Any, None), cast(Any, places), *[cast(Any, None)] * 8)
+    faces = ProxyEndpoints(cast(Any, None), cast(Any, places), *[cast(Any, None)] * 3)
     faces.servers["key"] = cast(Any, server)
     uri = "http://10.0.0.5:4000/"
     host = ipaddress.ip_address("10.0.0.5")

@@ -1,9 +1,9 @@
-"""Each relay is told what it carries, with its own port of each node; what moves takes its grants along."""
+"""Each relay receives its topics with its own port of each node; a moved topic keeps its grants."""
 
 import asyncio
 import ipaddress
 import socket
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Any, cast
 
 import pytest
@@ -11,12 +11,12 @@ import pytest
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.master.endpoints.delivery import Delivery
-from appliance.master.endpoints.endpoint_addresses import Places
-from appliance.master.endpoints.node_api import NodeApi
+from appliance.master.endpoints.node_api import NodeApiClient
+from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.endpoints.traffic import Carried
+from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.grants import Grants
-from appliance.master.graph.graph import Graph
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile.enactor import Enactor
 from appliance.policy.model import Address
@@ -24,7 +24,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import Bounds
 from appliance.quotas.table import GRANTS
-from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Plan
+from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, AllocationPlan, Move
 from appliance.store.state_file import PermissionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.uris import parse_node_uri
@@ -32,7 +32,7 @@ from tests.support.stated import stated
 
 pytestmark = pytest.mark.anyio
 HOST = ipaddress.ip_address("10.0.0.5")
-_UNUSED = object()  # a part that nothing is asked of
+_UNUSED = object()  # a part that is not used
 
 
 class Ports:
@@ -42,7 +42,7 @@ class Ports:
         self.sockets: dict[int, socket.socket] = {}
 
     def socket(self, port: int) -> socket.socket:
-        """As `Places`."""
+        """As `NodePorts`."""
         if port not in self.sockets:
             self.sockets[port] = socket.socket()
         return self.sockets[port]
@@ -67,7 +67,7 @@ class NoDelivery:
 
 
 class Link:
-    """A relay's end: what it was told, in order."""
+    """A relay's end of the link: the messages it received, in order."""
 
     def __init__(self) -> None:
         self.told: list[tuple[messages.Message, tuple[int, ...]]] = []
@@ -85,13 +85,13 @@ class Link:
         """As `Channel`."""
 
     def heard(self) -> list[messages.Message]:
-        """What was told since the last time."""
+        """Return the messages since the last call."""
         told, self.told = [message for message, _descriptors in self.told], []
         return told
 
 
 def policy(*limits: str, nodes: str = "default = 10.0.0.5") -> Policy:
-    """A policy with these limits, and rules for `nodes`."""
+    """Return a policy with these limits, and rules for `nodes`."""
     return compile_policy("\n".join(["[Limits]", *limits, "[Nodes]", nodes]), file="p.ini")
 
 
@@ -106,13 +106,13 @@ class World:
         self.policy = policy()
         self.put(left=0, right=1)
         self.ports = Ports()
-        carried = Carried(cast(AuditTrail, self), self.registry, 2)
+        carried = RelayTraffic(cast(AuditTrail, self), self.registry, 2)
         self.grants = Grants(carried.used, grants)
         self.relay = RelayControl(
             self.registry,
             self.grants,
-            cast(Places, self.ports),
-            cast(NodeApi, NoDelivery()),
+            cast(NodePorts, self.ports),
+            cast(NodeApiClient, NoDelivery()),
             carried,
             allocation=self.allocation,
             policy=lambda: self.policy,
@@ -121,7 +121,7 @@ class World:
             own_header=None,
             own_call=cast(Any, None),
         )
-        self.graph = Graph(
+        self.graph = RosGraph(
             self.registry, self.grants, cast(Any, _UNUSED), may_be_told=lambda _node, _key, _value: True
         )
         self.enactor = Enactor(
@@ -132,7 +132,7 @@ class World:
             delivery=cast(Delivery, NoDelivery()),
             relay=self.relay,
             faces=cast(Any, _UNUSED),
-            places=cast(Places, self.ports),
+            places=cast(NodePorts, self.ports),
         )
         uri = "http://10.0.0.5:4000/"
         self.node = Incarnation(
@@ -164,17 +164,17 @@ class World:
         return ""
 
     def grant_topic(self, topic: str, host: Address, caller_id: str) -> None:
-        """The node's topic is granted."""
+        """Grant the node's topic."""
         self.enactor.carry_out(self.graph.topic_granted(self.node, topic, host, caller_id))
 
     def limits_changed(self, before: Policy, now: Policy) -> None:
-        """Another policy is in force."""
+        """Bring another policy into force."""
         self.enactor.carry_out(self.graph.limits_changed(before, now))
 
     def put(self, **topics: int) -> None:
-        """These topics belong to these relays."""
+        """Assign these topics to these relays."""
         resources = {(TOPIC, f"/{name}"): relay for name, relay in topics.items()}
-        self.allocation.adopt(Plan({}, {**resources, (SERVICE, "/serve"): 0}))
+        self.allocation.adopt(AllocationPlan({}, {**resources, (SERVICE, "/serve"): 0}))
 
     def close(self) -> None:
         """Close the sockets."""
@@ -182,9 +182,16 @@ class World:
             one.close()
 
 
-async def test_orders_are_carried_out_when_every_relay_says_so() -> None:
-    """Or is gone, or another has come, which begins with what is wanted; nobody waits for one that is away."""
+@pytest.fixture
+async def world() -> AsyncIterator[World]:
+    """Yield control with two relays."""
     world = World()
+    yield world
+    world.close()
+
+
+async def test_an_order_is_done_when_every_relay_confirms_it(world: World) -> None:
+    """A relay that is gone or was restarted counts as confirmed; an absent relay is not waited for."""
     relay, (first, second) = world.relay, world.links
 
     async def waiting() -> asyncio.Task[None]:
@@ -204,12 +211,10 @@ async def test_orders_are_carried_out_when_every_relay_says_so() -> None:
     relay.attach(0, cast(Channel, again := Link()))
     again.end()
     await relay.carried_out()
-    world.close()
 
 
-async def test_each_relay_is_told_what_it_carries() -> None:
-    """With its own port of the node; so are grants, withdrawals and what a relay is told that comes anew."""
-    world = World()
+async def test_each_relay_receives_its_topics(world: World) -> None:
+    """Publications, grants, withdrawals and the state for a restarted relay have its own port of the node."""
     relay, node, (first, second) = world.relay, world.node, world.links
     placed = messages.NodePlaced("key", "/node", "10.0.0.5")
     assert (placed, (world.ports.socket(2).fileno(),)) in first.told
@@ -232,12 +237,10 @@ async def test_each_relay_is_told_what_it_carries() -> None:
     assert (first.heard(), again.heard()) == ([messages.PublicationWithdrawn("key", "/left")], [])
     relay.withdraw_node(node)
     assert first.heard() == again.heard() == [messages.NodeWithdrawn("key")]
-    world.close()
 
 
-async def test_relays_know_which_hosts_the_policy_names() -> None:
-    """Publications and grants say whether their host is named, and again when another policy differs about it."""
-    world = World()
+async def test_relays_know_which_hosts_the_policy_names(world: World) -> None:
+    """Publications and grants say whether their host is named; a policy that changes this sends them again."""
     (first, second) = world.links
     world.grant_topic("/right", HOST, "/ear")
     world.enactor.carry_out(world.graph.service_granted(world.node, "/serve", HOST, "/client"))
@@ -255,12 +258,10 @@ async def test_relays_know_which_hosts_the_policy_names() -> None:
     ]
     world.limits_changed(world.policy, policy(nodes="default = *"))
     assert first.heard() == second.heard() == []
-    world.close()
 
 
-async def test_a_topic_moves_with_its_grants() -> None:
-    """Withdrawn by the old allocation, placed by the new one; other topics are not touched."""
-    world = World()
+async def test_a_topic_moves_with_its_grants(world: World) -> None:
+    """It is withdrawn from the old relay and placed on the new one; other topics are not touched."""
     relay, (first, second) = world.relay, world.links
     world.grant_topic("/right", HOST, "/ear")
     world.grant_topic("/left", HOST, "/ear")
@@ -279,19 +280,17 @@ async def test_a_topic_moves_with_its_grants() -> None:
         messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear"),
     ]
     assert relay.port(world.node, Kind.PUBLICATION, "/right") == 2
-    world.close()
 
 
-async def test_a_grant_that_is_revoked_after_its_topic_moved_is_good_nowhere() -> None:
-    """Not on the relay it came from either, should the topic come back to it; so it is with a service."""
-    world = World()
+async def test_a_grant_that_is_revoked_after_a_move_is_invalid_everywhere(world: World) -> None:
+    """It stays invalid on the first relay if the topic returns; the same holds for a service."""
     relay, (first, second) = world.relay, world.links
     world.enactor.carry_out(world.graph.service_granted(world.node, "/serve", HOST, "/c"))
     first.heard()
     away, back = [Move(SERVICE, "/serve", 0, 1)], [Move(SERVICE, "/serve", 1, 0)]
     relay.withdraw_moving(away)
     assert messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c") in first.heard()
-    world.allocation.adopt(Plan({}, {(SERVICE, "/serve"): 1}))
+    world.allocation.adopt(AllocationPlan({}, {(SERVICE, "/serve"): 1}))
     relay.place_moved(away)
     world.enactor.carry_out(world.grants.take(world.grants.all()[0]))
     assert second.heard()[-1] == messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c")
@@ -299,12 +298,10 @@ async def test_a_grant_that_is_revoked_after_its_topic_moved_is_good_nowhere() -
     world.put()
     relay.place_moved(back)
     assert first.heard() == [messages.ServicePlaced("key", "/serve", "10.0.0.5", 4001)]
-    world.close()
 
 
-async def test_one_relay_goes_and_its_connections_with_it() -> None:
-    """Numbers of connections are each relay's own; who is asked after them gets numbers that differ."""
-    world = World()
+async def test_a_lost_relay_loses_its_connections(world: World) -> None:
+    """Each relay numbers its own connections; the combined list has unique numbers."""
     relay, (first, second) = world.relay, world.links
     for link, topic in ((first, "/left"), (second, "/right")):
         link.say(messages.ConnectionOpened(7, "key", topic, "topic", "10.0.0.5", "/ear"), ())
@@ -314,12 +311,10 @@ async def test_one_relay_goes_and_its_connections_with_it() -> None:
     assert (world.lost, relay.presence) == ([1], "1 of 2 are away")
     first.end()
     assert relay.presence == "away"
-    world.close()
 
 
-async def test_a_publisher_that_is_cut_for_what_it_sent_is_recorded() -> None:
-    """With its address and name, as a denial that is folded; one whose connection only broke is not."""
-    world = World()
+async def test_a_publisher_that_is_cut_for_its_messages_is_recorded(world: World) -> None:
+    """The record is a folded denial with its address and name; a broken connection has no record."""
     say = world.links[0].say
     say(messages.UpstreamLost("key", "/left", "the publisher closed the connection"), ())
     assert world.records == []
@@ -330,24 +325,20 @@ async def test_a_publisher_that_is_cut_for_what_it_sent_is_recorded() -> None:
     assert fields["decision"] == "deny"
     say(messages.UpstreamLost("other", "/left", "of nobody that is known", "malformed"), ())
     assert len(world.records) == 1
-    world.close()
 
 
-async def test_what_a_relay_could_not_tell_is_said() -> None:
-    """Connections that nobody recorded, and traffic of the seconds without control as the rate that it was."""
-    world = World()
+async def test_unreported_events_of_a_relay_are_recorded(world: World) -> None:
+    """It reports unrecorded connections, and the traffic of the time without control as a rate."""
     row = messages.TopicTraffic("key", "/left", 400, 4000, 0, 1)
     world.links[0].say(messages.TrafficReported([row], 40.0, 7), ())
     assert world.relay.carried.traffic["key", "/left"].messages_per_second == 10
     ((event, reason, fields),) = world.records
     assert (event, fields["lost"]) == ("records lost", 7)
     assert "7 connections" in reason
-    world.close()
 
 
-async def test_limits_of_the_policy_are_stated_and_stated_again_when_they_change() -> None:
-    """With publications and grants, to the relay that carries the topic; what has not changed is not said again."""
-    world = World()
+async def test_limits_of_the_policy_are_sent_and_sent_again_on_change(world: World) -> None:
+    """The relay of the topic gets them with publications and grants; unchanged ones are not sent again."""
     relay, (first, second) = world.relay, world.links
     world.grant_topic("/right", HOST, "/ear")
     world.grant_topic("/left", HOST, "/ear")
@@ -378,12 +369,10 @@ async def test_limits_of_the_policy_are_stated_and_stated_again_when_they_change
         messages.PublicationPlaced("key", "/right", "std_msgs/String"),
         messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear"),
     ]
-    world.close()
 
 
-async def test_what_a_limit_dropped_is_a_record_with_the_limits_line() -> None:
-    """Of publishers a warning, of what is throttled on purpose a note; both are counted."""
-    world = World()
+async def test_drops_of_a_limit_are_recorded_with_its_line(world: World) -> None:
+    """Drops of publishers are warnings, intended throttling is informational; both are counted."""
     world.policy = policy("/left = publisher 30 Hz, subscriber 5 Hz")
     rows = [
         messages.LimitedRow("key", "/left", "publisher", "10.0.0.5", "/node", 7, 70),
@@ -395,12 +384,11 @@ async def test_what_a_limit_dropped_is_a_record_with_the_limits_line() -> None:
     assert (str(one["rule"]), one["count"], one["bytes"]) == ("[Limits] /left (p.ini:2)", 7, 70)
     assert (other["host"], other["caller_id"], other["publisher"]) == ("10.0.0.6", "/ear", "/node")
     assert world.relay.carried.limited_messages == {("/left", "publisher"): 7, ("/left", "subscriber"): 3}
-    world.close()
 
 
 async def test_grants_of_all_hosts_are_bounded() -> None:
-    """A host at its share, and of all hosts that with most, loses what nobody is connected by; others lose nothing."""
-    world = World(Bounds(whole=100, host=60, strangers=0, kept=0))
+    """A host at its quota, or the one with most grants, loses unused grants; others lose nothing."""
+    world = World(Bounds(whole=100, host=60, unknown=0, kept=0))
     robot = ipaddress.ip_address("10.0.0.9")
     world.grant_topic("/left", robot, "/ear")
     for number in range(200):

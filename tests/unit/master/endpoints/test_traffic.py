@@ -1,4 +1,4 @@
-"""What becomes of a relay's reports of refused connections."""
+"""Records of a relay's reports of refused connections."""
 
 import ipaddress
 from typing import Any, cast
@@ -7,7 +7,7 @@ import pytest
 
 from appliance.audit.record import Severity
 from appliance.channel.messages import ConnectionRefused
-from appliance.master.endpoints.traffic import Carried
+from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from roswire.uris import parse_node_uri
 
@@ -27,8 +27,8 @@ class Kept:
     ("host", "topic", "attack"),
     [("10.0.0.2", "/rosout", False), ("10.0.0.2", "/camera", True), ("10.0.0.66", "/rosout", True)],
 )
-def test_our_own_node_that_comes_too_late_attacks_nobody(host: str, topic: str, attack: bool) -> None:
-    """rosout connects to a node that has gone meanwhile: no denial. Others in its name are denied."""
+def test_a_late_connection_of_our_own_node_is_not_an_attack(host: str, topic: str, attack: bool) -> None:
+    """A connection of rosout to a node that has gone is not a denial; other hosts with its name are denied."""
     kept = Kept()
     registry = Registry()
     for key, name, own in (("k", "/talker", False), ("o", "/rosout", True)):
@@ -38,7 +38,7 @@ def test_our_own_node_that_comes_too_late_attacks_nobody(host: str, topic: str, 
         registry.add(node)
         if own:
             registry.register(node, Kind.SUBSCRIPTION, "/rosout", "rosgraph_msgs/Log")
-    told = Carried(cast(Any, kept), registry, 1)
+    told = RelayTraffic(cast(Any, kept), registry, 1)
     told.refused(ConnectionRefused("k", "topic", topic, host, "/rosout", "[/talker] is not a publisher", 1))
     (record,) = kept.records
     assert record["decision"] == ("deny" if attack else None)
@@ -47,8 +47,8 @@ def test_our_own_node_that_comes_too_late_attacks_nobody(host: str, topic: str, 
 
 
 def test_a_refusal_without_a_name_has_no_category() -> None:
-    """Who says nothing before he is refused has asked for neither a topic nor a service."""
+    """A host that is refused before it sends a header has requested neither a topic nor a service."""
     kept = Kept()
-    told = Carried(cast(Any, kept), Registry(), 1)
+    told = RelayTraffic(cast(Any, kept), Registry(), 1)
     told.refused(ConnectionRefused("k", "", "", "10.0.0.66", "", "said nothing", 2))
     assert (kept.records[0]["category"], kept.records[0]["count"]) == (None, 2)

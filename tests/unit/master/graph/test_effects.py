@@ -1,4 +1,4 @@
-"""What follows from a change is carried out: nobody who changes the graph lets the effects fall."""
+"""Every caller that changes the graph carries out the returned effects."""
 
 import ast
 import inspect
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import appliance
 from appliance.master.graph.grants import Grants
-from appliance.master.graph.graph import Graph
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Registry
 from appliance.master.graph.revocation import Revocation
 
@@ -16,10 +16,10 @@ _EFFECTS = {"Effects", "list[Durable]"}
 
 
 def verbs() -> set[tuple[str, str]]:
-    """The name of a part of the core, and a verb of it that returns what is to be carried out."""
+    """The name of a part of the core, and one of its methods that returns effects."""
     return {
-        (part.__name__.lower(), node.name)
-        for part in (Graph, Registry, Grants, Revocation)
+        (part.__name__.removeprefix("Ros").lower(), node.name)
+        for part in (RosGraph, Registry, Grants, Revocation)
         for node in ast.walk(ast.parse(inspect.getsource(part)))
         if isinstance(node, ast.FunctionDef)
         and node.returns is not None
@@ -28,7 +28,7 @@ def verbs() -> set[tuple[str, str]]:
 
 
 def dropped(tree: ast.Module, known: set[tuple[str, str]]) -> Iterator[str]:
-    """Calls of these verbs whose result nobody takes."""
+    """Return the calls of these methods whose result is dropped."""
     for node in ast.walk(tree):
         match node:
             case ast.Expr(value=ast.Call(func=ast.Attribute(value=part, attr=verb))):
@@ -37,8 +37,8 @@ def dropped(tree: ast.Module, known: set[tuple[str, str]]) -> Iterator[str]:
                     yield ast.unparse(node)
 
 
-def test_no_effect_falls() -> None:
-    """Nowhere in RVMaster and control."""
+def test_no_effect_is_dropped() -> None:
+    """No call in RVMaster or control drops effects."""
     files = [*(ROOT / "master").rglob("*.py"), *(ROOT / "control").rglob("*.py")]
     known = verbs()
     assert [
@@ -47,7 +47,7 @@ def test_no_effect_falls() -> None:
 
 
 def test_the_rule_finds_what_it_forbids() -> None:
-    """A verb by itself is found, one whose effects are carried out is not."""
+    """A call whose result is dropped is found; one whose effects are carried out is not."""
     assert {
         ("graph", "registered"),
         ("registry", "add"),

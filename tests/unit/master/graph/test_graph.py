@@ -1,4 +1,4 @@
-"""What the graph tells and takes when lives of one name overlap, and when control has died over a change."""
+"""The graph when incarnations of one name overlap, and after control died during a change."""
 
 from typing import Any, cast
 
@@ -13,8 +13,8 @@ pytestmark = pytest.mark.anyio
 
 
 @pytest.mark.parametrize("forgotten", [False, True], ids=["it unregisters", "it is forgotten"])
-async def test_a_lost_life_takes_nothing_from_the_one_that_has_its_name(forgotten: bool) -> None:
-    """It hung, another was started, and it wakes up to shut down: the grant of both, by name and host, stands."""
+async def test_a_lost_incarnation_takes_nothing_from_its_successor(forgotten: bool) -> None:
+    """A hung node wakes up and shuts down after its successor started: the grant of both, by name and host, stays."""
     world = await ControlParts.begun()
     talker, old, new = world.node("/talker"), world.node("/ear", 2), world.node("/ear", 3)
     await world.register(talker, Kind.PUBLICATION, "/a")
@@ -32,8 +32,8 @@ async def test_a_lost_life_takes_nothing_from_the_one_that_has_its_name(forgotte
     assert list(world.grants.of(talker.key)) == []
 
 
-async def test_who_lost_a_topic_is_told_again_by_the_next_control() -> None:
-    """Control may have died before it told it: whoever still knows a publisher would never hear it again."""
+async def test_the_next_control_repeats_the_news_of_a_lost_topic() -> None:
+    """If control died before the update, subscribers would otherwise keep the old publisher."""
     world = await ControlParts.begun()
     node = world.node("/ear")
     await world.register(node, Kind.SUBSCRIPTION, "/secret")
@@ -48,8 +48,8 @@ async def test_who_lost_a_topic_is_told_again_by_the_next_control() -> None:
     assert [params[0] for _name, _method, params in world.deliveries.told] == ["/plain"]
 
 
-async def test_who_is_absent() -> None:
-    """Whoever has a topic of somebody through the relay and is not connected, whether or not a grant is left."""
+async def test_subscribers_without_a_connection_are_absent() -> None:
+    """They have a publisher on the relay and no connection, with or without a grant."""
     world = await ControlParts.begun()
     talker, ear, other = world.node("/talker", 1), world.node("/ear", 2), world.node("/other", 3)
     await world.register(talker, Kind.PUBLICATION, "/a")
@@ -61,8 +61,8 @@ async def test_who_is_absent() -> None:
     assert list(world.graph.absent([other])) == []
 
 
-async def test_nobody_is_absent_where_nodes_connect_by_themselves() -> None:
-    """What the relay does not carry has no connections there; the appliance's own nodes have all of theirs there."""
+async def test_no_subscriber_is_absent_without_the_relay() -> None:
+    """Topics that the relay does not carry have no connections there; the appliance's own nodes always have."""
     world = await ControlParts.begun()
     cast(Any, world.mediation).carries_topic = lambda _topic: False
     talker, ear, own = world.node("/talker", 1), world.node("/ear", 2), world.node("/rosout", 3)

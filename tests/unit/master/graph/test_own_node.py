@@ -1,4 +1,4 @@
-"""What the appliance's own node may do: what an unmodified rosout asks for, and nothing else."""
+"""The appliance's own node may make the calls of an unmodified rosout, and no others."""
 
 import ipaddress
 
@@ -7,8 +7,8 @@ import pytest
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.calls.call import CALLER_API, SERVICE_API, Attempt
 from appliance.master.calls.call_table import MASTER_CALLS
-from appliance.master.calls.gate import Gate, HostLimits
-from appliance.master.graph.own_node import ROSOUT
+from appliance.master.calls.gate import CallGate, HostLimits
+from appliance.master.graph.own_node import rosout_may_have
 from appliance.master.graph.registry import Kind, Registry
 from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
@@ -30,7 +30,7 @@ ROSOUTS = [
 
 
 def decide(caller_id: str, method: str, resource: str) -> Decision:
-    """The decision on a call at the listener of the appliance's own nodes."""
+    """Return the decision on a call at the listener of the appliance's own nodes."""
     policy, call = compile_policy("[Nodes]\n", file="p.ini"), MASTER_CALLS[method]
     peer = Peer(ipaddress.ip_address("127.0.0.1"), "127.0.0.1", "127.0.0.1")
     arguments = tuple(
@@ -38,14 +38,14 @@ def decide(caller_id: str, method: str, resource: str) -> Decision:
         for one in call.method.parameters
     )
     attempt = Attempt(Caller(peer, caller_id, 0, own=True), call, arguments)
-    decision = Gate(lambda: policy, Registry(), HostLimits()).decide(attempt, {})
+    decision = CallGate(lambda: policy, Registry(), HostLimits()).decide(attempt, {})
     assert isinstance(decision, Decision)
     return decision
 
 
 @pytest.mark.parametrize(("method", "resource"), ROSOUTS)
-def test_rosout_may_be_rosout(method: str, resource: str) -> None:
-    """It may do what it does when it starts and ends, under its own name only."""
+def test_rosout_may_start_and_end(method: str, resource: str) -> None:
+    """Its calls at start and end are granted, under its own name only."""
     assert decide("/rosout", method, resource).allowed
     for other in ("/talker", "/rosrv", ""):
         decision = decide(other, method, resource)
@@ -54,7 +54,7 @@ def test_rosout_may_be_rosout(method: str, resource: str) -> None:
 
 
 @pytest.mark.parametrize("method", MASTER_CALLS)
-def test_it_may_do_nothing_else(method: str) -> None:
+def test_rosout_may_make_no_other_call(method: str) -> None:
     """No call of the Master API is granted for another topic, service or parameter, and most are not granted at all."""
     for resource in ("/cmd_vel", "/secret", "/", "/talker/set_logger_level"):
         decision = decide("/rosout", method, resource)
@@ -66,8 +66,8 @@ def test_it_may_do_nothing_else(method: str) -> None:
             assert not decide("/rosout", method, resource).allowed
 
 
-def test_what_it_publishes_it_may_not_hear() -> None:
-    """A right is one of a kind: the topic that it publishes is none that it subscribes to."""
-    assert ROSOUT.may_have(Kind.PUBLICATION, "/rosout_agg")
-    assert not ROSOUT.may_have(Kind.SUBSCRIPTION, "/rosout_agg")
-    assert not ROSOUT.may_have(Kind.PARAMETER, "/use_sim_time")
+def test_rosout_may_not_subscribe_to_its_own_topic() -> None:
+    """The right to publish a topic does not include subscribing to it."""
+    assert rosout_may_have(Kind.PUBLICATION, "/rosout_agg")
+    assert not rosout_may_have(Kind.SUBSCRIPTION, "/rosout_agg")
+    assert not rosout_may_have(Kind.PARAMETER, "/use_sim_time")

@@ -1,4 +1,4 @@
-"""Who is told of a parameter: as rosmaster's own code computes it, and never of a key that was not decided."""
+"""Updates of parameters go to the nodes that rosmaster computes, and never carry an undecided key."""
 
 import asyncio
 import copy
@@ -14,7 +14,7 @@ from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Kind
 from roswire.names import is_relative_member
 from roswire.xmlrpc import Value
-from tests.support.control_parts import ControlParts
+from tests.support.control_parts import OPEN, ControlParts
 from tests.support.examples import examples
 from tests.support.nodes import PYTHON
 
@@ -53,7 +53,7 @@ def oracle() -> Any:
 
 
 def in_order(told: list[Any]) -> list[str]:
-    """Updates without the order of those of one call, which says nothing."""
+    """Return the updates without their order within one call, which has no meaning."""
     return sorted(json.dumps(one, sort_keys=True) for one in told)
 
 
@@ -64,10 +64,10 @@ def in_order(told: list[Any]) -> list[str]:
     st.one_of(st.integers(0, 3), st.just([{"a": 1}]), NAMESPACE),
     st.one_of(CALLER, st.none()),
 )
-def test_the_same_nodes_hear_the_same_as_on_a_plain_master(
+def test_updates_equal_those_of_a_plain_master(
     oracle: Any, subscribed: list[tuple[str, str]], key: str, value: Any, caller: str | None
 ) -> None:
-    """Whatever is subscribed and whatever is set or deleted: who is told, of which keys, with which values."""
+    """For any subscriptions and changes, the nodes, keys and values of the updates are the same."""
     value = {} if caller is None else value  # deleted
     oracle.stdin.write(json.dumps([subscribed, key, value, caller]) + "\n")
     oracle.stdin.flush()
@@ -90,15 +90,15 @@ def test_the_same_nodes_hear_the_same_as_on_a_plain_master(
     ),
     st.lists(KEY, max_size=5),
 )
-def test_nobody_is_told_of_a_key_that_was_not_decided(key: str, value: Any, others: list[str]) -> None:
-    """Whatever the names in a value: told is the key, or a subscribed key below it."""
+def test_no_update_has_an_undecided_key(key: str, value: Any, others: list[str]) -> None:
+    """For any names in a value, an update has the key or a subscribed key below it."""
     below = [one for one in others if one != key and one.startswith(key.rstrip("/") + "/")]
     for update in updates_of(key, value, below):
         assert update.key in {key, *below}
 
 
-def test_what_is_told_is_what_was_set() -> None:
-    """A value that waits to be told is not changed by a later call that sets something in it."""
+def test_an_update_has_the_value_that_was_set() -> None:
+    """A later call that sets a member does not change the value of a waiting update."""
     tree: dict[str, Value] = {"a": {"b": 1}, "c": [1]}
     kept = settled(tree)
     before = copy.deepcopy(kept)
@@ -111,8 +111,8 @@ def test_what_is_told_is_what_was_set() -> None:
 @pytest.mark.parametrize("name", ["/limits/speed", "~own", "a//b", "", "a/", "/"])
 @pytest.mark.parametrize("depth", range(3))
 @pytest.mark.anyio
-async def test_a_member_that_is_no_relative_name_is_refused(name: str, depth: int) -> None:
-    """At every depth, alone and in a multicall: nothing is set, nobody is told, and the text names the member."""
+async def test_a_member_with_an_invalid_name_is_refused(name: str, depth: int) -> None:
+    """At every depth, alone and in a multicall, nothing is set or sent, and the error names the member."""
     world = await ControlParts.begun()
     node = world.node("/robot")
     await world.register(node, Kind.PARAMETER, "/limits/speed", "")
@@ -134,8 +134,8 @@ async def test_a_member_that_is_no_relative_name_is_refused(name: str, depth: in
 
 
 @pytest.mark.anyio
-async def test_a_subscription_meets_no_write_that_is_under_way() -> None:
-    """Who subscribes while the parameter is set has the new value: by the answer, or because it is told."""
+async def test_a_subscription_during_a_write_gets_the_new_value() -> None:
+    """A node that subscribes during a write gets the new value by the answer or by an update."""
     for first in ("subscribeParam", "setParam"):
         world = await ControlParts.begun()
         calls = {
@@ -149,3 +149,15 @@ async def test_a_subscription_meets_no_write_that_is_under_way() -> None:
         told = [one for one in world.deliveries.told if one[1] == "paramUpdate"]
         assert made == order
         assert told == ([("/robot", "paramUpdate", ("/arm/", 2))] if first == "subscribeParam" else [])
+
+
+@pytest.mark.anyio
+async def test_an_update_of_the_whole_tree_needs_the_right_to_all_of_it() -> None:
+    """The rights to other updates are in `conversations.txt`."""
+    world = await ControlParts.begun()
+    world.reload(f"{OPEN}[Parameters]\nread /arm = 10.0.0.5\nread default = 10.0.0.9\n")
+    node = world.node("/n")
+    await world.register(node, Kind.PARAMETER, "/arm", "")
+    world.enactor.carry_out(world.graph.tell_parameter(node, "/", {"arm": 4711}))
+    assert not [one for one in world.deliveries.told if one[1] == "paramUpdate"]
+    assert ("deny", "/") in world.records.events

@@ -1,4 +1,4 @@
-"""The registry's invariants under any sequence of changes, beside what can be counted naively."""
+"""The registry's invariants after any sequence of changes, compared with a naive count."""
 
 import ipaddress
 
@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
+from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration, Registry, new_key
 from roswire.uris import parse_node_uri
 from tests.support.examples import examples
 
@@ -20,7 +20,7 @@ STEP = st.tuples(
 
 
 def incarnation(number: int) -> Incarnation:
-    """One of two of a name."""
+    """Return one of two incarnations of a name."""
     api = f"http://h:{40000 + number}/"
     return Incarnation(
         new_key(), f"/n{number % 3}", HOSTS[number % 2], parse_node_uri(api), api, "10.0.0.9", 1, 2
@@ -30,7 +30,7 @@ def incarnation(number: int) -> Incarnation:
 @settings(max_examples=examples(300))
 @given(steps=st.lists(STEP, max_size=40))
 def test_invariants(steps: list[tuple[str, int, Kind, str]]) -> None:
-    """One live incarnation a name; shadows count for nobody; the indexes are what a look at everything finds."""
+    """A name has one live incarnation, replaced ones do not count, and the indexes equal a full scan."""
     registry = Registry()
     known = [incarnation(number) for number in range(6)]
     for one in known:
@@ -59,7 +59,7 @@ def test_invariants(steps: list[tuple[str, int, Kind, str]]) -> None:
 
 
 def check(registry: Registry, known: list[Incarnation]) -> None:
-    """Compare every question the registry answers with a look at all incarnations."""
+    """Compare each query of the registry with a scan of all incarnations."""
     there = [one for one in known if registry.by_key(one.key) is one]
     assert registry.all() == there
     holding = [one for one in there if one.life is Life.LIVE and one.registrations]
@@ -74,14 +74,14 @@ def check(registry: Registry, known: list[Incarnation]) -> None:
         mine = [one for one in there if one.host == host]
         assert registry.nodes_of(host) == len(mine)
         assert registry.registrations_of(host) == sum(len(one.registrations) for one in mine)
-    pairs: list[tuple[Incarnation, Registration]] = list(registry.in_order())
+    pairs: list[tuple[Incarnation, NodeRegistration]] = list(registry.in_order())
     orders = [registration.order for _, registration in pairs]
     assert orders == sorted(set(orders))
     assert {one.key for one, _ in pairs} == {one.key for one in holding}
 
 
-def test_the_one_that_was_lost_first_makes_room() -> None:
-    """Of a host's nodes that are gone, the one that went first is dropped first; a live one never is."""
+def test_the_node_that_was_lost_first_makes_room() -> None:
+    """A host's longest-lost node is dropped first; a live one never is."""
     registry = Registry()
     known = [incarnation(number) for number in (0, 2, 4)]
     for one in known:
@@ -94,8 +94,8 @@ def test_the_one_that_was_lost_first_makes_room() -> None:
     assert registry.spare_of(HOSTS[1]) is None
 
 
-def test_who_has_nothing_makes_room_first() -> None:
-    """A node that gave up all it had goes before one that is lost, and for other hosts, too; not one that asks now."""
+def test_a_node_without_registrations_makes_room_first() -> None:
+    """A node without registrations is dropped before a lost one, also for other hosts, unless it is calling now."""
     registry = Registry()
     lost, idle, busy = incarnation(0), incarnation(2), incarnation(4)
     for one in (lost, idle, busy):
@@ -115,8 +115,8 @@ def test_who_has_nothing_makes_room_first() -> None:
     assert registry.spare(HOSTS[1]) is busy
 
 
-def test_forgetting_one_life_leaves_the_next_findable() -> None:
-    """Two incarnations of one identity (name, host and URI again): the later one is found when the first is dropped."""
+def test_forgetting_one_incarnation_keeps_the_next() -> None:
+    """Two incarnations of one identity (name, host and URI again): the later one stays when the first is dropped."""
     registry = Registry()
     first, second = incarnation(0), incarnation(0)
     registry.add(first)
@@ -129,10 +129,10 @@ def test_forgetting_one_life_leaves_the_next_findable() -> None:
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_a_name_is_restored_to_the_one_that_has_something(order: tuple[int, int]) -> None:
-    """An idle life of a node, kept as live beside the one that has its name, does not take it at a restart."""
+def test_a_name_is_restored_to_the_node_with_registrations(order: tuple[int, int]) -> None:
+    """An idle incarnation that is still live does not get the name at a restart."""
     known = [incarnation(0), incarnation(3)]
-    known[1].registrations[Kind.PUBLICATION, "/x"] = Registration(Kind.PUBLICATION, "/x", "t", 1)
+    known[1].registrations[Kind.PUBLICATION, "/x"] = NodeRegistration(Kind.PUBLICATION, "/x", "t", 1)
     registry = Registry()
     for number in order:
         registry.restore(known[number])

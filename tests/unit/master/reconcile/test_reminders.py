@@ -1,6 +1,5 @@
-"""Subscribers that do not come back to a new relay are told again."""
+"""Subscribers that do not return to a new relay receive their lists again."""
 
-import asyncio
 import ipaddress
 from typing import Any, cast
 
@@ -11,11 +10,12 @@ from appliance.master.reconcile import reminders
 from appliance.master.reconcile.reminders import Reminders
 from roswire.uris import parse_node_uri
 
+pytestmark = pytest.mark.anyio
 HOST = ipaddress.ip_address("10.0.0.5")
 
 
 class Told:
-    """The graph, of which `/ear` is absent for so many looks, and who carries out what it returns."""
+    """A graph in which `/ear` is absent for a number of checks, and which carries out its effects."""
 
     def __init__(self, absent_for: int) -> None:
         self.absent_for = absent_for
@@ -36,7 +36,7 @@ class Told:
 
 
 def node(registry: Registry, name: str, kind: Kind) -> Incarnation:
-    """A live subscriber or publisher of /chatter."""
+    """Return a live subscriber or publisher of /chatter."""
     uri = "http://10.0.0.5:4000/"
     node = Incarnation(f"key of {name}", name, HOST, parse_node_uri(uri), uri, "10.0.0.1", 19001, 19002)
     registry.add(node)
@@ -45,23 +45,19 @@ def node(registry: Registry, name: str, kind: Kind) -> Incarnation:
 
 
 @pytest.mark.parametrize(("absent_for", "reminded", "renewed"), [(0, 0, 0), (2, 2, 0), (99, 2, 6)])
-def test_reminded_until_back(
+async def test_reminded_until_back(
     monkeypatch: pytest.MonkeyPatch, absent_for: int, reminded: int, renewed: int
 ) -> None:
-    """Nobody is told who is back; who stays away is told to take the publisher anew, and nobody for ever."""
+    """Returned nodes get no reminder; absent ones are reminded to connect again, a limited number of times."""
     monkeypatch.setattr(reminders, "_PAUSES", (0.0,) * 8)
     registry = Registry()
     node(registry, "/ear", Kind.SUBSCRIPTION)
     node(registry, "/other", Kind.SUBSCRIPTION)
     node(registry, "/mouth", Kind.PUBLICATION)
     told = Told(absent_for)
-
-    async def run() -> None:
-        looks = Reminders(registry, cast(Any, told), cast(Any, told))
-        looks.begin()
-        assert looks.round is not None
-        await looks.round
-
-    asyncio.run(run())
+    looks = Reminders(registry, cast(Any, told), cast(Any, told))
+    looks.begin()
+    assert looks.round is not None
+    await looks.round
     gentle, anew = ("/ear", "/chatter", list[str]()), ("/ear", "/chatter", ["key of /mouth"])
     assert told.reminded == [gentle] * reminded + [anew] * renewed

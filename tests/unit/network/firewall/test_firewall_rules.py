@@ -9,13 +9,13 @@ from appliance.network.firewall.firewall import statuses
 from appliance.network.firewall.firewall_rules import (
     Chain,
     FirewallSettings,
-    Forwarder,
+    ForwarderAccess,
     Interface,
-    OwnNode,
+    OwnNodeAccess,
+    PacketRule,
+    PacketVerdict,
     PortRange,
     RateLimit,
-    Rule,
-    Verdict,
     appliance_rules,
     family_of,
     inner_port,
@@ -30,7 +30,7 @@ FULL = FirewallSettings(
     api_port=8443,
     api_networks=("10.0.0.0/8", "fd00::/8"),
     tunnel_only=("10.9.9.1", "fd77::1"),
-    own_node=OwnNode(
+    own_node=OwnNodeAccess(
         uid=61018, relay_uid=61013, address="127.87.79.1", ports=PortRange(900, 963), master_port=5555
     ),
 )
@@ -38,12 +38,12 @@ FULL = FirewallSettings(
 
 def test_the_rules_only_ever_refuse() -> None:
     """No rule of the appliance's namespace accepts a packet over the head of another firewall."""
-    refusing = {Verdict.RETURN, Verdict.RESET, Verdict.DROP}
-    assert {rule.verdict for rule in appliance_rules(FULL)} == refusing | {Verdict.COUNTED}
+    refusing = {PacketVerdict.RETURN, PacketVerdict.RESET, PacketVerdict.DROP}
+    assert {rule.verdict for rule in appliance_rules(FULL)} == refusing | {PacketVerdict.COUNTED}
 
 
-def test_nobody_is_counted_before_he_has_answered() -> None:
-    """A limit for each host looks at what came after the handshake: a first packet may bear anybody's address."""
+def test_hosts_are_counted_after_the_handshake_only() -> None:
+    """A limit for each host counts packets after the handshake: the source of a first packet may be forged."""
     limited = [rule for rule in appliance_rules(FULL) if rule.above is not None]
     assert len(limited) == 3
     assert all(rule.answered and not rule.opening for rule in limited)
@@ -51,16 +51,16 @@ def test_nobody_is_counted_before_he_has_answered() -> None:
         replace(limited[0], answered=False)
 
 
-def test_the_one_user_is_let_pass_before_all_others_are_refused() -> None:
-    """For an inner port the owner's RETURN stands before the refusal of everyone, at the first packet."""
+def test_the_owner_passes_before_all_others_are_refused() -> None:
+    """For an inner port the owner's RETURN comes before the rule that refuses all users, at the first packet."""
     outside, owner, others = inner_port("ROSMaster port", 11312, "control", 61011)
     assert (outside.chain, outside.arrives_on, outside.verdict) == (
         Chain.IN,
         Interface("lo", other=True),
-        Verdict.RESET,
+        PacketVerdict.RESET,
     )
-    assert (owner.chain, owner.uid, owner.verdict) == (Chain.OUT, 61011, Verdict.RETURN)
-    assert (others.chain, others.uid, others.verdict) == (Chain.OUT, None, Verdict.RESET)
+    assert (owner.chain, owner.uid, owner.verdict) == (Chain.OUT, 61011, PacketVerdict.RETURN)
+    assert (others.chain, others.uid, others.verdict) == (Chain.OUT, None, PacketVerdict.RESET)
     assert all(
         rule.opening and rule.tcp_ports == PortRange(11312, 11312) for rule in (outside, owner, others)
     )
@@ -73,16 +73,18 @@ def test_unknown_ports_and_empty_lists_make_no_rule() -> None:
 
 
 def test_an_address_of_the_machine_is_for_its_own_packets() -> None:
-    """What a router passed on under such an address is dropped before any other rule, on both families."""
+    """A packet from a router with such an address is dropped before any other rule, for both families."""
     first, second, *_ = appliance_rules(replace(FULL, neighbours=("10.111.0.1", "fd52::1")))
     assert [rule.families() for rule in (first, second)] == [(4,), (6,)]
-    assert all(rule.distant and rule.opening and rule.verdict is Verdict.DROP for rule in (first, second))
+    assert all(
+        rule.distant and rule.opening and rule.verdict is PacketVerdict.DROP for rule in (first, second)
+    )
 
 
 def test_a_tunnelled_address_is_refused_both_ways_before_all_else() -> None:
     """The rules of tunnelled hosts come first, by IPsec policy or by the tunnel's interface."""
     first, second = appliance_rules(FULL)[:2]
-    assert (first.source, first.clear_text, first.verdict) == ("10.9.9.1", True, Verdict.DROP)
+    assert (first.source, first.clear_text, first.verdict) == ("10.9.9.1", True, PacketVerdict.DROP)
     assert (second.destination, second.clear_text, second.chain) == ("10.9.9.1", True, Chain.OUT)
     on_interface = FirewallSettings(
         control_uid=1, rosmaster_uid=2, tunnel_only=("10.9.9.1",), tunnel_interface="ipsec0"
@@ -93,7 +95,7 @@ def test_a_tunnelled_address_is_refused_both_ways_before_all_else() -> None:
 
 
 def test_the_rest_port_is_limited_before_its_networks_pass() -> None:
-    """The REST port's rate limit stands before the RETURN of the networks, its refusal after."""
+    """The REST port's rate limit comes before the RETURN of the networks, its refusal after."""
     purposes = [rule.purpose for rule in appliance_rules(FULL) if rule.purpose.startswith("REST")]
     assert purposes == [
         "REST port: new connections per host",
@@ -105,44 +107,58 @@ def test_the_rest_port_is_limited_before_its_networks_pass() -> None:
 
 
 def test_purposes_tell_rules_of_a_chain_apart() -> None:
-    """No two rules of a chain have the same purpose, for the counters are joined by it."""
+    """No two rules of a chain have the same purpose, because the counters are joined by it."""
     keys = [(rule.chain, rule.purpose) for rule in appliance_rules(FULL)]
     assert len(keys) == len(set(keys))
 
 
 def test_families_follow_the_addresses() -> None:
     """A rule with an address is of that address's family, any other of both."""
-    assert Rule(chain=Chain.IN, purpose="x", verdict=Verdict.DROP, source="fd00::/8").families() == (6,)
-    assert Rule(chain=Chain.IN, purpose="x", verdict=Verdict.DROP).families() == (4, 6)
+    assert PacketRule(
+        chain=Chain.IN, purpose="x", verdict=PacketVerdict.DROP, source="fd00::/8"
+    ).families() == (6,)
+    assert PacketRule(chain=Chain.IN, purpose="x", verdict=PacketVerdict.DROP).families() == (4, 6)
     assert family_of("10.0.0.0/8") == 4
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: PortRange(0, 5), "0-5 is no range"),
-        (lambda: PortRange(9, 5), "9-5 is no range"),
-        (lambda: PortRange(1, 65536), "1-65536 is no range"),
+        (lambda: PortRange(0, 5), "0-5 is not a range"),
+        (lambda: PortRange(9, 5), "9-5 is not a range"),
+        (lambda: PortRange(1, 65536), "1-65536 is not a range"),
         (lambda: RateLimit(0, 5), "1 to 100000"),
         (lambda: FirewallSettings(control_uid=-1, rosmaster_uid=2), "control_uid -1"),
         (lambda: FirewallSettings(control_uid=1, rosmaster_uid=2, rosmaster_port=70000), "70000"),
         (
             lambda: FirewallSettings(control_uid=1, rosmaster_uid=2, api_networks=("ten",)),
-            "'ten' is no address",
+            "'ten' is not an address",
         ),
         (
             lambda: FirewallSettings(control_uid=1, rosmaster_uid=2, tunnel_only=("10.0.0.1/8",)),
-            "'10.0.0.1/8' is no address",
+            "'10.0.0.1/8' is not an address",
         ),
-        (lambda: OwnNode(uid=-1, relay_uid=1, address="127.0.0.9", ports=PortRange.one(9)), "own node: -1"),
-        (lambda: OwnNode(uid=1, relay_uid=1, address="here", ports=PortRange.one(9)), "'here' is no address"),
-        (lambda: Rule(chain=Chain.IN, purpose="x", verdict=Verdict.RESET), "only TCP can be reset"),
-        (lambda: Rule(chain=Chain.IN, purpose="x", verdict=Verdict.DROP, uid=5), "has an owner"),
-        (lambda: Rule(chain=Chain.NAT, purpose="x", verdict=Verdict.DNAT), "DNAT and its address"),
+        (
+            lambda: OwnNodeAccess(uid=-1, relay_uid=1, address="127.0.0.9", ports=PortRange.one(9)),
+            "own node: -1",
+        ),
+        (
+            lambda: OwnNodeAccess(uid=1, relay_uid=1, address="here", ports=PortRange.one(9)),
+            "'here' is not an address",
+        ),
+        (
+            lambda: PacketRule(chain=Chain.IN, purpose="x", verdict=PacketVerdict.RESET),
+            "only TCP can be reset",
+        ),
+        (lambda: PacketRule(chain=Chain.IN, purpose="x", verdict=PacketVerdict.DROP, uid=5), "has an owner"),
+        (
+            lambda: PacketRule(chain=Chain.NAT, purpose="x", verdict=PacketVerdict.DNAT),
+            "DNAT and its address",
+        ),
     ],
 )
 def test_wrong_values_are_named(make: object, words: str) -> None:
-    """A setting or rule that cannot be meant is an error that names it."""
+    """An impossible setting or rule is an error that names it."""
     assert callable(make)
     with pytest.raises(ValueError, match=words):
         make()
@@ -150,7 +166,7 @@ def test_wrong_values_are_named(make: object, words: str) -> None:
 
 def test_a_rule_is_in_force_only_with_all_its_families() -> None:
     """Counters of both families are added up; a rule that one family has lost is not in force."""
-    rule = Rule(chain=Chain.IN, purpose="p", verdict=Verdict.DROP)
+    rule = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP)
     four = RuleCounter("ROSRV-IN", 4, "p", 3, 300)
     six = RuleCounter("ROSRV-IN", 6, "p", 1, 100)
     (status,) = statuses((rule,), (four, six))
@@ -162,8 +178,8 @@ def test_a_rule_is_in_force_only_with_all_its_families() -> None:
 
 def test_a_kernel_without_a_family_lacks_no_rule_of_it() -> None:
     """Where there is no IPv6, a rule for both is in force with IPv4's, and one for IPv6 alone has nothing to refuse."""
-    both = Rule(chain=Chain.IN, purpose="p", verdict=Verdict.DROP)
-    six = Rule(chain=Chain.IN, purpose="six", verdict=Verdict.DROP, source="fd00::/8")
+    both = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP)
+    six = PacketRule(chain=Chain.IN, purpose="six", verdict=PacketVerdict.DROP, source="fd00::/8")
     four = RuleCounter("ROSRV-IN", 4, "p", 3, 300)
     assert [one.in_force for one in statuses((both, six), (four,), families=(4,))] == [True, True]
     assert [one.in_force for one in statuses((both, six), (), families=(4,))] == [False, True]
@@ -177,14 +193,14 @@ def test_a_rule_describes_itself() -> None:
 
 
 def test_ports_of_the_own_nodes_are_closed_from_outside() -> None:
-    """What the kernel chose is nobody's business outside; ports of ours that lie there were chosen by us."""
+    """Ports that the kernel chose are closed to other hosts; our own ports in that range stay open."""
     bare = FirewallSettings(
         control_uid=1, rosmaster_uid=2, new_connections=None, client_ports=PortRange(32768, 60999)
     )
     [closed] = appliance_rules(bare)
     assert (closed.chain, closed.verdict, closed.tcp_ports) == (
         Chain.IN,
-        Verdict.RESET,
+        PacketVerdict.RESET,
         PortRange(32768, 60999),
     )
     assert closed.arrives_on == Interface("lo", other=True)
@@ -192,8 +208,8 @@ def test_ports_of_the_own_nodes_are_closed_from_outside() -> None:
     *ours, last = appliance_rules(inside)
     assert last == closed
     assert [(rule.verdict, rule.tcp_ports) for rule in ours] == [
-        (Verdict.RETURN, PortRange(50000, 50000)),
-        (Verdict.RETURN, PortRange(40000, 40099)),
+        (PacketVerdict.RETURN, PortRange(50000, 50000)),
+        (PacketVerdict.RETURN, PortRange(40000, 40099)),
     ]
 
 
@@ -201,65 +217,70 @@ def test_the_own_node_is_called_by_control_alone() -> None:
     """Control reaches it at one address, the relay at its ports for messages; any other connection it never answers."""
     of_node = [rule for rule in appliance_rules(FULL) if "own node" in rule.purpose]
     calls = [rule for rule in of_node if rule.destination == "127.87.79.1"]
-    assert [(rule.uid, rule.verdict) for rule in calls] == [(61011, Verdict.RETURN), (None, Verdict.RESET)]
+    assert [(rule.uid, rule.verdict) for rule in calls] == [
+        (61011, PacketVerdict.RETURN),
+        (None, PacketVerdict.RESET),
+    ]
     assert all(rule.chain is Chain.OUT and rule.tcp_ports == PortRange(1, 65535) for rule in calls)
     answers = [rule for rule in of_node if rule.accepting]
     assert [(rule.source, rule.from_ports, rule.verdict) for rule in answers] == [
-        ("127.87.79.1", None, Verdict.RETURN),
-        (None, PortRange(900, 963), Verdict.RETURN),
-        (None, None, Verdict.DROP),
+        ("127.87.79.1", None, PacketVerdict.RETURN),
+        (None, PortRange(900, 963), PacketVerdict.RETURN),
+        (None, None, PacketVerdict.DROP),
     ]
     assert {rule.uid for rule in answers} == {61018}
     assert answers[1].describe() == "from tcp 900-963, uid 61018, syn ack -> RETURN"
 
 
 def test_rosmaster_and_the_own_node_open_no_way_out() -> None:
-    """The programs that are not ours connect to what they are for; nothing of theirs leaves the machine."""
+    """Programs that are not ours connect to their own peers only; none of their packets leaves the machine."""
     rules = appliance_rules(FULL)
     for uid, port in ((61012, 4444), (61018, 5555)):
         opened = [rule for rule in rules if rule.uid == uid and rule.opening]
-        passed = {rule.tcp_ports for rule in opened if rule.verdict is Verdict.RETURN}
+        passed = {rule.tcp_ports for rule in opened if rule.verdict is PacketVerdict.RETURN}
         assert passed == {PortRange.one(port)}
-        assert Rule(
+        assert PacketRule(
             chain=Chain.OUT,
             purpose=opened[0].purpose,
-            verdict=Verdict.DROP,
+            verdict=PacketVerdict.DROP,
             leaves_on=Interface("lo", other=True),
             uid=uid,
         ) in {replace(rule, purpose=opened[0].purpose) for rule in rules}
-    refused = {rule.tcp_ports for rule in rules if rule.uid == 61018 and rule.verdict is Verdict.RESET}
+    refused = {rule.tcp_ports for rule in rules if rule.uid == 61018 and rule.verdict is PacketVerdict.RESET}
     assert refused == {PortRange.one(11311), PortRange.one(8443), PortRange(1, 1023)}
 
 
 def test_a_rule_is_for_tcp_or_for_udp() -> None:
     """A packet cannot be both; a port of UDP is named in the words of the rule."""
     with pytest.raises(ValueError, match="TCP or UDP"):
-        Rule(
+        PacketRule(
             chain=Chain.IN,
             purpose="both",
-            verdict=Verdict.DROP,
+            verdict=PacketVerdict.DROP,
             tcp_ports=PortRange.one(500),
             udp_ports=PortRange.one(500),
         )
-    rule = Rule(chain=Chain.IN, purpose="one", verdict=Verdict.DROP, udp_ports=PortRange.one(500))
+    rule = PacketRule(chain=Chain.IN, purpose="one", verdict=PacketVerdict.DROP, udp_ports=PortRange.one(500))
     assert rule.describe() == "udp 500 -> DROP"
 
 
-def test_the_forwarder_reaches_its_receiver_and_nobody_else() -> None:
-    """Of what the forwarder's user sends, only packets to the one address and port leave; nobody else is concerned."""
+def test_the_forwarder_reaches_its_receiver_only() -> None:
+    """The forwarder's user sends to one address and port only; the rule concerns no other user."""
     for datagrams in (False, True):
-        to = Forwarder(61017, "10.0.0.9", 6514, datagrams=datagrams)
+        to = ForwarderAccess(61017, "10.0.0.9", 6514, datagrams=datagrams)
         settings = FirewallSettings(control_uid=1, rosmaster_uid=2, forwarder=to, new_connections=None)
         receiver, others = appliance_rules(settings)
         assert (receiver.chain, receiver.uid, receiver.destination) == (Chain.OUT, 61017, "10.0.0.9")
-        assert receiver.verdict is Verdict.RETURN
+        assert receiver.verdict is PacketVerdict.RETURN
         assert receiver.udp_ports == (PortRange.one(6514) if datagrams else None)
         assert receiver.tcp_ports == (None if datagrams else PortRange.one(6514))
-        assert others == Rule(chain=Chain.OUT, purpose=others.purpose, verdict=Verdict.DROP, uid=61017)
+        assert others == PacketRule(
+            chain=Chain.OUT, purpose=others.purpose, verdict=PacketVerdict.DROP, uid=61017
+        )
 
 
 @pytest.mark.parametrize("wrong", [(-1, "10.0.0.9", 1), (1, "logs.example.com", 1), (1, "10.0.0.9", 0)])
-def test_a_forwarder_that_cannot_be(wrong: tuple[int, str, int]) -> None:
-    """What is no user, no address or no port is an error."""
-    with pytest.raises(ValueError, match=r"is no |port"):
-        Forwarder(*wrong)
+def test_an_invalid_forwarder_is_an_error(wrong: tuple[int, str, int]) -> None:
+    """An invalid user, address or port is an error."""
+    with pytest.raises(ValueError, match=r"is not a|port"):
+        ForwarderAccess(*wrong)

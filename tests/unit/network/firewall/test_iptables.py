@@ -1,12 +1,12 @@
-"""Tests of what the iptables back end makes of a rule, without a kernel."""
+"""Tests of the iptables back end, without a kernel."""
 
 from appliance.network.firewall.firewall_rules import (
     Chain,
     Interface,
+    PacketRule,
+    PacketVerdict,
     PortRange,
     RateLimit,
-    Rule,
-    Verdict,
     inner_port,
 )
 from appliance.network.firewall.iptables import RenderedRule, render_rule
@@ -38,10 +38,10 @@ def test_the_owner_rule_in_words_of_xtables() -> None:
 def test_a_rate_limit_is_a_hashlimit_that_ports_share() -> None:
     """Rules of the same limit name the same table of buckets, whatever their ports; ranges have a colon."""
     rules = [
-        Rule(
+        PacketRule(
             chain=Chain.IN,
             purpose="p",
-            verdict=Verdict.DROP,
+            verdict=PacketVerdict.DROP,
             arrives_on=Interface("lo", other=True),
             tcp_ports=ports,
             answered=True,
@@ -61,7 +61,9 @@ def test_a_rate_limit_is_a_hashlimit_that_ports_share() -> None:
 def test_ipsec_is_matched_by_policy_in_both_directions() -> None:
     """Clear text is `--pol none`, of the direction of the chain; an address makes the rule of one family."""
     for chain, direction in ((Chain.IN, "in"), (Chain.OUT, "out")):
-        rule = Rule(chain=chain, purpose="p", verdict=Verdict.DROP, source="fd77::1", clear_text=True)
+        rule = PacketRule(
+            chain=chain, purpose="p", verdict=PacketVerdict.DROP, source="fd77::1", clear_text=True
+        )
         (rendered,) = render_rule(rule)
         assert rendered.family == 6
         assert rendered.attributes == (("src", "fd77::1"),)
@@ -70,7 +72,7 @@ def test_ipsec_is_matched_by_policy_in_both_directions() -> None:
 
 def test_ports_of_udp_are_matched_as_udp() -> None:
     """The protocol and the match are those of UDP."""
-    rule = Rule(chain=Chain.IN, purpose="p", verdict=Verdict.DROP, udp_ports=PortRange(500, 501))
+    rule = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP, udp_ports=PortRange(500, 501))
     rendered = render_rule(rule)[0]
     assert ("protocol", "udp") in rendered.attributes
     assert rendered.matches[0] == ("udp", (("dport", "500:501"),))

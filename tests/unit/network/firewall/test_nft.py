@@ -1,4 +1,4 @@
-"""Tests of what the nft back end makes of rules, without a kernel."""
+"""Tests of the nft back end, without a kernel."""
 
 import errno
 import json
@@ -13,10 +13,10 @@ from appliance.network.firewall.firewall import statuses
 from appliance.network.firewall.firewall_rules import (
     Chain,
     FirewallSettings,
+    PacketRule,
+    PacketVerdict,
     PortRange,
     RateLimit,
-    Rule,
-    Verdict,
     appliance_rules,
     inner_port,
 )
@@ -72,7 +72,9 @@ def test_each_chain_is_jumped_to_from_its_hooks() -> None:
 
 def test_translation_is_hooked_for_the_network_and_for_the_host_itself() -> None:
     """ROSRV-NAT is reached from prerouting and from output; the address is of the rule's family."""
-    rule = Rule(chain=Chain.NAT, purpose="p", verdict=Verdict.DNAT, tcp_ports=PortRange(5, 9), to="fd00::2")
+    rule = PacketRule(
+        chain=Chain.NAT, purpose="p", verdict=PacketVerdict.DNAT, tcp_ports=PortRange(5, 9), to="fd00::2"
+    )
     commands = render((rule,))
     hooks = {one["add"]["chain"]["hook"] for one in commands if "hook" in one["add"].get("chain", {})}
     assert hooks == {"prerouting", "output"}
@@ -84,10 +86,10 @@ def test_translation_is_hooked_for_the_network_and_for_the_host_itself() -> None
 def test_a_rate_limit_has_one_set_for_each_family() -> None:
     """Two rules of the same limit share their buckets, kept apart by family, with a bound on their number."""
     rules = tuple(
-        Rule(
+        PacketRule(
             chain=Chain.IN,
             purpose=f"p{port}",
-            verdict=Verdict.DROP,
+            verdict=PacketVerdict.DROP,
             tcp_ports=PortRange.one(port),
             answered=True,
             above=RateLimit(10, 20),
@@ -101,8 +103,8 @@ def test_a_rate_limit_has_one_set_for_each_family() -> None:
     ]
 
 
-def listed(rules: tuple[Rule, ...], *, without: int | None = None) -> str:
-    """What `nft list table` answers while these rules are in force, but for one of them."""
+def listed(rules: tuple[PacketRule, ...], *, without: int | None = None) -> str:
+    """Return the output of `nft list table` while all these rules but one are in force."""
     bodies = [one["add"]["rule"] for one in render(rules) if "rule" in one["add"]]
     jumps = [body for body in bodies if "comment" not in body]
     kept = [
@@ -125,10 +127,10 @@ def listed(rules: tuple[Rule, ...], *, without: int | None = None) -> str:
 
 def test_a_rate_limit_is_in_force_with_all_its_rules_only() -> None:
     """Each family has a rule for hosts with a bucket and one for those without: they are one in the report."""
-    rule = Rule(
+    rule = PacketRule(
         chain=Chain.IN,
         purpose="p",
-        verdict=Verdict.DROP,
+        verdict=PacketVerdict.DROP,
         tcp_ports=PortRange.one(1),
         answered=True,
         above=RateLimit(10, 20),
@@ -141,24 +143,26 @@ def test_a_rate_limit_is_in_force_with_all_its_rules_only() -> None:
 
 
 def test_ipsec_is_matched_as_each_hook_knows_it() -> None:
-    """Arriving packets are asked for their security path, leaving ones for their route's."""
+    """Arriving packets are matched by their security path, leaving ones by that of their route."""
     keys = []
     for chain in (Chain.IN, Chain.OUT):
-        rule = Rule(chain=chain, purpose="p", verdict=Verdict.DROP, source="10.9.9.1", clear_text=True)
+        rule = PacketRule(
+            chain=chain, purpose="p", verdict=PacketVerdict.DROP, source="10.9.9.1", clear_text=True
+        )
         (body,) = render_rule(rule)
         keys.append(body["expr"][2]["match"]["left"])
     assert keys == [{"meta": {"key": "ipsec"}}, {"rt": {"key": "ipsec"}}]
 
 
 class Machine(Namespace):
-    """A namespace where `nft` is what a test says: an error on the way to it, or what it prints."""
+    """A namespace where a test chooses the output of `nft`, or the error of starting it."""
 
     def __init__(self, nft: OSError | str) -> None:
         super().__init__("machine")
         self.nft = nft
 
     def popen(self, args: Any, **options: Any) -> "subprocess.Popen[Any]":
-        """The program that stands in."""
+        """Return the output, or raise the error."""
         if isinstance(self.nft, OSError):
             raise self.nft
         return subprocess.Popen([sys.executable, "-c", f"print({self.nft!r})"], **options)
@@ -170,18 +174,18 @@ class Machine(Namespace):
         (OSError(errno.EAGAIN, "Resource temporarily unavailable"), "Resource temporarily unavailable"),
         (OSError(errno.EMFILE, "Too many open files"), "Too many open files"),
         ("{", "not JSON"),
-        ('{"something": []}', "not what is understood"),
-        ('{"nftables": [7]}', "not what is understood"),
+        ('{"something": []}', "unknown form"),
+        ('{"nftables": [7]}', "unknown form"),
     ],
 )
-def test_an_nft_that_cannot_be_asked_is_an_error_of_the_firewall(nft: OSError | str, said: str) -> None:
-    """No process, no file, an answer that cannot be read: an error with words, which a caller expects."""
+def test_an_nft_that_does_not_run_is_an_error_of_the_firewall(nft: OSError | str, said: str) -> None:
+    """A missing process or file, or an unreadable answer, raises the error that callers expect."""
     with pytest.raises(FirewallError, match=said) as caught:
         NftBackend(Machine(nft)).counters()
     assert not isinstance(caught.value, BackendMissingError)
 
 
-def test_an_nft_that_is_not_there_is_to_be_installed() -> None:
-    """Only then another back end is what the machine has."""
+def test_a_missing_nft_selects_another_back_end() -> None:
+    """The machine has no nft, so another back end may be used."""
     with pytest.raises(BackendMissingError, match="apt install nftables"):
         NftBackend(Machine(FileNotFoundError(errno.ENOENT, "no such file"))).remove()

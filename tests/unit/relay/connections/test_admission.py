@@ -1,4 +1,4 @@
-"""What a header lacks, in itself and in the table."""
+"""Checks of a header: missing fields, and missing entries in the table."""
 
 import pytest
 
@@ -11,7 +11,7 @@ from appliance.channel.messages import (
     ServicePlaced,
 )
 from appliance.relay.connections.admission import asked_for, bound_name, flaw, missing
-from appliance.relay.granted import StatedTable
+from appliance.relay.grant_table import GrantTable
 
 TOPIC = {"topic": "/chatter", "md5sum": "*", "callerid": "/listener"}
 SERVICE = {"service": "/mode", "md5sum": "*", "callerid": "/client"}
@@ -20,7 +20,7 @@ SERVICE = {"service": "/mode", "md5sum": "*", "callerid": "/client"}
 @pytest.mark.parametrize(
     ("fields", "asked"), [(TOPIC, ("topic", "/chatter")), (SERVICE, ("service", "/mode")), ({}, ("", ""))]
 )
-def test_a_header_names_what_is_asked_for(fields: dict[str, str], asked: tuple[str, str]) -> None:
+def test_a_header_names_its_topic_or_service(fields: dict[str, str], asked: tuple[str, str]) -> None:
     """For the report of a refusal."""
     assert asked_for(fields) == asked
 
@@ -42,7 +42,7 @@ def test_a_client_may_send_its_request_with_the_header_a_subscriber_nothing() ->
 
 def test_the_reason_says_what_is_missing_until_nothing_is() -> None:
     """First the publication, then the grant; likewise for a service."""
-    table = StatedTable()
+    table = GrantTable()
     table.state(NodePlaced("k", "/talker", "10.0.0.1"))
     assert missing(table, "k", "10.0.0.2", TOPIC) == "[/talker] is not a publisher of [/chatter]"
     table.state(PublicationPlaced("k", "/chatter", "*"))
@@ -58,15 +58,15 @@ def test_the_reason_says_what_is_missing_until_nothing_is() -> None:
 
 @pytest.mark.parametrize("kind", [TOPIC, SERVICE])
 @pytest.mark.parametrize("name", ["", "listener", "/a\nb", "//a", "/a/", "/" + "a" * 2000, "/é"])
-def test_a_callerid_that_is_no_name_is_refused(kind: dict[str, str], name: str) -> None:
-    """Whoever connects says under which global name, before anything is looked up or told."""
+def test_an_invalid_callerid_is_refused(kind: dict[str, str], name: str) -> None:
+    """A peer must send a global name before anything is looked up or sent."""
     assert "caller_id" in flaw(kind | {"callerid": name}, b"")
     assert flaw(kind | {"callerid": "/rosservice-4711"}, b"") == ""
 
 
-def test_a_client_calls_under_the_name_it_looked_up_with() -> None:
+def test_a_client_calls_under_the_name_of_its_lookup() -> None:
     """Another name has no grant; who only probes may have another, and the service sees the one that was looked up."""
-    table = StatedTable()
+    table = GrantTable()
     for message in (
         NodePlaced("k", "/server", "10.0.0.1"),
         ServicePlaced("k", "/mode", "10.0.0.1", 1),

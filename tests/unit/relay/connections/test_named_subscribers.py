@@ -6,24 +6,24 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from appliance.quotas.pool import Standing
-from appliance.relay.bounds import Limits
-from appliance.relay.connections.frames import Scratch
-from appliance.relay.connections.memory import Memory
-from appliance.relay.connections.named_subscribers import Presences, looks_for_names
+from appliance.quotas.pool import QuotaClass
+from appliance.relay.connections.named_subscribers import NamedSubscribers, looks_for_names
 from appliance.relay.context import RelayContext
-from appliance.relay.loop import Loop
-from appliance.relay.monitors.interceptor import Middle
+from appliance.relay.loop import EventLoop
+from appliance.relay.monitors.interceptor import Interceptor
+from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
+from appliance.relay.transport.frames import Scratch
+from appliance.relay.transport.memory import RelayMemory
 from roswire.tcpros import HeaderParser
 
 TOPIC = "/fibonacci/goal"
 
 
 @pytest.fixture
-def loop() -> Iterator[Loop]:
+def loop() -> Iterator[EventLoop]:
     """The relay's loop."""
-    loop = Loop()
+    loop = EventLoop()
     yield loop
     loop.close()
 
@@ -41,19 +41,19 @@ def _nothing(_what: object) -> None:
 
 
 @pytest.fixture
-def presences(loop: Loop) -> Iterator[Presences]:
+def presences(loop: EventLoop) -> Iterator[NamedSubscribers]:
     """The presences of one topic."""
-    limits = Limits()
+    limits = RelayLimits()
     reporter = Reporter(limits)
-    memory = Memory.of(limits, lambda _host: Standing.REGISTERED)
-    middle = Middle(loop, reporter, budget=1.0, publish=_nothing, changed=_nothing)
-    context = RelayContext(loop, limits, reporter, memory, Scratch(), middle, str)
-    presences = Presences(context, TOPIC, "10.0.0.9")
+    memory = RelayMemory.of(limits, lambda _host: QuotaClass.REGISTERED)
+    interceptor = Interceptor(loop, reporter, budget=1.0, publish=_nothing, changed=_nothing)
+    context = RelayContext(loop, limits, reporter, memory, Scratch(), interceptor, str)
+    presences = NamedSubscribers(context, TOPIC, "10.0.0.9")
     yield presences
     presences.close()
 
 
-def turn_until(loop: Loop, done: Callable[[], bool]) -> None:
+def turn_until(loop: EventLoop, done: Callable[[], bool]) -> None:
     """Let the loop turn until something has happened."""
     deadline = time.monotonic() + 30
     while not done():
@@ -61,7 +61,7 @@ def turn_until(loop: Loop, done: Callable[[], bool]) -> None:
         loop.turn(0.01)
 
 
-def accept(loop: Loop, publisher: socket.socket) -> tuple[socket.socket, dict[str, str]]:
+def accept(loop: EventLoop, publisher: socket.socket) -> tuple[socket.socket, dict[str, str]]:
     """The next connection at the publisher, and its header."""
     found: list[tuple[socket.socket, dict[str, str]]] = []
     parser, connections = HeaderParser(65536), list[socket.socket]()
@@ -91,16 +91,16 @@ def ended(sock: socket.socket) -> bool:
 
 
 def test_each_subscriber_is_seen_under_its_own_name_and_goes_when_it_leaves(
-    loop: Loop, presences: Presences, publisher: socket.socket
+    loop: EventLoop, presences: NamedSubscribers, publisher: socket.socket
 ) -> None:
     """One connection a name; the one that is served no longer is closed, the other stays."""
     address = publisher.getsockname()
-    presences.want(frozenset({"/one", "/other"}), address)
+    presences.update(frozenset({"/one", "/other"}), address)
     seen = dict(
         sorted((header["callerid"], sock) for sock, header in (accept(loop, publisher) for _ in "ab"))
     )
     assert list(seen) == ["/one", "/other"]
-    presences.want(frozenset({"/other"}), address)
+    presences.update(frozenset({"/other"}), address)
     turn_until(loop, lambda: ended(seen["/one"]))
     assert not ended(seen["/other"])
     for sock in seen.values():
@@ -108,10 +108,10 @@ def test_each_subscriber_is_seen_under_its_own_name_and_goes_when_it_leaves(
 
 
 def test_a_presence_that_breaks_is_made_again(
-    loop: Loop, presences: Presences, publisher: socket.socket
+    loop: EventLoop, presences: NamedSubscribers, publisher: socket.socket
 ) -> None:
     """The publisher closes it; it comes back under the same name."""
-    presences.want(frozenset({"/one"}), publisher.getsockname())
+    presences.update(frozenset({"/one"}), publisher.getsockname())
     first, _header = accept(loop, publisher)
     first.close()
     second, header = accept(loop, publisher)

@@ -14,9 +14,10 @@ from appliance.channel.messages import (
     ServicePlaced,
 )
 from appliance.relay.connections.own_service import HEADER
+from appliance.relay.relay_limits import RelayLimits
 from roswire.standard import standard_definitions
 from roswire.tcpros import encode_frame, encode_header, encode_service_reply
-from tests.unit.relay.world import LOOPBACK, Peer, World
+from tests.unit.relay.world import IMPATIENT, LIMITS, LOOPBACK, Peer, World
 
 OTHER = "127.0.0.9"
 CALL = {"callerid": "/client", "service": "/rosrv/record_now", "md5sum": "*"}
@@ -25,8 +26,8 @@ CALL = {"callerid": "/client", "service": "/rosrv/record_now", "md5sum": "*"}
 class Scene(World):
     """A relay with the service of the appliance, which /client may call from two hosts; its port is `port`."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, limits: RelayLimits = LIMITS) -> None:
+        super().__init__(limits)
         self.port = self.listen()
         self.state(NodePlaced("own", "/rosrv", LOOPBACK, monitors=True), self.port)
         self.state(ServicePlaced("own", CALL["service"], LOOPBACK, 1))
@@ -40,14 +41,14 @@ class Scene(World):
         return peer
 
     def called(self) -> list[OwnServiceCalled]:
-        """What control was told of calls."""
+        """Return the calls that control received."""
         return [message for message in self.told if isinstance(message, OwnServiceCalled)]
 
 
 @pytest.fixture
-def scene() -> Iterator[Scene]:
+def scene(request: pytest.FixtureRequest) -> Iterator[Scene]:
     """A relay."""
-    scene = Scene()
+    scene = Scene(getattr(request, "param", LIMITS))
     yield scene
     scene.close()
 
@@ -58,13 +59,13 @@ def reply(success: bool, text: str) -> bytes:
 
 
 def test_the_header_is_that_of_the_type() -> None:
-    """Whoever knows std_srvs/Trigger may call."""
+    """A client with the type std_srvs/Trigger may call."""
     definitions = standard_definitions()
     assert HEADER["md5sum"] == definitions.service_md5sum("std_srvs/Trigger")
 
 
 def test_control_answers_a_call(scene: Scene) -> None:
-    """It is told who calls from where; the client gets what it says, and on a persistent connection the next, too."""
+    """Control gets caller and host; the client gets its answer, on a persistent connection also the next one."""
     client = scene.client(persistent="1")
     assert scene.hears(ConnectionOpened, resource=CALL["service"]).host == LOOPBACK
     client.send(encode_frame(b""))
@@ -81,7 +82,7 @@ def test_control_answers_a_call(scene: Scene) -> None:
 
 
 def test_a_flood_of_one_host_is_one_call_to_control(scene: Scene) -> None:
-    """What it calls while one is with control is answered as that is, and control hears of another host at once."""
+    """Calls during an open one get its answer; a call of another host reaches control at once."""
     flood = [scene.client(persistent="1") for _one in range(5)]
     for client in flood:
         client.send(encode_frame(b""))
@@ -119,15 +120,16 @@ def test_a_call_is_answered_when_control_ends(scene: Scene) -> None:
     assert scene.ends(other) == reply(True, "two")
 
 
-def test_who_means_another_type_is_told_so(scene: Scene) -> None:
+def test_a_client_with_another_type_gets_an_error(scene: Scene) -> None:
     """As a node would; control hears nothing of it."""
     client = scene.connect(encode_header(CALL | {"md5sum": "0" * 32}))
     assert f"not {'0' * 32}" in scene.gets_header(client)["error"]
     assert scene.called() == []
 
 
-def test_without_a_grant_nobody_calls(scene: Scene) -> None:
+@pytest.mark.parametrize("scene", [IMPATIENT], indirect=True)
+def test_without_a_grant_no_client_calls(scene: Scene) -> None:
     """The policy decides at lookupService, as of each service."""
-    client = scene.connect(encode_header(CALL | {"callerid": "/stranger"}))
-    assert "no grant for [/stranger]" in scene.gets_header(client)["error"]
+    client = scene.connect(encode_header(CALL | {"callerid": "/unknown"}))
+    assert "no grant for [/unknown]" in scene.gets_header(client)["error"]
     assert scene.called() == []

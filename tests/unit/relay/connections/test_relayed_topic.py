@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping
 import pytest
 
 from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, TopicTraffic
-from appliance.relay.connections.frames import Batch
-from appliance.relay.connections.rate_limit import Flow
-from appliance.relay.connections.relayed_topic import Recorder, RelayedTopic
+from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
+from appliance.relay.recorder_ring import RecorderRing
+from appliance.relay.transport.frames import Batch
+from appliance.relay.transport.rate_limit import SharedRateLimit
 from tests.support.relay_memory import share
 from tests.support.steps import steps
 
@@ -22,18 +23,18 @@ def batch(*texts: bytes) -> Batch:
     return Batch(memoryview(data), len(frames), len(data) - len(frames[-1]))
 
 
-class RecordedUpstream:
+class RecordedUpstream(Upstream):
     """Writes down what the topic asks of its publisher's connection."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []
         self.announced: tuple[list[str], str] = ([], "")
 
-    def want(self) -> None:
+    def connect(self) -> None:
         """Somebody is there."""
         self.asked.append("want")
 
-    def spare(self) -> None:
+    def release(self) -> None:
         """Nobody is there."""
         self.asked.append("spare")
 
@@ -49,13 +50,13 @@ class RecordedUpstream:
         """These are served."""
         self.announced = (sorted(names()), type_name)
 
-    def give_again(self) -> None:
+    def request_latched(self) -> None:
         """The latched message is wanted once more."""
         self.asked.append("give again")
 
 
 class RecordedMember:
-    """A subscriber that takes everything until it is told that it is behind."""
+    """A subscriber that takes everything until a test sets it behind."""
 
     def __init__(self, *, fits: bool = True, caller_id: str = "/listener", host: str = "10.0.0.2") -> None:
         self.caller_id = caller_id
@@ -88,7 +89,7 @@ class RecordedMember:
         self.trimmed += 1
         return 3
 
-    def look(self) -> None:
+    def check_stall(self) -> None:
         """Nothing is looked at."""
 
     def cut(self, reason: str) -> None:
@@ -100,7 +101,7 @@ class Story:
     """A topic with a clock that a test sets."""
 
     def __init__(
-        self, *, memory: int = 1 << 30, fresh: bool = True, recorded: Recorder | None = None
+        self, *, memory: int = 1 << 30, fresh: bool = True, recorded: RecorderRing | None = None
     ) -> None:
         self.now = 100.0
         self.share = share(memory)
@@ -143,7 +144,7 @@ def test_subscribers_wait_for_the_publishers_header_and_get_it_with_the_true_nam
     assert member.header == HEADER | {"callerid": "/talker", "topic": "/chatter"}
 
 
-def test_everybody_gets_every_message_in_order() -> None:
+def test_all_subscribers_get_every_message_in_order() -> None:
     """From the moment a subscriber is served."""
     story = Story()
     first = story.join()
@@ -155,12 +156,12 @@ def test_everybody_gets_every_message_in_order() -> None:
     assert second.received == bytes(batch(b"2", b"3").view)
 
 
-def test_what_is_beyond_a_limit_goes_to_no_monitor_and_to_no_subscriber() -> None:
+def test_messages_beyond_a_limit_reach_no_monitor_or_subscriber() -> None:
     """And the last message of a latching publisher goes on later, to both."""
     story, judged = Story(), []
     member = story.join()
-    story.topic.monitor(lambda batch: judged.append(batch.first) or batch, wanted=True)  # type: ignore[func-returns-value]  # it is told if it is asked
-    story.topic.flow.set(Flow(FlowLimit(messages=2), story.now).of(""), None)
+    story.topic.monitor(lambda batch: judged.append(batch.first) or batch, wanted=True)  # type: ignore[func-returns-value]  # the call is noted
+    story.topic.flow.set(SharedRateLimit(FlowLimit(messages=2), story.now).of(""), None)
     story.topic.upstream_opened(HEADER | {"latching": "1"})
     for number in range(4):
         story.receive(batch(b"%d" % number))
@@ -212,7 +213,7 @@ def test_the_publisher_is_let_go_with_the_last_subscriber() -> None:
 
 
 def test_a_latched_message_is_given_once_to_each() -> None:
-    """Who triggers the connection gets it from the publisher, who comes later from us; nobody twice."""
+    """The first subscriber gets it from the publisher, later ones from the relay; none gets it twice."""
     story = Story()
     first = story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
@@ -232,15 +233,15 @@ def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
 
 
 def monitored(*, latching: str = "0", fresh: bool = True) -> Story:
-    """A topic that a monitor wants, with its publisher connected and nobody else."""
+    """Return a topic that a monitor needs, with a publisher and no subscriber."""
     story = Story(fresh=fresh)
     story.topic.monitor(lambda batch: batch, wanted=True)
     story.topic.upstream_opened(HEADER | {"latching": latching})
     return story
 
 
-def test_what_a_new_publisher_said_first_is_not_lost_to_a_monitor() -> None:
-    """Subscribers on their way get it, without a gap to what follows; nobody twice, and nobody who comes later."""
+def test_the_first_messages_of_a_publisher_are_replayed() -> None:
+    """Subscribers that are connecting get them once and without a gap; later ones do not."""
     story = monitored()
     story.receive(batch(b"0"))
     story.now += 0.2
@@ -258,8 +259,8 @@ def test_what_a_new_publisher_said_first_is_not_lost_to_a_monitor() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.3, 2.0, 60.0])
-def test_of_a_stream_that_nobody_hears_the_next_subscriber_gets_nothing_old(seconds: float) -> None:
-    """As in plain ROS: what comes from then on. A gun that is started anew acts on no old command."""
+def test_a_later_subscriber_gets_no_old_messages(seconds: float) -> None:
+    """As in plain ROS, it gets only later messages: a restarted actuator acts on no old command."""
     story = monitored()
     for _ in range(int(seconds * 20) + 1):
         story.receive(batch(b"old"))
@@ -289,7 +290,7 @@ def test_a_publisher_that_has_been_there_said_nothing_first(case: str) -> None:
     assert story.join("/next").received == b""
 
 
-def test_what_nobody_came_for_takes_no_memory_for_long() -> None:
+def test_first_messages_without_subscribers_are_dropped_soon() -> None:
     """It is let go at the next look at the counters, though no other message comes."""
     story = monitored()
     story.receive(batch(b"1"))
@@ -300,8 +301,8 @@ def test_what_nobody_came_for_takes_no_memory_for_long() -> None:
     assert story.share.used == 0
 
 
-def test_a_latched_message_beyond_the_share_is_passed_on_and_not_kept() -> None:
-    """Control is told once; who comes later gets it from the publisher, as soon as there is room for it."""
+def test_a_latched_message_beyond_the_quota_is_not_kept() -> None:
+    """It is passed on, with one report; later subscribers get it from the publisher once there is room."""
     story = Story(memory=100)
     early = story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
@@ -373,8 +374,8 @@ def test_a_publisher_that_comes_back_with_another_type_loses_its_subscribers() -
     assert "another type" in member.was_cut
 
 
-def test_an_old_header_is_not_given_once_nobody_stands_on_it() -> None:
-    """Whoever comes when the publisher is lost and its last subscriber gone waits for a new header."""
+def test_an_old_header_is_dropped_with_its_last_subscriber() -> None:
+    """A subscriber that comes after the publisher and all subscribers are gone waits for a new header."""
     story = Story()
     first = story.join()
     story.topic.upstream_opened(HEADER)
@@ -421,7 +422,7 @@ def test_a_stuck_subscriber_is_not_waited_for() -> None:
     story.receive(batch(b"1"))
     assert member.trimmed == 1
     assert "pause" not in "".join(story.upstream.asked)
-    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 1, 5, 3, 1, [1] + [0] * 10, 0.0)
+    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 1, 5, 3, 1, [1] + [0] * 10, 0.0, "m")
 
 
 def test_traffic_is_reported_once() -> None:
@@ -431,11 +432,11 @@ def test_traffic_is_reported_once() -> None:
     story.join()
     story.topic.upstream_opened(HEADER)
     story.receive(batch(b"1", b"22"))
-    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 2, 11, 0, 1, [2] + [0] * 10, 0.0)
+    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 2, 11, 0, 1, [2] + [0] * 10, 0.0, "m")
     assert story.topic.traffic() is None
 
 
-def test_a_withdrawn_topic_cuts_who_is_served_and_who_waits() -> None:
+def test_a_withdrawn_topic_cuts_served_and_waiting_subscribers() -> None:
     """Each with the reason."""
     story = Story()
     served = story.join()
@@ -497,7 +498,7 @@ def test_the_upstream_hears_who_is_served() -> None:
 
 
 def test_a_host_with_hundreds_of_names_is_seen_by_a_few() -> None:
-    """Each is one more connection to the publisher; another host's subscriber is seen whoever was there first."""
+    """Each name costs a connection to the publisher; another host's subscriber always gets one."""
     scene = Story()
     for number in range(300):
         scene.topic.join(RecordedMember(caller_id=f"/guest_{number}", host="10.0.0.66"))
@@ -509,7 +510,7 @@ def test_a_host_with_hundreds_of_names_is_seen_by_a_few() -> None:
 
 
 def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
-    """From receiving a batch to handing it over, for each message that goes on; nobody served, nothing delayed."""
+    """The delay is that from receiving a batch to sending each message; without subscribers there is none."""
     story = Story()
     story.topic.upstream_opened(HEADER)
     story.receive(batch(b"1"), late=0.003)

@@ -1,14 +1,14 @@
-"""What a publisher says first is kept within bounds, and without a gap."""
+"""The first messages of a publisher are kept within bounds, and without a gap."""
 
 import pytest
 
-from appliance.relay.connections.frames import Batch
-from appliance.relay.connections.startup_replay import APPEARED, SECONDS, SPEECH, FirstWords
+from appliance.relay.connections.startup_replay import APPEARED, SECONDS, SPEECH, StartupReplay
+from appliance.relay.transport.frames import Batch
 from tests.support.relay_memory import share
 
 
 def frames(messages: int, size: int = 8) -> Batch:
-    """So many frames, in so many bytes."""
+    """Return a batch of frames with this number and size."""
     return Batch(memoryview(bytes(size)), messages, 0)
 
 
@@ -17,25 +17,25 @@ def frames(messages: int, size: int = 8) -> Batch:
     [[(1, 8)] * 201, [(150, 8), (51, 8)], [(1, 600 << 10), (1, 600 << 10)], [(201, 8)], [(1, 2 << 20)]],
 )
 def test_never_more_than_the_bounds(added: list[tuple[int, int]]) -> None:
-    """What is more is no first words: all of it is given up, and no gap is left."""
+    """Beyond the bounds all first messages are dropped, so that no gap is left."""
     memory = share()
-    words = FirstWords(memory, 0.0)
+    words = StartupReplay(memory, 0.0)
     assert [words.add(frames(*one), 0.0) for one in added] == [True] * (len(added) - 1) + [False]
     words.forget()
     assert memory.used == 0
 
 
-def test_nothing_is_kept_when_the_share_of_its_host_is_spent() -> None:
+def test_nothing_is_kept_when_the_quota_of_its_host_is_spent() -> None:
     """Two messages fit, a third does not."""
     memory = share(16)
-    words = FirstWords(memory, 0.0)
+    words = StartupReplay(memory, 0.0)
     assert [words.add(frames(1), 0.0) for _ in range(3)] == [True, True, False]
     assert memory.used == 16
 
 
 def test_the_time_ends_for_speech_for_keeping_and_for_appearing() -> None:
     """A speech is short, it is kept for a second, and who was silent for long has not just appeared."""
-    words = FirstWords(share(), 10.0)
+    words = StartupReplay(share(), 10.0)
     assert (words.over(10.0 + APPEARED), words.over(10.1 + APPEARED)) == (False, True)
     assert words.add(frames(1), 12.0)
     assert words.add(frames(2), 12.0 + SPEECH)

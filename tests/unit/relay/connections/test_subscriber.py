@@ -1,4 +1,4 @@
-"""Whether a subscriber's type fits a publisher's (the rest of a subscriber's life is told in test_relay)."""
+"""Whether a subscriber's type fits a publisher's (test_data_plane has the other tests of subscribers)."""
 
 import pytest
 

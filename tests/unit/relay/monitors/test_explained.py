@@ -1,7 +1,7 @@
 """Everything that a monitor does explains itself: who, which events, which values, which line.
 
 Each row of the tables is a kind of event and what comes of it. The events that a record names are given alone to the
-same specification, which begins anew; they must bring about the same. The lines for people are made of the record as
+same specification in its initial state; they must have the same effect. The lines for people are made of the record as
 `rosrv audit why`, REST and the console show them.
 """
 
@@ -13,22 +13,22 @@ from typing import Any, NamedTuple, cast
 
 import pytest
 
-from appliance.audit.record import Record, Severity
-from appliance.audit.record_format import Entry, without_contents
+from appliance.audit.record import AuditRecord, Severity
+from appliance.audit.record_format import LogEntry, without_contents
 from appliance.audit.why import lines_of
 from appliance.channel.messages import MonitorEvent
-from appliance.relay.monitors.observation_points import Place
+from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.specifications.records import MonitorRecords
 from appliance.telemetry.audit_trail import AuditTrail
 from rosmop.run.explanations import moment
 from rosmop.tests.acting import message
 from rosmop.tests.random_specifications import Traffic, definitions
 from tests.support.idle import idle_class
-from tests.unit.relay.monitors.test_batch import Monitored
+from tests.unit.relay.monitors.test_batch_progress import Monitored
 
 MS = 1_000_000
 START = time.time_ns() + 3_600_000 * MS
-"""Later than now: specifications on trial look at the clock, which is not to be ahead of the messages."""
+"""Later than now: specifications in shadow mode read the clock, which must not be ahead of the messages."""
 
 
 class Given(NamedTuple):
@@ -41,7 +41,7 @@ class Given(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What is written, what comes, which kind of event is told of it, and what that has to say."""
+    """A specification, its messages, the kind of the reported event, and its expected details."""
 
     text: str
     given: list[Given]
@@ -62,7 +62,7 @@ class Trail(idle_class(AuditTrail)):  # type: ignore[misc]  # it is made
     """Keeps records."""
 
     def __init__(self) -> None:
-        self.records: list[Record] = []
+        self.records: list[AuditRecord] = []
 
     def happened(
         self, event: str, reason: str, *, severity: Severity, host: str | None, caller_id: str | None, category: str,
@@ -70,7 +70,7 @@ class Trail(idle_class(AuditTrail)):  # type: ignore[misc]  # it is made
     ) -> str:  # fmt: skip
         """As `AuditTrail`."""
         self.records.append(
-            Record(
+            AuditRecord(
                 id="1", time=1, event=event, severity=severity, host=host, caller_id=caller_id, category=category,
                 resource=resource, reason=reason, detail={**more, **detail},
             )
@@ -79,14 +79,14 @@ class Trail(idle_class(AuditTrail)):  # type: ignore[misc]  # it is made
 
 
 def events_of(
-    row: Row, given: Iterable[Given], *, together: bool, trials: Collection[str] = ()
+    row: Row, given: Iterable[Given], *, together: bool, shadows: Collection[str] = ()
 ) -> list[MonitorEvent]:
-    """What control is told when these have come."""
+    """Return the reports to control after these messages."""
     monitored = Monitored(
         {"x.rv": row.text},
         definitions(),
         together=together,
-        trials=trials,
+        shadows=shadows,
         restarted=row.restarted,
         began=START,
     )
@@ -94,29 +94,29 @@ def events_of(
         for one in given:
             monitored.time = START + one.at * MS
             if one.where == "request":
-                place = Place("k", "/mode", "10.0.0.8", one.who)
-                monitored.middle.request(place, bytes([one.value]))
+                place = ObservationPoint("k", "/mode", "10.0.0.8", one.who)
+                monitored.interceptor.judge(place, "request", bytes([one.value]))
             elif one.where == "response":
-                place = Place("k", "/mode", "10.0.0.9", one.who)
-                monitored.middle.response(place, struct.pack("<BI", one.value, 0))
+                place = ObservationPoint("k", "/mode", "10.0.0.9", one.who)
+                monitored.interceptor.judge(place, "response", struct.pack("<BI", one.value, 0))
             else:
                 body = message("std_msgs/Int32", data=one.value)
                 monitored.through(
                     Traffic(one.where, struct.pack("<I", len(body)) + body, 1), publisher=one.who
                 )
-            if trials:
-                monitored.middle.trials.have_turn()
-        monitored.middle.observations.flush()
+            if shadows:
+                monitored.interceptor.shadow.have_turn()
+        monitored.interceptor.observations.flush()
         return [one for one in monitored.sent() if isinstance(one, MonitorEvent)]
     finally:
         monitored.close()
 
 
-def told(row: Row, given: Iterable[Given], *, together: bool, trial: bool = False) -> MonitorEvent | None:
-    """The first event of the row's kind that is told in full."""
-    names = [row.text.removeprefix("hold ").split("(")[0].strip()] if trial else []
-    kind = f"trial {row.kind}" if trial else row.kind
-    found = events_of(row, given, together=together, trials=names)
+def told(row: Row, given: Iterable[Given], *, together: bool, shadow: bool = False) -> MonitorEvent | None:
+    """Return the first fully reported event of the row's kind."""
+    names = [row.text.removeprefix("hold ").split("(")[0].strip()] if shadow else []
+    kind = f"shadow {row.kind}" if shadow else row.kind
+    found = events_of(row, given, together=together, shadows=names)
     return next((one for one in found if one.kind == kind and not one.count), None)
 
 
@@ -126,9 +126,9 @@ def place(text: str, piece: str) -> str:
     return f"x.rv:{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
 
 
-def check(row: Row, *, together: bool, trial: bool = False) -> None:
+def check(row: Row, *, together: bool, shadow: bool = False) -> None:
     """The event, the record of it and its lines say what the row does, and the events named are enough."""
-    found = told(row, row.given, together=together, trial=trial)
+    found = told(row, row.given, together=together, shadow=shadow)
     assert found is not None
     detail = found.detail
     assert found.caller_id == row.by
@@ -160,7 +160,7 @@ def check(row: Row, *, together: bool, trial: bool = False) -> None:
     assert sum(line.startswith("because: ") for line in lines) == len(row.because)
     for name, value in (*row.values.items(), *(pair for one in where.values() for pair in one.items())):
         assert any(f"{name} = {value}" in line for line in lines)
-    hidden = "\n".join(lines_of(without_contents(Entry(1, record)).record))
+    hidden = "\n".join(lines_of(without_contents(LogEntry(1, record)).record))
     assert "because: " not in hidden
     assert "where: " not in hidden
     assert "with: " not in hidden
@@ -168,7 +168,7 @@ def check(row: Row, *, together: bool, trial: bool = False) -> None:
         times = {one["time"] for one in named}
         alone = [one for one in row.given if moment(START + one.at * MS) in times]
         again = told(
-            row, [*alone, Given(row.given[-1].at, "/clock", 0, "/clock")], together=together, trial=trial
+            row, [*alone, Given(row.given[-1].at, "/clock", 0, "/clock")], together=together, shadow=shadow
         )
         assert again is not None
         assert again.text == found.text
@@ -227,11 +227,11 @@ VERDICTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("trial", [False, True], ids=["in force", "on trial"])
+@pytest.mark.parametrize("shadow", [False, True], ids=["in force", "shadow"])
 @pytest.mark.parametrize("name", VERDICTS)
-def test_a_verdict(name: str, *, trial: bool) -> None:
-    """Of each logic, by a message or by the time that passes: the events that alone give it, and who sent them."""
-    check(VERDICTS[name], together=not trial, trial=trial)
+def test_a_verdict(name: str, *, shadow: bool) -> None:
+    """For each logic, a verdict by a message or by time names the sufficient events and their senders."""
+    check(VERDICTS[name], together=not shadow, shadow=shadow)
 
 
 WHEN = "when (b > 2)"
@@ -359,12 +359,12 @@ OUTCOMES = {
 
 
 @pytest.mark.parametrize("name", OUTCOMES)
-def test_what_comes_of_an_event(name: str) -> None:
+def test_the_outcome_of_an_event(name: str) -> None:
     """Every kind of event with every outcome."""
     check(OUTCOMES[name], together=True)
 
 
 @pytest.mark.parametrize("name", [name for name in OUTCOMES if name not in ("what is held",)])
-def test_what_would_come_of_it_on_trial(name: str) -> None:
+def test_the_outcome_in_shadow_mode(name: str) -> None:
     """The same of a specification that is given copies; it holds nothing."""
-    check(OUTCOMES[name], together=False, trial=True)
+    check(OUTCOMES[name], together=False, shadow=True)

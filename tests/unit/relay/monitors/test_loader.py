@@ -1,4 +1,4 @@
-"""What compiles specifications beside the relay's loop."""
+"""The thread that compiles specifications beside the relay's loop."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What control is told of monitors: who dropped, changed and published, in records and counters."""
+"""Reports of monitors to control: records and counters of drops, changes and publications."""
 
 import struct
 from collections.abc import Iterator
@@ -8,10 +8,10 @@ import pytest
 
 from appliance.channel.messages import MonitorEvent, MonitorsCounted, MonitorsReported
 from appliance.relay.monitors import observations
-from appliance.relay.monitors.observation_points import Place
+from appliance.relay.monitors.observation_points import ObservationPoint
 from rosmop.tests.acting import message
 from rosmop.tests.random_specifications import Traffic, definitions
-from tests.unit.relay.monitors.test_batch import Monitored
+from tests.unit.relay.monitors.test_batch_progress import Monitored
 
 COMMAND = "geometry_msgs/Twist"
 STOP = """stop() { std_msgs::String s; event drive(double v) /cmd geometry_msgs/Twist '{linear:{x:v}}' {
@@ -37,9 +37,9 @@ class Told:
         self.monitored.through(Traffic("/cmd", frames, len(bodies)))
 
     def events(self, kind: str) -> list[MonitorEvent]:
-        """What control is told of this kind when the second is over."""
-        self.monitored.middle.tick()
-        self.monitored.middle.observations.flush()
+        """Return the reports of this kind at the end of the second."""
+        self.monitored.interceptor.tick()
+        self.monitored.interceptor.observations.flush()
         found: list[Any] = [one for one in self.monitored.sent() if getattr(one, "kind", "") == kind]
         self.monitored.heard.messages.clear()
         return found
@@ -136,11 +136,11 @@ def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(
     ]
     frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
     monitored.through(Traffic("/pose", frames, len(bodies)))
-    monitored.middle.tick()
+    monitored.interceptor.tick()
     assert {row.name: row.changes for row in monitored.rows()} == dict.fromkeys(
         (f"m{bit}" for bit in range(8)), 128
     ) | {"m8": 256}
-    monitored.middle.observations.flush()
+    monitored.interceptor.observations.flush()
     changes: list[Any] = [one for one in monitored.sent() if getattr(one, "kind", "") == "change"]
     assert {one.monitor for one in changes} == {"m8"}
     assert sum(one.count or 1 for one in changes) == 256
@@ -149,9 +149,9 @@ def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(
 
 
 def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: Told) -> None:
-    """Who reads of a drop in the audit log finds it in the counters, events included."""
+    """A drop in the audit log is already in the counters, events included."""
     told.send((1, 5, 0))
-    told.monitored.middle.observations.flush()
+    told.monitored.interceptor.observations.flush()
     *_before, events, counters = told.monitored.heard.messages
     assert isinstance(events, MonitorsReported)
     assert isinstance(counters, MonitorsCounted)
@@ -162,7 +162,7 @@ def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: T
 
 @pytest.mark.parametrize("together", [False, True], ids=["one by one", "together"])
 @pytest.mark.parametrize("equal", [False, True], ids=["of any length", "equally long"])
-def test_what_is_told_names_publisher_and_message(together: bool, equal: bool) -> None:
+def test_reports_name_publisher_and_message(together: bool, equal: bool) -> None:
     """Caller id and host, the number in the publication, and the header as it was received."""
     look = """look() { event far(int seq) /scan geometry_msgs/PoseStamped '{header:{seq:seq}}' {
         if (seq == 7 || seq == 9) { seq = 0; return; } if (seq == 8) { int zero = 0; seq = 1 / zero; } } }"""
@@ -175,8 +175,8 @@ def test_what_is_told_names_publisher_and_message(together: bool, equal: bool) -
         bodies.append(message("geometry_msgs/PoseStamped", **header))
     frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
     told.monitored.through(Traffic("/scan", frames, len(bodies)), first=101)
-    told.monitored.middle.tick()
-    told.monitored.middle.observations.flush()
+    told.monitored.interceptor.tick()
+    told.monitored.interceptor.observations.flush()
     found: list[Any] = [one for one in told.monitored.sent() if isinstance(one, MonitorEvent)]
     [drop, more] = [one for one in found if one.kind == "drop"]
     [fault] = [one for one in found if one.kind == "fault"]
@@ -190,10 +190,12 @@ def test_what_is_told_names_publisher_and_message(together: bool, equal: bool) -
 def test_clients_of_one_host_are_counted_together_and_those_of_two_are_not() -> None:
     """A client that calls itself by ever new names makes no record for each; the first is named, hosts are apart."""
     told = Told(together=True)
-    observations = told.monitored.middle.observations
+    observations = told.monitored.interceptor.observations
     for number in range(50):
         for host in ("10.0.0.1", "10.0.0.2"):
-            observations.note("drop", "gate", Place("k", "/mode", host, f"/client{number}"), 1, "no")
+            observations.note(
+                "drop", "gate", ObservationPoint("k", "/mode", host, f"/client{number}"), 1, "no"
+            )
     first, second, *counts = told.events("drop")
     assert [(one.host, one.caller_id, one.count) for one in (first, second)] == [
         ("10.0.0.1", "/client0", 0),
@@ -208,7 +210,7 @@ def test_clients_of_one_host_are_counted_together_and_those_of_two_are_not() -> 
 
 @pytest.mark.parametrize("together", [False, True])
 def test_a_verdict_names_its_binding(together: bool) -> None:
-    """Each binding's is told in full, not counted with that of another one."""
+    """The verdict of each binding is reported in full, not counted with that of another one."""
     turns = (
         "turns(double x) { event on(double x) /cmd geometry_msgs/Twist '{linear.x:x}' { } "
         'ere: on on @match { ROS_INFO("twice"); } }'
@@ -240,10 +242,10 @@ TURNED = """turned() { event on(double z) /cmd geometry_msgs/Twist '{angular.z:z
 
 @pytest.mark.parametrize("together", [False, True])
 @pytest.mark.parametrize("bindings", [[5.0] * 20, [float(number) for number in range(20)]])
-def test_what_is_only_counted_takes_no_explanation(
+def test_counted_events_have_no_explanation(
     together: bool, bindings: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither a binding that repeats nor one of more than can be told apart: the next that is told in full has it."""
+    """Repeated and excess bindings are only counted: the next full report has the explanation."""
     monkeypatch.setattr(observations, "_DISTINCT", 2)
     told = Told(together=together, texts=(AGAIN, TURNED))
     told.send(*[(x, 0, 0) for x in bindings], (5.0, 0, 2))

@@ -1,11 +1,11 @@
-"""What is in the memory after a process was killed anywhere: the state before or after, and never anything else."""
+"""After a process was killed anywhere, the memory has the state before or after, never another."""
 
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from appliance.relay.monitors.state_memory import Kept, StateMemory, read
+from appliance.relay.monitors.state_memory import StateMemory, StoredState, read
 
 SIZE = 8192
 
@@ -31,8 +31,8 @@ class Written:
         self.data[index] = value
 
 
-def killed_anywhere(data: bytearray, act: Callable[[Any], object]) -> list[Kept | None]:
-    """What is read after each prefix of the stores of an act."""
+def killed_anywhere(data: bytearray, act: Callable[[Any], object]) -> list[StoredState | None]:
+    """Return the result of a read after each prefix of the stores of an action."""
     torn, written = bytearray(data), Written(data)
     act(written)
     found = [read(torn)]
@@ -84,10 +84,10 @@ def test_a_kill_leaves_what_was_before_or_after(act: str, rounds: int) -> None:
 def test_the_first_kill_leaves_nothing_or_all() -> None:
     """A process that is killed while it writes for the first time leaves an empty memory."""
     found = killed_anywhere(bytearray(SIZE), lambda one: StateMemory(one).lay_out(b"head", [(b"one", 0)]))
-    assert set(map(repr, found)) == {"None", repr(Kept(b"head", [(b"one", None)]))}
+    assert set(map(repr, found)) == {"None", repr(StoredState(b"head", [(b"one", None)]))}
 
 
-def test_what_has_no_room_changes_nothing() -> None:
+def test_a_state_without_room_changes_nothing() -> None:
     """A state beyond its place is refused, and the one before stays; so is a set beyond the memory."""
     data = bytearray(SIZE)
     memory = StateMemory(data)
@@ -99,7 +99,7 @@ def test_what_has_no_room_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("place", range(0, 200, 3))
-def test_what_nobody_wrote_is_refused(place: int) -> None:
+def test_arbitrary_bytes_are_refused(place: int) -> None:
     """Any byte may be wrong: what is read is some bytes, or `ValueError`."""
     data = bytearray(SIZE)
     StateMemory(data).lay_out(b"head", [(b"one", 8), (b"two", 0)])

@@ -1,0 +1,118 @@
+"""Tests of `appliance.channel.rest_meaning`: a request and its order, both ways, for every operation."""
+
+import json
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.channel import admin
+from appliance.channel.admin import OPERATIONS
+from appliance.channel.messages.api import ClientRequest
+from appliance.channel.rest_meaning import BadTagError, NoOrderError, RestCall, call_of, filled_in, meant
+from appliance.channel.rest_operation import Operation, plain
+
+ASKED = [operation for operation in OPERATIONS if operation.path]
+TEXT = st.text(st.characters(codec="utf-8"), max_size=9)
+
+
+def values(kind: Any) -> st.SearchStrategy[Any]:
+    """Return values of a field's type."""
+    if get_origin(kind) is Annotated:
+        return values(get_args(kind)[0])
+    if get_origin(kind) is Literal:
+        return st.sampled_from(get_args(kind))
+    if get_origin(kind) is list:
+        return st.lists(values(get_args(kind)[0]), min_size=1, max_size=3)
+    if get_origin(kind) is dict:
+        return st.dictionaries(TEXT, TEXT, max_size=3)
+    if get_args(kind):
+        return st.one_of([values(one) for one in get_args(kind)])
+    plainly: dict[Any, st.SearchStrategy[Any]] = {
+        bool: st.booleans(), int: st.integers(1, 10**15), str: TEXT, type(None): st.none(),
+        float: st.floats(allow_nan=False, allow_infinity=False),
+    }  # fmt: skip
+    return plainly[kind]
+
+
+@st.composite
+def orders(draw: st.DrawFn, operation: Operation) -> Any:
+    """Draw an order that can be asked in the way of a row."""
+    fields = dict(operation.fixed)
+    for name, field in operation.fields().items():
+        if field.name == "expected" or field.name in fields:
+            continue
+        value = draw(values(field.type))
+        if f"{{{name}}}" in operation.path and isinstance(value, list):
+            value = value[:1]
+        fields[field.name] = value
+    return operation.request(**fields)
+
+
+def request_of(call: RestCall, if_match: str) -> ClientRequest:
+    """Return a call as the api gets it."""
+    body = b"" if call.body is None else json.dumps(call.body).encode()
+    return ClientRequest("10.0.0.1", call.method, call.target, if_match, "application/json", "", body)
+
+
+@pytest.mark.parametrize(
+    "operation", ASKED, ids=lambda one: f"{one.request.__name__} {one.method} {one.path}"
+)
+@given(data=st.data())
+def test_an_order_means_itself(operation: Operation, data: st.DataObject) -> None:
+    """The request that asks for an order means this order, for the revision that If-Match names."""
+    order = data.draw(orders(operation))
+    call = call_of(order, operation)
+    if not operation.is_change or "expected" not in operation.fields():
+        assert not call.match
+        assert filled_in(meant(request_of(call, "")), order) == order
+        return
+    assert call.match
+    assert filled_in(meant(request_of(call, "*")), order) == order
+    numbered = plain(operation.fields()["expected"].type) is int
+    seen = msgspec.structs.replace(order, expected=7 if numbered else "7")
+    assert filled_in(meant(request_of(call, '"7"')), seen) == seen
+    for wrong in ("", "7", 'W/"7"', '"7", "8"', '"' + "9" * 91 + '"', '"-1"' if numbered else '""'):
+        with pytest.raises(BadTagError):
+            meant(request_of(call, wrong))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"target": "/v1/policy?dry_run=1"}, {"target": "/v1/policy?dry_run=yes"}, {"target": "/v1/policy/"},
+        {"method": "GET"}, {"method": "PUT"}, {"target": "/v1/nothing"}, {"if_match": ""}, {"if_match": '"x"'},
+        {"body": b"\xff"}, {"content_type": "application/json"}, {"target": "/v1/policy?confirm_within=x"},
+        {"body": b"[" * 100_000, "content_type": "application/json"},
+        {"body": b"[]", "content_type": "application/json"}, {"target": ""},
+        {"body": b'{"text": 7}', "content_type": "application/json"},
+    ],
+)  # fmt: skip
+def test_requests_that_are_not_orders(change: dict[str, Any]) -> None:
+    """A dry run, another route or another type of body gives no order, and no error."""
+    good = ClientRequest("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", b"[Nodes]\n")
+    assert meant(good) == admin.PolicyLoad("[Nodes]\n")
+    with pytest.raises(NoOrderError):
+        meant(msgspec.structs.replace(good, **change))
+
+
+@pytest.mark.parametrize("text", ["1h", "yesterday", "2026-13-01"])
+def test_an_order_has_no_relative_date(text: str) -> None:
+    """`1h` ago would differ between control and the api."""
+    body = json.dumps({"since": text}).encode()
+    asked = ClientRequest("10.0.0.1", "POST", "/v1/recordings/memory", "", "application/json", "", body)
+    with pytest.raises(NoOrderError, match=rf"body.since: '{text}' is not a date"):
+        meant(asked)
+
+
+def test_a_date_is_nanoseconds_or_seconds() -> None:
+    """Whole-number fields get nanoseconds, others seconds."""
+    recording = ClientRequest(
+        "10.0.0.1", "POST", "/v1/recordings/memory", "", "application/json", "", b'{"since": "2026-03-01"}'
+    )
+    assert meant(recording) == admin.RecordingOfMemory(since=1_772_323_200_000_000_000)
+    body = b'{"state": "open", "checked": "2026-03-01T00:00:00.5Z"}'
+    ports = ClientRequest("10.0.0.1", "PUT", "/v1/hosts/laptop/ports", "*", "application/json", "", body)
+    assert meant(ports) == admin.HostPorts("laptop", "open", checked=1_772_323_200.5)

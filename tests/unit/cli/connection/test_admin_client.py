@@ -1,0 +1,22 @@
+"""Tests of `appliance.cli.connection.admin_client`: its timeout, and words that cannot be encoded."""
+
+from pathlib import Path
+
+import pytest
+
+from appliance.channel.admin import OPERATIONS, TokenAdd
+from appliance.cli.connection import admin_client
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+
+NO_TEXT = "alice\udcff"
+
+
+def test_it_waits_for_the_slowest_answer() -> None:
+    """It waits longer than REST does for the slowest order: a new host."""
+    assert max(operation.seconds for operation in OPERATIONS) < admin_client.SECONDS
+
+
+def test_undecodable_bytes_are_an_error(tmp_path: Path) -> None:
+    """The error shows the word; nothing is sent."""
+    with pytest.raises(NotRunningError, match=r"'alice\\udcff' is not valid UTF-8"):
+        AdminSocket(tmp_path).ask(TokenAdd(NO_TEXT, "viewer", 60.0))

@@ -1,0 +1,127 @@
+"""Tests of `appliance.cli.connection.audit_over_rest`: the log over REST behaves as the log's file does."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, cast
+
+import pytest
+
+from appliance.audit.query import Filter, FilterError
+from appliance.audit.record import AuditRecord
+from appliance.audit.record_format import LogEntry, as_object
+from appliance.cli.connection import audit_over_rest as audit_rest
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.audit_over_rest import RestLog
+from appliance.cli.connection.rest_session import RestClient, RestProblemError
+
+END = 'data: {"reason": "the token has ended"}'
+
+
+class Answer:
+    """An answer with these lines, after which the connection breaks unless it ends."""
+
+    def __init__(self, lines: list[str], *, breaks: bool) -> None:
+        self._lines = lines
+        self._breaks = breaks
+
+    def iter_lines(self) -> Iterator[str]:
+        """Yield the lines."""
+        yield from self._lines
+        if self._breaks:
+            raise NotRunningError("the connection broke")
+
+
+class Rest:
+    """REST that gives these answers to streams in turn, and an empty log otherwise."""
+
+    url = "https://robot"
+
+    def __init__(self, *answers: Answer | Exception) -> None:
+        self.answers = list(answers)
+
+    def call(self, _method: str, path: str, **_more: Any) -> dict[str, Any]:
+        """Return a page without records."""
+        assert path == "/v1/audit"
+        return {"records": [], "cursor": None}
+
+    @contextmanager
+    def streamed(self, _method: str, _path: str, **_more: Any) -> Iterator[Answer]:
+        """Return the next answer."""
+        answer = self.answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        yield answer
+
+
+def log_of(*answers: Answer | Exception) -> RestLog:
+    """Return the log of this REST."""
+    return RestLog(cast(RestClient, Rest(*answers)))
+
+
+def line(sequence: int) -> str:
+    """Return a record as a line of REST."""
+    return json.dumps(
+        as_object(LogEntry(sequence, AuditRecord(id=f"{sequence:020x}", time=1, event="decision")))
+    )
+
+
+@pytest.mark.parametrize(
+    ("refusal", "told"),
+    [
+        (RestProblemError(422, "bad-input", ["resource: too many stars"]), FilterError),
+        (RestProblemError(503, "log-unreadable", ["audit.db: damaged"]), NotRunningError),
+        (RestProblemError(500, "defect", ["a defect"]), NotRunningError),
+    ],
+)
+def test_refused_streams_raise_the_errors_of_a_file(
+    refusal: RestProblemError, told: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An export and a stream that REST refuses raise the same errors as the log's file."""
+    monkeypatch.setattr(audit_rest, "_AGAIN_SECONDS", 0.0)
+    with pytest.raises(told, match=refusal.lines[0]):
+        list(log_of(refusal).export(Filter()))
+    log = log_of(*[refusal] * 5)
+    with pytest.raises(told, match=refusal.lines[0]):
+        list(log.follow(Filter(), 0, on=True))
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"sequence": 1}', '"text"', "7"])
+def test_invalid_lines_are_an_error_of_the_server(text: str) -> None:
+    """A server that is not an appliance is reported as such, not as our defect."""
+    with pytest.raises(NotRunningError, match="is not the REST of an appliance"):
+        list(log_of(Answer([text], breaks=False)).export(Filter()))
+
+
+def test_an_export_gives_its_records() -> None:
+    """Every line is a record, in order."""
+    found = list(log_of(Answer([line(1), "", line(2)], breaks=False)).export(Filter()))
+    assert [one.sequence for one in found] == [1, 2]
+
+
+def test_following_survives_broken_connections(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stream that opened and broke does not count as a failure, even without a record."""
+    monkeypatch.setattr(audit_rest, "_AGAIN_SECONDS", 0.0)
+    broken = [Answer([": ping"], breaks=True) for _ in range(20)]
+    last = Answer(["event: record", f"data: {line(9)}", "event: end", END], breaks=False)
+    followed = log_of(*broken, last).follow(Filter(), 0, on=True)
+    assert [one.sequence for one in next(followed)] == [9]
+    with pytest.raises(NotRunningError, match="the token has ended"):
+        next(followed)
+
+
+def test_following_ends_without_a_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five failed connections in a row end the command."""
+    monkeypatch.setattr(audit_rest, "_AGAIN_SECONDS", 0.0)
+    rest: list[Answer | Exception] = [Answer([], breaks=True)]
+    rest += [NotRunningError("cannot be reached")] * 5
+    with pytest.raises(NotRunningError, match="cannot be reached"):
+        list(log_of(*rest).follow(Filter(), 0, on=True))
+
+
+@pytest.mark.parametrize(
+    "record_id", ["XYZ", "18E9AA02EFC40ABB0E51", "a" * 21, "verify", "stream", "", "../x", "é"]
+)
+def test_an_invalid_id_matches_no_record(record_id: str) -> None:
+    """As with the log's file, no record matches; REST gets no request."""
+    assert log_of().show(record_id, 500) is None

@@ -1,0 +1,95 @@
+"""`--api` only sends to a server with a trusted certificate; `rest.txt` has the rest of `rest_session`."""
+
+import datetime
+import ipaddress
+import ssl
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from tests.support.command import rosrv
+from tests.support.fake_appliance import TOKEN, FakeAppliance
+
+
+def certificate(path: Path, address: str = "127.0.0.1", days: int = 2) -> ssl.SSLContext:
+    """Return a self-signed certificate for an address, and the context that serves it."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    now = datetime.datetime.now(datetime.UTC)
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "rosrv")])
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(days=10))
+        .not_valid_after(now + datetime.timedelta(days=days))
+        .add_extension(
+            x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(address))]), critical=False
+        )
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    path.write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    pair = path.with_suffix(".key")
+    pair.write_bytes(
+        path.read_bytes()
+        + key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+    )
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(pair)
+    return context
+
+
+CERTIFICATES = {"right": {}, "other": {}, "elsewhere": {"address": "10.9.9.9"}, "old": {"days": -2}}
+
+
+@pytest.mark.parametrize(
+    ("served", "trusted", "said"),
+    [
+        ("right", None, "is not trusted: copy STATE/api/certificate.pem"),
+        ("right", "other", "is not trusted"),
+        ("elsewhere", "elsewhere", "is not for this name or address"),
+        ("old", "old", "has expired"),
+        ("right", "text", "has no certificate in PEM"),
+        ("right", "nowhere", "No such file"),
+    ],
+)
+def test_an_untrusted_certificate_gets_nothing(
+    tmp_path: Path, served: str, trusted: str | None, said: str
+) -> None:
+    """Unknown, for another name, expired, or missing: nothing is sent, and each has its own message."""
+    contexts = {name: certificate(tmp_path / name, **given) for name, given in CERTIFICATES.items()}  # type: ignore[arg-type]  # a table
+    (tmp_path / "text").write_text("nothing")
+    with FakeAppliance(contexts[served]) as fake:
+        given = [] if trusted is None else ["--api-ca", str(tmp_path / trusted)]
+        done = rosrv("status", "--api", fake.url, *given, ROSRV_TOKEN=TOKEN)
+        assert (done.returncode, fake.requests) == (2, [])
+        assert said in done.stderr
+
+
+def test_a_trusted_certificate_gets_the_request(tmp_path: Path) -> None:
+    """The option and the environment name the certificate; https to a server without TLS is an error."""
+    right = str(tmp_path / "right.pem")
+    with FakeAppliance(certificate(Path(right))) as fake:
+        fake.problem(403, "refused", "reached")
+        assert "reached" in rosrv("status", "--api", fake.url, "--api-ca", right, ROSRV_TOKEN=TOKEN).stderr
+        by_environment = {"ROSRV_API_CA": right, "ROSRV_TOKEN": TOKEN}
+        assert "reached" in rosrv("status", "--api", fake.url, **by_environment).stderr
+    with FakeAppliance() as fake:
+        url = fake.url.replace("http:", "https:")
+        assert "is it http" in rosrv("status", "--api", url, ROSRV_TOKEN=TOKEN).stderr
+
+
+def test_deeply_nested_json_is_an_error_of_the_server() -> None:
+    """The answer of another server does not exhaust the stack."""
+    with FakeAppliance() as fake:
+        fake.body = b"[" * 100_000
+        done = rosrv("status", "--api", fake.url, ROSRV_TOKEN=TOKEN)
+    assert done.returncode == 2
+    assert "is not the REST of an appliance" in done.stderr

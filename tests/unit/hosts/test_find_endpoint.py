@@ -1,0 +1,53 @@
+"""The address at which hosts reach the appliance."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from appliance.channel.answers.host_answers import Endpoint
+from appliance.channel.messages import EndpointFound
+from appliance.configuration.settings import Ipsec, Settings
+from appliance.hosts.enrolment import find_endpoint
+from appliance.hosts.host_table import HostRefusedError
+
+
+def _settings(endpoint: str | None = None, **more: Any) -> Settings:
+    return Settings(ipsec=Ipsec(endpoint=endpoint), **more)
+
+
+async def _found() -> EndpointFound:
+    return EndpointFound("10.0.0.5", "the only address here")
+
+
+async def _several() -> EndpointFound:
+    return EndpointFound(None, "there are several addresses here (10.0.0.5, 10.0.1.5)")
+
+
+def test_what_is_configured_comes_first() -> None:
+    """Nobody looks then, so that it also helps where nothing can be found."""
+    assert asyncio.run(find_endpoint(_settings("robot.example.org"), _several)) == Endpoint(
+        "robot.example.org", "ipsec.endpoint of the configuration"
+    )
+
+
+def test_what_the_supervisor_sees_is_taken_with_its_reason() -> None:
+    """So that a person can judge it."""
+    assert asyncio.run(find_endpoint(_settings(), _found)) == Endpoint("10.0.0.5", "the only address here")
+
+
+def test_an_unknown_endpoint_is_refused_with_advice() -> None:
+    """The error has flag, REST field and key; it is not a defect of the appliance (not `ours`)."""
+    with pytest.raises(HostRefusedError) as caught:
+        asyncio.run(find_endpoint(_settings(), _several))
+    for words in ("10.0.0.5, 10.0.1.5", "--appliance ADDRESS", "ipsec: {endpoint: ADDRESS}", "`endpoint`"):
+        assert words in str(caught.value), words
+    assert not caught.value.ours
+
+
+@pytest.mark.parametrize("endpoint", [None, "10.0.0.5"])
+def test_without_tunnels_no_endpoint_is_needed(endpoint: str | None) -> None:
+    """The error names the missing requirement."""
+    with pytest.raises(HostRefusedError, match="`isolation: netns` or `container`") as caught:
+        asyncio.run(find_endpoint(_settings(endpoint, isolation="none"), _found))
+    assert "--appliance" not in str(caught.value)

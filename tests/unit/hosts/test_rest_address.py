@@ -1,0 +1,58 @@
+"""Tests of where REST is reached: by machines that want to enrol, and by hosts in their tunnels."""
+
+from typing import Any
+
+import pytest
+
+from appliance.configuration.config_sources import read
+from appliance.configuration.settings import Settings
+from appliance.hosts.rest_address import rest_address
+
+NET = ["192.168.1.0/24"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "trouble"),
+    [
+        ({"api": "off", "isolation": "netns"}, "REST is off"),
+        ({"api": "127.0.0.1:8443", "api_tls": False, "isolation": "container"}, "clear text"),
+        ({"isolation": "none", "api_networks": NET}, "no tunnels"),
+        ({"api": "127.0.0.1:8443", "isolation": "container", "api_networks": NET}, "api: 0.0.0.0:8443"),
+        ({"api": "0.0.0.0:8443", "isolation": "container"}, "api_networks"),
+        ({"api": "127.0.0.1:8443", "isolation": "netns"}, "api_networks"),
+        (
+            {"api": "0.0.0.0:8443", "isolation": "container", "api_networks": NET, "api_published": False},
+            "publish port 8443 of the container on an address of this machine",
+        ),
+    ],
+)
+def test_who_cannot_be_reached_says_what_to_set(settings: dict[str, Any], trouble: str) -> None:
+    """No host can enrol itself, and the reason is a thing to do."""
+    place = rest_address(read(settings))
+    assert place.port is None
+    assert trouble in place.trouble
+
+
+@pytest.mark.parametrize(
+    ("settings", "port", "inner"),
+    [
+        ({"api": "0.0.0.0:8443", "isolation": "container", "api_networks": NET}, 8443, 8443),
+        ({"api": "10.1.2.3:8443", "isolation": "container", "api_networks": NET}, 8443, None),
+        ({"api": "127.0.0.1:9000", "isolation": "netns", "api_networks": NET}, 9000, 9000),
+    ],
+)
+def test_who_can_be_reached(settings: dict[str, Any], port: int, inner: int | None) -> None:
+    """In a namespace of its own always where the networks are named; bound to one address, not through tunnels."""
+    place = rest_address(read(settings))
+    assert (place.port, place.trouble, place.inner_port) == (port, "", inner)
+
+
+def test_in_a_namespace_hosts_renew_without_any_setting() -> None:
+    """The defaults are enough for hosts in tunnels; only enrolling themselves needs a network to be named."""
+    assert rest_address(Settings(isolation="netns")).inner_port == 8443
+
+
+def test_a_port_that_is_not_published_is_there_for_tunnels() -> None:
+    """They end in the container, past what its engine publishes."""
+    settings = {"api": "0.0.0.0:8443", "isolation": "container", "api_networks": NET, "api_published": False}
+    assert rest_address(read(settings)).inner_port == 8443

@@ -1,0 +1,202 @@
+"""The ports of incarnations are kept over a restart, and reused as late as possible."""
+
+import errno
+import ipaddress
+import os
+import socket
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from appliance.master.endpoints.node_ports import NodePorts, NoPortError
+from appliance.master.graph.registry import Incarnation
+from appliance.policy.model import Address
+from appliance.policy.policy import DEFAULT_PORTS
+from appliance.policy.policy_compiler import compile_policy
+from appliance.quotas.table import NODE_PORTS
+from roswire.uris import parse_node_uri
+
+
+@pytest.fixture
+def first() -> Iterator[int]:
+    """Return the first of eight free ports."""
+    for port in range(40_000, 60_000, 8):
+        probes = [socket.socket() for _ in range(8)]
+        try:
+            for offset, probe in enumerate(probes):
+                probe.bind(("127.0.0.1", port + offset))
+        except OSError:
+            continue
+        finally:
+            for probe in probes:
+                probe.close()
+        yield port
+        return
+    pytest.fail("no eight free ports in a row")
+
+
+def places(
+    first: int, relays: int = 1, count: int = 8, drop: Callable[[str], None] = lambda _name: None
+) -> NodePorts:
+    """A listener store that keeps no sockets."""
+    return NodePorts(
+        "127.0.0.1", range(first, first + count), keep=lambda *_: None, drop=drop, named_as=NAMING.named_as,
+        relays=relays,
+    )  # fmt: skip
+
+
+def without_sockets(monkeypatch: pytest.MonkeyPatch, first: int, count: int) -> NodePorts:
+    """Return a store with four relays whose ports are never opened."""
+    here = places(first, relays=4, count=count)
+    monkeypatch.setattr(here, "listen", lambda: Listening(here.unused.popleft()))
+    return here
+
+
+class Listening:
+    """Stands for a listening socket: 800 real ones would take ports of other programs."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+
+    def getsockname(self) -> tuple[str, int]:
+        """Return its address."""
+        return "127.0.0.1", self.port
+
+    def close(self) -> None:
+        """Return no descriptor."""
+
+
+NAMING = compile_policy("[Nodes]\n/** = 10.0.0.1 10.1.0.0/24\n", file="a.ini")
+HOSTS = [ipaddress.ip_address(f"10.0.0.{number}") for number in range(1, 9)]
+
+
+def incarnation(ports: tuple[int, ...], host: Address = HOSTS[0]) -> Incarnation:
+    """Return an incarnation with these ports."""
+    uri = "http://127.0.0.1:4000/"
+    outer, relay, *more = ports
+    api = parse_node_uri(uri)
+    return Incarnation(
+        "key", "/node", host, api, uri, "127.0.0.1", outer, relay, more_relay_ports=tuple(more)
+    )
+
+
+def test_closed_ports_are_reused_last(first: int) -> None:
+    """Ports that were given back are given out again only after all others."""
+    here = places(first)
+    closed = here.open(HOSTS[0])
+    here.close(incarnation(closed))
+    others = [here.open(host) for host in HOSTS[1:4]]
+    assert closed not in others
+    assert here.open(HOSTS[0]) == closed
+    here.close_unclaimed(set())
+
+
+def test_closed_ports_are_reused_last_after_a_restart(first: int) -> None:
+    """A restarted control begins after the ports in use, so ports closed before the crash are not reused first."""
+    before = places(first)
+    before.open(HOSTS[0])
+    kept = before.open(HOSTS[0])
+    after = places(first)
+    for port in kept:
+        after.adopt(f"port:{port}", before.socket(port).dup())
+    after.close_unclaimed(set(kept))
+    assert after.open(HOSTS[0]) == (first + 4, first + 5)
+    before.close_unclaimed(set())
+    after.close_unclaimed(set())
+
+
+def test_a_port_for_every_relay(first: int) -> None:
+    """Without a free port the error says so."""
+    here = places(first, relays=3)
+    opened = [here.open(HOSTS[0]), here.open(HOSTS[1])]
+    assert [len(ports) for ports in opened] == [4, 4]
+    here.close(incarnation(opened[0]))
+    assert here.open(HOSTS[0]) == opened[0]
+    with pytest.raises(NoPortError, match="4 per node"):
+        here.open(HOSTS[0])
+    here.close_unclaimed(set())
+
+
+def test_another_number_of_relays_after_a_restart(first: int) -> None:
+    """A node has one port for each present relay, and keeps those that it already had."""
+    before = places(first, relays=2)
+    node = incarnation(before.open(HOSTS[0]))
+    had = node.ports
+    before.close_unclaimed(set())
+    more = places(first, relays=3)
+    assert more.reopen(node)
+    assert (node.ports[:3], len(set(node.ports))) == (had, 4)
+    more.close_unclaimed(set())
+    fewer = places(first, relays=1)
+    assert fewer.reopen(node)
+    assert node.ports == had[:2]
+    fewer.close_unclaimed(set())
+
+
+def test_no_port_is_lost_while_none_can_be_opened(first: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without descriptors a node receives an error; later the whole range is available."""
+    held = places(first)
+
+    def exhausted(_host: str, _port: int) -> socket.socket:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("appliance.master.endpoints.node_ports.listen", exhausted)
+        for _try in range(20):
+            with pytest.raises(NoPortError, match="Too many open files"):
+                held.open(HOSTS[0])
+    assert sorted(held.unused) == list(range(first, first + 8))
+
+
+def test_a_port_of_an_earlier_range_is_not_reused(first: int) -> None:
+    """A port of the policy's earlier range is closed and not used again."""
+    before = places(first + 4, count=4)
+    kept = before.open(HOSTS[0])
+    dropped: list[str] = []
+    after = places(first, count=4, drop=dropped.append)
+    for port in kept:
+        after.adopt(f"port:{port}", before.socket(port).dup())
+    before.close_unclaimed(set())
+    after.close_unclaimed(set())
+    assert dropped == [f"port:{port}" for port in kept]
+    assert [*after.open(HOSTS[0]), *after.open(HOSTS[1])] == [*range(first, first + 4)]
+    with pytest.raises(NoPortError):
+        after.open(HOSTS[0])
+    after.close_unclaimed(set())
+
+
+def test_no_host_takes_all_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hosts that take all they can, one after the other, leave some for the next; released ports no longer count."""
+    here = without_sockets(monkeypatch, 20_000, 800)
+    for host in HOSTS[:3]:
+        taken = []
+        with pytest.raises(NoPortError, match=r"3 times as many as are left; widen \[Ports\] range"):
+            while True:
+                taken.append(here.open(host))
+        assert len(taken) >= 3
+    assert here.taken.total <= 800 - 10
+    before = here.taken.held(NAMING.named_as(HOSTS[2]))
+    here.close(incarnation(taken[0], HOSTS[2]))
+    assert here.taken.held(NAMING.named_as(HOSTS[2])) == before - 5
+    assert here.open(HOSTS[3])
+
+
+def test_a_thousand_nodes_fit_the_default_range(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without `[Ports]`, 1,000 nodes of one network have their ports, with as many relays as any machine starts."""
+    here = without_sockets(monkeypatch, DEFAULT_PORTS.start, len(DEFAULT_PORTS))
+    assert len({here.open(HOSTS[0]) for _ in range(1000)}) == 1000
+    assert (len(DEFAULT_PORTS), DEFAULT_PORTS.stop <= 32768) == (NODE_PORTS.bounds.whole, True)
+
+
+def test_many_addresses_of_one_network_are_one_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two hundred guests whom one network of the policy names have three quarters of the ports together."""
+    here = without_sockets(monkeypatch, 20_000, 800)
+    refused = ""
+    for number in range(200):
+        try:
+            here.open(ipaddress.ip_address("10.1.0.0") + number)
+        except NoPortError as error:
+            refused = str(error)
+    assert refused.startswith("10.1.0.0/24 has 600 ports (5 per node), and 200 are left")
+    for _ in range(30):
+        here.open(HOSTS[0])

@@ -1,0 +1,204 @@
+"""A relay with monitors, whose control states specifications, and dialogues with it as text."""
+
+import struct
+from typing import Any, ClassVar
+
+from appliance.channel.messages import (
+    MonitorEvent,
+    MonitorsCounted,
+    MonitorsReported,
+    SpecificationsRefused,
+    SpecificationsTaken,
+)
+from roswire.tcpros import encode_frame, encode_header
+from tests.support.stated import stated
+from tests.unit.relay.dialogue import Dialogue, agrees
+from tests.unit.relay.world import ASK, HEADER, Peer, World
+
+STRING_MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
+SET_BOOL_MD5 = "09fb03525b03e7ea1fd3992bafd87e16"
+TYPED = HEADER | {"md5sum": STRING_MD5}
+WANTED = ASK | {"md5sum": STRING_MD5}
+
+GUARD = """
+guard() {
+    int seen = 0;
+    event said(std::string text) /chatter std_msgs/String '{data:text}' {
+        seen = seen + 1;
+        if (text == "bad") { ROS_WARN("no such word"); return; }
+        if (text == "one") text = "two";
+        if (text == "long") text = "a longer text";
+        if (text == "count") text = std::to_string(seen);
+        if (text == "loop") { while (true) { seen = seen; } }
+    }
+}
+"""
+BEGINNING = GUARD.replace("guard()", "begin guard()")
+"""The same, which does not hold its topics where its state is lost."""
+
+
+def string(text: str) -> bytes:
+    """The frame of a std_msgs/String."""
+    data = text.encode()
+    return encode_frame(struct.pack("<I", len(data)) + data)
+
+
+def data_of(peer: Peer) -> bytes:
+    """Everything the peer has been sent."""
+    peer.read()
+    return bytes(peer.data)
+
+
+COSTLY = """a() { int n; event e(std::string s) /chatter std_msgs/String '{data:s}' {
+    for (int i = 0; i < s.size(); i++) { if (s[i] == 'y') n += i; } } }"""
+
+
+class Monitored(World):
+    """A relay whose control states specifications, and keeps what monitors did."""
+
+    def load(self, *texts: str, revision: int = 1, restarted: bool = False, **enabled: bool) -> Any:
+        """State these files; the relay's answer."""
+        files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
+        self.state(stated(revision, files, {}, enabled, restarted))
+        return self.until(
+            lambda: self.taken(SpecificationsTaken, revision) or self.taken(SpecificationsRefused, revision)
+        )
+
+    def taken(self, kind: type[Any], revision: int) -> Any:
+        """The answer of this kind to a statement, once."""
+        for message in self.told:
+            if isinstance(message, kind) and message.revision == revision:
+                self.told.remove(message)
+                return message
+        return None
+
+    def event(self, kind: str, **fields: Any) -> MonitorEvent:
+        """Return this action of a monitor, and remove it from the reports."""
+
+        def find() -> MonitorEvent | None:
+            for message in self.told:
+                if isinstance(message, MonitorsReported):
+                    for event in message.events:
+                        if event.kind == kind and all(getattr(event, k) == v for k, v in fields.items()):
+                            message.events.remove(event)
+                            return event
+            return None
+
+        found: MonitorEvent = self.until(find)
+        return found
+
+    def typed(self) -> tuple[Peer, Peer]:
+        """A publisher of std_msgs/String and a subscriber that is served."""
+        publisher = self.upstream(TYPED)
+        subscriber = self.connect(encode_header(WANTED))
+        assert self.gets_header(subscriber) == TYPED
+        return publisher, subscriber
+
+
+LATCH = """
+gate() {
+    bool open = false;
+    event ask(bool wish) service /mode std_srvs/SetBool request '{data:wish}' {
+        if (open) { ROS_WARN("it is open"); return; }
+        open = wish;
+    }
+}
+"""
+OTHER = "other() { event e() /elsewhere std_msgs/String '{}' { } }"
+SPECIFICATIONS = {
+    "GUARD": GUARD.strip(),
+    "BEGINNING": BEGINNING.strip(),
+    "LATCH": LATCH,
+    "OTHER": OTHER,
+    "OTHER-HELD": "hold " + OTHER.replace("{ }", "{ return; }"),
+    "ELSEWHERE": GUARD.replace("guard", "other").replace("/chatter", "/elsewhere"),
+    "COSTLY": COSTLY,
+    "IN-PLACE": "a() { event e(std::string s) /chatter std_msgs/String '{data:s}' { s[0] = 'X'; s[1] = 'Y'; } }",
+    "LONGER": "b() { event e(std::string s) /chatter std_msgs/String '{data:s}' { s += \"more\"; } }",
+    "LAST": "c() { event e(std::string s) /chatter std_msgs/String '{data:s}' { return; } }",
+    "AGAIN": """again(std::string name) {
+        event said(std::string name) /chatter std_msgs/String '{data:name}' { }
+        pattern: globally: said causes said within 50ms
+        @violation { ROS_ERROR("%s is late", name.c_str()); __RESET; }
+    }""",
+    "ECHO": """s() { std_msgs::String said; event e(std::string t) /chatter std_msgs/String '{data:t}' {
+        said.data = t; PUBLISH(/alarm, std_msgs/String, said); } event tick() every 10ms { ROS_INFO("tick"); } }""",
+    "DEADLINE": """s() { std_msgs::String said; warn() { said.data = "late"; PUBLISH(/alarm, std_msgs/String, said); }
+        event e() /chatter std_msgs/String '{}' { } event done() /done std_msgs/String '{}' { }
+        pattern: globally: e causes done within 10ms enforced by warn @violation { } }""",
+    "SERVICE": """s() { event ask(bool on) service /mode std_srvs/SetBool request '{data:on}' { if (on) { return; } }
+        event told(std::string m) service /mode std_srvs/SetBool response '{message:m}' { m = "changed"; } }""",
+    "nonsense": "nonsense",
+}
+
+
+class MonitoredDialogue(Dialogue):
+    """Steps with a relay that has monitors; messages are of type std_msgs/String."""
+
+    served: ClassVar = {"callerid": "/talker", "type": "std_srvs/SetBool", "md5sum": SET_BOOL_MD5}
+    asked = WANTED
+    published = TYPED
+    world: Monitored
+
+    def __init__(self, world: Monitored) -> None:
+        super().__init__(world)
+        self._revision = 0
+        self._answer: Any = None
+
+    def string(self, word: str) -> bytes:
+        """Return the frame of a std_msgs/String."""
+        return string(word)
+
+    def _load(self, *words: str) -> None:
+        enabled = {word.removesuffix("=off"): False for word in words if word.endswith("=off")}
+        shadows = tuple(word.removeprefix("shadow=") for word in words if word.startswith("shadow="))
+        texts = [_text(word) for word in words if word != "restarted" and not word.endswith("=off")]
+        texts = [text for text in texts if not text.startswith("shadow=")]
+        self._revision += 1
+        files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
+        self.world.state(stated(self._revision, files, {}, enabled, "restarted" in words, shadows=shadows))
+        kinds = (SpecificationsTaken, SpecificationsRefused)
+        self._answer = self.world.until(
+            lambda: next(filter(None, (self.world.taken(kind, self._revision) for kind in kinds)), None)
+        )
+
+    def _taken(self, *words: str) -> None:
+        assert isinstance(self._answer, SpecificationsTaken)
+        assert agrees(self._answer, words), self._answer
+
+    def _refused(self, *words: str) -> None:
+        assert isinstance(self._answer, SpecificationsRefused)
+        assert agrees(self._answer, words), self._answer
+
+    def _event(self, *words: str) -> None:
+        kind, fields = words[0], words[1:]
+
+        def find() -> bool:
+            for report in (one for one in self.world.told if isinstance(one, MonitorsReported)):
+                for event in report.events:
+                    if event.kind == kind and agrees(event, fields, self.string):
+                        report.events.remove(event)
+                        return True
+            return False
+
+        self.world.until(find)
+
+    def _counts(self, name: str, *words: str) -> None:
+        self.world.engine.interceptor.observations.tell_counters()
+        self.world.link.catch_up()
+        self.world.until(lambda: any(isinstance(one, MonitorsCounted) for one in self.world.told))
+        counted = [row for one in self.world.told if isinstance(one, MonitorsCounted) for row in one.rows]
+        row = next(row for row in reversed(counted) if row.name == name)
+        assert agrees(row, words), row
+
+    def _kinds(self, *words: str) -> None:
+        reports = [one for one in self.world.told if isinstance(one, MonitorsReported)]
+        assert {event.kind for one in reports for event in one.events} <= set(words)
+
+
+def _text(word: str) -> str:
+    """Return a specification by its name, with a text replaced (`NAME|old|new`), `hold:` in front if it is to hold."""
+    name, *change = word.removeprefix("hold:").split("|")
+    text = SPECIFICATIONS.get(name, name)
+    text = text.replace(*change) if change else text  # type: ignore[arg-type]  # two texts
+    return f"hold {text}" if word.startswith("hold:") else text

@@ -1,0 +1,408 @@
+"""A batch through the monitors together is what its messages are one by one: bytes, records, counters, state."""
+
+import struct
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from appliance.channel.messages import Message, MonitorRow
+from appliance.relay.loop import EventLoop
+from appliance.relay.monitors.interceptor import Interceptor
+from appliance.relay.monitors.observation_points import ObservationPoint
+from appliance.relay.monitors.topic_pipeline import TopicPipeline
+from appliance.relay.relay_limits import RelayLimits
+from appliance.relay.report import Reporter
+from appliance.relay.transport.frames import FrameReceiver, Scratch
+from rosmop.check.sources import compiled_from
+from rosmop.logics.interface import ClockedRun, FiniteRun
+from rosmop.run.engine import MonitorSet
+from rosmop.run.fast_path import BatchResult
+from rosmop.runtime.action_context import Published
+from rosmop.tests.acting import message
+from rosmop.tests.on_module import on_module
+from rosmop.tests.random_specifications import (
+    Messages,
+    Specifications,
+    Traffic,
+    definitions,
+)
+from rosmop.text.errors import SpecificationError
+from roswire.definitions import Definitions
+from tests.support.examples import examples
+from tests.support.relay_memory import share
+from tests.support.stated import stated
+from tests.unit.transcripts import transcripts
+
+MONITORS = Path(__file__).parents[4] / "monitors"
+
+
+class Heard(Reporter):
+    """Keeps what would be sent."""
+
+    def __init__(self) -> None:
+        super().__init__(RelayLimits())
+        self.messages: list[Message] = []
+
+    @property
+    def attached(self) -> bool:
+        """There is a control."""
+        return True
+
+    def send(self, told: Message) -> None:
+        """Keep it."""
+        self.messages.append(told)
+
+
+class Monitored:
+    """Monitors, with a clock that is set, with or without the module that takes messages together."""
+
+    def __init__(
+        self,
+        texts: dict[str, str],
+        known: Definitions,
+        *,
+        together: bool,
+        on_fault: Any = "drop",
+        shadows: Collection[str] = (),
+        restarted: bool = False,
+        began: int = 1_000_000_000,
+    ) -> None:
+        self.heard = Heard()
+        self.time = began
+        self.published: list[Published] = []
+        """Return the messages that monitors published."""
+        self._loop = EventLoop()
+        self.interceptor = Interceptor(
+            self._loop,
+            self.heard,
+            budget=1000.0,
+            publish=self.published.append,
+            changed=lambda _topics: None,
+        )
+        self.interceptor.over = lambda: False
+        self.interceptor.now = lambda: self.time  # type: ignore[method-assign]  # the test sets the time
+        self._lanes: dict[tuple[str, str], TopicPipeline] = {}
+        compiled, make = compiled_from(texts, known), on_module if together else MonitorSet.of
+        self.set = make(compiled, on_fault, shadows=shadows)
+        self.interceptor.loaded(stated(1, [], {}, {}, restarted=restarted), self.set)
+
+    def close(self) -> None:
+        """End."""
+        self.interceptor.close()
+        self._loop.close()
+
+    def through(
+        self, traffic: Traffic, first: int = 1, publisher: str = "/talker"
+    ) -> tuple[int, bytes, bytes]:
+        """Return the remaining messages: their number, all of them, the last one."""
+        if " " in traffic.topic:
+            return self._asked(traffic, publisher)
+        scratch = Scratch()
+        scratch.move(self.set.area)
+        receiver = FrameReceiver(scratch, 1 << 20, share(1 << 30))
+        receiver.buffer()[: len(traffic.frames)] = traffic.frames
+        batch = receiver.received(len(traffic.frames))
+        assert batch is not None
+        assert batch.messages == traffic.messages
+        batch.first = first
+        place = ObservationPoint("key", traffic.topic, "10.0.0.7", publisher)
+        lane = self._lanes.setdefault((traffic.topic, publisher), TopicPipeline(self.interceptor, place))
+        left = lane.through(batch)
+        if left is None:
+            return 0, b"", b""
+        return left.messages, bytes(left.view), bytes(left.keep_last().view)
+
+    def _asked(self, traffic: Traffic, client: str) -> tuple[int, bytes, bytes]:
+        """The same of requests or replies, one by one; of those that are refused what is read instead."""
+        service, part = traffic.topic.split()
+        judged = [
+            self.interceptor.judge(ObservationPoint("key", service, "10.0.0.7", client), part, body)
+            for body in traffic.bodies()
+        ]
+        left = [one.body if one.refused is None else one.refused.encode() for one in judged]
+        return sum(one.refused is None for one in judged), b"\0".join(left), left[-1]
+
+    def told(self) -> list[str]:
+        """Everything that was sent to control, the counts of a second in a fixed order."""
+        self.interceptor.tick()
+        self.interceptor.observations.flush()
+        told = sorted(repr(one) for one in self.sent())
+        self.heard.messages.clear()
+        return told
+
+    def sent(self) -> Iterable[object]:
+        """All that was sent to control, rows and events one by one."""
+        for one in self.heard.messages:
+            yield from getattr(one, "events", None) or getattr(one, "rows", None) or [one]
+
+    def rows(self) -> list[MonitorRow]:
+        """The counters."""
+        return self.interceptor.observer.rows(self.set.monitors, self.interceptor.now())
+
+    def state(self) -> list[object]:
+        """Variables, states of properties, what is due (`next_due` may be too early: what moves on is asked later)."""
+        state: list[object] = []
+        for monitor in self.set.monitors:
+            state.append((monitor.name, monitor.seen, monitor.faults, monitor.held))
+            names = self.set.interpreter.variables
+            state += [(name, repr(names.get(code))) for name, code in monitor.code.variables.items()]
+            state += [
+                one.run.state for one in monitor.properties if isinstance(one.run, FiniteRun | ClockedRun)
+            ]
+            state += [timer.due for timer in monitor.timers]
+            state += [one.run.deadline for one in monitor.properties]
+        return state
+
+
+def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traffic], on_fault: str = "drop",
+          switched: tuple[int, str] | None = None) -> Monitored:  # fmt: skip
+    """The same traffic both ways; fails at the first difference."""
+    ways = [Monitored(texts, known, together=together, on_fault=on_fault) for together in (False, True)]
+    try:
+        for number, traffic in enumerate(all_traffic):
+            for way in ways:
+                way.time += 700_000
+                if switched is not None and number in (switched[0], switched[0] + 3):
+                    way.interceptor.switch(switched[1], number != switched[0])
+            one, together = (way.through(traffic) for way in ways)
+            assert one == together, f"batch {number} of {traffic.topic}"
+            assert ways[0].published == ways[1].published
+            one_state, state = (way.state() for way in ways)
+            assert one_state == state, f"after batch {number} of {traffic.topic}"
+            if number % 4 == 3:
+                one_told, told = (way.told() for way in ways)
+                assert one_told == told
+        one_told, told = (way.told() for way in ways)
+        assert one_told == told
+        assert ways[0].rows() == ways[1].rows()
+    finally:
+        for way in ways:
+            way.close()
+    return ways[1]
+
+
+def random_case(seed: int) -> tuple[dict[str, str], list[Traffic]]:
+    """Specifications that are right, and what comes."""
+    texts = Specifications(seed).texts()
+    messages = Messages(seed)
+    return {f"{number}.rv": text for number, text in enumerate(texts)}, [
+        messages.traffic() for _ in range(12)
+    ]
+
+
+@settings(max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+@given(st.integers(0, 1 << 40))
+def test_random_monitors_do_the_same_together(seed: int) -> None:
+    """Whatever monitors do, a batch taken together is what its messages are one by one."""
+    texts, traffic = random_case(seed)
+    try:
+        agree(texts, definitions(), traffic, ("drop", "pass")[seed % 2], (2, "s1") if seed % 3 == 0 else None)
+    except SpecificationError:
+        return
+
+
+HARD = {
+    title: "\n".join(lines)
+    for title, lines in transcripts(Path(__file__).with_name("hard_cases.txt")).items()
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+@pytest.mark.parametrize("on_fault", ["drop", "pass"])
+def test_hard_cases_are_the_same_together(name: str, on_fault: str) -> None:
+    """Changes that are taken back, faults in the middle, drops after changes: as one by one."""
+    for seed in range(examples(18)):
+        messages = Messages(seed)
+        agree({"x.rv": HARD[name]}, definitions(), [messages.traffic() for _ in range(10)], on_fault)
+
+
+def _shipped_traffic(seed: int) -> list[Traffic]:
+    """Messages on the topics of the shipped specifications."""
+    random = Random(seed)  # noqa: S311  draws examples, not keys
+    kinds = {
+        "/landshark/battery": lambda: message("sensor_msgs/BatteryState", percentage=random.random(), voltage=12.0),
+        "/landshark/gps": lambda: message("sensor_msgs/NavSatFix", latitude=37.4 + random.random() / 9),
+        "/landshark/odom": lambda: message("nav_msgs/Odometry", pose__pose__position__x=random.uniform(0, 40),
+                                           twist__twist__linear__x=random.uniform(-2, 2)),
+        "/landshark_control/base_velocity": lambda: message(
+            "geometry_msgs/TwistStamped", twist__linear__x=random.uniform(-1, 1)),
+        "/landshark/joint_states": lambda: message(
+            "sensor_msgs/JointState", name=["turret_pan", "turret_tilt"][: random.choice((1, 2, 2, 2))],
+            position=[0.1, random.uniform(-1, 1)]),
+        "/landshark_control/trigger": lambda: message("std_msgs/Header", frame_id="ocu") + b"\x01",
+        "/landshark/scan": lambda: message("sensor_msgs/LaserScan", angle_increment=0.1,
+                                           ranges=[random.uniform(0, 5) for _ in range(4)]),
+    }  # fmt: skip
+    found = []
+    for _ in range(30):
+        topic = random.choice(sorted(kinds))
+        bodies = [kinds[topic]() for _ in range(random.choice((1, 3, 9)))]
+        frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
+        found.append(Traffic(topic, frames, len(bodies)))
+    return found
+
+
+def test_shipped_monitors_do_the_same_together() -> None:
+    """The specifications in `monitors/`, all in force, on traffic of the LandShark."""
+    known = definitions().extended(
+        Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": "Header header\nuint8 trigger\n"})
+    )
+    texts = {path.name: path.read_text() for path in sorted(MONITORS.glob("*.rv"))}
+    for seed in range(5):
+        agree(texts, known, _shipped_traffic(seed))
+
+
+def test_requests_and_replies_need_the_engine_only_for_what_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In each second these are the first verdict and change, and all refusals."""
+    text = """s() { int n = 0; bool b = false;
+        event ask(bool wish) service /mode std_srvs/SetBool request '{data:wish}' {
+            n++; ROS_INFO("%d", n); if (n % 10 == 9) { return; } if (wish) { wish = false; } }
+        event answer(bool ok) service /mode std_srvs/SetBool response '{success:ok}' {
+            b = ok; }
+        fsm: a [ ask -> b, answer -> a ] b [ answer -> a, ask -> b ] @b { } }"""
+    monitored = Monitored({"x.rv": text}, definitions(), together=True)
+    asked: list[bytes] = []
+    process = monitored.set.process_service
+
+    def noted(*arguments: Any) -> Any:
+        asked.append(bytes(arguments[2]))
+        return process(*arguments)
+
+    monkeypatch.setattr(monitored.set, "process_service", noted)
+    request, response = (
+        ObservationPoint("k", "/mode", "10.0.0.7", "/client"),
+        ObservationPoint("k", "/mode", "10.0.0.8", "/server"),
+    )
+    answer = b"\1" + struct.pack("<I", 2) + b"ok"
+    try:
+        for second in range(2):
+            left = [
+                monitored.interceptor.judge(request, "request", bytes([number % 2])) for number in range(40)
+            ]
+            assert [one.body for one in left if one.refused is None] == [b"\0"] * 36
+            assert [monitored.interceptor.judge(response, "response", answer).body for _ in range(40)] == [
+                answer
+            ] * 40
+            assert len(asked) == 4 + 2
+            asked.clear()
+            (row,) = monitored.rows()
+            counted = row.events, row.verdicts, row.drops, row.changes
+            assert counted == tuple(count * (second + 1) for count in (80, 36, 4, 20))
+            monitored.told()
+    finally:
+        monitored.close()
+
+
+def test_most_messages_are_taken_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A monitor that reads, writes and steps looks at no message of a batch singly, but for the first of a second."""
+    text = """s() { event e(int count, double x) /plain own/Plain '{count:count, x:x}' { x = count + 0.5; }
+                  fsm: a [ e -> b ] b [ e -> a ] @fail { } }"""
+    monitored = Monitored({"x.rv": text}, definitions(), together=True)
+    single = 0
+    process = monitored.set.process
+
+    def counted(*arguments: Any) -> Any:
+        nonlocal single
+        single += 1
+        return process(*arguments)
+
+    monkeypatch.setattr(monitored.set, "process", counted)
+    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
+    frame = struct.pack("<I", len(body)) + body
+    for _ in range(5):
+        left = monitored.through(Traffic("/plain", frame * 1000, 1000))
+        assert left == (1000, left[1], left[1][-len(frame) :])
+        assert struct.unpack_from("<d", left[1], 4 + 5) == (5.5,)
+    monitored.interceptor.tick()
+    assert single == 1
+    assert [(row.events, row.changes) for row in monitored.rows()] == [(5000, 5000)]
+    monitored.close()
+
+
+def test_lines_describe_the_received_message() -> None:
+    """The message has a header that is also changed, or is shorter than a header."""
+    text = """s() { event e(unsigned int n) /h geometry_msgs/PointStamped '{header.seq:n}' { n = 3; } }
+        t() { int k = 0; event e() /h geometry_msgs/PointStamped '{}' { k++; ROS_INFO("came %d", k); } }
+        u() { event e(std::string f) /j geometry_msgs/PointStamped '{header.frame_id:f}' {
+                ROS_INFO("from %s", f.c_str()); }
+              event all() /j geometry_msgs/PointStamped '{}' { ROS_WARN("any"); } }"""
+    bodies = [
+        message("geometry_msgs/PointStamped", header__seq=seq, header__frame_id=name)
+        for seq, name in ((7, "a"), (8, "b"), (9, "a"))
+    ]
+    for one in (bodies, [b"abc", *bodies]):
+        frames = b"".join(struct.pack("<I", len(body)) + body for body in one)
+        agree({"x.rv": text}, definitions(), [Traffic(topic, frames, len(one)) for topic in ("/h", "/j")] * 5)
+
+
+@pytest.mark.parametrize("does", ["count = 3;", 'count = 3; } @fail { puts("never");', 'puts("came");'])
+def test_a_batch_is_prepared_once_until_an_event_happens(does: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports of a monitor are sent, and the next batch uses the prepared function again."""
+    event, _, handler = does.partition("}")
+    logic = f"fsm: one [ e -> other ] other [ e -> one ] {handler} }}" if handler else ""
+    text = f"s() {{ event e(int count) /plain own/Plain '{{count:count}}' {{ {event} }} {logic} }}"
+    monitored = Monitored({"x.rv": text}, definitions(), together=True)
+    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
+    batch = Traffic("/plain", (struct.pack("<I", len(body)) + body) * 50, 50)
+    for _ in range(2):  # the engine takes the first message, and the first change
+        monitored.through(batch)
+    asked = []
+    walks = MonitorSet.lane_ready
+
+    def watched(*given: Any) -> bool:
+        asked.append(given)
+        return walks(*given)
+
+    monkeypatch.setattr(MonitorSet, "lane_ready", watched)
+    for _ in range(3):
+        monitored.through(batch)
+    assert not asked
+    monitored.interceptor.tick()
+    monitored.through(batch)
+    assert asked
+    monitored.close()
+
+
+def test_what_several_change_is_counted_for_each_of_them() -> None:
+    """Taken together, by bits and runs, as one by one: a message counts for each monitor that changed it."""
+    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
+    quiet = struct.pack("<BidfBII3qI", 1, 17, 2.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
+    far = struct.pack("<BidfBII3qI", 2, 5, 9.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
+    frames = b"".join(struct.pack("<I", len(one)) + one for one in (far, body, body, quiet, far, quiet))
+    monitored = agree(
+        {"x.rv": HARD["who changes it differs"]}, definitions(), [Traffic("/plain", frames, 6)] * 50
+    )
+    assert {row.name: row.changes for row in monitored.rows()} == {"one": 100, "two": 200, "three": 0}
+
+
+def test_a_defect_of_the_walk_is_told_once_and_the_engine_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages go on, one by one; the walk of this topic is not tried again."""
+    monitored = Monitored(
+        {"x.rv": "s() { event e(int count) /plain own/Plain '{count:count}' { count = 3; } }"},
+        definitions(),
+        together=True,
+    )
+    shadowed = []
+
+    def defect(*arguments: object) -> BatchResult:
+        shadowed.append(arguments)
+        raise ZeroDivisionError
+
+    lane = monitored.set.lane("/plain")
+    assert lane is not None
+    monkeypatch.setattr(lane, "process_batch", defect)
+    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
+    frame = struct.pack("<I", len(body)) + body
+    changed = frame[:5] + struct.pack("<i", 3) + frame[9:]
+    for _ in range(3):
+        left = monitored.through(Traffic("/plain", frame * 6, 6))
+        assert left == (6, changed * 6, changed)
+    told = [one for one in monitored.told() if "kind='fault'" in one]
+    assert len(told) == len(shadowed) == 1
+    assert "a defect of rosrv" in told[0]
+    monitored.close()

@@ -1,0 +1,33 @@
+"""The processor time of messages after one that used up its budget."""
+
+from itertools import pairwise
+
+from appliance.relay.monitors.time_budget import TimeBudget
+
+_SECOND = 10**9
+
+
+def reductions(budget: TimeBudget, seconds: float) -> list[float]:
+    """Cut off every message that has the whole budget, 100 a second; return the seconds at which one was."""
+    times = [number / 100 for number in range(round(100 * seconds))]
+    cut = []
+    for time in times:
+        now = round((1 + time) * _SECOND)
+        if budget.part(now) == 1:
+            cut.append(time)
+        budget.cut(now)
+    return cut
+
+
+def test_a_sender_of_costly_messages_has_the_whole_budget_ever_more_rarely() -> None:
+    """After 4, 8 and then every 16 seconds."""
+    cut = reductions(TimeBudget(), 64)
+    assert [after - before for before, after in pairwise(cut)] == [4, 8, 16, 16, 16]
+
+
+def test_one_costly_message_reduces_the_budget_for_four_seconds() -> None:
+    """Also when there was another one eight seconds before."""
+    budget = TimeBudget()
+    for begin in (5 * _SECOND, 13 * _SECOND, 30 * _SECOND):
+        budget.cut(begin)
+        assert [budget.part(begin + after) for after in (0, 4 * _SECOND - 1, 4 * _SECOND)] == [0.1, 0.1, 1]

@@ -1,0 +1,229 @@
+"""Whole frames out of a stream of bytes, however it is cut."""
+
+import struct
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from appliance.relay.transport.frames import (
+    LARGE,
+    SCRATCH,
+    Batch,
+    FrameReceiver,
+    Scratch,
+    boundary_at,
+    equal_frames,
+    last_frame,
+)
+from appliance.relay.transport.memory import HostMemory
+from roswire.errors import LimitExceededError, PeerError
+from tests.support.examples import examples
+from tests.support.relay_memory import share
+
+LIMIT = 16 << 20
+
+
+def frame(size: int, fill: int = 7) -> bytes:
+    """Return a frame with a body of this size."""
+    return struct.pack("<I", size) + bytes([fill % 256]) * size
+
+
+def receiver(limit: int = LIMIT, memory: int = 1 << 30) -> tuple[FrameReceiver, HostMemory]:
+    """A receiver with a scratch area of its own."""
+    budget = share(memory)
+    return FrameReceiver(Scratch(), limit, budget), budget
+
+
+def feed(one: FrameReceiver, data: bytes, cuts: list[int]) -> list[tuple[bytes, int, int]]:
+    """Give `data` in reads of the sizes `cuts` (the last repeats); what the batches held."""
+    batches, position, turn = [], 0, 0
+    while position < len(data):
+        buffer = one.buffer()
+        count = min(len(buffer), cuts[min(turn, len(cuts) - 1)], len(data) - position)
+        buffer[:count] = data[position : position + count]
+        position, turn = position + count, turn + 1
+        batch = one.received(count)
+        if batch is not None:
+            assert batch.last is not None
+            batches.append((bytes(batch.view), batch.messages, batch.last))
+    return batches
+
+
+sizes = st.lists(
+    st.one_of(st.integers(0, 300), st.integers(LARGE - 10, LARGE + 10), st.integers(0, 3 * LARGE)),
+    max_size=12,
+)
+cut_sizes = st.lists(st.integers(1, 2 * LARGE), min_size=1, max_size=20)
+
+
+@settings(max_examples=examples(150))
+@given(sizes, cut_sizes)
+def test_every_way_of_cutting_the_stream_gives_the_same_frames(lengths: list[int], cuts: list[int]) -> None:
+    """Nothing is lost, repeated or torn, and each batch says where its last frame begins."""
+    data = b"".join(frame(size, index) for index, size in enumerate(lengths))
+    one, budget = receiver()
+    batches = feed(
+        one, data, [*cuts, max(cuts[-1], len(data) // 2000)]
+    )  # millions of single bytes add nothing
+    assert b"".join(view for view, _messages, _last in batches) == data
+    assert sum(messages for _view, messages, _last in batches) == len(lengths)
+    for view, _messages, last in batches:
+        assert struct.unpack_from("<I", view, last)[0] == len(view) - last - 4
+    one.trim_buffer()
+    one.trim_buffer()
+    assert budget.used == 0
+
+
+def test_a_torn_frame_is_never_part_of_a_batch() -> None:
+    """A batch ends with a whole frame, so a dying publisher tears no stream."""
+    one, _budget = receiver()
+    (batch,) = feed(one, frame(10) + frame(20) + frame(30)[:-1], [SCRATCH])
+    assert batch == (frame(10) + frame(20), 2, 14)
+
+
+def test_receivers_share_the_scratch_area_without_mixing_their_bytes() -> None:
+    """A torn frame of one connection survives what another receives meanwhile."""
+    scratch, budget = Scratch(), share(1 << 30)
+    one, other = FrameReceiver(scratch, LIMIT, budget), FrameReceiver(scratch, LIMIT, budget)
+    data = frame(100, 1)
+    assert feed(one, data[:50], [50]) == []
+    assert feed(other, frame(400, 2), [404])[0][0] == frame(400, 2)
+    assert feed(one, data[50:], [54])[0][0] == data
+
+
+def test_the_scratch_area_moves_between_two_reads() -> None:
+    """A torn frame goes on in the other area; nothing is received into the first one any more."""
+    scratch, first, other = Scratch(), bytearray(SCRATCH), bytearray(SCRATCH)
+    one = FrameReceiver(scratch, LIMIT, share(1 << 30))
+    scratch.move(memoryview(first))
+    assert feed(one, frame(100, 1)[:50], [50]) == []
+    scratch.move(memoryview(other))
+    assert feed(one, frame(100, 1)[50:], [54]) == [(frame(100, 1), 1, 0)]
+    assert (bytes(first[:60]), bytes(other[:104])) == (frame(100, 1)[:50] + bytes(10), frame(100, 1))
+
+
+@pytest.mark.parametrize("size", [LIMIT + 1, 0xFFFFFFFF])
+def test_a_length_beyond_the_limit_is_refused_at_its_first_bytes(size: int) -> None:
+    """The connection is given up before anything of the message is kept."""
+    one, budget = receiver()
+    with pytest.raises(LimitExceededError, match=str(size)):
+        feed(one, struct.pack("<I", size), [4])
+    assert budget.used == 0
+
+
+def test_the_limit_holds_for_a_frame_after_a_large_one() -> None:
+    """Also where reading goes on in the large frame's own area."""
+    one, _budget = receiver()
+    with pytest.raises(LimitExceededError):
+        feed(one, frame(2 * LARGE) + struct.pack("<I", LIMIT + 1), [SCRATCH])
+
+
+def test_a_declared_length_costs_nothing_until_its_bytes_come() -> None:
+    """Only received bytes count, so lengths cannot be used to fill the relay."""
+    one, budget = receiver()
+    feed(one, struct.pack("<I", LIMIT) + b"x" * 10, [14])
+    assert budget.used == 14
+    one.abandon()
+    assert budget.used == 0
+
+
+def test_a_large_message_is_given_up_when_the_process_is_out_of_memory() -> None:
+    """The error says whose fault it is not, and the receiver can be abandoned."""
+    one, budget = receiver(memory=2 * LARGE)
+    with pytest.raises(PeerError, match="no memory"):
+        feed(one, frame(4 * LARGE), [LARGE])
+    one.abandon()
+    assert budget.used == 0
+
+
+@pytest.mark.parametrize("size", [2 * LARGE, 3 << 20, 9 << 20])
+def test_a_kept_large_frame_is_not_overwritten_by_the_next(size: int) -> None:
+    """A queue that holds a frame keeps its bytes, whatever comes after; also beyond the areas that are kept."""
+    one, _budget = receiver(limit=16 << 20)
+    kept = []
+    for fill in (1, 2, 3):
+        data, position = frame(size, fill), 0
+        while position < len(data):
+            buffer = one.buffer()
+            count = min(len(buffer), len(data) - position)
+            buffer[:count] = data[position : position + count]
+            position += count
+            batch = one.received(count)
+            if batch is not None:
+                kept.append(batch.keep())
+    assert [view[4] for view in kept] == [1, 2, 3]
+    assert all(len(set(bytes(view[4:]))) == 1 for view in kept)
+
+
+def test_a_kept_batch_survives_the_reuse_of_its_buffer() -> None:
+    """`keep` copies once, and returns the same copy to all callers."""
+    area = bytearray(frame(4, 1) + frame(4, 2))
+    batch = Batch(memoryview(area), 2, 8)
+    kept, last = batch.keep(), batch.keep_last()
+    area[:] = bytes(len(area))
+    assert bytes(kept) == frame(4, 1) + frame(4, 2)
+    assert batch.keep() is kept
+    assert (bytes(last.view), last.messages, last.last) == (frame(4, 2), 1, 0)
+
+
+def test_for_little_of_a_large_frame_its_memory_is_not_kept() -> None:
+    """The next frame is received there; for more of it, or where all is kept already, nothing is copied."""
+    view = memoryview(bytearray(frame(1 << 20)))
+    batch = Batch(view, 1, 0, owned=True)
+    little, kept = batch.rest(len(view) - 1000), batch.kept
+    view[-1] = 99
+    assert bytes(little) == frame(1 << 20)[-1000:]
+    assert batch.rest(1000).obj is view.obj
+    assert (kept, batch.kept) == (False, True)
+    assert batch.rest(len(view) - 1000).obj is view.obj
+
+
+def test_boundary_at_finds_the_frame_a_send_stopped_in() -> None:
+    """How many frames are sent, and where the one in progress ends."""
+    view = memoryview(frame(6) + frame(0) + frame(10))
+    assert [boundary_at(view, offset) for offset in (0, 3, 10, 11, 14, 15, 28)] == [
+        (0, 0),
+        (0, 10),
+        (1, 10),
+        (1, 14),
+        (2, 14),
+        (2, 28),
+        (3, 28),
+    ]
+
+
+@given(st.lists(st.sampled_from([0, 5, 5, 5, 252, 256, 65_536]), max_size=12), st.integers(0, 9))
+@example([5, 5, 5, 5, 0], 0)
+def test_equal_frames_are_seen_at_once_exactly_if_all_are_equal(lengths: list[int], torn: int) -> None:
+    """The result for the whole buffer equals that of a walk from frame to frame."""
+    data = b"".join(frame(length) for length in lengths) + frame(20)[:torn]
+    stride, count = equal_frames(memoryview(data), len(data))
+    if count:
+        assert lengths[:count] == [stride - 4] * count
+        assert all(length + 4 > len(data) - stride * count for length in lengths[count:])
+    else:
+        assert stride == 0
+        assert len(lengths) < 4 or len(set(lengths)) > 1 or torn >= lengths[0] + 4
+
+
+def test_a_batch_of_equal_frames_says_so() -> None:
+    """A reader can take all fields at once; a frame of another size ends that."""
+    one, _ = receiver()
+    data = frame(6) * 5 + frame(6)[:3]
+    one.buffer()[: len(data)] = data
+    equal = one.received(len(data))
+    rest = frame(6)[3:] + frame(6) * 3 + frame(7)
+    one.buffer()[: len(rest)] = rest
+    other = one.received(len(rest))
+    assert equal is not None
+    assert other is not None
+    assert (equal.messages, equal.stride, equal.last) == (5, 10, 40)
+    assert (other.messages, other.stride, other.last) == (5, 0, 40)
+
+
+def test_the_last_frame_is_looked_for_where_it_is_not_known() -> None:
+    """A batch that something was cut out of is latched all the same."""
+    view = memoryview(frame(6) + frame(0) + frame(10, 3))
+    assert last_frame(view) == 14
+    assert bytes(Batch(view, 3, None).keep_last().view) == frame(10, 3)

@@ -1,0 +1,133 @@
+"""A channel served by the relay's loop."""
+
+import os
+import socket
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import pytest
+
+from appliance.channel.channel import Channel
+from appliance.channel.messages import NodePlaced, NodeWithdrawn, RelayLink, UpstreamWanted
+from appliance.relay.loop import QUANTUM, EventLoop
+from appliance.relay.transport.loop_channel import LoopLink
+
+
+class Ends:
+    """A link and its other end."""
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        self.used = 0
+        self.loop = EventLoop(lambda: self.used)
+        self.received: list[Any] = []
+        self.waits = False
+        self.ended: list[str] = []
+        self.raw = ours
+        self.other = Channel(ours, RelayLink)
+        self.link = LoopLink(self.loop, Channel(theirs, RelayLink), self._take, self.ended.append)
+
+    def _take(self, message: Any, descriptors: tuple[int, ...]) -> bool:
+        if self.waits:
+            return True
+        self.received.append(message)
+        self.used += QUANTUM // 100
+        for descriptor in descriptors:
+            os.close(descriptor)
+        return False
+
+    def close(self) -> None:
+        """End both."""
+        self.link.close()
+        self.other.close()
+        self.loop.close()
+
+
+def send(sock: socket.socket, count: int) -> None:
+    """Return this number of withdrawals in one piece, as the kernel takes them at once."""
+    bodies = [msgspec.msgpack.encode(NodeWithdrawn(str(number))) for number in range(count)]
+    data = b"".join(struct.pack(">I", len(body)) + body for body in bodies)
+    assert sock.send(data) == len(data)
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    """Both ends."""
+    ends = Ends()
+    yield ends
+    ends.close()
+
+
+def test_thousands_of_messages_are_carried_out_a_quantum_at_a_time_and_in_order(ends: Ends) -> None:
+    """Other sockets have their turn in between, as messages cost a hundredth of a quantum here."""
+    send(ends.raw, 1000)
+    ends.loop.turn(1)
+    assert 0 < len(ends.received) <= 210
+    while len(ends.received) < 1000:
+        ends.loop.turn(1)
+    assert [message.key for message in ends.received] == [str(number) for number in range(1000)]
+
+
+def test_catch_up_carries_out_everything_that_was_sent(ends: Ends) -> None:
+    """Peers are judged by the latest grants."""
+    send(ends.raw, 1000)
+    ends.link.catch_up()
+    assert len(ends.received) == 1000
+
+
+def test_what_was_sent_before_the_end_counts(ends: Ends) -> None:
+    """The end is reported after it, once."""
+    send(ends.raw, 600)
+    ends.other.close()
+    for _ in range(4):
+        ends.loop.turn(0.1)
+    assert len(ends.received) == 600
+    assert len(ends.ended) == 1
+
+
+def test_closing_closes_descriptors_that_nobody_took(ends: Ends) -> None:
+    """A replaced control leaves nothing open."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        for number in range(40):
+            ends.other.send(NodePlaced(str(number), "/n", "h"), (listening.fileno(),))
+        before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - of the kernel, not a folder
+        ends.link.close()
+        assert len(os.listdir("/proc/self/fd")) <= before  # noqa: PTH208 - of the kernel, not a folder
+
+
+def test_while_messages_wait_no_more_is_read(ends: Ends) -> None:
+    """What waits is bounded, and reports go out meanwhile. Then all is carried out in order, and the end after it."""
+    ends.waits = True
+    body = msgspec.msgpack.encode(NodeWithdrawn("k"))
+    frame, sent = struct.pack(">I", len(body)) + body, 0
+    ends.raw.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        while sent < 1 << 24:
+            data = frame * 1000
+            sent += ends.raw.send(data[sent % len(frame) :])
+            ends.link.catch_up()
+            ends.loop.turn(0)
+    ends.link.send(UpstreamWanted("k", "/topic"))
+    assert [message for message, _ in ends.other.receive()] == [UpstreamWanted("k", "/topic")]
+    ends.other.close()
+    ends.loop.turn(0)
+    assert ends.received == ends.ended == []
+    ends.waits = False
+    ends.link.go_on()
+    while not ends.ended:
+        ends.loop.turn(1)
+    assert len(ends.received) == sent // len(frame)
+    assert len(ends.ended) == 1
+
+
+def test_an_end_that_does_not_read_yet_gets_everything_later(ends: Ends) -> None:
+    """Nothing is lost while the socket is full, and nothing blocks."""
+    for number in range(20_000):
+        ends.link.send(UpstreamWanted(str(number), "/topic"))
+    keys: list[str] = []
+    while len(keys) < 20_000:
+        ends.loop.turn(0.1)
+        keys += [message.key for message, _descriptors in ends.other.receive()]
+    assert keys == [str(number) for number in range(20_000)]

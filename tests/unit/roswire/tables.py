@@ -1,0 +1,15 @@
+"""Tables of texts for tests: `tables.txt` has a row in each line, its columns between ` => `, with Python's escapes."""
+
+from pathlib import Path
+
+from tests.unit.transcripts import transcripts
+
+_TABLES = transcripts(Path(__file__).with_name("tables.txt"))
+
+
+def rows(title: str) -> list[tuple[str, ...]]:
+    """Return the rows of a table."""
+    return [
+        tuple(column.encode("ascii").decode("unicode_escape") for column in line.split(" => "))
+        for line in _TABLES[title]
+    ]

@@ -1,0 +1,27 @@
+"""Fixtures of the tests of RVMaster's server."""
+
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+
+from tests.support.http_server import Client, Server, serving
+
+
+@pytest.fixture
+def anyio_backend() -> tuple[str, dict[str, Any]]:
+    """Return the loop that control runs on."""
+    return "asyncio", {"use_uvloop": True}
+
+
+@pytest.fixture
+async def server() -> AsyncIterator[Server]:
+    """Run a server that echoes bodies."""
+    async with serving() as server:
+        yield server
+
+
+@pytest.fixture
+async def client(server: Server) -> Client:
+    """Return a connection to it."""
+    return await server.connect()

@@ -1,0 +1,178 @@
+"""Connections are sorted by source address into two accept queues."""
+
+import contextlib
+import ipaddress
+import socket
+from collections.abc import Callable, Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.policy.model import address_of
+from appliance.policy.policy_compiler import compile_policy
+from appliance.rpc.acceptor import BACKLOG
+from appliance.rpc.server import listen
+from appliance.rpc.source_queues import FIRST, SECOND, NamedFirst, Network, SourceQueues, first_for
+from tests.support.classic_bpf import choose
+
+WAIT = 20.0
+
+
+def networks(*texts: str) -> list[Network]:
+    """Parse networks."""
+    return [ipaddress.ip_network(text) for text in texts]
+
+
+def _network(version: int, bits: int) -> st.SearchStrategy[Network]:
+    def network(number: int, length: int) -> Network:
+        return ipaddress.ip_network((number >> (bits - length) << (bits - length), length))
+
+    assert version in (4, 6)
+    # All addresses begin alike, so that most comparisons go beyond the first word.
+    small = st.integers(0, 2**bits - 1).map(lambda number: number & (0x3 << (bits // 2)) | number & 0x3)
+    lengths = st.integers(1 if version == 4 else 33, bits)
+    return st.builds(network, small if version == 4 else small.map(lambda number: number | 1 << 120), lengths)
+
+
+NETWORK = _network(4, 32) | _network(6, 128)
+
+
+@given(st.lists(NETWORK, max_size=12), st.lists(NETWORK, min_size=1, max_size=12))
+def test_the_program_sends_hosts_of_the_networks_to_the_first_socket(
+    known: list[Network], others: list[Network]
+) -> None:
+    """An address goes to the first socket exactly if one of the networks holds it."""
+    program = first_for(known)
+    for network in [*known, *others]:
+        for source in (network.network_address, network.broadcast_address):
+            held = any(source in one for one in known if one.version == source.version)
+            assert choose(program, source) == (FIRST if held else SECOND)
+
+
+def test_more_networks_than_a_program_has_room_for() -> None:
+    """No host is put behind others because of a policy that names too many networks."""
+    many = [ipaddress.ip_network(f"10.{number >> 8}.{number & 255}.0/24") for number in range(1000)]
+    assert choose(first_for(many[:200]), ipaddress.ip_address("192.0.2.1")) == SECOND
+    assert choose(first_for(many), ipaddress.ip_address("192.0.2.1")) == FIRST
+
+
+class Port:
+    """A port with two queues; `known` is sorted into the first."""
+
+    def __init__(self, host: str, *known: str) -> None:
+        self.program = first_for(networks(*known))
+        self.first = listen(host, 0)
+        self.first.settimeout(WAIT)
+        self.queues = SourceQueues(self.first, lambda: self.program, BACKLOG)
+        self.queues.second.settimeout(WAIT)
+
+    def accepts(self, source: str, by: socket.socket) -> None:
+        """Connect from a source; the connection must come out of this socket."""
+        target = (source if ":" in source else "127.0.0.1", self.first.getsockname()[1])
+        other = self.queues.second if by is self.first else self.first
+        with socket.create_connection(target, WAIT, source_address=(source, 0)):
+            by.accept()[0].close()
+            if other.fileno() >= 0:
+                other.setblocking(False)
+                with pytest.raises(BlockingIOError):
+                    other.accept()
+                other.settimeout(WAIT)
+
+
+@pytest.fixture
+def port() -> Iterator[Callable[..., Port]]:
+    """Open ports, and close them at the end."""
+    with contextlib.ExitStack() as stack:
+
+        def opened(host: str, *known: str) -> Port:
+            port = Port(host, *known)
+            stack.enter_context(port.first)
+            stack.enter_context(port.queues.second)
+            return port
+
+        yield opened
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0", "::"])
+def test_the_kernel_sorts_connections(port: Callable[..., Port], host: str) -> None:
+    """Also those that come over IPv4 to a socket of IPv6."""
+    both = port(host, "127.0.0.2/32", "127.0.1.0/24")
+    for source in ("127.0.0.2", "127.0.1.9"):
+        both.accepts(source, both.first)
+    for source in ("127.0.0.3", "127.0.2.1"):
+        both.accepts(source, both.queues.second)
+
+
+@pytest.mark.parametrize(
+    ("known", "first"), [("::1", True), ("::/0", True), ("::2", False), ("127.0.0.0/8", False)]
+)
+def test_the_kernel_sorts_connections_of_ipv6(port: Callable[..., Port], known: str, first: bool) -> None:
+    """By the whole address."""
+    both = port("::", known)
+    both.accepts("::1", both.first if first else both.queues.second)
+
+
+def test_a_full_queue_keeps_no_host_of_the_other_one_out(port: Callable[..., Port]) -> None:
+    """Unknown hosts fill their queue: a known host connects at once."""
+    both = port("127.0.0.1", "127.0.0.2/32")
+    both.queues.second.listen(1)
+    with contextlib.ExitStack() as stack:
+        with pytest.raises(TimeoutError):
+            for _ in range(10):
+                stack.enter_context(
+                    socket.create_connection(both.first.getsockname(), 0.3, source_address=("127.0.0.3", 0))
+                )
+        with socket.create_connection(both.first.getsockname(), WAIT, source_address=("127.0.0.2", 0)):
+            both.first.accept()[0].close()
+
+
+def test_a_new_policy_changes_the_queues(port: Callable[..., Port]) -> None:
+    """The program is attached again when it is another one."""
+    both = port("127.0.0.1", "127.0.0.2/32")
+    both.program = first_for(networks("127.0.0.3/32"))
+    both.queues.update()
+    both.accepts("127.0.0.3", both.first)
+    both.accepts("127.0.0.2", both.queues.second)
+
+
+def test_the_first_socket_outlives_the_second(port: Callable[..., Port]) -> None:
+    """Control ends, and its second socket with it: all connections wait at the first, and the next control sorts."""
+    both = port("127.0.0.1", "127.0.0.2/32")
+    both.queues.second.close()
+    for source in ("127.0.0.2", "127.0.0.3"):
+        both.accepts(source, both.first)
+    both.queues = SourceQueues(both.first, lambda: both.program, BACKLOG)
+    both.queues.second.settimeout(WAIT)
+    both.accepts("127.0.0.2", both.first)
+    both.accepts("127.0.0.3", both.queues.second)
+    both.queues.second.close()
+
+
+def test_a_port_with_two_sockets_is_in_use(port: Callable[..., Port]) -> None:
+    """A search for a free port passes it by."""
+    both = port("127.0.0.1")
+    with pytest.raises(OSError, match="in use"):
+        listen("127.0.0.1", both.first.getsockname()[1])
+
+
+def test_a_new_policy_sorts_connections() -> None:
+    """The program is made once for each policy."""
+    policies = [compile_policy(f"[Nodes]\ndefault = {host}\n", file="a.ini") for host in ("10.0.0.1", "*")]
+    policy = policies[0]
+    program = NamedFirst(lambda: policy)
+    before = program()
+    assert program() is before
+    policy = policies[1]
+    assert program() != before
+
+
+def test_hosts_that_the_policy_names_are_accepted_first() -> None:
+    """Members of groups and networks, and this machine; not hosts that only `*` names."""
+    rules = "default = team 10.1.0.0/16\n/guest/** = *\n"
+    policy = compile_policy(f"[Groups]\nteam = 10.0.0.1 fd77::/64\n[Nodes]\n{rules}", file="a.ini")
+    program = NamedFirst(lambda: policy)()
+    for text in ("10.0.0.1", "10.1.9.9", "fd77::9", "127.0.0.1", "::1"):
+        assert choose(program, address_of(text)) == FIRST
+    for text in ("10.0.0.2", "10.2.0.1", "fd78::9", "::2"):
+        assert choose(program, address_of(text)) == SECOND

@@ -1,0 +1,329 @@
+"""The monitors of one control over its life times, with a relay that takes everything; and orders to them as text.
+
+Orders (`Dialogue.say`); `b` is the file b.rv with the text `b` of `TEXTS`, `c.rv:u` the file c.rv with the text `u`:
+
+    start [enable=none] [restarted] [no-folder]     a control starts
+    folder b | folder c.rv:u |    folder -b         write or delete a file of the folder
+    live /other /talker std_msgs/Int32              a node publishes a topic
+    relay no | relay yes | relay away               the relay refuses every statement, takes it, or is away
+    relay begins b                                  its answers name the monitors that began in their initial state
+    relay starts | relay takes 1 held=b             another relay is sent its statement; its answer
+    revisions                                       list the kept revisions
+    eve load b shadow confirm_within=0              an operator's order, with fields of its request
+    revision 3                                      wait until this revision is in force
+
+Effects follow: the answer (or refusal), what the relay is sent, the records, and the monitors if they have changed.
+"""
+
+import asyncio
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from msgspec.structs import asdict
+
+from appliance.audit.log import AuditLog
+from appliance.channel import admin, messages
+from appliance.specifications.allocation import Allocation, Move, Resource
+from appliance.specifications.checking import check
+from appliance.specifications.live_topics import LiveType, Published
+from appliance.specifications.specification_files import (
+    CheckedSpecifications,
+    Sources,
+    SpecificationsRefusedError,
+)
+from appliance.specifications.specification_manager import (
+    MonitorsChangedError,
+    SpecificationManager,
+    UnknownMonitorError,
+)
+from appliance.specifications.specification_revisions import Check
+from appliance.store.state_file import StateStore
+from tests.support.audit import RecordingTrail
+from tests.support.stated import parts_here
+
+A = "a() { int shared; event said() /chatter std_msgs/String '{}' { } }"
+B = "hold b() { event said() /other std_msgs/String '{}' { } }"
+C = "c() { event said() /third std_msgs/String '{}' { } }"
+USER = "u() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
+TEXTS = {
+    "a": A,
+    "a2": A.replace("{", "{ int n;", 1),
+    "b": B,
+    "c": C,
+    "u": USER,
+    "v": USER.replace("u()", "v()"),
+    "c-user": C.replace("{ }", "{ shared = 2; }"),
+    "c-and-d": USER.replace("u()", "c()") + "\nd() { event said() /x std_msgs/String '{}' { } }",
+    "c-unknown": "c() { event e() /x nobody/Knows '{}' { } }",
+    "nonsense": "nonsense",
+}
+
+
+async def here(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+    """The compiler, in this process."""
+    return await asyncio.to_thread(check, sources, site_keys)
+
+
+class Desk:
+    """The monitors of one control over its life times, with a relay that takes everything."""
+
+    def __init__(self, home: Path) -> None:
+        self.home, self.folder = home, home / "monitors"
+        self.folder.mkdir()
+        (self.folder / "a.rv").write_text(A)
+        self.log = AuditLog(home / "audit.db")
+        self.trail = RecordingTrail(self.log)
+        self.store = StateStore(home, failed=pytest.fail)
+        self.sent: list[messages.Message] = []
+        self.findings: list[str] = []
+        self.began: list[str] = []
+        self.away = False
+        self.carried_out = asyncio.Event()
+        self.carried_out.set()
+        self.try_out: Check = here
+        self.check: Check = here
+        self.live: Published = {}
+
+    async def monitors(
+        self,
+        enable: str = "all",
+        *,
+        restarted: bool = False,
+        folder: bool = True,
+        site_keys: Sequence[str] = (),
+    ) -> SpecificationManager:
+        """A control starts."""
+        relay = Taking(self)
+        relay.monitors = SpecificationManager(
+            self.folder if folder else None,
+            enable,
+            self.store,
+            self.trail,
+            on_fault="drop",
+            slices=1000,
+            allocation=Allocation(1),
+            relays=relay,
+            published=lambda: None,
+            told=[],
+            site_keys=site_keys,
+            check=lambda sources, keys: self.check(sources, keys),  # noqa: PLW0108  of whatever it is then
+            try_out=self.try_out,
+            parts=parts_here,
+            live=lambda: self.live,
+        )
+        await relay.monitors.start(restarted=restarted)
+        return relay.monitors
+
+    def close(self) -> None:
+        """Close its files."""
+        self.store.close()
+        self.log.close()
+
+
+class Taking:
+    """One relay, which takes everything, or refuses it with the findings of the desk; or is away."""
+
+    monitors: SpecificationManager
+
+    def __init__(self, desk: Desk) -> None:
+        self.desk = desk
+
+    def send(self, message: messages.Message, relay: int) -> bool:
+        """It answers in the next turn of the loop."""
+        if self.desk.away:
+            return False
+        self.desk.sent.append(message)
+        if isinstance(message, messages.SpecificationsStated):
+            answer: messages.Message = messages.SpecificationsTaken(
+                message.revision, self.desk.began, [], message.statement
+            )
+            if self.desk.findings:
+                answer = messages.SpecificationsRefused(
+                    message.revision, self.desk.findings, message.statement
+                )
+            asyncio.get_running_loop().call_soon(self.monitors.received, answer, relay)
+        return True
+
+    async def carried_out(self) -> None:
+        """When the desk says so."""
+        await self.desk.carried_out.wait()
+
+    def carried_now(self) -> set[Resource]:
+        """Nothing is carried."""
+        return set()
+
+    def withdraw(self, moves: Sequence[Move]) -> None:
+        """Nothing is carried."""
+
+    def place(self, moves: Sequence[Move]) -> None:
+        """Nothing is carried."""
+
+
+_ORDERS: dict[str, tuple[str, type[Any], dict[str, Any]]] = {
+    "load": ("load", admin.MonitorLoad, {}),
+    "try": ("attempt", admin.MonitorTry, {}),
+    "reload": ("reload", admin.MonitorReload, {}),
+    "remove": ("remove", admin.MonitorRemove, {}),
+    "rollback": ("roll_back", admin.MonitorRollback, {}),
+    "confirm": ("confirm", admin.MonitorConfirm, {}),
+    "enable": ("switch", admin.MonitorSwitch, {"enabled": True}),
+    "disable": ("switch", admin.MonitorSwitch, {"enabled": False}),
+    "shadow": ("shadow", admin.MonitorShadow, {"shadow": True}),
+    "promote": ("shadow", admin.MonitorShadow, {"shadow": False}),
+    "trial": ("trial", admin.MonitorTrial, {"trial": True}),
+    "end-trial": ("trial", admin.MonitorTrial, {"trial": False}),
+    "resume": ("resume", admin.MonitorResume, {}),
+}
+_FLAGS = {"shadow", "force", "prune"}
+
+
+def _file(word: str) -> tuple[str, str]:
+    name, _, text = word.partition(":")
+    return (name, TEXTS[text]) if text else (f"{name}.rv", TEXTS[name])
+
+
+class Dialogue:
+    """Orders to the monitors of a desk, and their effects."""
+
+    def __init__(self, desk: Desk) -> None:
+        self.desk = desk
+        self._monitors: SpecificationManager | None = None
+        self._last = ""
+
+    async def say(self, line: str) -> list[str]:
+        """Return the effects of one line."""
+        self.desk.sent.clear()
+        self.desk.trail.heard.clear()
+        effects = await self._done(shlex.split(line))
+        for _ in range(3):  # a relay answers in the next turn
+            await asyncio.sleep(0)
+        now = self._now()
+        effects += [*map(_shown, self.desk.sent), *(_record(*one) for one in self.desk.trail.heard)]
+        if now != self._last:
+            effects.append(now)
+        self._last = now
+        return effects
+
+    async def _done(self, said: list[str]) -> list[str]:  # noqa: PLR0912 - one branch for each action
+        desk = self.desk
+        match said:
+            case ["start", *how]:
+                await desk.store.settled()
+                given = dict(word.split("=") for word in how if "=" in word)
+                start = desk.monitors(restarted="restarted" in how, folder="no-folder" not in how, **given)
+                try:
+                    self._monitors, self._last = await start, ""
+                except SpecificationsRefusedError as refusal:
+                    return _refused(refusal)
+            case ["folder", word] if word.startswith("-"):
+                (desk.folder / f"{word[1:]}.rv").unlink()
+            case ["folder", word]:
+                name, text = _file(word)
+                (desk.folder / name).write_text(text)
+            case ["live", topic, node, kind]:
+                desk.live = {**desk.live, topic: {node: LiveType(kind)}}
+            case ["relay", "no" | "yes" | "away" as how]:
+                desk.away, desk.findings = how == "away", ["the relay says no"] if how == "no" else []
+            case ["relay", "begins", *names]:
+                desk.began = names
+            case ["relay", "starts"]:
+                desk.sent.append(self.monitors.statement(0))
+            case ["revisions"]:
+                rows = (await self.monitors.revisions(admin.MonitorRevisions())).revisions
+                return [f"revision {row.revision} by {row.who}: {row.note}" for row in rows]
+            case ["relay", "takes", revision, *how]:
+                fields = {key: value.split(",") for key, value in (word.split("=") for word in how)}
+                taken = messages.SpecificationsTaken(
+                    int(revision), fields.get("began", []), fields.get("held", [])
+                )
+                self.monitors.received(taken)
+            case ["revision", number]:
+                async with asyncio.timeout(30):
+                    while self.monitors.revision != int(number):
+                        await asyncio.sleep(0.01)
+            case [who, verb, *words]:
+                return await self._ordered(who, verb, words)
+        return []
+
+    @property
+    def monitors(self) -> SpecificationManager:
+        """The monitors of the control that started last."""
+        assert self._monitors is not None
+        return self._monitors
+
+    async def _ordered(self, who: str, verb: str, words: list[str]) -> list[str]:
+        method, request, fixed = _ORDERS[verb]
+        fields: dict[str, Any] = dict(fixed)
+        fields |= {word: True for word in words if word in _FLAGS}
+        fields |= dict(word.split("=") for word in words if "=" in word)
+        plain = [word for word in words if word not in _FLAGS and "=" not in word]
+        if verb in ("load", "try"):
+            fields["files"] = dict(map(_file, plain))
+        elif verb == "rollback":
+            fields["revision"] = plain[0] if plain else None
+        elif plain:
+            fields["names"] = plain
+        try:
+            answer = await getattr(self.monitors, method)(msgspec.convert(fields, request, strict=False), who)
+        except (SpecificationsRefusedError, UnknownMonitorError, MonitorsChangedError) as refusal:
+            return _refused(refusal)
+        given = {key: value for key, value in asdict(answer).items() if value and key not in _VARYING}
+        limit = ["to confirm"] if getattr(answer, "confirm_by", None) else []
+        return [f"answer {_words(given)}".strip(), *limit]
+
+    def _now(self) -> str:
+        if self._monitors is None:
+            return ""
+        one, states = self.monitors, self.monitors.switches.states
+        shown = [f"{name}={_STATES.get(states[name], states[name])}" for name in one.names()]
+        extra = {
+            "to be confirmed": one.confirm_by is not None,
+            "differs from the folder": one.differs_from_folder,
+            f"holds {','.join(sorted(one.rollout.held))}": bool(one.rollout.held),
+            f"switched off {','.join(one.switches.switched_off())}": bool(one.switches.switched_off()),
+        }
+        said = "".join(f"; {text}" for text, holds in extra.items() if holds)
+        return f"now {one.tag} by {one.in_force.who or 'nobody'}: {' '.join(shown) or 'nothing'}{said}"
+
+
+_VARYING = {"confirm_by", "tag"}
+_STATES = {True: "on", False: "off", "shadow": "shadow"}
+_RECORDED = ("who", "monitor", "began", "held", "count", "lost")
+
+
+def _words(fields: dict[str, Any]) -> str:
+    shown = {
+        key: ",".join(map(str, value)) if isinstance(value, list) else value for key, value in fields.items()
+    }
+    return " ".join(f"{key}={value}" for key, value in shown.items())
+
+
+def _refused(refusal: Exception) -> list[str]:
+    match refusal:
+        case MonitorsChangedError():
+            how = f"outdated, now {refusal.tag}"
+        case UnknownMonitorError():
+            how = "unknown"
+        case _:
+            how = "refused"
+    return [f"{how}: {line}" for line in str(refusal).splitlines()]
+
+
+def _shown(message: messages.Message) -> str:
+    if isinstance(message, messages.SpecificationsStated):
+        states = {name: "on" if on else "off" for name, on in message.enabled.items()}
+        states |= {
+            name: "shadow" if states.get(name) == "on" else "off and in shadow" for name in message.shadows
+        }
+        restarted = " restarted" if message.restarted else ""
+        return f"relay {message.revision}{restarted}: {_words(states)}".strip()
+    return f"relay {message}"
+
+
+def _record(event: str, fields: dict[str, Any]) -> str:
+    given = {key: fields[key] for key in _RECORDED if fields.get(key)}
+    return f"record {event}: {_words(given)}".strip()

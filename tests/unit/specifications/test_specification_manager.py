@@ -1,0 +1,307 @@
+"""The specifications in force: revisions, switches, statements to the relay and its answers."""
+
+import asyncio
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from msgspec.structs import asdict
+
+from appliance.base.withdrawal import WithdrawnError, awaited
+from appliance.channel import admin, messages
+from appliance.specifications.specification_files import (
+    CheckedSpecifications,
+    Sources,
+    SpecificationsRefusedError,
+)
+from appliance.specifications.specification_manager import (
+    DryRunUnderWayError,
+    MonitorsChangedError,
+)
+from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
+from tests.unit.specifications.monitor_desk import A, B, Desk, Dialogue, here
+from tests.unit.transcripts import played, transcripts
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    """A folder with one specification."""
+    desk = Desk(tmp_path)
+    yield desk
+    desk.close()
+
+
+ORDERS = transcripts(Path(__file__).with_name("orders.txt"))
+
+
+@pytest.mark.parametrize("title", ORDERS, ids=ORDERS)
+async def test_orders(desk: Desk, title: str) -> None:
+    """Each order has the effects below it, all of them and in that order (`monitor_desk.py` has the form)."""
+    assert await played(ORDERS[title], Dialogue(desk).say) == ORDERS[title]
+
+
+async def test_a_monitor_that_is_disabled_for_a_time_comes_back(desk: Desk) -> None:
+    """It is enabled again automatically, as before, and both changes are recorded."""
+    monitors = await desk.monitors()
+    await monitors.shadow(admin.MonitorShadow(["a"], True), "eve")
+    for state, seconds in (("shadow", 0.05), (True, 0.05)):
+        await monitors.shadow(admin.MonitorShadow(["a"], state is not True), "eve")
+        tag = monitors.tag
+        await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=seconds), "eve")
+        assert monitors.returns.until("a") is not None
+        async with asyncio.timeout(30):
+            while monitors.switches.states["a"] is False:
+                await asyncio.sleep(0.01)
+        assert (monitors.switches.states["a"], monitors.returns.until("a")) == (state, None)
+        assert monitors.tag != tag
+    rows = [row for row in desk.trail.heard if row[0] in {"monitor disabled", "monitor enabled"}]
+    assert [row[0] for row in rows] == [
+        "monitor disabled", "monitor enabled", "monitor disabled", "monitor enabled"
+    ]  # fmt: skip
+
+
+async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -> None:
+    """After a restart the monitor comes back; an operator's switch, or a removal, ends the time."""
+    monitors = await desk.monitors()
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
+    await monitors.switch(admin.MonitorSwitch(["a", "b"], False, for_seconds=3600), "eve")
+    again = await desk.monitors()
+    assert again.returns.until("a") == pytest.approx(monitors.returns.until("a"), abs=5)
+    await again.switch(admin.MonitorSwitch(["a"], False, for_seconds=0.05), "eve")  # shorter than before
+    await again.remove(admin.MonitorRemove(["b"]), "eve")
+    assert again.returns.until("b") is None
+    later = await desk.monitors(restarted=True)
+    async with asyncio.timeout(30):
+        while not later.switches.enabled("a"):
+            await asyncio.sleep(0.01)
+    await later.switch(admin.MonitorSwitch(["a"], False, for_seconds=3600), "eve")
+    assert (await later.switch(admin.MonitorSwitch(["a"], False), "eve")).names == ["a"]  # now without an end
+    assert (later.switches.states["a"], later.returns.until("a")) == (False, None)
+
+
+async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> None:
+    """A slow load that is withdrawn while it is compiled, or while it waits for another change, changes nothing."""
+    begun, goes_on, gone = asyncio.Event(), asyncio.Event(), False
+
+    async def slow(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+        begun.set()
+        await goes_on.wait()
+        return await here(sources, site_keys)
+
+    monitors = await desk.monitors()
+    desk.check = slow
+
+    async def order(*changes: Callable[[], Any]) -> None:
+        with awaited(lambda: gone):
+            for change in changes:
+                await change()
+
+    load = partial(monitors.load, admin.MonitorLoad({"b.rv": B}, shadow=True, confirm_within=60.0), "eve")
+    first = asyncio.ensure_future(order(load))
+    await begun.wait()
+    switch = partial(monitors.switch, admin.MonitorSwitch(["a"], False), "eve")
+    second = asyncio.ensure_future(order(switch))
+    await asyncio.sleep(0)
+    desk.sent.clear()
+    tag, gone = monitors.tag, True
+    goes_on.set()
+    for withdrawn in (first, second):
+        with pytest.raises(WithdrawnError):
+            await withdrawn
+    assert (monitors.tag, monitors.names(), monitors.switches.states) == (tag, ["a"], {"a": True})
+    assert (monitors.confirm_by, monitors.switches.said, desk.sent) == (None, {}, [])
+    gone = False
+    await order(load)
+    assert monitors.names() == ["a", "b"]
+
+
+async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
+    """A second dry run of the same token is refused, that of another token is not; then it may have another one."""
+    begun, goes_on = asyncio.Event(), asyncio.Event()
+
+    async def slow(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+        begun.set()
+        await goes_on.wait()
+        return await here(sources, site_keys)
+
+    desk.try_out = slow
+    monitors = await desk.monitors()
+    shadowed = admin.MonitorTry({"b.rv": B})
+    first = asyncio.ensure_future(monitors.attempt(shadowed, "eve"))
+    await begun.wait()
+    with pytest.raises(DryRunUnderWayError, match="you have a dry run under way"):
+        await monitors.attempt(shadowed, "eve")
+    other = asyncio.ensure_future(monitors.attempt(shadowed, "adam"))
+    goes_on.set()
+    assert [(await one).added for one in (first, other)] == [["b.rv"]] * 2
+    assert (await monitors.attempt(shadowed, "eve")).added == ["b.rv"]
+
+
+async def test_records_of_loads_have_the_hash_of_the_files_and_of_what_was_compiled(desk: Desk) -> None:
+    """The first is what `sha256sum` makes of the files; equal texts have the same hash, whoever compiled them."""
+    monitors = await desk.monitors()
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
+    await monitors.reload(admin.MonitorReload(prune=True), "operator")
+    (desk.folder / "b.rv").write_text(B)
+    lines = [
+        f"{hashlib.sha256((desk.folder / name).read_bytes()).hexdigest()}  {name}\n"
+        for name in ("a.rv", "b.rv")
+    ]
+    of_all = [hashlib.sha256("".join(some).encode()).hexdigest() for some in (lines[:1], lines, lines[:1])]
+    loaded = [fields for event, fields in desk.trail.heard if event == "specifications loaded"]
+    assert [fields["sha256"] for fields in loaded] == of_all
+    compiled = [fields["compiled_sha256"] for fields in loaded]
+    assert compiled[0] == compiled[2] != compiled[1]
+
+
+async def test_a_switch_is_answered_when_the_relay_has_carried_it_out(desk: Desk) -> None:
+    """Messages after the answer are judged by the switch; the same holds when monitors are resumed."""
+    monitors = await desk.monitors()
+    monitors.received(messages.SpecificationsTaken(1, [], ["a"], monitors.statement(0).statement))
+    for order in (
+        monitors.switch(admin.MonitorSwitch(["a"], False), "eve"),
+        monitors.resume(admin.MonitorResume(["a"]), "eve"),
+    ):
+        desk.carried_out.clear()
+        told = len(desk.sent)
+        task = asyncio.ensure_future(order)
+        while len(desk.sent) == told:
+            await asyncio.sleep(0)
+        await desk.store.settled()
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert not task.done()
+        desk.carried_out.set()
+        assert (await task).names == ["a"]
+
+
+async def test_one_of_two_concurrent_changes_is_made(desk: Desk) -> None:
+    """They arrive together, and the first takes long."""
+    (desk.folder / "b.rv").write_text(B)
+    monitors = await desk.monitors()
+    monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
+    tag = monitors.tag
+    done = await asyncio.gather(
+        monitors.load(admin.MonitorLoad({"c.rv": A.replace("a()", "c()")}, expected=tag), "adam"),
+        monitors.switch(admin.MonitorSwitch(["a"], False, expected=tag), "eve"),
+        monitors.resume(admin.MonitorResume(["b"], expected=tag), "eve"),
+        return_exceptions=True,
+    )
+    assert [isinstance(one, MonitorsChangedError) for one in done] == [False, True, True]
+    assert monitors.switches.enabled("a")
+    assert messages.MonitorResumed("b") not in desk.sent
+
+
+async def test_actions_of_monitors_are_recorded_with_their_count(desk: Desk) -> None:
+    """Records have the bytes before and after as hexadecimal digits, and the count of unreported actions."""
+    monitors = await desk.monitors()
+    told = [
+        messages.MonitorEvent("change", "a", "k", "/chatter", 1, "a changed", {}, b"\x01", b"\x02", 1),
+        messages.MonitorEvent("change", "a", "k", "/chatter", 2, "", {}, count=41),
+        messages.MonitorEvent("fault", "a", "k", "/chatter", 3, "a.rv:1:2: division by zero", {"line": 1}),
+    ]
+    together = {"changed_by": ["a.e", "b.e", "b.f"]}
+    told += [
+        messages.MonitorEvent(
+            "change", "b", "k", "/cmd", 4, "a and b changed a message", together, b"\x01", b"\x02", 1
+        ),
+        messages.MonitorEvent("change", "b", "k", "/cmd", 5, "a.e, b.e, b.f", together, count=9),
+    ]
+    monitors.received(messages.MonitorsReported(told, 5))
+    changed = [fields for event, fields in desk.trail.heard if event == "message changed"]
+    assert (changed[0]["before"], changed[0]["after"], changed[1]["count"]) == ("01", "02", 41)
+    assert changed[3]["more"] == together
+    assert (monitors.records.counts["change", "a"], monitors.records.counts["change", "b"]) == (52, 10)
+    assert (monitors.records.at["change", "/chatter"], monitors.records.at["change", "/cmd"]) == (42, 10)
+    assert [fields["lost"] for event, fields in desk.trail.heard if event == "records lost"] == [5]
+
+
+def sources(**texts: str) -> Sources:
+    """Files and their signatures."""
+    files = {f"{name}.rv": text for name, text in texts.items()}
+    return Sources(files, {}, {name: signed(text) for name, text in files.items()})
+
+
+async def test_where_the_site_signs_nothing_else_comes_into_force(desk: Desk) -> None:
+    """Start, load, reload, removal, rollback, and the start after a crash: each asks for the site's signatures."""
+    unsigned = "a.rv:1:1: error: it has no signature of the site"
+    with pytest.raises(SpecificationsRefusedError, match=unsigned):
+        await desk.monitors(site_keys=[LINE])
+    await desk.monitors()  # revision 1 is unsigned
+    await desk.store.settled()
+    beside = desk.folder / "a.rv.sig"
+    beside.write_text(signed(A))
+    monitors = await desk.monitors(site_keys=[LINE])
+    assert (monitors.revision, monitors.differs_from_folder) == (2, False)
+    for new in (
+        Sources({"b.rv": B}),
+        Sources({"b.rv": B}, {}, {"b.rv": signed(A)}),
+        Sources({"a.rv": A + "//"}),
+    ):
+        with pytest.raises(SpecificationsRefusedError):
+            await monitors.load(admin.MonitorLoad(**asdict(new)), "eve")
+    with pytest.raises(SpecificationsRefusedError, match=r"msg/own/T.msg:1:1: error: it has no signature"):
+        await monitors.load(
+            admin.MonitorLoad({"a.rv": A}, {"own/T.msg": "int32 x"}, signatures={"a.rv": signed(A)}), "eve"
+        )
+    with pytest.raises(SpecificationsRefusedError, match=unsigned):
+        await monitors.roll_back(admin.MonitorRollback(1), "eve")
+    assert monitors.revision == 2
+    await monitors.load(admin.MonitorLoad(**asdict(sources(b=B))), "adam")
+    await monitors.remove(admin.MonitorRemove(["a"]), "adam")
+    assert monitors.sources == sources(b=B)
+    await monitors.roll_back(admin.MonitorRollback(3), "adam")
+    assert monitors.sources == sources(a=A, b=B)
+    (desk.folder / "a.rv").write_text(A + " ")
+    with pytest.raises(SpecificationsRefusedError, match="it is not the text that"):
+        await monitors.reload(admin.MonitorReload(), "adam")
+    beside.write_text(signed(A + " "))
+    assert (await monitors.reload(admin.MonitorReload(), "adam")).changed == ["a.rv"]
+    assert (await desk.monitors(restarted=True, site_keys=[LINE])).sources == sources(a=A + " ", b=B)
+    with pytest.raises(SpecificationsRefusedError, match="rosrv monitor reset"):
+        await desk.monitors(restarted=True, site_keys=[OTHER_LINE])
+    loaded = [fields["signed_by"] for event, fields in desk.trail.heard if event == "specifications loaded"]
+    assert loaded == [[], *([[NAME]] * 5)]
+
+
+async def test_a_signature_that_changes_is_a_change(desk: Desk) -> None:
+    """Keys are replaced by signing the files again; definitions of messages also have signatures."""
+    (desk.folder / "msg" / "own").mkdir(parents=True)
+    texts = {desk.folder / "a.rv": A, desk.folder / "msg" / "own" / "T.msg": "int32 x"}
+    for path, text in texts.items():
+        path.write_text(text)
+        Path(f"{path}.sig").write_text(signed(text))
+    monitors = await desk.monitors(site_keys=[LINE, OTHER_LINE])
+    differs = [monitors.differs_from_folder]
+    for path, text in texts.items():
+        Path(f"{path}.sig").write_text(signed(text, OTHER_KEY))
+    differs.append(monitors.differs_from_folder)
+    await monitors.reload(admin.MonitorReload(), "adam")
+    assert [*differs, monitors.differs_from_folder] == [False, True, False]
+    assert (await desk.monitors(restarted=True, site_keys=[OTHER_LINE])).names() == ["a"]
+
+
+async def test_interventions_in_shadow_mode_do_not_count_as_drops(desk: Desk) -> None:
+    """They are in neither the events nor the counts of drops; `detail` names the intervention."""
+    monitors = await desk.monitors()
+    told = [
+        messages.MonitorEvent(
+            "shadow drop", "a", "k", "/chatter", 1, "a.said dropped it", {}, b"\x01", size=1
+        ),
+        messages.MonitorEvent(
+            "shadow fault", "a", "k", "/chatter", 2, "a.rv:1:2: division by zero", {"line": 1}
+        ),
+    ]
+    monitors.received(messages.MonitorsReported(told, 0))
+    observed = [fields for event, fields in desk.trail.heard if event == "shadow observed"]
+    assert [(fields["shadow"], fields["would"]) for fields in observed] == [(True, "drop"), (True, "fault")]
+    assert {str(fields["severity"]) for fields in observed} == {str(observed[0]["severity"])}
+    assert not {"message dropped", "monitor fault"} & {event for event, _ in desk.trail.heard}
+    assert monitors.records.counts["shadow drop", "a"] == 1
+    assert not monitors.records.counts["drop", "a"]
+    assert not monitors.records.at

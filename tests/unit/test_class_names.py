@@ -1,0 +1,22 @@
+"""A public class name says which class is meant: it is used once in the product."""
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("appliance", "rosmop", "roswire")
+
+
+def test_no_public_class_name_is_used_twice() -> None:
+    """A name without an underscore has one definition in `appliance`, `rosmop` and `roswire`."""
+    places = defaultdict(list)
+    for path in (path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))):
+        relative = path.relative_to(ROOT)
+        if "tests" in relative.parts:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places[node.name].append(f"{relative}:{node.lineno}")
+    assert len(places) > 1000
+    assert {name: found for name, found in places.items() if len(found) > 1} == {}

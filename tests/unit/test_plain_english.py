@@ -1,0 +1,133 @@
+"""Pages, docstrings and comments are written in plain English: one word for one thing, and none of the habits below.
+
+`ROOTS` lists the files that are checked: pages as a whole, Python files by their docstrings and comments. Code,
+quoted output and generated pages are left out.
+"""
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+ROOTS = (
+    "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs", "appliance", "rosmop", "roswire", "examples",
+    "benchmarks", "distribution",
+)  # fmt: skip
+GENERATED = ("metrics.md", "audit-events.md")
+
+
+class Habit(NamedTuple):
+    """A pattern, the words to write instead, and a sentence that the pattern finds."""
+
+    pattern: str
+    instead: str
+    example: str
+
+
+HABITS = (
+    Habit(r"\banew\b", "again", "It is read anew."),
+    Habit(r"\bamid\b", "while", "It was killed amid a write."),
+    Habit(r"\b[Aa]t last\b", "finally", "At last it ends."),
+    Habit(r"\bmend(?:s|ed|ing)?\b", "fix, repair", "The loop mends it."),
+    Habit(r"\bstrangers?\b", "unknown host", "A stranger connects."),
+    Habit(r"\bfallen\b(?! behind)", "compromised", "A fallen process keeps its rights."),
+    Habit(r"\bwalls\b", "sandbox", "The walls of a process hold."),
+    Habit(r"\bcalls? of the kernel\b", "system call", "It makes a call of the kernel."),
+    Habit(r"\bby (?:it|them)sel(?:f|ves)\b", "automatically", "It goes back by itself."),
+    Habit(r"(?<!there )(?<!There )\b(?:is|are|was|were) no (?!longer\b)", "is not a", "A group is no host."),
+    Habit(
+        r"\b(?:is|are|was|were|be|been|being) told\b",
+        "gets, receives, is notified",
+        "A node is told its list.",
+    ),
+    Habit(r"\bOn trial\b|\bon trial\b", "in shadow mode, with commit-confirm", "It is loaded on trial."),
+    Habit(
+        r"\bROSMaster\b|\bROS Master\b(?! API)",
+        "ROS master; `rosmaster` for the program",
+        "ROSMaster answers.",
+    ),
+    Habit(r"\b[Ww]hoever\b", "any host that, anyone who", "Whoever reaches it may call."),
+    Habit(r"(?:^|[.:;|]\s+)(?:Who|That of|Those of|Of)\s(?![^.]*\?)", "the noun", "Who asks is recorded."),
+    Habit(r", too\b(?! \w+ly)", "also", "It is recorded, too."),
+    Habit(
+        r"\b(?:nobody|everybody|anybody|somebody)\b",
+        "the host, process or person",
+        "It is granted to nobody.",
+    ),
+    Habit(r"(?:^|[.]\s+)What\s(?![^.?]*[?])", "the noun", "What is loaded survives."),
+    Habit(r"\b(?:is|are) said\b", "is reported, printed", "It is said at start."),
+    Habit(r"\b(?:held|holds?) (?:\w+ )?against\b", "compare with", "It is held against the formula."),
+    Habit(r"\bput back\b", "restore, register again", "A node is put back."),
+    Habit(r"\bbelongs? into\b", "belongs in", "It belongs into the policy."),
+    Habit(r"\bso many\b", "the number", "So it has so many slices."),
+    Habit(
+        r"\bnode proxy\b|\bnode proxies\b|\bouter face\b|\binner face\b", "proxy endpoint", "The outer face."
+    ),
+    Habit(r"\bstands? (?:in|at|on|already)\b", "is in, uses, is defined", "The key stands in section A."),
+    Habit(r"\bcomes? home\b", "is copied back", "The state has to come home."),
+    Habit(r"\bgood for nothing\b", "invalid, useless", "The token is good for nothing."),
+    Habit(r"\bwithout a word\b", "without an answer, without a message", "It is closed without a word."),
+    Habit(r"\bhe\b|\bhis\b|\bhim\b", "they, the host, the process", "An operator signs his order."),
+)
+
+
+def files() -> Iterator[Path]:
+    """Yield every checked file."""
+    for name in ROOTS:
+        path = ROOT / name
+        found = sorted([*path.rglob("*.md"), *path.rglob("*.py")]) if path.is_dir() else [path]
+        yield from (file for file in found if file.name not in GENERATED and "tests" not in file.parts[-3:-1])
+
+
+def prose(path: Path) -> str:
+    """Return the text of a file with everything else replaced by blanks; lines keep their numbers."""
+    text = path.read_text()
+    if path.suffix == ".py":
+        return _without_code(_said_in(text))
+    return _without_code(re.sub(r"^ {4,}\S.*$", "", text, flags=re.MULTILINE))
+
+
+def _without_code(text: str) -> str:
+    code = r"```.*?```|<!--.*?-->|`[^`\n]*`|\]\([^)]*\)"
+    return re.sub(code, lambda found: re.sub(r"[^\n]", " ", found[0]), text, flags=re.DOTALL)
+
+
+def _said_in(source: str) -> str:
+    """Return the docstrings and comments of a Python file, each on its line."""
+    lines = [""] * (source.count("\n") + 2)
+    for node in ast.walk(ast.parse(source)):
+        if (
+            isinstance(node, ast.Expr)
+            and isinstance(node.value, ast.Constant)
+            and isinstance(node.value.value, str)
+        ):
+            for offset, line in enumerate(node.value.value.split("\n")):
+                lines[node.lineno + offset] += line.strip()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            lines[token.start[0]] += f" {token.string.lstrip('# ')}"
+    return "\n".join(lines[1:])
+
+
+@pytest.mark.parametrize("page", list(files()), ids=lambda page: str(page.relative_to(ROOT)))
+def test_no_file_has_a_bad_habit(page: Path) -> None:
+    """Each finding has its line and the words to write instead."""
+    text = prose(page)
+    found = [
+        f"{page.name}:{text.count(chr(10), 0, hit.start()) + 1}: {hit[0].strip()!r}: write {habit.instead!r}"
+        for habit in HABITS
+        for hit in re.finditer(habit.pattern, text, re.MULTILINE)
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize("habit", HABITS, ids=lambda habit: habit.instead)
+def test_each_pattern_finds_its_example(habit: Habit) -> None:
+    """A pattern that finds nothing would never fail."""
+    assert re.search(habit.pattern, habit.example, re.MULTILINE)

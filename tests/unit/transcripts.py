@@ -1,0 +1,27 @@
+"""Transcripts: a line at the margin is an action, the indented lines below it are its effects.
+
+A file has several, each with a title behind `# ` that states the promise, and an empty line between two.
+"""
+
+from collections.abc import Awaitable, Callable
+from itertools import groupby
+from pathlib import Path
+
+
+def transcripts(file: Path) -> dict[str, list[str]]:
+    """Return the lines of each transcript in the file, by title."""
+    texts = file.read_text(encoding="utf-8").strip().removeprefix("# ").split("\n\n# ")
+    return {title: lines for title, *lines in (text.splitlines() for text in texts)}
+
+
+async def played(written: list[str], say: Callable[[str], Awaitable[list[str]]]) -> list[str]:
+    """Play the actions; return them with their effects, an equal effect that repeats in one line."""
+    lines: list[str] = []
+    for action in written:
+        if not action.startswith(" "):
+            effects = [(effect, len(list(equal))) for effect, equal in groupby(await say(action))]
+            lines += [
+                action,
+                *(f"    {effect}{f' ({many} times)' if many > 1 else ''}" for effect, many in effects),
+            ]
+    return lines
