@@ -1,10 +1,9 @@
-"""What the thesis tried on the LandShark (its research question 3), with real nodes on two machines.
+"""The thesis's attempts on the LandShark (its research question 3), with real nodes on two machines.
 
-A second machine may not publish where only the first may, and may not end a node of the first.
+Only the first machine may publish the topic, and the second one may not end a node of the first.
 """
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -37,28 +36,21 @@ shutdown = first
 
 @pytest.fixture(scope="module")
 def appliance(common_lab: Lab) -> Iterator[Appliance]:
-    """An appliance with the policy of this file."""
+    """Run an appliance with the policy of this file."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     host = common_lab.host("appliance", "10.77.0.2/24")
     with Appliance(host, policy=POLICY, options=("--api", "off")) as running:
         yield running
 
 
-@pytest.fixture
-def ros(appliance: Appliance, common_robot: Host, tmp_path: Path) -> Iterator[RosSession]:
-    """The nodes of the first machine; `ros.on(second)` starts them on the second."""
-    with RosSession(appliance.master_uri, tmp_path, common_robot) as session:
-        yield session
-
-
 @pytest.fixture(scope="module")
 def second(common_lab: Lab) -> Host:
-    """The machine with fewer rights."""
+    """Return the machine with fewer rights."""
     return common_lab.host("second", "10.77.0.66/24")
 
 
 def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, second: Host) -> None:
-    """Only the first machine is heard on the topic; the refusal names the rule, in the answer and the log."""
+    """Only the first machine is heard on the topic; the denial names the rule, in the answer and the log."""
     listener = ros.listener("roscpp", "/topic1")
     ros.talker("rospy", "/topic1", name="rightful")
     answer = call_on(
@@ -81,14 +73,14 @@ def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, s
 
 
 def test_second_machine_may_publish_elsewhere(ros: RosSession, second: Host) -> None:
-    """What the policy grants the second machine works as with any master."""
+    """The second machine publishes what the policy grants it, as with any master."""
     listener = ros.listener("rospy", "/topic2")
     ros.on(second).talker("roscpp", "/topic2", name="guest")
     assert listener.wait_for(event="received")["publisher"] == "/guest"
 
 
 def test_kill_from_the_wrong_machine(appliance: Appliance, ros: RosSession, second: Host) -> None:
-    """`rosnode kill` from the second machine ends nothing; from the first it does, as ever."""
+    """`rosnode kill` has no effect from the second machine; from the first it works as usual."""
     talker = ros.talker("roscpp", "/topic1", name="driver")
     listener = ros.listener("rospy", "/topic1")
     ros.on(second).run("rosnode", "kill", "/driver", check=False)
@@ -100,7 +92,7 @@ def test_kill_from_the_wrong_machine(appliance: Appliance, ros: RosSession, seco
 
 
 def test_name_of_another_machines_node(appliance: Appliance, ros: RosSession, second: Host) -> None:
-    """A name that lives on one machine cannot be taken over from another, though the policy lets both use it."""
+    """A name in use on one machine cannot be taken over from another, though the policy lets both use it."""
     listener = ros.listener("rospy", "/topic2")
     ros.talker("rospy", "/topic2", "--text", "mine", name="voice")
     listener.wait_for(event="received")
@@ -118,7 +110,7 @@ def test_name_of_another_machines_node(appliance: Appliance, ros: RosSession, se
     assert after["data"].startswith("mine")
 
 
-def test_rest_can_be_off(appliance: Appliance) -> None:
+def test_rest_can_be_disabled(appliance: Appliance) -> None:
     """With `--api off` there is no process, no port, no token."""
     assert appliance.ready["api"] is None
     assert "token" not in appliance.ready

@@ -1,4 +1,4 @@
-"""A backup of the running appliance, put back in another place, where the appliance goes on from it."""
+"""A backup of the running appliance is restored in another place, where the appliance continues."""
 
 import contextlib
 import json
@@ -9,6 +9,7 @@ from pathlib import Path
 
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.command import ROSRV
+from tests.support.processes import LIMIT
 from tests.support.rosmaster import master_at
 from tests.support.waiting import eventually
 
@@ -17,7 +18,7 @@ LOADED = OPEN_POLICY + "[Services]\ndefault = *\n"
 
 @contextlib.contextmanager
 def busy(uri: str) -> Iterator[None]:
-    """A node that sets parameters all the time."""
+    """Run a node that sets parameters all the time."""
     ending = threading.Event()
 
     def work() -> None:
@@ -37,14 +38,14 @@ def busy(uri: str) -> Iterator[None]:
 
 
 def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
-    """Taken under load; elsewhere the log proves itself and is signed on; policy, parameters and tokens are there.
+    """After a backup under load and a restore elsewhere, the log verifies and grows; policy, parameters and tokens
+    exist.
 
-    The appliance it was taken of notices nothing, and its own log stays whole.
+    The original appliance is not affected, and its own log stays complete.
     """
-    config = tmp_path / "appliance.yaml"
-    config.write_text(json.dumps({"audit": {"checkpoint_records": 20, "checkpoint_seconds": 1}}))
+    settings = "audit: {checkpoint_records: 20, checkpoint_seconds: 1}\n"
     file = tmp_path / "backup.tar.gz"
-    with Appliance(options=("--config", str(config))) as old:
+    with Appliance(settings=settings) as old:
         with master_at(old.master_uri) as master:
             assert master.setParam("/robot", "/arm", {"joints": [1.5, -2.0], "name": "left"})[0] == 1
         old.reload(LOADED)
@@ -52,9 +53,9 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
         with busy(old.master_uri):
             eventually(lambda: old.audit(event="checkpoint"), "a checkpoint is recorded")
             old.rosrv("backup", str(file))
-        assert "complete and unchanged" in old.rosrv("audit", "verify").stdout
+        assert "The log is " in old.rosrv("audit", "verify").stdout
 
-    new = Appliance(policy=LOADED, options=("--config", str(config)))
+    new = Appliance(policy=LOADED, settings=settings)
     try:
         new.rosrv("restore", str(file))
         before = json.loads(new.rosrv("audit", "verify", "--json").stdout)
@@ -69,7 +70,7 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
             lambda: (
                 json.loads(new.rosrv("audit", "verify", "--json").stdout)["signed_through"] > before["last"]
             ),
-            "what came since is signed",
+            "later records are signed",
         )
         assert new.audit(event="signature refused") == []
     finally:
@@ -77,15 +78,15 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
 
 
 def test_a_half_restored_state_is_not_started() -> None:
-    """`rosrv up` on what a torn restore left ends with the thing to do, and changes nothing there."""
+    """On the remains of an interrupted restore, `rosrv up` ends with the remedy, and changes nothing."""
     appliance = Appliance()
     try:
         appliance.state.mkdir(mode=0o711)
         (appliance.state / "restoring").touch()
         command = [ROSRV, "up", "--isolation", "none", "--state", str(appliance.state)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=2 * LIMIT, check=False)
         assert done.returncode == 1
-        assert "was not put back to its end: remove it, and `rosrv restore` once more" in done.stderr
+        assert "a restore did not finish: remove this folder, and run `rosrv restore` again" in done.stderr
         assert [one.name for one in appliance.state.iterdir()] == ["restoring"]
     finally:
         appliance.close()

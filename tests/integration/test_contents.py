@@ -1,9 +1,8 @@
-"""What messages said is for those who may read it: every path of REST, as each role sees it."""
+"""Contents of messages are for authorized roles only: every path of REST, for each role."""
 
 import itertools
 import json
 import re
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,26 +31,22 @@ publishes() { event e(std::string text) /f std_msgs/String '{data:text}' {
 
 @pytest.fixture
 def appliance() -> Iterator[Appliance]:
-    """An appliance with monitors that do all that monitors do, and a recorder."""
+    """Run an appliance with monitors that use every feature, and a recorder."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with tempfile.TemporaryDirectory(prefix="rosrv-contents-") as name:
-        folder = Path(name)
-        folder.chmod(0o755)
-        (folder / "monitors").mkdir()
-        (folder / "monitors" / "all.rv").write_text(MONITORS)
-        (folder / "appliance.yaml").write_text(
-            "recorder: {enabled: true, memory: 16MiB, before: 5, after: 1, longest: 8, disk: 512MiB,"
-            " triggers: [drop, change, verdict, fault]}\naudit: {reserve_bytes: 1MiB}\n"
-        )
-        options = (
-            "--config", str(folder / "appliance.yaml"), "--monitors", str(folder / "monitors"), "--api", "127.0.0.1:0"
-        )  # fmt: skip
-        with Appliance(options=options) as appliance:
-            yield appliance
+    settings = (
+        "recorder: {enabled: true, memory: 16MiB, before: 5, after: 1, longest: 8, disk: 512MiB,"
+        " triggers: [drop, change, verdict, fault]}\naudit: {reserve_bytes: 1MiB}\n"
+    )
+    with Appliance(
+        settings=settings, monitors={"all": MONITORS}, options=("--api", "127.0.0.1:0")
+    ) as appliance:
+        yield appliance
 
 
-def test_no_path_shows_a_viewer_what_messages_said(appliance: Appliance, tmp_path: Path) -> None:
-    """Nor an operator the messages of a recording, which investigators see; nor does a log line or a metric."""
+def test_no_path_shows_contents_of_messages_to_a_viewer(appliance: Appliance, tmp_path: Path) -> None:
+    """Neither do operators see the messages of a recording, which are for investigators; nor does a log line or a
+    metric.
+    """
     tokens: dict[str, Rest] = {}
     for role in ("viewer", "operator", "investigator"):
         made = appliance.rosrv("token", "add", f"the-{role}", "--role", role, "--json").stdout
@@ -69,8 +64,8 @@ def test_no_path_shows_a_viewer_what_messages_said(appliance: Appliance, tmp_pat
             "monitor published",
         ):
             appliance.recorded("--event", event)
-        appliance.rosrv("monitor", "enable", "drops", "tells", "--trial")
-        appliance.recorded("--event", "trial observed")
+        appliance.rosrv("monitor", "enable", "drops", "tells", "--shadow")
+        appliance.recorded("--event", "shadow observed")
         listed = eventually(
             lambda: tokens["viewer"].get("/v1/recordings").json["recordings"], appliance.story
         )
@@ -93,13 +88,13 @@ def test_no_path_shows_a_viewer_what_messages_said(appliance: Appliance, tmp_pat
 
 
 def places_with(word: str, rest: Rest, values: dict[str, list[str]]) -> Iterator[str]:
-    """The paths whose answer has it, of all that can be asked with GET, and the streams."""
+    """Return the paths, of all GET paths and streams, whose answer contains it."""
     asked = {
         "/v1/audit": "?limit=500", "/v1/evidence": "?since=1h", "/v1/monitors": "?texts=true",
         "messages": "?at=1970-01-01", "/v1/audit/stream": "?after=1",
     }  # fmt: skip
     for path, methods in rest.get("/v1/openapi.json").json["paths"].items():
-        if "get" not in methods or path == "/v1/messages":  # that one's frames are for operators alone
+        if "get" not in methods or path == "/v1/messages":  # its frames are for operators alone
             continue
         needed = re.search(r"\{(\w+)", path)
         for value in values[needed[1]] if needed else [""]:

@@ -1,4 +1,4 @@
-"""Bundles of a running appliance: over the command line and REST, by whom, on record, and right on another machine."""
+"""Evidence bundles of a running appliance: by command and REST, by role, recorded, and verified on another machine."""
 
 import json
 import subprocess
@@ -24,12 +24,10 @@ MONITOR = "a() { event said() /chatter std_msgs/String '{}' { } }"
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """An appliance with REST that was worked with; checkpoints are an hour apart."""
-    config = tmp_path_factory.mktemp("config") / "appliance.yaml"
-    config.write_text(CONFIGURATION)
-    specification = config.with_name("a.rv")
+    """Run an appliance with REST and some activity; checkpoints are an hour apart."""
+    specification = tmp_path_factory.mktemp("specification") / "a.rv"
     specification.write_text(MONITOR)
-    with Appliance(options=("--config", str(config))) as running:
+    with Appliance(settings=CONFIGURATION) as running:
         running.rosrv("monitor", "load", str(specification))
         running.reload(CLOSED)
         with xmlrpc.client.ServerProxy(running.master_uri) as master:
@@ -43,13 +41,13 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 
 
 def cast(answer: Any) -> list[Any]:
-    """What a master answers."""
+    """Return a master's answer with its type."""
     assert isinstance(answer, list)
     return answer
 
 
 def proved(bundle: Path, key: Path) -> str:
-    """What its own verifier says of it, run by the system's Python without an environment."""
+    """Return the output of the bundle's own verifier, run by the system's Python without an environment."""
     with zipfile.ZipFile(bundle) as archive:
         program = archive.read("verify.py")
     command = ["/usr/bin/python3", "-I", "-", str(bundle), "--key", str(key)]
@@ -59,13 +57,13 @@ def proved(bundle: Path, key: Path) -> str:
 
 
 def records_of(bundle: Path) -> list[dict[str, Any]]:
-    """The records in it."""
+    """Return the records in the bundle."""
     with zipfile.ZipFile(bundle) as archive:
         return [json.loads(line) for line in archive.read("records.ndjson").splitlines()]
 
 
 def test_over_the_command_line(appliance: Appliance, tmp_path: Path) -> None:
-    """All up to now is in it and proven though no checkpoint was due; who exported is on record."""
+    """The bundle has all records up to now, with proof although no checkpoint was due; the export is recorded."""
     bundle = tmp_path / "incident.zip"
     appliance.rosrv("evidence", "export", "--since", "1h", "-o", str(bundle))
     assert bundle.stat().st_mode & 0o777 == 0o600
@@ -87,7 +85,7 @@ def test_over_the_command_line(appliance: Appliance, tmp_path: Path) -> None:
 
 
 def test_over_rest_it_is_not_for_viewers(appliance: Appliance, tmp_path: Path) -> None:
-    """The same bundle as over the socket; a viewer is told so, and what makes no sense is refused in words."""
+    """The bundle is the same as over the socket; a viewer and an invalid request are refused with a reason."""
     rest = appliance.rest()
     viewer = appliance.rest(
         json.loads(appliance.rosrv("token", "add", "eve", "--role", "viewer", "--json").stdout)["token"]
@@ -114,7 +112,9 @@ def test_over_rest_it_is_not_for_viewers(appliance: Appliance, tmp_path: Path) -
 
 
 def test_of_a_recording(appliance: Appliance, tmp_path: Path) -> None:
-    """Its messages are in the bundle, proven by the log; who took them is on record; another id is refused in words."""
+    """The bundle has its messages, proven by the log; the export is recorded; an unknown id is refused with a
+    reason.
+    """
     order = appliance.rosrv(
         "record", "now", "--before", "2s", "--after", "1s", "--note", "the arm hit the door", "--json"
     )
@@ -143,8 +143,8 @@ def test_of_a_recording(appliance: Appliance, tmp_path: Path) -> None:
     assert appliance.rosrv(*both, check=False).returncode == 2
 
 
-def test_a_time_of_which_there_is_nothing(appliance: Appliance, tmp_path: Path) -> None:
-    """It is refused in words, and no file is left."""
+def test_a_time_without_records(appliance: Appliance, tmp_path: Path) -> None:
+    """It is refused with a reason, and leaves no file."""
     place = tmp_path / "x.zip"
     span = ("--since", "1970-01-01", "--until", "1970-01-02")
     done = appliance.rosrv("evidence", "export", *span, "-o", str(place), check=False)
@@ -153,7 +153,7 @@ def test_a_time_of_which_there_is_nothing(appliance: Appliance, tmp_path: Path) 
 
 
 def test_the_verifier_of_this_version_is_the_one_in_its_bundles(appliance: Appliance, tmp_path: Path) -> None:
-    """Who does not trust the one in a bundle compares it."""
+    """A user who distrusts the verifier in a bundle can compare it."""
     bundle = tmp_path / "a.zip"
     appliance.rosrv("evidence", "export", "--since", "1h", "-o", str(bundle))
     with zipfile.ZipFile(bundle) as archive:

@@ -1,4 +1,4 @@
-"""The audit log of the real appliance, forwarded to a syslog receiver that comes and goes."""
+"""The audit log of the real appliance is forwarded to a syslog receiver that is sometimes away."""
 
 import json
 import os
@@ -21,57 +21,55 @@ from tests.support.waiting import allowed, eventually
 
 
 @contextmanager
-def forwarding(port: int, tmp_path: Path, **syslog: Any) -> Iterator[Appliance]:
-    """An appliance that forwards to this port on loopback, and seals its log every second."""
-    file = tmp_path / "appliance.yaml"
+def forwarding(port: int, **syslog: Any) -> Iterator[Appliance]:
+    """Return an appliance that forwards to this port on loopback, and seals its log every second."""
     settings = {"syslog": {"to": f"tcp://127.0.0.1:{port}", **syslog}, "checkpoint_seconds": 1}
-    file.write_text(json.dumps({"audit": settings}))
-    with Appliance(options=("--config", str(file))) as appliance:
+    with Appliance(settings=json.dumps({"audit": settings})) as appliance:
         yield appliance
 
 
 @pytest.fixture(scope="module")
 def collector() -> Iterator[StreamCollector]:
-    """A receiver that several tests share."""
+    """Run a receiver for several tests."""
     with StreamCollector() as collector:
         yield collector
 
 
 @pytest.fixture(scope="module")
-def appliance(collector: StreamCollector, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """An appliance that forwards all to it, and is at work after each test."""
-    with forwarding(collector.port, tmp_path_factory.mktemp("forwarding")) as appliance:
+def appliance(collector: StreamCollector) -> Iterator[Appliance]:
+    """Run an appliance that forwards all records to it; after each test all processes run."""
+    with forwarding(collector.port) as appliance:
         yield appliance
 
 
 def work(appliance: Appliance, count: int) -> None:
-    """Calls of a node: each is a record."""
+    """Make calls of a node, each of which is a record."""
     with master_at(appliance.master_uri) as master:
         for number in range(count):
             assert master.setParam("/worker", f"/value{number}", number)[0] == 1
 
 
 def another_life(appliance: Appliance, role: str, before: list[int]) -> None:
-    """Return once the process was started again."""
+    """Return once the process was restarted."""
     eventually(lambda: appliance.pids(role) not in ([], before), f"another {role} runs")
 
 
 def all_sequences(appliance: Appliance) -> set[int]:
-    """What the log has now."""
+    """Return the sequence numbers in the log."""
     lines = appliance.rosrv("audit", "export").stdout.splitlines()
     return {int(json.loads(line)["sequence"]) for line in lines}
 
 
 def forwarding_status(appliance: Appliance) -> dict[str, Any]:
-    """How it stands, by `rosrv status`."""
+    """Return the state of forwarding in `rosrv status`."""
     status = json.loads(appliance.rosrv("status", "--json", check=False).stdout)
     return dict(status["audit"]["forwarding"])
 
 
-def test_everything_arrives_and_proves(
+def test_every_record_arrives_and_verifies(
     collector: StreamCollector, appliance: Appliance, tmp_path: Path
 ) -> None:
-    """What the receiver has is the whole log in order, and its checkpoints prove the log against root himself."""
+    """The receiver gets the whole log in order, and its checkpoints prove the log even against root."""
     work(appliance, 50)
     wanted = all_sequences(appliance)
     collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
@@ -92,28 +90,28 @@ def test_everything_arrives_and_proves(
         assert (owner.st_uid, owner.st_gid) == (61017, 61014)
 
 
-def test_a_receiver_that_is_away(collector: StreamCollector, appliance: Appliance) -> None:
-    """While nobody receives, nodes are served as ever, the state says so; then everything arrives."""
-    appliance.leave_out_what_was()
+def test_an_unavailable_receiver(collector: StreamCollector, appliance: Appliance) -> None:
+    """While the receiver is away, nodes are served and the status reports it; then every record arrives."""
+    appliance.ignore_earlier_records()
     collector.wait_for(lambda messages: messages)
     collector.close()
     start = time.monotonic()
     work(appliance, 200)
     assert time.monotonic() - start < allowed(10)
-    eventually(lambda: forwarding_status(appliance)["trouble"], "the trouble is in the status")
+    eventually(lambda: forwarding_status(appliance)["trouble"], "the status reports the problem")
     told = appliance.rosrv("status", check=False)
     assert told.returncode == 1
     assert "the audit log is not forwarded to tcp://" in told.stdout
     eventually(lambda: appliance.audit(event="forwarding failed"), "it is recorded")
     collector.open()
-    eventually(lambda: not forwarding_status(appliance)["trouble"], "the trouble is over")
-    eventually(lambda: appliance.audit(event="forwarding resumed"), "that it is over is recorded")
+    eventually(lambda: not forwarding_status(appliance)["trouble"], "the problem is over")
+    eventually(lambda: appliance.audit(event="forwarding resumed"), "the recovery is recorded")
     wanted = all_sequences(appliance)
     collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
 
 
 def test_deaths(collector: StreamCollector, appliance: Appliance) -> None:
-    """The forwarder killed again and again, control too, the appliance stopped and started: nothing is missing."""
+    """After repeated kills of forwarder and control, and a restart of the appliance, no record is missing."""
     for role in ("syslog", "control", "syslog"):
         work(appliance, 60)
         before = appliance.pids(role)
@@ -128,11 +126,11 @@ def test_deaths(collector: StreamCollector, appliance: Appliance) -> None:
     assert collector.problems == []
 
 
-def test_only_denials(tmp_path: Path) -> None:
-    """With `send: denials` what was allowed stays here; what was refused arrives, with who and why."""
+def test_only_denials() -> None:
+    """With `send: denials` only denials are sent, with caller and reason."""
     with (
         StreamCollector() as collector,
-        forwarding(collector.port, tmp_path, send="denials", facility=10) as appliance,
+        forwarding(collector.port, send="denials", facility=10) as appliance,
     ):
         work(appliance, 20)
         with master_at(appliance.master_uri) as master:
@@ -146,9 +144,9 @@ def test_only_denials(tmp_path: Path) -> None:
         assert all(one.fields.get("decision") != "allow" for one in collector.messages)
 
 
-def test_history_written_anew_by_root(tmp_path: Path) -> None:
-    """Root rewrites the log with the real key: here all is right, and the other machine's file knows better."""
-    with StreamCollector() as collector, forwarding(collector.port, tmp_path) as appliance:
+def test_a_log_rewritten_by_root(tmp_path: Path) -> None:
+    """Root rewrites the log with the real key: it verifies here, but the receiver's copy reveals the change."""
+    with StreamCollector() as collector, forwarding(collector.port) as appliance:
         with master_at(appliance.master_uri) as master:
             assert master.noSuchCall("/thief")[0] == 0
         work(appliance, 20)
@@ -164,7 +162,7 @@ def test_history_written_anew_by_root(tmp_path: Path) -> None:
         log = appliance.state / "control" / "audit.db"
         change = "UPDATE record SET decision = 'allow', caller_id = '/friend' WHERE caller_id = '/thief'"
         write_anew(log, key, appliance.state / "signer", change)
-        assert "complete and unchanged" in appliance.rosrv("audit", "verify").stdout
+        assert "The log is " in appliance.rosrv("audit", "verify").stdout
         assert appliance.audit("--caller", "/thief") == []
         done = appliance.rosrv("audit", "verify", "--checkpoints", str(kept), check=False)
         assert done.returncode == 1
@@ -172,5 +170,5 @@ def test_history_written_anew_by_root(tmp_path: Path) -> None:
 
 
 def sealed(messages: list[Message]) -> list[Message]:
-    """The checkpoints among them."""
+    """Return the checkpoints among them."""
     return [one for one in messages if one.event == "checkpoint-signed"]

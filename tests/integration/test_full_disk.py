@@ -1,4 +1,4 @@
-"""Orders to an appliance whose state has a disk that is full: done and kept, or refused before anything is changed."""
+"""With a full state disk, each change is stored, or refused before it has any effect."""
 
 import subprocess
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from appliance.channel import admin
-from appliance.cli.admin_client import AdminSocket
+from appliance.cli.connection.admin_client import AdminSocket
 from appliance.control.administration import KEPT
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.waiting import eventually
@@ -47,35 +47,35 @@ LOOKS = (
 
 
 class SmallDisk:
-    """An appliance whose state is on a disk of its own."""
+    """An appliance with its state on a separate disk."""
 
     def __init__(self, appliance: Appliance) -> None:
         self.appliance = appliance
         self.filler = appliance.state / "filler"
 
     def ask(self, request: admin.AdminRequest[Any]) -> admin.AdminAnswer[Any]:
-        """One question or order."""
+        """Return the answer to one request."""
         return AdminSocket(self.appliance.state).ask(request)
 
     def fill(self) -> None:
-        """Nothing more can be written."""
+        """Fill the disk."""
         with self.filler.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
             while True:
                 file.write(bytes(1 << 16))
 
     def revoked(self) -> set[str]:
-        """The tokens that are good for nothing."""
+        """Return the revoked tokens."""
         known = self.ask(admin.TokenList()).body
         return {token.name for token in known.tokens if token.revoked is not None} if known else set()
 
     def all(self) -> list[object]:
-        """What orders change, as it can be seen."""
+        """Return all visible state that requests change."""
         return [msgspec.to_builtins(self.ask(look).body) for look in LOOKS]
 
 
 @pytest.fixture
 def small() -> Iterator[SmallDisk]:
-    """Its disk has 32 MiB; a token `guest` and a monitor are there."""
+    """Run it with a disk of 32 MiB, a token `guest` and a monitor."""
     appliance = Appliance()
     appliance.state.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=32m,mode=755", "rosrv-state-test", str(appliance.state)]
@@ -93,8 +93,8 @@ def small() -> Iterator[SmallDisk]:
         appliance.close()
 
 
-def test_an_order_that_cannot_be_kept_changes_nothing(small: SmallDisk) -> None:
-    """Each says so, and that room must be made; with room it is carried out, after a crash too."""
+def test_a_change_that_cannot_be_stored_has_no_effect(small: SmallDisk) -> None:
+    """Each refusal asks for disk space; with space the change is carried out, and survives a crash."""
     assert {type(order) for order in ORDERS} == KEPT
     before = small.all()
     small.fill()
@@ -116,8 +116,8 @@ def test_an_order_that_cannot_be_kept_changes_nothing(small: SmallDisk) -> None:
     assert eventually(lambda: small.all() or None, small.appliance.story) == after
 
 
-def test_who_is_let_in_no_more_is_out_though_that_cannot_be_kept(small: SmallDisk) -> None:
-    """At once; the answer says what a restart would do, and when there is room it is kept after all."""
+def test_a_revocation_is_effective_even_if_it_cannot_be_stored(small: SmallDisk) -> None:
+    """The revocation is effective at once; the answer warns of a restart, and it is stored once there is space."""
     small.fill()
     answer = small.ask(admin.TokenRevoke("guest"))
     assert answer.error is not None

@@ -1,4 +1,4 @@
-"""The simulated LandShark is a robot like any other: without the appliance it is as open as ROS 1 is."""
+"""The simulated LandShark is an ordinary robot: without the appliance it is as open as ROS 1."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,7 @@ from tests.support.nodes import ROOT, has_ros
 from tests.support.requirements import need_root, needs
 from tests.support.rosmaster import PlainMaster
 
-ATTACKS = [  # those that end a node come after those that need it
+ATTACKS = [  # attacks that end a node come after those that need it
     "watch the battery",
     "look around",
     "spy on the position",
@@ -27,7 +27,7 @@ ATTACKS = [  # those that end a node come after those that need it
 
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
-    """The robot and its operator behind a plain ROSMaster."""
+    """Run the robot and its operator behind a plain ROS master."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     home = tmp_path_factory.mktemp("master")
@@ -42,7 +42,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
 
 @pytest.fixture(scope="module")
 def operator(stage: Stage) -> Actor:
-    """The operator's unit, with the robot at its other end."""
+    """Return the operator's unit, connected to the robot."""
     stage.start_robot()
     operator = stage.start_operator()
     operator.expect("connected")
@@ -61,5 +61,5 @@ def test_mission(operator: Actor) -> None:
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attack_succeeds_against_a_plain_master(stage: Stage, operator: Actor, name: str) -> None:
-    """Each attack of the demonstration is real: nothing but the appliance stops it."""
+    """Each attack of the demonstration is real: it succeeds without the appliance."""
     assert stage.attack(name).succeeded

@@ -1,6 +1,5 @@
 """`[Limits]` of a policy with real nodes: floods, throttles, and a change while they run."""
 
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +8,7 @@ import pytest
 
 from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.nodes import Client, RosSession, has_ros
+from tests.support.nodes import Client, RosSession, has_ros, numbers, without_gap
 from tests.support.processes import Host, Process
 from tests.support.requirements import need_root, needs
 from tests.support.waiting import eventually
@@ -29,7 +28,7 @@ LIMITED = (
 
 @pytest.fixture(scope="module")
 def lab() -> Iterator[Lab]:
-    """Hosts in namespaces."""
+    """Make hosts in namespaces."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-limits") as lab:
@@ -38,60 +37,47 @@ def lab() -> Iterator[Lab]:
 
 @pytest.fixture(scope="module")
 def appliance(lab: Lab) -> Iterator[Appliance]:
-    """An appliance with limits, and a monitor on /watched."""
-    with tempfile.TemporaryDirectory(prefix="rosrv-limits-") as name:
-        folder = Path(name)
-        folder.chmod(0o755)
-        (folder / "counter.rv").write_text(MONITOR)
-        middle = lab.host("master", "10.77.0.2/24")
-        options = ("--monitors", str(folder), "--api", "off")
-        with Appliance(middle, policy=LIMITED, options=options) as appliance:
-            yield appliance
+    """Run an appliance with limits, and a monitor on /watched."""
+    middle, monitors = lab.host("master", "10.77.0.2/24"), {"counter": MONITOR}
+    with Appliance(middle, policy=LIMITED, monitors=monitors, options=("--api", "off")) as appliance:
+        yield appliance
 
 
 @pytest.fixture(scope="module")
 def hosts(lab: Lab) -> tuple[Host, Host]:
-    """The robot's machine, and the operator's."""
+    """Return the robot's machine, and the operator's."""
     return lab.host("robot", "10.77.0.10/24"), lab.host("ocu", "10.77.0.20/24")
 
 
 @pytest.fixture
 def ros(appliance: Appliance, hosts: tuple[Host, Host], tmp_path: Path) -> Iterator[RosSession]:
-    """The robot's nodes."""
+    """Provide the robot's nodes."""
     with RosSession(appliance.master_uri, tmp_path, hosts[0]) as session:
         yield session
 
 
 def seconds_for(listener: Process, count: int) -> float:
-    """How long so many more messages take."""
+    """Return the time until so many more messages have arrived."""
     there = len(listener.seen(event="received"))
     began = time.monotonic()
     listener.wait_for_count(there + count, event="received")
     return time.monotonic() - began
 
 
-def numbers(listener: Process) -> list[int]:
-    """The numbers of the messages that came."""
-    return [int(event["data"].split()[-1]) for event in listener.seen(event="received")]
-
-
-def without_gap(heard: list[int]) -> bool:
-    """Whether nothing is missing, and the order is kept."""
-    return heard == list(range(heard[0], heard[0] + len(heard)))
-
-
 def judged(appliance: Appliance) -> int:
-    """How many messages the monitor has judged."""
+    """Return the number of messages that the monitor has judged."""
     [row] = [one for one in appliance.rosrv("monitor", "list").stdout.splitlines() if "counter" in one]
     return int(row.split()[3])
 
 
 @pytest.mark.parametrize("topic", ["/flood", "/watched"])
 @pytest.mark.parametrize("client", CLIENTS)
-def test_a_publisher_beyond_its_limit_loses_messages_and_another_none(
+def test_only_the_publisher_beyond_its_limit_loses_messages(
     appliance: Appliance, ros: RosSession, client: Client, topic: str
 ) -> None:
-    """A hundred in a second become five, with or without a monitor, with a record; the other topic has all of its."""
+    """Of a hundred messages a second five pass, with or without a monitor, with a record; the other topic loses
+    none.
+    """
     before = judged(appliance)
     listener, other = ros.listener(client, topic), ros.listener(client, "/quiet")
     ros.talker(client, "/quiet", "--rate", "50")
@@ -99,17 +85,17 @@ def test_a_publisher_beyond_its_limit_loses_messages_and_another_none(
     talker = ros.talker(client, topic, "--rate", "100", name=name)
     listener.wait_for_count(4, event="received")
     assert seconds_for(listener, 15) > (15 - 4) / 5
-    heard = numbers(listener)
+    heard = numbers(listener.seen(event="received"))
     assert heard == sorted(heard)
     talker.wait_for_count(2 * len(heard), event="sent")
     assert heard[-1] > len(heard)
-    assert without_gap(numbers(other))
+    assert without_gap(numbers(other.seen(event="received")))
     [first, *_] = reversed(appliance.recorded("--event", "rate limited", caller_id=f"/{name}"))
     assert (first["host"], first["resource"], first["rule"]["key"]) == ("10.77.0.10", topic, topic)
     assert first["detail"]["part"] == "publisher"
     if topic == "/watched":
-        # The relay reports its counters once in a second.
-        eventually(lambda: judged(appliance) - before >= len(heard), "what was heard is counted")
+        # The relay reports its counters once a second.
+        eventually(lambda: judged(appliance) - before >= len(heard), "the messages are counted")
         assert judged(appliance) - before < talker.seen(event="sent")[-1]["number"]
 
 
@@ -117,7 +103,7 @@ def test_a_publisher_beyond_its_limit_loses_messages_and_another_none(
 def test_two_subscribers_have_different_throttles_and_a_reload_lifts_one(
     appliance: Appliance, hosts: tuple[Host, Host], ros: RosSession, client: Client
 ) -> None:
-    """The tablet gets five in a second, the robot twenty; without the limit the same connection gets all."""
+    """The tablet gets five a second, the robot twenty; without the limit the same connection gets all."""
     tablet, robot = ros.on(hosts[1]).listener(client, "/camera"), ros.listener(client, "/camera")
     ros.talker(client, "/camera", "--rate", "100", name=f"camera_{client}")
     for listener, rate in ((tablet, 5), (robot, 20)):
@@ -125,11 +111,11 @@ def test_two_subscribers_have_different_throttles_and_a_reload_lifts_one(
         assert seconds_for(listener, 2 * rate) > (2 * rate - rate / 2 - 1) / rate
     appliance.reload(OPEN_POLICY)
     try:
-        mark = len(numbers(tablet))
+        mark = len(numbers(tablet.seen(event="received")))
         tablet.wait_for_count(mark + 200, event="received")
-        assert without_gap(numbers(tablet)[-100:])
+        assert without_gap(numbers(tablet.seen(event="received"))[-100:])
         appliance.reload(LIMITED)
-        mark = len(numbers(tablet))
+        mark = len(numbers(tablet.seen(event="received")))
         tablet.wait_for_count(mark + 5, event="received")
         assert seconds_for(tablet, 10) > (10 - 3) / 5
     finally:
@@ -137,8 +123,8 @@ def test_two_subscribers_have_different_throttles_and_a_reload_lifts_one(
 
 
 @pytest.mark.parametrize("client", CLIENTS)
-def test_a_latched_message_beyond_the_limit_comes_a_little_later(ros: RosSession, client: Client) -> None:
-    """The last of a quick few is what everybody has in the end, those that come later included."""
+def test_a_latched_message_beyond_the_limit_is_delayed(ros: RosSession, client: Client) -> None:
+    """The last of several quick messages reaches every subscriber, including later ones."""
     listener = ros.listener(client, "/map", name=f"reader_{client}")
     ros.start(
         [
@@ -153,7 +139,7 @@ def test_a_latched_message_beyond_the_limit_comes_a_little_later(ros: RosSession
         label="mapper",
     )
     listener.wait_for(event="received", data="map 5")
-    heard = numbers(listener)
+    heard = numbers(listener.seen(event="received"))
     assert (heard[0], heard[-1], heard == sorted(set(heard)), len(heard) < 5) == (1, 5, True, True)
     late = ros.listener(client, "/map", name=f"late_{client}")
     assert late.wait_for(event="received")["data"] == "map 5"

@@ -1,19 +1,18 @@
-"""Monitors in the middle of real rospy and roscpp nodes: drop, change, publish, verdict; loaded while they talk."""
+"""Monitors between real rospy and roscpp nodes: drop, change, publish, verdict; loaded during traffic."""
 
 import itertools
 import json
 import signal
 import sqlite3
-import tempfile
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
 import pytest
 
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.nodes import PYTHON, ROOT, Client, RosSession, has_ros
+from tests.support.nodes import PYTHON, ROOT, Client, RosSession, has_ros, numbers, without_gap
 from tests.support.processes import Process
 from tests.support.requirements import needs
 from tests.support.waiting import eventually
@@ -33,54 +32,27 @@ begin words() {
 """
 
 
-@contextmanager
-def specifications() -> Iterator[Path]:
-    """A folder of specifications with one file, which the appliance's users may read."""
-    with tempfile.TemporaryDirectory(prefix="rosrv-monitors-") as name:
-        path = Path(name)
-        path.chmod(0o755)
-        (path / "words.rv").write_text(WORDS)
-        yield path
-
-
-@pytest.fixture
-def folder() -> Iterator[Path]:
-    """A folder of the test's own."""
-    with specifications() as folder:
-        yield folder
-
-
 @pytest.fixture(scope="module")
 def common_appliance() -> Iterator[Appliance]:
-    """An appliance with the monitor `words` on /chatter."""
+    """Run an appliance with the monitor `words` on /chatter."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    policy = OPEN_POLICY + "getRVState = *\n"
-    with (
-        specifications() as folder,
-        Appliance(policy=policy, options=("--monitors", str(folder), "--api", "127.0.0.1:0")) as appliance,
-    ):
+    policy, options = OPEN_POLICY + "getRVState = *\n", ("--api", "127.0.0.1:0")
+    with Appliance(policy=policy, monitors={"words": WORDS}, options=options) as appliance:
         yield appliance
 
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """The same, as it is at its start: `words` alone, in its initial state, and a log of this test."""
-    common_appliance.leave_out_what_was()
+    """Provide it as at its start: `words` alone, in its initial state, and the log of this test only."""
+    common_appliance.ignore_earlier_records()
     yield common_appliance
     common_appliance.rosrv("monitor", "remove", "words", check=False)
     common_appliance.rosrv("monitor", "reload", "--prune")
     common_appliance.rosrv("monitor", "enable", "words")
 
 
-@pytest.fixture
-def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
-    """Nodes of one test."""
-    with RosSession(appliance.master_uri, tmp_path) as session:
-        yield session
-
-
 def monitor(appliance: Appliance, name: str) -> dict[str, object]:
-    """The row of one monitor in `rosrv monitor list`."""
+    """Return the row of one monitor in `rosrv monitor list`."""
     lines = appliance.rosrv("monitor", "list", "--json").stdout.splitlines()
     rows: list[dict[str, object]] = [json.loads(line) for line in lines]
     return next(row for row in rows if row["name"] == name)
@@ -91,10 +63,8 @@ def dropped_by(appliance: Appliance, name: str, count: int) -> bool:
     return monitor(appliance, name)["drops"] == count
 
 
-def test_messages_are_changed_and_dropped_and_the_audit_log_says_so(
-    appliance: Appliance, ros: RosSession
-) -> None:
-    """From both clients to both, with the publisher's own header; what a monitor publishes comes from the appliance."""
+def test_changed_and_dropped_messages_are_recorded(appliance: Appliance, ros: RosSession) -> None:
+    """Both clients reach both, with the publisher's own header; publications of a monitor come from the appliance."""
     alarms = [ros.listener(client, "/alarm") for client in CLIENTS]
     listeners = [ros.listener(client, "/chatter") for client in CLIENTS]
     for client in CLIENTS:
@@ -125,7 +95,7 @@ def test_messages_are_changed_and_dropped_and_the_audit_log_says_so(
 def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """No message is lost, the order is kept, and each change is a record that says who."""
+    """No message is lost, the order is kept, and each change is recorded with its author."""
     listener = ros.listener("roscpp", "/chatter")
     ros.talker("roscpp", "/chatter", name="voice")
     listener.wait_for(lambda event: event.get("data", "").startswith("checked hello"))
@@ -141,8 +111,7 @@ def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
     assert not appliance.rosrv("monitor", "list", "--json").stdout
     last = len(listener.seen(event="received"))
     listener.wait_for_count(last + 3, event="received")
-    numbers = [int(event["data"].split()[-1]) for event in listener.seen(event="received")]
-    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert without_gap(numbers(listener.seen(event="received")))
     assert listener.seen(event="received")[-1]["data"].startswith("hello")
     appliance.rosrv("monitor", "reload")
     assert monitor(appliance, "words")["enabled"] is True
@@ -153,10 +122,10 @@ def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
     assert ["words.rv"] in [detail["changed"] for detail in loaded]
 
 
-def test_a_monitor_on_trial_says_what_it_would_do_until_it_is_promoted(
+def test_a_monitor_in_shadow_mode_records_only_until_it_is_promoted(
     appliance: Appliance, ros: RosSession
 ) -> None:
-    """No message is lost meanwhile, and the first changed one follows the last untouched one."""
+    """No message is lost meanwhile, and the first changed one follows the last unchanged one."""
     assert appliance.rosrv("monitor", "enable", "words", "--shadow").stdout == "shadow mode: words\n"
     listener = ros.listener("roscpp", "/chatter")
     ros.talker("roscpp", "/chatter", name="voice")
@@ -166,16 +135,16 @@ def test_a_monitor_on_trial_says_what_it_would_do_until_it_is_promoted(
     assert all(event["data"].startswith("bad") for event in heard)
 
     def observed() -> bool:
-        records = appliance.audit("--event", "trial observed", resource="/chatter")
+        records = appliance.audit("--event", "shadow observed", resource="/chatter")
         return {"drop", "change", "log"} <= {
-            one["detail"]["trial"] and one["detail"]["would"] for one in records
+            one["detail"]["shadow"] and one["detail"]["would"] for one in records
         }
 
-    eventually(observed, "a drop, a change and a line that would have been")
+    eventually(observed, "records of a drop, a change and a line in shadow mode")
     row = monitor(appliance, "words")
     assert row["would_drop"]
     assert row["would_change"]
-    assert (row["trial"], row["enabled"], row["drops"], row["changes"], row["missed"]) == (
+    assert (row["shadow"], row["enabled"], row["drops"], row["changes"], row["missed"]) == (
         True,
         False,
         0,
@@ -183,7 +152,7 @@ def test_a_monitor_on_trial_says_what_it_would_do_until_it_is_promoted(
         0,
     )
     status = appliance.status()["monitors"]
-    assert (status["enabled"], status["trials"]) == (0, ["words"])
+    assert (status["enabled"], status["shadow"]) == (0, ["words"])
     assert "1 in shadow mode" in appliance.rosrv("status").stdout
     assert "rosrv monitor promote" in appliance.rosrv("monitor", "enable", "words", check=False).stderr
     assert appliance.rosrv("monitor", "promote", "words").stdout == "enabled: words\n"
@@ -191,9 +160,10 @@ def test_a_monitor_on_trial_says_what_it_would_do_until_it_is_promoted(
     said = [event["data"] for event in listener.seen(event="received") if event["publisher"] == "/voice"]
     changed = [text.startswith("checked ") for text in said]
     assert changed == sorted(changed)
-    numbers = [int(text.split()[-1]) for text in said]
-    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-    assert {one["detail"]["who"] for one in appliance.recorded("--event", "monitor on trial")} == {"operator"}
+    assert without_gap([int(text.split()[-1]) for text in said])
+    assert {one["detail"]["who"] for one in appliance.recorded("--event", "monitor in shadow mode")} == {
+        "operator"
+    }
 
 
 WATCH = """
@@ -208,10 +178,10 @@ watch() {
 """
 
 
-def test_what_was_due_is_published_at_the_deadline(
+def test_a_missing_message_is_published_at_the_deadline(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """By the appliance, on record; and `check` says so beforehand."""
+    """The appliance publishes it, with a record; and `check` predicts it."""
     spec = tmp_path / "watch.rv"
     spec.write_text(WATCH)
     said = "enforced: at the deadline raise_alarm publishes what was due (/alarm)"
@@ -228,10 +198,10 @@ def test_what_was_due_is_published_at_the_deadline(
     assert appliance.recorded(event="monitor published", resource="/alarm")
 
 
-def test_a_bad_specification_is_refused_with_its_place_and_changes_nothing(
+def test_an_invalid_specification_is_rejected_without_effect(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Exit status 1, as `monitor check`."""
+    """Exit status 1, as for `monitor check`."""
     spec = tmp_path / "words.rv"
     spec.write_text(WORDS.replace("heard + 1", "herd + 1"))
     done = appliance.rosrv("monitor", "load", str(spec), check=False)
@@ -245,8 +215,10 @@ def test_a_bad_specification_is_refused_with_its_place_and_changes_nothing(
     listener.wait_for(lambda event: event.get("data", "").startswith("checked hello"))
 
 
-def test_a_new_relay_begins_in_the_initial_state_and_says_so(appliance: Appliance, ros: RosSession) -> None:
-    """As an alarm; the switches and what was loaded stay, and `hold` blocks until resumed."""
+def test_a_new_relay_reports_that_it_begins_in_the_initial_state(
+    appliance: Appliance, ros: RosSession
+) -> None:
+    """An alarm reports it; switches and loaded files stay, and `hold` blocks messages until resumed."""
     held = WORDS.strip().replace("begin words()", "hold gate()").replace("/chatter", "/held")
     path = Path(appliance.directory) / "gate.rv"
     path.write_text(held)
@@ -268,8 +240,8 @@ def test_a_new_relay_begins_in_the_initial_state_and_says_so(appliance: Applianc
     listener.wait_for_count(before + 3, event="received")
 
 
-def test_what_was_loaded_and_switched_survives_a_restart(appliance: Appliance, tmp_path: Path) -> None:
-    """Of the whole appliance and of control; ROSRV's calls and flags tell the same."""
+def test_loaded_and_switched_monitors_survive_a_restart(appliance: Appliance, tmp_path: Path) -> None:
+    """They survive a restart of the appliance and of control; ROSRV's calls and flags report the same."""
     spec = tmp_path / "more.rv"
     spec.write_text(WORDS.replace("words()", "more()").replace("/chatter", "/other"))
     appliance.rosrv("monitor", "load", str(spec))
@@ -293,10 +265,8 @@ def test_what_was_loaded_and_switched_survives_a_restart(appliance: Appliance, t
     assert said[3] == "-1"
 
 
-def test_a_kept_revision_that_is_not_understood_any_more_has_a_way_back(
-    appliance: Appliance, tmp_path: Path
-) -> None:
-    """As after an upgrade: the start says which verb gives it up, and the next one has the folder's monitors."""
+def test_an_incompatible_stored_revision_can_be_discarded(appliance: Appliance, tmp_path: Path) -> None:
+    """As after an upgrade, the start names the verb that discards it; the next start has the folder's monitors."""
     spec = tmp_path / "more.rv"
     spec.write_text(WORDS.replace("words()", "more()").replace("/chatter", "/other"))
     appliance.rosrv("monitor", "load", str(spec))
@@ -312,16 +282,16 @@ def test_a_kept_revision_that_is_not_understood_any_more_has_a_way_back(
     assert "rosrv monitor reset --state" in appliance.story()
     appliance.stop()
     said = appliance.rosrv("monitor", "reset").stdout
-    assert "is given up" in said
+    assert "is discarded" in said
     appliance.start()
     assert monitor(appliance, "words")["enabled"] is True
     assert len(appliance.rosrv("monitor", "list", "--json").stdout.splitlines()) == 1
 
 
-def test_a_start_with_a_bad_file_is_an_error_that_says_where(folder: Path) -> None:
+def test_a_start_with_an_invalid_file_fails_with_its_place() -> None:
     """The appliance does not serve without its monitors."""
-    (folder / "broken.rv").write_text("broken() { event }")
-    appliance = Appliance(options=("--monitors", str(folder), "--api", "off"))
+    monitors = {"words": WORDS, "broken": "broken() { event }"}
+    appliance = Appliance(monitors=monitors, options=("--api", "off"))
     with pytest.raises(AssertionError):
         appliance.start()
     assert "broken.rv:1:" in appliance.story()
@@ -345,7 +315,7 @@ gate() {
 def test_requests_are_refused_and_responses_changed(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """From both clients to both: the client learns why as the service's error; the service never sees the request."""
+    """Both clients call both: the client gets the reason as the service's error; the service never gets the request."""
     for to in CLIENTS:
         spec = tmp_path / f"gate_{to}.rv"
         spec.write_text(GATE.replace("gate()", f"gate_{to}()").replace("/mode", f"/mode_{to}"))
@@ -366,18 +336,14 @@ def test_requests_are_refused_and_responses_changed(
 
 
 def said(listener: Process, prefix: str) -> None:
-    """The listener receives, from now on, something that begins so."""
+    """Wait until the listener receives a text with this beginning."""
     listener.wait_for(lambda event: event.get("data", "").startswith(prefix), since=listener.mark())
 
 
-def _numbers(listener: Process) -> list[int]:
-    return [int(event["data"].split()[-1]) for event in listener.seen(event="received")]
-
-
-def test_monitors_come_and_go_under_a_thousand_messages_a_second(
+def test_monitors_change_during_a_thousand_messages_a_second(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """One listener keeps up, one is stopped for a while, one comes late: in order, nobody lacks what another has."""
+    """One listener is fast, one is stopped for a while, one is late: each gets the messages in order, without gaps."""
     spec = tmp_path / "words.rv"
     steady, stopped = ros.listener("rospy", "/chatter"), ros.listener("roscpp", "/chatter")
     ros.talker("roscpp", "/chatter", "--rate", "1000", name="voice")
@@ -401,15 +367,15 @@ def test_monitors_come_and_go_under_a_thousand_messages_a_second(
     appliance.rosrv("monitor", "remove", "words")
     said(steady, "hello")
     late.wait_for_count(500, event="received")
-    # A talker that gets no processor time loses messages of its own queue: then nobody has them.
-    mine, others = _numbers(steady), _numbers(late)
+    # A talker without processor time loses messages of its own queue: no listener gets those.
+    mine, others = numbers(steady.seen(event="received")), numbers(late.seen(event="received"))
     first, last = others[0], min(mine[-1], others[-1])
     assert first < last
     assert [one for one in mine if first <= one <= last] == [one for one in others if one <= last]
     assert mine == sorted(set(mine))
-    # The one that was stopped may have lost the oldest that its queue had no room for, and is told the rest in order.
-    numbers = _numbers(stopped)
-    assert numbers == sorted(set(numbers))
+    # The stopped listener may have lost the oldest messages to its full queue, and gets the rest in order.
+    rest = numbers(stopped.seen(event="received"))
+    assert rest == sorted(set(rest))
     assert stopped.seen(event="received")[-1]["publisher"] == "/voice"
 
 
@@ -454,7 +420,7 @@ for line in sys.stdin:
 
 @pytest.mark.parametrize("relay", ["all", "monitored"])
 def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -> None:
-    """The gun fires only while it does not point at the robot itself; in either mode of the relay."""
+    """The gun fires only while it does not point at the robot itself, in either mode of the relay."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     options = (
         "--monitors",
@@ -478,9 +444,7 @@ def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -
             process.wait_for(event="ready")
         for tilt, shots, drops in ((0.2, 1, 0), (-0.6, 1, 1), (0.1, 2, 1)):
             operator.send(str(tilt))
-            gun.wait_for(
-                event="aimed", tilt=tilt
-            )  # the two topics are two connections: either may be the faster
+            gun.wait_for(event="aimed", tilt=tilt)  # the two topics are two connections: either may be faster
             operator.send("fire")
             gun.wait_for_count(shots, event="shot")
             dropping = partial(dropped_by, appliance, "safeTrigger", drops)
@@ -489,17 +453,16 @@ def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -
         assert dropped[0]["detail"]["monitor"] == "safeTrigger"
 
 
-def test_the_publisher_has_the_configured_name_and_is_hidden_and_faults_pass(
-    folder: Path, tmp_path: Path
-) -> None:
-    """`publish_as`, `hide_publisher` and `on_fault` of appliance.yaml."""
+def test_settings_of_the_monitors_publisher(tmp_path: Path) -> None:
+    """Test `publish_as`, `hide_publisher` and `on_fault` of appliance.yaml."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     divide = "if (heard == 2) { heard = heard / (heard - 2); }\n        text = "
-    (folder / "words.rv").write_text(WORDS.replace("text = ", divide, 1))
-    config = folder / "appliance.yaml"
-    config.write_text("publish_as: /guard\nhide_publisher: true\non_fault: pass\n")
-    options = ("--config", str(config), "--monitors", str(folder), "--api", "off")
-    with Appliance(options=options) as appliance, RosSession(appliance.master_uri, tmp_path) as ros:
+    monitors = {"words": WORDS.replace("text = ", divide, 1)}
+    settings = "publish_as: /guard\nhide_publisher: true\non_fault: pass\n"
+    with (
+        Appliance(settings=settings, monitors=monitors, options=("--api", "off")) as appliance,
+        RosSession(appliance.master_uri, tmp_path) as ros,
+    ):
         alarm = ros.listener("rospy", "/alarm")
         listener = ros.listener("rospy", "/chatter")
         ros.talker("rospy", "/chatter", "--rate", "3")
@@ -510,8 +473,8 @@ def test_the_publisher_has_the_configured_name_and_is_hidden_and_faults_pass(
         assert "/guard" not in ros.run("rostopic", "info", "/alarm").stdout
 
 
-def test_each_goal_of_an_action_is_monitored_by_itself(appliance: Appliance, ros: RosSession) -> None:
-    """The shipped `goals.rv`: an id that comes again and again is told of; actionlib's own goal has no record."""
+def test_each_goal_of_an_action_is_monitored_separately(appliance: Appliance, ros: RosSession) -> None:
+    """The shipped `goals.rv` reports a repeated id; actionlib's own goals leave no record."""
     appliance.rosrv("monitor", "load", str(ROOT / "monitors" / "goals.rv"))
     goal = "{goal_id: {id: twin}, goal: {goal: 1}}"
     twins = ros.start(["rostopic", "pub", "-r", "5", "/count/goal", "actionlib/TestActionGoal", goal])
@@ -540,10 +503,10 @@ judge() {
 """
 
 
-def test_what_a_monitor_does_explains_itself_on_the_command_line_as_over_rest(
+def test_explanations_of_monitors_are_the_same_by_command_and_rest(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Verdict, change, publication, fault and drop of a running appliance: who, which event, value and line."""
+    """Verdict, change, publication, fault and drop are explained with author, event, value and line."""
     file = tmp_path / "judge.rv"
     file.write_text(JUDGE)
     appliance.rosrv("monitor", "remove", "words")

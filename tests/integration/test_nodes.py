@@ -1,13 +1,22 @@
-"""Unmodified rospy and roscpp nodes talk to each other, behind a plain master and behind the appliance."""
+"""Unmodified rospy and roscpp nodes communicate behind a plain master and behind the appliance."""
 
 import json
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from tests.support.nodes import Client, RosSession
+from tests.support.nodes import Client, RosSession, numbers, without_gap
 from tests.support.site import Site
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
+
+
+@pytest.fixture
+def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
+    """Provide the robot's nodes and tools of one test."""
+    with RosSession(site.master_uri, tmp_path, site.robot) as session:
+        yield session
 
 
 @pytest.mark.parametrize("subscriber_first", [True, False], ids=["listener-first", "talker-first"])
@@ -22,15 +31,14 @@ def test_talker_to_listener(ros: RosSession, by: Client, to: Client, subscriber_
         ros.talker(by, "/chatter", name="voice")
         listener = ros.listener(to, "/chatter")
     heard = listener.wait_for_count(5, event="received")
-    numbers = [int(event["data"].removeprefix("hello ")) for event in heard]
-    assert numbers == list(range(numbers[0], numbers[0] + 5))
+    assert without_gap(numbers(heard))
     assert {event["publisher"] for event in heard} == {"/voice"}
 
 
 @pytest.mark.parametrize("to", CLIENTS)
 @pytest.mark.parametrize("by", CLIENTS)
 def test_latched_message(ros: RosSession, by: Client, to: Client) -> None:
-    """Who subscribes late gets the last message of a latched topic, once each."""
+    """Late subscribers get the last message of a latched topic, once each."""
     talker = ros.talker(by, "/map", "--latch")
     talker.wait_for(event="sent")
     for number in range(2):
@@ -41,7 +49,7 @@ def test_latched_message(ros: RosSession, by: Client, to: Client) -> None:
 
 @pytest.mark.parametrize("to", CLIENTS)
 def test_two_talkers_on_one_topic(ros: RosSession, to: Client) -> None:
-    """A subscriber hears every publisher of its topic and knows which is which."""
+    """A subscriber hears every publisher of its topic, and can tell them apart."""
     listener = ros.listener(to, "/chatter")
     ros.talker("rospy", "/chatter", "--text", "one", name="one")
     ros.talker("roscpp", "/chatter", "--text", "two", name="two")
@@ -51,8 +59,8 @@ def test_two_talkers_on_one_topic(ros: RosSession, to: Client) -> None:
 
 @pytest.mark.parametrize("to", CLIENTS)
 @pytest.mark.parametrize("by", CLIENTS)
-def test_talker_comes_back(ros: RosSession, by: Client, to: Client) -> None:
-    """A publisher that ended and came back under its name is heard again."""
+def test_restarted_talker(ros: RosSession, by: Client, to: Client) -> None:
+    """A publisher that ended and returned under its name is heard again."""
     listener = ros.listener(to, "/chatter")
     first = ros.talker(by, "/chatter", "--text", "before", name="voice")
     listener.wait_for(lambda event: event.get("data", "").startswith("before"))
@@ -63,7 +71,7 @@ def test_talker_comes_back(ros: RosSession, by: Client, to: Client) -> None:
 
 @pytest.mark.parametrize("by", CLIENTS)
 def test_second_node_of_a_name_replaces_the_first(ros: RosSession, by: Client) -> None:
-    """ROS's own rule stays: a new node of the same name on the same host ends the old one."""
+    """ROS's own rule holds: a new node of the same name on the same host ends the old one."""
     listener = ros.listener("rospy", "/chatter")
     first = ros.talker(by, "/chatter", "--text", "first", name="voice")
     listener.wait_for(event="received")
@@ -74,7 +82,7 @@ def test_second_node_of_a_name_replaces_the_first(ros: RosSession, by: Client) -
 
 @pytest.mark.parametrize("by", CLIENTS)
 def test_talker_notices_that_the_listener_left(ros: RosSession, by: Client) -> None:
-    """A publisher is told when somebody connects and when nobody is left."""
+    """A publisher is notified when a subscriber connects and when the last one leaves."""
     talker = ros.talker(by, "/chatter")
     listener = ros.listener("roscpp", "/chatter")
     talker.wait_for(event="connected")
@@ -85,7 +93,7 @@ def test_talker_notices_that_the_listener_left(ros: RosSession, by: Client) -> N
 @pytest.mark.parametrize("to", CLIENTS)
 @pytest.mark.parametrize("by", CLIENTS)
 def test_service(ros: RosSession, by: Client, to: Client) -> None:
-    """A service answers its client, again and again, and learns the client's name."""
+    """A service answers its client repeatedly, and learns the client's name."""
     server = ros.service_server(by, "/negate")
     client = ros.service_client(to, "/negate", name="asker")
     for number, given in enumerate(("true", "false", "true")):
@@ -111,8 +119,8 @@ def test_persistent_service_connection(ros: RosSession, client: Client) -> None:
 
 
 @pytest.mark.parametrize("client", CLIENTS)
-def test_service_that_is_not_there(ros: RosSession, client: Client) -> None:
-    """A call of a service nobody offers fails for the client and leaves it running."""
+def test_missing_service(ros: RosSession, client: Client) -> None:
+    """A call of a missing service fails for the client and leaves it running."""
     asker = ros.service_client(client, "/nobody")
     asker.send("true")
     asker.wait_for(event="failed")
@@ -122,7 +130,7 @@ def test_service_that_is_not_there(ros: RosSession, client: Client) -> None:
 
 
 def test_watched_parameter(ros: RosSession) -> None:
-    """A parameter set by one node reaches the nodes that watch it, rospy and roscpp."""
+    """A parameter set by one node reaches the watching nodes, rospy and roscpp."""
     python, cpp = ros.parameters("rospy"), ros.parameters("roscpp")
     python.send(json.dumps({"do": "set", "key": "/speed", "value": "slow"}))
     python.wait_for(event="done", do="set")
@@ -143,7 +151,7 @@ def test_watched_parameter(ros: RosSession) -> None:
     ids=repr,
 )
 def test_parameter_values(ros: RosSession, value: object) -> None:
-    """Every kind of value a parameter can have comes back as it was set."""
+    """Every kind of parameter value is returned as it was set."""
     node = ros.parameters("rospy")
     for told in ({"do": "set", "key": "/value", "value": value}, {"do": "get", "key": "/value"}):
         node.send(json.dumps(told))
@@ -165,7 +173,7 @@ def test_nodes_on_two_hosts(site: Site, ros: RosSession) -> None:
 
 
 def test_relative_and_private_names(ros: RosSession) -> None:
-    """Namespaces and remappings are resolved as ever."""
+    """Namespaces and remappings are resolved as usual."""
     listener = ros.listener("roscpp", "/left/chatter")
     ros.talker("rospy", "chatter", "__ns:=/left")
     listener.wait_for(event="received")
@@ -175,7 +183,7 @@ def test_relative_and_private_names(ros: RosSession) -> None:
 
 
 def test_action(ros: RosSession) -> None:
-    """An action server takes a goal, gives feedback in order, and its result arrives: five topics both ways."""
+    """An action server accepts a goal, sends feedback in order, and a result: five topics both ways."""
     server = ros.node("rospy", "action", "server", name="counter")
     client = ros.node("rospy", "action", "client", name="asker")
     assert client.wait_for(event="result") == {"event": "result", "result": 3, "state": 3}

@@ -1,7 +1,6 @@
-"""The policy changes while a robot works: what is taken back stops at once, what is granted again goes on by itself."""
+"""The policy changes while a robot works: revoked rights end at once, rights granted again work without a restart."""
 
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,20 +15,18 @@ NO_CHATTER = OPEN_POLICY.replace("[Subscribers]", "/chatter =\n[Subscribers]", 1
 NO_EARS = OPEN_POLICY.replace("[Commands]", "/chatter =\n[Commands]", 1)
 
 
-@pytest.fixture
-def ros(appliance: Appliance, common_robot: Host, tmp_path: Path) -> Iterator[RosSession]:
-    """The robot's nodes behind the appliance."""
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with RosSession(appliance.master_uri, tmp_path, common_robot) as session:
-        yield session
+@pytest.fixture(scope="module")
+def appliance(own_appliance: Appliance) -> Appliance:
+    """Return an appliance of this file's own."""
+    return own_appliance
 
 
 @pytest.mark.parametrize("without", [NO_CHATTER, NO_EARS], ids=["publication", "subscription"])
 @pytest.mark.parametrize("client", ["rospy", "roscpp"])
-def test_a_rollback_gives_running_nodes_back_what_a_bad_policy_took(
+def test_a_rollback_restores_rights_of_running_nodes(
     appliance: Appliance, ros: RosSession, client: Client, without: str
 ) -> None:
-    """Messages stop with the bad revision and come again with the rollback; no node is started again."""
+    """Messages stop with the bad revision and return with the rollback; no node is restarted."""
     listener = ros.listener(client, "/chatter")
     ros.talker(client, "/chatter", name="voice")
     listener.wait_for(event="received")
@@ -46,10 +43,10 @@ def test_a_rollback_gives_running_nodes_back_what_a_bad_policy_took(
 
 
 @pytest.mark.parametrize("client", ["rospy", "roscpp"])
-def test_what_was_taken_is_remembered_over_a_crash_of_control(
+def test_revocations_survive_a_crash_of_control(
     appliance: Appliance, ros: RosSession, client: Client
 ) -> None:
-    """Control is killed between the bad revision and the rollback: it makes no difference."""
+    """A crash of control between the bad revision and the rollback makes no difference."""
     listener = ros.listener(client, "/chatter")
     ros.talker(client, "/chatter", name="voice")
     listener.wait_for(event="received")
@@ -60,11 +57,11 @@ def test_what_was_taken_is_remembered_over_a_crash_of_control(
     listener.wait_for(event="received", publisher="/voice", since=after)
 
 
-def test_a_policy_that_changed_while_the_appliance_was_down_holds_for_nodes_that_run(
+def test_a_policy_changed_during_downtime_applies_to_running_nodes(
     appliance: Appliance, ros: RosSession
 ) -> None:
-    """The file is edited between a stop and a start: what it no longer allows is taken from the nodes at the start."""
-    appliance.reload(OPEN_POLICY)  # what is in force is the file's
+    """After the file was edited between a stop and a start, running nodes lose the revoked rights at the start."""
+    appliance.reload(OPEN_POLICY)  # the policy in force is that of the file
     listener = ros.listener("rospy", "/chatter")
     ros.talker("roscpp", "/chatter", name="voice")
     listener.wait_for(event="received")
@@ -79,17 +76,12 @@ def test_a_policy_that_changed_while_the_appliance_was_down_holds_for_nodes_that
     listener.wait_for(event="received", publisher="/voice", since=after)
 
 
-def test_a_node_that_stood_still_over_a_reload_has_lost_what_the_policy_took(
-    lab: Lab, robot: Host, tmp_path: Path
-) -> None:
-    """It is lost, the policy changes, it goes on: nothing of the topic goes through it until a rollback."""
+def test_a_node_paused_during_a_reload_loses_revoked_rights(lab: Lab, robot: Host, tmp_path: Path) -> None:
+    """A node that was lost during the change and continues later gets no message of the topic until a rollback."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    config = tmp_path / "appliance.yaml"
-    config.write_text("liveness: {interval: 0.5, silent: 2}\n")
+    middle, settings = lab.host("appliance", "10.77.0.2/24"), "liveness: {interval: 0.5, silent: 2}\n"
     with (
-        Appliance(
-            lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config), "--api", "off")
-        ) as appliance,
+        Appliance(middle, settings=settings, options=("--api", "off")) as appliance,
         RosSession(appliance.master_uri, tmp_path, robot) as ros,
     ):
         listener = ros.listener("rospy", "/chatter")
@@ -115,8 +107,8 @@ def test_a_node_that_stood_still_over_a_reload_has_lost_what_the_policy_took(
             listener.wait_for(event="received", publisher=name, since=after)
 
 
-def test_sighup_reads_the_policy_again(appliance: Appliance) -> None:
-    """As `rosrv policy reload` does; a file with errors changes nothing, and the log says what is wrong."""
+def test_sighup_reloads_the_policy(appliance: Appliance) -> None:
+    """SIGHUP works like `rosrv policy reload`; a file with errors changes nothing, and the log names them."""
     assert appliance.process is not None
     revision = appliance.status()["policy"]["revision"]
     appliance.policy_file.write_text(NO_CHATTER)
@@ -124,5 +116,5 @@ def test_sighup_reads_the_policy_again(appliance: Appliance) -> None:
     eventually(lambda: appliance.status()["policy"]["revision"] == revision + 1, "the new policy is in force")
     appliance.policy_file.write_text("[Nonsense]\n")
     appliance.process.popen.send_signal(signal.SIGHUP)
-    eventually(lambda: appliance.audit("--event", "policy refused"), "the refusal is recorded")
+    eventually(lambda: appliance.audit("--event", "policy refused"), "the rejection is recorded")
     assert appliance.status()["policy"]["revision"] == revision + 1

@@ -1,4 +1,4 @@
-"""A refusal of the running appliance is granted: by its record, on the command line and over REST."""
+"""Grant a denied call of the running appliance from its record, by command and over REST."""
 
 import re
 import subprocess
@@ -28,14 +28,14 @@ HERE = "http://127.0.0.1:4000/"
 
 @pytest.fixture(scope="module")
 def common_appliance() -> Iterator[Appliance]:
-    """An appliance with REST."""
+    """Run an appliance with REST."""
     with Appliance(policy=POLICY, options=("--api", "127.0.0.1:0")) as appliance:
         yield appliance
 
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """The same with its first policy: only the operator's station may command. No node is registered."""
+    """Provide it with its first policy: only the operator's station may command. No node is registered."""
     yield common_appliance
     common_appliance.reload(POLICY)
     with ServerProxy(common_appliance.master_uri) as master:
@@ -43,7 +43,7 @@ def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
 
 
 def refused(appliance: Appliance, method: str, *arguments: object) -> str:
-    """The id of the record of a call that is refused."""
+    """Return the id of the record of a denied call."""
     with ServerProxy(appliance.master_uri) as master:
         code, text, _value = getattr(master, method)(*arguments)
     assert code == 0
@@ -53,7 +53,7 @@ def refused(appliance: Appliance, method: str, *arguments: object) -> str:
 
 
 def test_a_full_disk_leaves_the_policy_as_it_was(appliance: Appliance, tmp_path: Path) -> None:
-    """`--write` to the file in force: without room for it the file is whole, says so, and is itself."""
+    """With `--write` to the file in force and no disk space, the file stays complete, and the error says so."""
     record = refused(appliance, "registerPublisher", "/base", "/cmd_vel", "std_msgs/String", HERE)
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8k", "rosrv-grant-test", tmp_path], check=True)
     try:
@@ -72,8 +72,8 @@ def test_a_full_disk_leaves_the_policy_as_it_was(appliance: Appliance, tmp_path:
         subprocess.run(["umount", "--lazy", tmp_path], check=True)
 
 
-def test_what_was_refused_is_granted_on_trial(appliance: Appliance, tmp_path: Path) -> None:
-    """Shown as a diff, over REST alike; loaded with the time limit of any change; the node gets it without more ado."""
+def test_a_denied_call_is_granted_with_commit_confirm(appliance: Appliance, tmp_path: Path) -> None:
+    """The change is shown as a diff, also over REST, and loaded with a time limit; then the node gets the right."""
     call = ("registerPublisher", "/base", "/cmd_vel", "std_msgs/String", HERE)
     record = refused(appliance, *call)
     shown = appliance.rosrv("policy", "grant", record).stdout
@@ -87,11 +87,11 @@ def test_what_was_refused_is_granted_on_trial(appliance: Appliance, tmp_path: Pa
     assert appliance.rest().get(f"/v1/audit/{record}/why").json["lines"] == why
     new, dos = tmp_path / "new.ini", tmp_path / "dos.ini"
     dos.write_bytes(b"[Groups]\r\n")
-    for file, ends in ((new, b"\n"), (dos, b"\r\n")):  # whose lines go on ending as they did
+    for file, ends in ((new, b"\n"), (dos, b"\r\n")):  # its line endings stay the same
         appliance.rosrv("policy", "grant", record, "--write", str(file))
         assert set(re.findall(rb"\r?\n", file.read_bytes())) == {ends}
     done = appliance.rosrv("policy", "grant", record, "--load", "--confirm-within", "5m")
-    assert "unless you say: rosrv policy confirm" in done.stdout
+    assert "unless you run: rosrv policy confirm" in done.stdout
     with ServerProxy(appliance.master_uri) as master:
         answer = getattr(master, call[0])(*call[1:])
     assert answer[0] == 1
@@ -99,8 +99,8 @@ def test_what_was_refused_is_granted_on_trial(appliance: Appliance, tmp_path: Pa
     assert (again.returncode, "the policy in force grants it" in again.stdout) == (1, True)
 
 
-def test_what_no_policy_grants_is_said(appliance: Appliance) -> None:
-    """A call that the appliance does not know; a record that is not there, or of something else."""
+def test_calls_that_no_policy_can_grant(appliance: Appliance) -> None:
+    """An unknown call, and a missing or unsuitable record, are reported as such."""
     record = refused(appliance, "bogus", "/base")
     done = appliance.rosrv("policy", "grant", record, check=False)
     assert (done.returncode, "is not a call that the appliance knows" in done.stderr) == (1, True)
@@ -110,7 +110,7 @@ def test_what_no_policy_grants_is_said(appliance: Appliance) -> None:
     assert rest.get("/v1/audit/ffffffffffffffffffff/why").status == 404
     assert rest.get(f"/v1/audit/{record}/why").json["refusal"]
     started = appliance.recorded("--event", "appliance started")[0]["id"]
-    assert "no record of a decision" in appliance.rosrv("policy", "grant", started, check=False).stderr
+    assert "not a record of a decision" in appliance.rosrv("policy", "grant", started, check=False).stderr
 
 
 CLOSED = """
@@ -152,7 +152,7 @@ DENIALS: dict[str, tuple[tuple[object, ...], list[str]]] = {
 
 
 def test_every_denial_explains_itself(appliance: Appliance) -> None:
-    """Who, which rule in which line, and what would allow it; on the command line as over REST."""
+    """Each has the caller, the rule with its line, and the change that would allow it; by command and over REST."""
     appliance.reload(CLOSED)
     rest = appliance.rest()
     allowed: dict[str, list[str]] = {}
@@ -168,8 +168,8 @@ def test_every_denial_explains_itself(appliance: Appliance) -> None:
     assert allowed == {what: added for what, (_call, added) in DENIALS.items()}
 
 
-def test_what_is_taken_back_says_what_would_keep_it(appliance: Appliance) -> None:
-    """A publication that another policy ends: the record of that has the change that lets it be had again."""
+def test_a_revocation_explains_the_change_that_would_undo_it(appliance: Appliance) -> None:
+    """The record of a publication that another policy ends has the change that would allow it again."""
     open_to_all = CLOSED.replace("[Publishers]\ndefault = ocu", "[Publishers]\ndefault = *")
     appliance.reload(open_to_all)
     with ServerProxy(appliance.master_uri) as master:

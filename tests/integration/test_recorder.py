@@ -1,11 +1,10 @@
-"""The flight recorder beside real nodes: a monitor's drop makes a recording that stock tools read."""
+"""The flight recorder beside real nodes: a drop by a monitor makes a recording that stock tools read."""
 
 import hashlib
 import json
 import os
 import signal
 import stat
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -45,39 +44,24 @@ audit: {reserve_bytes: 1MiB}
 
 @pytest.fixture(scope="module")
 def recording() -> Iterator[Appliance]:
-    """An appliance with a recorder, and a monitor that drops what is said on /rude."""
+    """Run an appliance with a recorder, and a monitor that drops the messages on /rude."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with tempfile.TemporaryDirectory(prefix="rosrv-recorder-") as name:
-        folder = Path(name)
-        folder.chmod(0o755)
-        (folder / "monitors").mkdir()
-        (folder / "monitors" / "censor.rv").write_text(MONITOR)
-        (folder / "appliance.yaml").write_text(CONFIGURATION)
-        options = (
-            "--config", str(folder / "appliance.yaml"), "--monitors", str(folder / "monitors"), "--api", "127.0.0.1:0"
-        )  # fmt: skip
-        with Appliance(options=options) as appliance:
-            yield appliance
+    monitors, options = {"censor": MONITOR}, ("--api", "127.0.0.1:0")
+    with Appliance(settings=CONFIGURATION, monitors=monitors, options=options) as appliance:
+        yield appliance
 
 
 @pytest.fixture
 def appliance(recording: Appliance) -> Iterator[Appliance]:
-    """The same, without a recording; what other tests said on topics of their own is in its memory."""
-    recording.leave_out_what_was()
+    """Provide it without recordings; its memory has messages of other tests on other topics."""
+    recording.ignore_earlier_records()
     yield recording
     for line in recording.rosrv("record", "list", "--json", check=False).stdout.splitlines():
         recording.rosrv("record", "remove", json.loads(line)["id"])
 
 
-@pytest.fixture
-def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
-    """Nodes of one test."""
-    with RosSession(appliance.master_uri, tmp_path) as session:
-        yield session
-
-
 def recordings(appliance: Appliance, count: int = 1) -> list[dict[str, Any]]:
-    """The recordings, once there are so many."""
+    """Return the recordings, once there are so many."""
 
     def found() -> list[dict[str, Any]] | None:
         listed = appliance.rosrv("record", "list", "--json", check=False)
@@ -88,7 +72,7 @@ def recordings(appliance: Appliance, count: int = 1) -> list[dict[str, Any]]:
 
 
 def fetched(appliance: Appliance, recording: str, folder: Path) -> Path:
-    """The bag of a recording, as an operator gets it."""
+    """Return the bag of a recording, as an operator gets it."""
     bag = folder / f"{recording}.bag"
     appliance.rosrv("record", "fetch", recording, "--out", str(bag))
     assert stat.S_IMODE(bag.stat().st_mode) == 0o600
@@ -96,7 +80,7 @@ def fetched(appliance: Appliance, recording: str, folder: Path) -> Path:
 
 
 def said(ros: RosSession, bag: Path, topic: str) -> list[str]:
-    """The strings of a topic, as Debian's rosbag reads them, one after the other and (as rqt_bag does) by the index."""
+    """Return the strings of a topic by Debian's rosbag, read in sequence and (as rqt_bag does) by the index."""
     program = (
         "import rosbag, sys\n"
         "bag, topics = rosbag.Bag(sys.argv[1]), [sys.argv[2]]\n"
@@ -109,10 +93,10 @@ def said(ros: RosSession, bag: Path, topic: str) -> list[str]:
     return ros.run("/usr/bin/python3", "-c", program, str(bag), topic).stdout.splitlines()
 
 
-def test_a_recording_has_the_time_that_monitors_had(
+def test_a_recording_has_the_timestamps_of_the_monitors(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """To the nanosecond: what they do with time, and what follows from it, comes out the same again."""
+    """Times are exact to the nanosecond: time-dependent monitors give the same results on the recording."""
     ros.talker("rospy", "/dated")
     lines = appliance.recorded(event="monitor log", count=15)
     appliance.rosrv("record", "now", "--before", "1m", "--after", "1s")
@@ -124,7 +108,7 @@ def test_a_recording_has_the_time_that_monitors_had(
 
 
 def viewers_see_no_contents(appliance: Appliance, dropped: str) -> None:
-    """What a monitor dropped is for all but viewers, and so is what would give it away."""
+    """Assert that viewers see neither the dropped message nor anything that reveals it."""
     path, every = f"/v1/audit/{dropped}?neighbours=0", "event=message+dropped"
     for role in ("viewer", "investigator", "operator"):
         made = appliance.rosrv("token", "add", f"a-{role}", "--role", role, "--json").stdout
@@ -143,8 +127,10 @@ def viewers_see_no_contents(appliance: Appliance, dropped: str) -> None:
 def test_a_drop_makes_a_recording_that_stock_tools_read(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """With what was dropped, what was said before and after, and the decisions; the log proves it, and who took it."""
-    assert "nothing has been recorded: rosrv record now" in appliance.rosrv("record", "list").stdout
+    """It has the dropped message, earlier and later ones, and the decisions; the log proves it and records its
+    export.
+    """
+    assert "no recordings; make one: rosrv record now" in appliance.rosrv("record", "list").stdout
     listener = ros.listener("roscpp", "/chatter", name="ear")
     for topic in ("/rude", "/secret/key"):
         ros.listener("rospy", topic)
@@ -201,9 +187,7 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
     closest = ("monitor", "replay", "censor", "--since", "1h", "--margins", "--json")
     margins = [json.loads(line) for line in appliance.rosrv(*closest).stdout.splitlines()]
     [offline] = [margin for margin in margins if margin["kind"] == "margin"]
-    live = json.loads(appliance.rosrv("monitor", "margins", "censor", "--json").stdout)
-    assert (live["line"], live["holds"]) == (offline["line"], offline["holds"]) == (4, True)
-    assert live["since_load"]["threshold_at"] == offline["threshold_at"] == len("bad 1")
+    assert (offline["line"], offline["holds"], offline["threshold_at"]) == (4, True, len("bad 1"))
     secret = tmp_path / "secret.rv"
     secret.write_text(MONITOR.replace("/rude", "/secret/key"))
     refused = appliance.rosrv("monitor", "replay", str(secret), "--since", "1h", check=False)
@@ -221,10 +205,10 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
 
 
 @pytest.mark.parametrize("victims", [("relay",), ("relay", "control")])
-def test_what_a_killed_relay_had_received_is_in_the_recording(
+def test_messages_of_a_killed_relay_are_in_the_recording(
     appliance: Appliance, ros: RosSession, tmp_path: Path, victims: tuple[str, ...]
 ) -> None:
-    """Every message that a subscriber got before and after is there, once; but that which was just being passed on."""
+    """Every message that a subscriber got is in it once, except the one in transfer."""
     topic = f"/chatter_{len(victims)}"
     listener = ros.listener("roscpp", topic, name="ear")
     ros.talker("roscpp", topic, name="voice")
@@ -244,8 +228,8 @@ def test_what_a_killed_relay_had_received_is_in_the_recording(
     assert appliance.recorded(event="recording closed")[0]["detail"]["recording"] == row["id"]
 
 
-def test_a_killed_recorder_goes_on(appliance: Appliance, ros: RosSession, tmp_path: Path) -> None:
-    """The recording that it had begun is finished by the next, under the same name, with every message once."""
+def test_a_killed_recorder_resumes(appliance: Appliance, ros: RosSession, tmp_path: Path) -> None:
+    """The next recorder completes the recording under the same name, with every message once."""
     listener = ros.listener("roscpp", "/speech", name="ear")
     ros.talker("roscpp", "/speech", name="voice")
     heard = [event["data"] for event in listener.wait_for_count(10, event="received")]
@@ -258,8 +242,8 @@ def test_a_killed_recorder_goes_on(appliance: Appliance, ros: RosSession, tmp_pa
     assert len(chatter) == len(set(chatter))
 
 
-def test_nodes_call_for_a_recording_if_the_policy_lets_them(appliance: Appliance, ros: RosSession) -> None:
-    """A roscpp and a rospy node, and the stock tool; who may not is told so, and nobody takes the service's place."""
+def test_nodes_can_order_a_recording_if_the_policy_allows(appliance: Appliance, ros: RosSession) -> None:
+    """roscpp, rospy and the stock tool can; a denied node gets the reason, and no node can take over the service."""
     service = "/rosrv/record_now"
     ros.talker("roscpp", "/chatter", name="voice")
     eventually(lambda: appliance.status()["recorder"]["running"], appliance.story)
@@ -289,18 +273,18 @@ def test_nodes_call_for_a_recording_if_the_policy_lets_them(appliance: Appliance
     [denied] = appliance.recorded(event="decision", decision="deny", caller_id="/namesake")
     assert denied["reason"] == f"the service {service} belongs to the appliance"
     appliance.reload(OPEN_POLICY + f"[Clients]\n{service} = 10.9.9.9\ndefault = *\n")
-    stranger = ros.service_client("roscpp", service, "--trigger", name="stranger")
-    stranger.send("now")
-    stranger.wait_for(event="failed")
+    unknown = ros.service_client("roscpp", service, "--trigger", name="unknown")
+    unknown.send("now")
+    unknown.wait_for(event="failed")
     appliance.reload(OPEN_POLICY)
-    [denied] = appliance.recorded(event="decision", decision="deny", caller_id="/stranger")
+    [denied] = appliance.recorded(event="decision", decision="deny", caller_id="/unknown")
     assert (denied["category"], denied["resource"]) == ("call", service)
 
 
 def test_over_rest_messages_are_for_investigators(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Operators order, viewers look, admins remove; the bag is whole, and who fetched it is on record."""
+    """Operators order, viewers list, admins remove; the bag is complete, and its download is recorded."""
 
     def token(role: str) -> str:
         made = appliance.rosrv("token", "add", f"the-{role}", "--role", role, "--json").stdout

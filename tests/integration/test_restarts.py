@@ -1,31 +1,25 @@
-"""A process of the appliance is killed while a robot works: nodes that run go on, and new ones can join."""
+"""A process of the appliance is killed while a robot works: running nodes go on, and new ones can join."""
 
 import itertools
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from examples.landshark.lab import Host
 from tests.support.appliance import Appliance
-from tests.support.nodes import Client, RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import Client, RosSession
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 ROLES = ["control", "relay", "rosmaster", "signer", "rosout"]
 
 
-@pytest.fixture
-def ros(appliance: Appliance, common_robot: Host, tmp_path: Path) -> Iterator[RosSession]:
-    """The robot's nodes behind the appliance."""
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with RosSession(appliance.master_uri, tmp_path, common_robot) as session:
-        yield session
+@pytest.fixture(scope="module")
+def appliance(own_appliance: Appliance) -> Appliance:
+    """Return an appliance of this file's own."""
+    return own_appliance
 
 
 @pytest.mark.parametrize("role", ROLES)
 def test_kill(appliance: Appliance, ros: RosSession, role: str) -> None:
-    """Messages come again, a service answers, parameters are there, and a node started afterwards is heard."""
+    """Messages arrive again, a service answers, parameters exist, and a node started afterwards is heard."""
     listeners = [ros.listener(client, "/chatter") for client in CLIENTS]
     ros.talker("rospy", "/chatter", name="python_voice")
     ros.talker("roscpp", "/chatter", name="cpp_voice")

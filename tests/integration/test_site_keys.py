@@ -1,4 +1,4 @@
-"""Where the site signs, no way into the appliance takes what it did not sign."""
+"""With a site key, every way into the appliance requires its signature."""
 
 import contextlib
 import json
@@ -22,22 +22,9 @@ NO_SIGNATURE = "it has no signature of the site (site_keys in appliance.yaml)"
 
 @contextlib.contextmanager
 def of_a_site() -> Iterator[Appliance]:
-    """An appliance with a key of the site, a signed policy and an empty folder of specifications; not started."""
-    appliance = Appliance()
-    folder = appliance.directory / "monitors"
-    folder.mkdir()
-    config = appliance.directory / "appliance.yaml"
-    config.write_text(f"site_keys:\n  - {LINE}\n")
-    appliance.options = (
-        "--config",
-        str(config),
-        "--monitors",
-        str(folder),
-        "--api",
-        "127.0.0.1:0",
-        "--api-tls",
-        "off",
-    )
+    """Return an appliance with a site key, a signed policy and an empty folder of specifications; not started."""
+    options = ("--api", "127.0.0.1:0", "--api-tls", "off")
+    appliance = Appliance(settings=f"site_keys:\n  - {LINE}\n", monitors={}, options=options)
     sign(appliance.policy_file)
     try:
         yield appliance
@@ -47,30 +34,30 @@ def of_a_site() -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def started() -> Iterator[Appliance]:
-    """One that runs; a test loads policies, the other specifications."""
+    """Run it; some tests load policies, others specifications."""
     with of_a_site() as appliance:
         yield appliance.start()
 
 
 def sign(file: Path) -> None:
-    """The site signs what is in a file now."""
+    """Sign the present contents of a file."""
     file.with_name(f"{file.name}.sig").write_text(signed(file.read_text()))
 
 
 def post(appliance: Appliance, path: str, **body: Any) -> Answer:
-    """POST of the first token's holder, whatever is in force."""
+    """POST with the first token, whatever revision is in force."""
     headers = {"If-Match": "*", "Content-Type": "application/json"}
     return appliance.rest().request("POST", path, json.dumps(body).encode(), headers)
 
 
 def in_force(appliance: Appliance) -> dict[str, Any] | None:
-    """`GET /v1/policy`; None while control is away."""
+    """Return `GET /v1/policy`; None while control is away."""
     answer = appliance.rest().get("/v1/policy")
     return answer.json if answer.status == 200 else None
 
 
-def test_an_unsigned_policy_ends_the_start_before_anything_is_there() -> None:
-    """In words that say what to do; no process, no state directory."""
+def test_an_unsigned_policy_fails_the_start() -> None:
+    """The error says what to do; no process and no state directory is made."""
     with of_a_site() as appliance:
         Path(f"{appliance.policy_file}.sig").unlink()
         with pytest.raises(AssertionError, match="ended"):
@@ -83,8 +70,8 @@ def test_an_unsigned_policy_ends_the_start_before_anything_is_there() -> None:
         assert not appliance.state.exists()
 
 
-def test_no_way_leads_past_the_signature_of_a_policy(started: Appliance) -> None:
-    """File, SIGHUP, REST, rollback and a crash: each asks for it, and the record of what is taken names the key."""
+def test_every_way_requires_the_signature_of_a_policy(started: Appliance) -> None:
+    """File, SIGHUP, REST, rollback and a crash require it, and the record names the key."""
     appliance = started
     appliance.policy_file.write_text(OTHER)
     assert "it is not the text that" in appliance.rosrv("policy", "reload", check=False).stderr
@@ -109,8 +96,8 @@ def test_no_way_leads_past_the_signature_of_a_policy(started: Appliance) -> None
     assert [one["detail"]["signed_by"] for one in records] == [NAME] * 3
 
 
-def test_no_way_leads_past_the_signature_of_a_specification(started: Appliance) -> None:
-    """Command, folder and REST: each asks for it, and the record of what is taken names the key."""
+def test_every_way_requires_the_signature_of_a_specification(started: Appliance) -> None:
+    """Command, folder and REST require it, and the record names the key."""
     appliance = started
     file = appliance.directory / "monitors" / "count.rv"
     file.write_text(SPECIFICATION)

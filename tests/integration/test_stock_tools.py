@@ -1,7 +1,8 @@
-"""The stock command line tools work as ever, behind a plain master and behind the appliance."""
+"""The stock command line tools work as usual, behind a plain master and behind the appliance."""
 
 import re
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,8 +29,15 @@ PACKAGE = """\
 """
 
 
+@pytest.fixture
+def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
+    """Provide the robot's nodes and tools of one test."""
+    with RosSession(site.master_uri, tmp_path, site.robot) as session:
+        yield session
+
+
 def test_rostopic_list(ros: RosSession) -> None:
-    """`rostopic list` shows the topics, and `-v` who publishes and who subscribes."""
+    """`rostopic list` prints the topics, and `-v` their publishers and subscribers."""
     ros.talker("rospy", "/chatter")
     ros.listener("roscpp", "/chatter")
     assert "/chatter" in ros.run("rostopic", "list").stdout.split()
@@ -47,14 +55,14 @@ def test_rostopic_echo(ros: RosSession, client: Client) -> None:
 
 
 def test_rostopic_echo_does_not_stay_in_the_graph(ros: RosSession) -> None:
-    """A tool that has ended is no subscriber any more."""
+    """A tool that has ended is not a subscriber any more."""
     ros.talker("rospy", "/chatter", name="voice")
     ros.run("rostopic", "echo", "-n", "1", "/chatter")
     assert "Subscribers: None" in ros.run("rostopic", "info", "/chatter").stdout
 
 
 def test_rostopic_hz(ros: RosSession) -> None:
-    """`rostopic hz` measures the rate the node publishes with."""
+    """`rostopic hz` measures the publishing rate of the node."""
     ros.talker("roscpp", "/chatter")
     hz = ros.start(["rostopic", "hz", "/chatter"])
     rate = float(hz.wait_for_text("average rate").removeprefix("average rate: "))
@@ -70,7 +78,7 @@ def test_rostopic_pub(ros: RosSession) -> None:
 
 
 def test_rostopic_info_and_type(ros: RosSession) -> None:
-    """`rostopic info` names type, publisher and subscriber; `type` and `find` agree."""
+    """`rostopic info` prints type, publisher and subscriber; `type` and `find` agree."""
     ros.talker("roscpp", "/chatter", name="voice")
     ros.listener("rospy", "/chatter", name="ear")
     info = ros.run("rostopic", "info", "/chatter").stdout
@@ -82,14 +90,14 @@ def test_rostopic_info_and_type(ros: RosSession) -> None:
 
 
 def test_rosnode_list(ros: RosSession) -> None:
-    """`rosnode list` shows the robot's nodes and `/rosout`, and nothing of the appliance."""
+    """`rosnode list` prints the robot's nodes and `/rosout`, and no node of the appliance."""
     ros.talker("rospy", "/chatter", name="voice")
     assert ros.run("rosnode", "list").stdout.split() == ["/rosout", "/voice"]
 
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_rosnode_info(ros: RosSession, client: Client) -> None:
-    """`rosnode info` shows publications, subscriptions, services, and the node's connections."""
+    """`rosnode info` prints publications, subscriptions, services, and the node's connections."""
     ros.talker(client, "/chatter", name="voice")
     ros.listener("rospy", "/chatter", name="ear").wait_for(event="received")
     info = ros.run("rosnode", "info", "/voice").stdout
@@ -155,7 +163,7 @@ def test_rosbag(ros: RosSession, tmp_path: Path) -> None:
 
 
 def package_of_two_nodes(workspace: Path) -> Path:
-    """A ROS package with a rospy talker, a roscpp listener and a launch file for both: the launch file."""
+    """Make a ROS package with a rospy talker, a roscpp listener and a launch file, and return the launch file."""
     package = workspace / "pair"
     package.mkdir(parents=True)
     (package / "package.xml").write_text(PACKAGE)
@@ -169,7 +177,7 @@ def package_of_two_nodes(workspace: Path) -> Path:
 
 
 def test_roslaunch(ros: RosSession, tmp_path: Path) -> None:
-    """`roslaunch` sets its parameters, starts two nodes that talk, and ends them when interrupted."""
+    """`roslaunch` sets its parameters, starts two nodes that communicate, and ends them when interrupted."""
     file = package_of_two_nodes(tmp_path / "workspace")
     launch = ros.start(["roslaunch", "--wait", str(file)], ROS_PACKAGE_PATH=str(tmp_path / "workspace"))
     assert launch.wait_for(event="received")["publisher"] == "/pair/voice"
@@ -181,7 +189,7 @@ def test_roslaunch(ros: RosSession, tmp_path: Path) -> None:
     ros.run("rosparam", "delete", "/launched")
 
 
-def test_tools_on_another_host(site: Site, ros: RosSession) -> None:
+def test_tools_run_on_another_host(site: Site, ros: RosSession) -> None:
     """The tools work on the operator's machine as on the robot."""
     ros.talker("roscpp", "/chatter", name="voice")
     elsewhere = ros.on(site.ocu)

@@ -1,4 +1,4 @@
-"""What somebody tries who reaches REST and wants in, or wants it gone; beside the floods of `test_robustness.py`."""
+"""Attacks on REST to gain access or to stop it; floods are in `test_robustness.py`."""
 
 import gzip
 import http.client
@@ -21,7 +21,7 @@ CONFIG = "api: 127.0.0.1:0\napi_tls: off\napi_limits: {requests_per_second: 1000
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """REST in clear text, which does not slow an attacker of this module down."""
+    """Run REST in clear text, without rate limits for this module's attacks."""
     appliance = Appliance()
     config = appliance.directory / "appliance.yaml"
     config.write_text(CONFIG)
@@ -32,25 +32,25 @@ def appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def rest(appliance: Appliance) -> Iterator[Rest]:
-    """REST; after each attack it serves as before, by the same process, which has not grown much."""
+    """Return a REST client; after each attack the same process serves as before, and has not grown much."""
     rest = appliance.rest()
     pid = api_of(rest)
     before = resident(pid)
     yield rest
     assert api_of(rest) == pid
-    # The allocator keeps what the largest text took while it was compiled, once: about 66 MiB.
+    # The allocator keeps the memory of compiling the largest text, once: about 66 MiB.
     assert resident(pid) < before + (96 << 20)
 
 
 def api_of(rest: Rest) -> int:
-    """The process that serves REST."""
+    """Return the process that serves REST."""
     answer = rest.get("/v1/status")
     assert answer.status == 200
     return next(int(row["pid"]) for row in answer.json["processes"] if row["role"] == "api")
 
 
 def resident(pid: int) -> int:
-    """The memory of a process, in bytes."""
+    """Return the memory of a process, in bytes."""
     text = Path(f"/proc/{pid}/status").read_text()
     found = re.search(r"VmRSS:\s+(\d+) kB", text)
     assert found is not None
@@ -58,7 +58,7 @@ def resident(pid: int) -> int:
 
 
 def statuses(rest: Rest, data: bytes, idle: float = 2) -> list[int]:
-    """Send bytes as they are; the status of each answer, until the connection ends or nothing came for a while."""
+    """Send raw bytes, and return the status of each answer until the connection ends or stays silent for a while."""
     assert rest.url.hostname is not None
     got = bytearray()
     with socket.create_connection((rest.url.hostname, rest.url.port), 10) as sock:
@@ -81,8 +81,8 @@ def statuses(rest: Rest, data: bytes, idle: float = 2) -> list[int]:
         "/v1/audit/export?x=/healthz", "/\\v1\\status", "/v1/status\t", "/.well-known/../v1/status",
     ],
 )  # fmt: skip
-def test_no_spelling_of_a_path_goes_around_the_token(rest: Rest, path: str) -> None:
-    """Whatever a path looks like, without a token it shows nothing: only the probes and the contract answer 200."""
+def test_no_spelling_of_a_path_bypasses_the_token(rest: Rest, path: str) -> None:
+    """No spelling of a path bypasses the token: only the probes and the contract answer 200."""
     request = f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n".encode()
     found = statuses(rest, request)
     assert found in ([400], [401], [421], [422], [200]), found
@@ -113,8 +113,8 @@ HIDDEN = b"GET /v1/policy HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
         (b"Transfer-Encoding: chunked\r\n", b"0\r\nAuthorization: Bearer TOKEN\r\n\r\n" + HIDDEN),
     ],
 )  # fmt: skip
-def test_a_request_inside_another_is_nobodys(rest: Rest, head: bytes, body: bytes) -> None:
-    """Lengths that contradict each other: a hidden request is not served by the token of the outer one."""
+def test_a_smuggled_request_is_not_served(rest: Rest, head: bytes, body: bytes) -> None:
+    """With contradictory lengths, a smuggled request is not served with the token of the outer one."""
     token = f"Authorization: Bearer {rest.token}\r\n".encode()
     outer = b"POST /v1/policy/explain HTTP/1.1\r\nHost: 127.0.0.1\r\n" + token + head + b"\r\n"
     data = outer + body.replace(b"TOKEN", (rest.token or "").encode())
@@ -124,8 +124,8 @@ def test_a_request_inside_another_is_nobodys(rest: Rest, head: bytes, body: byte
     assert len(found) <= 2
 
 
-def test_pipelined_requests_are_each_asked_for_their_token(rest: Rest) -> None:
-    """On one connection: with, without, with a token: 200, 401, 200, in order."""
+def test_each_pipelined_request_needs_its_token(rest: Rest) -> None:
+    """Requests on one connection with, without, and with a token get 200, 401, 200, in order."""
     token = f"Authorization: Bearer {rest.token}\r\n"
     parts = [
         f"GET /v1/whoami HTTP/1.1\r\nHost: 127.0.0.1\r\n{one}\r\n"
@@ -134,8 +134,8 @@ def test_pipelined_requests_are_each_asked_for_their_token(rest: Rest) -> None:
     assert statuses(rest, "".join(parts).encode()) == [200, 401, 200]
 
 
-def test_two_tokens_are_none(rest: Rest) -> None:
-    """Two Authorization headers, one of them right: what is taken is one of them, and never both roles' sum."""
+def test_two_tokens_do_not_add_up(rest: Rest) -> None:
+    """Of two Authorization headers, one valid, at most one is used, and roles never add up."""
     wrong = "Authorization: Bearer rosrv_000000000000_" + "A" * 43 + "\r\n"
     right = f"Authorization: Bearer {rest.token}\r\n"
     for headers in (wrong + right, right + wrong):
@@ -144,7 +144,7 @@ def test_two_tokens_are_none(rest: Rest) -> None:
 
 
 def test_compressed_bodies_stay_compressed(rest: Rest) -> None:
-    """A bomb that would be 1 GB: nobody unpacks it; it is not JSON."""
+    """A compression bomb of 1 GB is not unpacked: it is invalid JSON."""
     bomb = gzip.compress(b"\0" * (1 << 26), 9) * 16
     headers = {"Content-Type": "application/json", "Content-Encoding": "gzip", "If-Match": "*"}
     began = time.monotonic()
@@ -167,8 +167,8 @@ def test_compressed_bodies_stay_compressed(rest: Rest) -> None:
         "many files",
     ],
 )  # fmt: skip
-def test_json_that_is_meant_to_hurt_is_refused(rest: Rest, path: str, body: bytes) -> None:
-    """Deep, long, endless, invalid: a problem, within seconds."""
+def test_hostile_json_is_rejected(rest: Rest, path: str, body: bytes) -> None:
+    """Deep, long, endless and invalid JSON gets a problem within seconds."""
     began = time.monotonic()
     answer = rest.request("POST", path, body, {"Content-Type": "application/json", "If-Match": "*"})
     assert answer.status in (413, 415, 422), answer.body[:300]
@@ -176,8 +176,8 @@ def test_json_that_is_meant_to_hurt_is_refused(rest: Rest, path: str, body: byte
     assert time.monotonic() - began < allowed(10)
 
 
-def test_specifications_that_are_meant_to_hurt_are_refused_or_compiled_in_time(rest: Rest) -> None:
-    """Formulas that explode, blocks without end: an answer in time; meanwhile others are answered."""
+def test_hostile_specifications_are_rejected_or_compiled_in_time(rest: Rest) -> None:
+    """Exploding formulas and endless blocks are answered in time, and other clients meanwhile."""
     events = "\n".join(f"event e{one}() /a std_msgs/Bool '{{}}' {{ }}" for one in range(14))
     sometime = " and ".join(f"<>(e{one} and <>e{one + 1})" for one in range(12))
     bombs = [
@@ -215,8 +215,8 @@ def test_specifications_that_are_meant_to_hurt_are_refused_or_compiled_in_time(r
     assert max(others) < allowed(5), max(others)
 
 
-def test_names_in_paths_are_names(rest: Rest) -> None:
-    """What is no name of a monitor, token, host or record is 404 or 422, and is answered as text, not as a page."""
+def test_invalid_names_in_paths_are_rejected(rest: Rest) -> None:
+    """An invalid name of a monitor, token, host or record is 404 or 422, answered as text, not as a page."""
     for name in (
         "..%2f..%2fetc%2fpasswd",
         "%00",
@@ -246,7 +246,7 @@ def test_names_in_paths_are_names(rest: Rest) -> None:
 
 
 def test_guessing_tokens_is_slowed_down_and_recorded(appliance: Appliance, rest: Rest) -> None:
-    """After some wrong tokens their sender waits; the holder of a good one, on the same machine, does not."""
+    """After several wrong tokens their sender must wait; the holder of a valid one on the same machine need not."""
     guesses = [
         rest.impatient().with_token(f"rosrv_{number:012x}_{'A' * 43}").get("/v1/status").status
         for number in range(60)
@@ -258,12 +258,12 @@ def test_guessing_tokens_is_slowed_down_and_recorded(appliance: Appliance, rest:
         lambda: any(
             one["detail"].get("status") == 429 for one in appliance.audit("--deny", "--category", "rest")
         ),
-        "a refusal is recorded",
+        "a denial is recorded",
     )
 
 
-def test_a_hundred_thousand_headers_are_cut_off(rest: Rest) -> None:
-    """Headers without end, and one that is 10 MB long: the connection is cut, quickly."""
+def test_endless_headers_close_the_connection(rest: Rest) -> None:
+    """With endless headers, or one of 10 MB, the connection is closed quickly."""
     began = time.monotonic()
     many = b"GET /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\n" + b"".join(
         b"H%d: x\r\n" % one for one in range(100_000)
@@ -274,8 +274,8 @@ def test_a_hundred_thousand_headers_are_cut_off(rest: Rest) -> None:
     assert time.monotonic() - began < allowed(20)
 
 
-def test_methods_that_are_none_are_refused(rest: Rest) -> None:
-    """TRACE does not echo, CONNECT opens nothing, an invented method is refused."""
+def test_unsupported_methods_are_refused(rest: Rest) -> None:
+    """TRACE does not echo, CONNECT opens no connection, and an unknown method is refused."""
     for method in ("TRACE", "CONNECT", "PROPFIND", "OPTIONS", "INVENTED"):
         data = (
             f"{method} /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Secret: echo\r\nConnection: close\r\n\r\n"
@@ -284,8 +284,8 @@ def test_methods_that_are_none_are_refused(rest: Rest) -> None:
         assert not {200, 101, 204} & set(found), (method, found)
 
 
-def test_an_upgrade_is_no_way_around(rest: Rest) -> None:
-    """WebSocket, h2c: answered as plain HTTP, by the rules of plain HTTP."""
+def test_an_upgrade_bypasses_no_check(rest: Rest) -> None:
+    """Requests for WebSocket and h2c are answered as plain HTTP, by the same rules."""
     for kind in ("websocket", "h2c"):
         data = (
             f"GET /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: Upgrade, HTTP2-Settings\r\nUpgrade: {kind}\r\n"
@@ -296,8 +296,8 @@ def test_an_upgrade_is_no_way_around(rest: Rest) -> None:
         assert not {101, 200} & set(found), (kind, found)
 
 
-def test_a_client_that_reads_nothing_is_not_waited_for(rest: Rest) -> None:
-    """Twenty clients ask for a long answer and do not read it: others are served meanwhile."""
+def test_a_client_that_does_not_read_delays_no_other(rest: Rest) -> None:
+    """While twenty clients request a long answer without reading it, others are served."""
     idle = []
     try:
         for _ in range(20):
@@ -311,3 +311,17 @@ def test_a_client_that_reads_nothing_is_not_waited_for(rest: Rest) -> None:
     finally:
         for connection in idle:
             connection.close()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\x16\x03\x01\x02\x00garbage", b"GET / HTTP/1.1\r\nA: " + b"x" * 200_000, b"GET /v1/status HT",
+        b"POST /v1/policy HTTP/1.1\r\nTransfer-Encoding: chunked\r\nContent-Length: 5\r\n\r\nzz\r\n",
+        b"GET http://evil/ HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: evil\r\n\r\n", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",
+    ],
+)  # fmt: skip
+def test_malformed_requests_are_not_served(rest: Rest, data: bytes) -> None:
+    """Bytes that are not HTTP, endless headers and an interrupted request; the next client is served."""
+    assert not {101, 200} & set(statuses(rest, data))
+    assert rest.get("/v1/status").status == 200

@@ -1,4 +1,4 @@
-"""The audit log over REST: searched, followed live, verified, exported; what REST did is in it."""
+"""The audit log over REST: searched, followed live, verified, exported; it contains REST's own calls."""
 
 import json
 import threading
@@ -19,7 +19,7 @@ POLICY = "[Nodes]\ndefault = *\n[Publishers]\n/allowed = *\n[Commands]\ndefault 
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """An appliance that denies every publisher but that of /allowed; what it answered is in the log."""
+    """Run an appliance that denies every publisher except that of /allowed, with some decisions in its log."""
     config = tmp_path_factory.mktemp("config") / "appliance.yaml"
     config.write_text("audit: {durability: strict, checkpoint_seconds: 2}\napi: 127.0.0.1:0\napi_tls: off\n")
     with Appliance(policy=POLICY, options=("--config", str(config))) as running:
@@ -28,18 +28,18 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def rest(appliance: Appliance) -> Rest:
-    """REST as an admin."""
+    """Return a REST client of an admin."""
     return appliance.rest()
 
 
 def publish(appliance: Appliance, topic: str) -> Any:
-    """Ask RVMaster to be a publisher."""
+    """Register a publisher at RVMaster."""
     with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
         return master.registerPublisher("/tester", topic, "std_msgs/String", "http://127.0.0.1:1/")
 
 
-def test_a_denial_is_seen_live(appliance: Appliance, rest: Rest) -> None:
-    """A client that follows denials hears of one as it happens, with rule and reason; of nothing else."""
+def test_followers_get_a_denial_live(appliance: Appliance, rest: Rest) -> None:
+    """A client that follows denials gets each one at once, with rule and reason, and nothing else."""
     events = rest.events("/v1/audit/stream?decision=deny&category=publish")
     next(events)
     publish(appliance, "/allowed")
@@ -51,8 +51,8 @@ def test_a_denial_is_seen_live(appliance: Appliance, rest: Rest) -> None:
     assert record["host"] == "127.0.0.1"
 
 
-def test_a_client_that_comes_back_misses_nothing(appliance: Appliance, rest: Rest) -> None:
-    """With Last-Event-ID (what a browser sends), or `after`, the stream goes on after that record."""
+def test_a_reconnecting_client_misses_no_record(appliance: Appliance, rest: Rest) -> None:
+    """With Last-Event-ID (as a browser sends it) or `after`, the stream continues after that record."""
     publish(appliance, "/first")
     first = rest.get("/v1/audit?resource=/first&event=decision").json["records"][0]
     publish(appliance, "/second")
@@ -65,8 +65,8 @@ def test_a_client_that_comes_back_misses_nothing(appliance: Appliance, rest: Res
         assert json.loads(next(events)["data"])["resource"] == "/second"
 
 
-def test_search_is_what_the_command_finds(appliance: Appliance, rest: Rest) -> None:
-    """The same filters give the same records, field by field."""
+def test_search_returns_the_same_as_the_command(appliance: Appliance, rest: Rest) -> None:
+    """The same filters return the same records, field by field."""
     publish(appliance, "/sought")
     found = rest.get("/v1/audit?resource=/sou*&decision=deny&since=1h").json["records"]
     assert found == appliance.audit("--topic", "/sou*", "--deny", "--since", "1h")
@@ -75,7 +75,7 @@ def test_search_is_what_the_command_finds(appliance: Appliance, rest: Rest) -> N
 
 
 def test_pages_join_without_gap_or_repetition(appliance: Appliance, rest: Rest) -> None:
-    """Following the cursor gives every record that matches once, in both orders."""
+    """Following the cursor returns every matching record once, in both orders."""
     for number in range(7):
         publish(appliance, f"/page/{number}")
     for order in ("newest", "oldest"):
@@ -92,8 +92,8 @@ def test_pages_join_without_gap_or_repetition(appliance: Appliance, rest: Rest) 
         assert seen == (wanted if order == "oldest" else wanted[::-1])
 
 
-def test_one_record_and_what_was_around_it(appliance: Appliance, rest: Rest) -> None:
-    """By id and by sequence it is the same; its neighbours are of the same host or caller."""
+def test_one_record_and_its_neighbours(appliance: Appliance, rest: Rest) -> None:
+    """The id and the sequence return the same record; its neighbours are of the same host or caller."""
     publish(appliance, "/middle")
     record = rest.get("/v1/audit?resource=/middle&event=decision").json["records"][0]
     shown = rest.get(f"/v1/audit/{record['id']}").json
@@ -107,7 +107,7 @@ def test_one_record_and_what_was_around_it(appliance: Appliance, rest: Rest) -> 
 
 
 def test_the_log_is_proven(rest: Rest) -> None:
-    """Verification says that the chain is whole, and how much a signature covers."""
+    """Verification reports that the chain is complete, and how much a signature covers."""
     verified = rest.get("/v1/audit/verify").json
     assert verified["ok"] is True
     assert verified["records"] > 0
@@ -115,7 +115,7 @@ def test_the_log_is_proven(rest: Rest) -> None:
 
 
 def test_export_is_ndjson_oldest_first(appliance: Appliance, rest: Rest) -> None:
-    """A record a line, in order, as `rosrv audit export` writes them."""
+    """Export has one record per line, in order, as `rosrv audit export` writes them."""
     publish(appliance, "/exported")
     answer = rest.get("/v1/audit/export?event=decision")
     assert answer.headers["content-type"].startswith("application/x-ndjson")
@@ -126,8 +126,8 @@ def test_export_is_ndjson_oldest_first(appliance: Appliance, rest: Rest) -> None
     assert list(map(_record, lines)) == list(map(_record, here))
 
 
-def test_what_rest_exports_proves_itself(appliance: Appliance, rest: Rest, tmp_path: Path) -> None:
-    """An export over REST, of some records only, is proven by the appliance's public key, without the log."""
+def test_an_export_over_rest_is_verifiable(appliance: Appliance, rest: Rest, tmp_path: Path) -> None:
+    """A partial export over REST is proven by the appliance's public key, without the log."""
     publish(appliance, "/evidence")
     file, public = tmp_path / "evidence.ndjson", appliance.state / "control" / "audit.pub"
     proven, deadline = 0, time.monotonic() + 60
@@ -150,12 +150,14 @@ def test_what_rest_exports_proves_itself(appliance: Appliance, rest: Rest, tmp_p
 
 
 def _record(line: str) -> dict[str, Any]:
-    """A line of an export without its place in the chain, of which more is known with each checkpoint."""
+    """Return a line of an export without its position in the chain, to which each checkpoint adds."""
     return {name: value for name, value in json.loads(line).items() if name != "chain"}
 
 
-def test_what_rest_did_is_in_the_log(rest: Rest) -> None:
-    """Each call has who, method, path and status; five equal reads are the first in full, and sums of the others."""
+def test_calls_of_rest_are_recorded(rest: Rest) -> None:
+    """Each call is recorded with caller, method, path and status; of five equal reads the first in full, the others
+    as sums.
+    """
     events = rest.events("/v1/audit/stream?event=rest%20call&resource=/v1/graph")
     next(events)
     for _ in range(5):
@@ -173,8 +175,8 @@ def test_what_rest_did_is_in_the_log(rest: Rest) -> None:
     events.close()
 
 
-def test_what_rest_changed_is_never_folded(rest: Rest) -> None:
-    """Equal orders that were carried out, and dry runs, are a record each, however fast they come."""
+def test_changes_over_rest_are_never_folded(rest: Rest) -> None:
+    """Equal changes and dry runs get a record each, at any rate."""
     events = rest.events("/v1/audit/stream?event=rest%20call&resource=/v1/policy*")
     next(events)
     for _ in range(3):
@@ -189,8 +191,8 @@ def test_what_rest_changed_is_never_folded(rest: Rest) -> None:
     events.close()
 
 
-def test_an_error_in_a_draft_is_nothing_refused(rest: Rest) -> None:
-    """What the console asks while somebody writes is no denial: neither a dry run nor a question is an order."""
+def test_an_error_in_a_draft_is_not_a_denial(rest: Rest) -> None:
+    """The console's checks of a draft are not denials: neither a dry run nor a question is a change."""
     events = rest.events("/v1/audit/stream?event=rest%20call&resource=/v1/policy*")
     next(events)
     draft = {"text": "[Nodes]\nbogus\n"}
@@ -201,9 +203,9 @@ def test_an_error_in_a_draft_is_nothing_refused(rest: Rest) -> None:
     events.close()
 
 
-def test_who_was_refused_is_in_the_log(rest: Rest) -> None:
-    """A call without a good token is a denial, and names nobody."""
-    rest.with_token(None).get("/v1/graph?from=stranger")
+def test_refused_callers_are_recorded(rest: Rest) -> None:
+    """A call without a valid token is a denial, and names no user."""
+    rest.with_token(None).get("/v1/graph?from=unknown")
     events = rest.events("/v1/audit/stream?event=rest%20call&decision=deny&after=0")
     next(events)
     refused = json.loads(next(events)["data"])
@@ -212,11 +214,11 @@ def test_who_was_refused_is_in_the_log(rest: Rest) -> None:
 
 
 @pytest.mark.parametrize(
-    "query", ["since=yesterday", "limit=0", "limit=100000", "cursor=-1", "decision=maybe", "severity=loud",
+    "query", ["since=tomorrow", "limit=0", "limit=100000", "cursor=-1", "decision=maybe", "severity=loud",
               "host=" + "*" * 9, "since=9999999999999999999999w"],
 )  # fmt: skip
-def test_a_filter_that_makes_no_sense_is_told(rest: Rest, query: str) -> None:
-    """A problem that names the parameter or says what can be given; the same for search, stream and export."""
+def test_an_invalid_filter_is_reported(rest: Rest, query: str) -> None:
+    """The problem names the parameter or the possible values; search, stream and export behave alike."""
     for path in ("/v1/audit", "/v1/audit/export"):
         if path.endswith("export") and query.startswith(("limit", "cursor")):
             continue
@@ -228,8 +230,8 @@ def test_a_filter_that_makes_no_sense_is_told(rest: Rest, query: str) -> None:
 @pytest.mark.parametrize(
     "path", ["/v1/audit", "/v1/audit/export", "/v1/audit/stream", "/v1/graph", "/v1/policy"]
 )
-def test_a_parameter_that_there_is_not_is_told(rest: Rest, path: str) -> None:
-    """A misspelt filter is refused and does not find everything; the answer names what was meant."""
+def test_an_unknown_parameter_is_reported(rest: Rest, path: str) -> None:
+    """A misspelt filter is refused instead of matching all records; the answer suggests the correct name."""
     answer = rest.get(f"{path}?resourse=/cmd_*")
     assert answer.status == 422
     assert answer.json["errors"][0]["where"] == "query.resourse"
@@ -237,18 +239,24 @@ def test_a_parameter_that_there_is_not_is_told(rest: Rest, path: str) -> None:
         assert "did you mean resource?" in answer.json["detail"]
 
 
-def test_denials_of_a_topic_are_found_by_the_words_of_the_command(rest: Rest) -> None:
-    """`deny` and `topic` are what `rosrv audit search --deny --topic` asks; two words for one thing are refused."""
+def test_search_takes_the_filters_of_the_command(rest: Rest) -> None:
+    """`deny` and `topic` are parameters as in `rosrv audit search`; `topic` and `resource` exclude each other."""
     rest.with_token(None).get("/v1/graph")
-    found = rest.get("/v1/audit?deny=1&since=1h&topic=/v1/gra*").json["records"]
-    assert found
+
+    def denials() -> Any:
+        return rest.get("/v1/audit?deny=1&since=1h&topic=/v1/gra*").json["records"]
+
+    eventually(denials, "the denial is recorded")
+    found = denials()
     assert {(one["decision"], one["resource"]) for one in found} == {("deny", "/v1/graph")}
     assert rest.get("/v1/audit?deny=1&topic=/none*").json["records"] == []
     assert rest.get("/v1/audit?resource=/a&topic=/a").status == 422
 
 
-def test_followers_have_a_share_each(appliance: Appliance, rest: Rest) -> None:
-    """A viewer's token takes six of sixteen streams, and is told; an admin still follows, and there is room again."""
+def test_followers_have_a_quota_of_streams(appliance: Appliance, rest: Rest) -> None:
+    """A viewer's token gets six of sixteen streams, then an error; an admin can still follow, and closed streams
+    free slots.
+    """
     made = appliance.rosrv("token", "add", "greedy", "--role", "viewer", "--json").stdout
     admin, rest = rest, rest.with_token(json.loads(made)["token"])
     eventually(lambda: rest.get("/v1/whoami").status == 200, "the api knows the token")
@@ -272,6 +280,6 @@ def test_followers_have_a_share_each(appliance: Appliance, rest: Rest) -> None:
             next(rest.events("/v1/audit/stream?event=nothing"))
             break
         except AssertionError:
-            rest.get("/healthz")  # the api notices that a client left when the kernel tells it
+            rest.get("/healthz")  # the api notices that a client left when the kernel reports it
     else:
-        raise AssertionError("no room again")
+        raise AssertionError("no stream was freed")

@@ -1,6 +1,6 @@
-"""The examples of the contract: an appliance takes the bodies, and its answers have the form of those that are shown.
+"""Examples of the contract: an appliance accepts the bodies, and its answers have the form of the shown ones.
 
-That each fits its schema, and that none is missing: tests/unit/api/test_contract.py.
+tests/unit/api/test_contract.py checks that each fits its schema and that none is missing.
 """
 
 import json
@@ -25,7 +25,7 @@ CLOSED = OPEN_POLICY.replace("[Publishers]\n", "[Publishers]\n/cmd_vel = 192.0.2
 
 @pytest.fixture(scope="module")
 def rest() -> Iterator[Rest]:
-    """REST of an appliance with the monitor of the examples, which has refused what theirs did."""
+    """Run REST of an appliance with the monitor of the examples, and cause the denials that they show."""
     with tempfile.TemporaryDirectory(prefix="rosrv-examples-") as name:
         folder = Path(name)
         folder.chmod(0o755)  # the appliance's processes run as other users
@@ -44,7 +44,7 @@ def rest() -> Iterator[Rest]:
 
 
 def asked(rest: Rest, call: str, body: Any = None) -> Any:
-    """What a call is answered; a body is JSON."""
+    """Return the answer to a call; a body is JSON."""
     method, path = call.split()
     headers = {"If-Match": "*"} if method != "GET" else {}
     if body is not None:
@@ -55,7 +55,7 @@ def asked(rest: Rest, call: str, body: Any = None) -> Any:
 
 
 def differences(given: Any, shown: Any, place: str, *, whole: bool = True) -> list[str]:
-    """Where an answer is not of the form of an example; below its own fields they may have others of each kind."""
+    """Return where an answer differs from the form of an example; extra fields may appear below its own."""
     if isinstance(given, dict) and isinstance(shown, dict):
         nowhen = {f"{name}_utc" for one in (given, shown) for name, value in one.items() if value is None}
         found = [f"{place}: {name}" for name in (given.keys() ^ shown.keys()) - nowhen if whole]
@@ -83,7 +83,7 @@ CALLS = {
     "GET /v1/audit?deny=1&topic=/cmd_vel": "search_audit", "GET /v1/audit/verify": "Verification",
     "GET /v1/audit/checkpoints": "LogCheckpoints", "GET /v1/recordings": "Recordings",
 }  # fmt: skip
-# The examples of bodies are sent as they are, in this order.
+# The examples of bodies are sent unchanged, in this order.
 BODIES = (
     ("POST /v1/policy?dry_run=1", "PolicyText", "Report"),
     ("POST /v1/policy/explain", "Question", "Explained"),
@@ -101,7 +101,7 @@ BODIES = (
 
 
 def test_answers_are_as_the_contract_shows_them(rest: Rest) -> None:
-    """What can be asked without nodes and tunnels: fields, and what they can be."""
+    """Answers that need no nodes and no tunnels have the fields and types of the contract."""
     found = [
         line for call, kind in CALLS.items() for line in differences(asked(rest, call), EXAMPLES[kind], call)
     ]
@@ -115,8 +115,8 @@ def test_answers_are_as_the_contract_shows_them(rest: Rest) -> None:
     assert found == []
 
 
-def test_the_bodies_of_the_contract_are_taken(rest: Rest) -> None:
-    """Each is sent as the contract shows it, and answered as it shows."""
+def test_the_bodies_of_the_contract_are_accepted(rest: Rest) -> None:
+    """Each body is sent as the contract shows it, and answered as it shows."""
     found = [
         line
         for call, body, kind in BODIES
@@ -125,7 +125,7 @@ def test_the_bodies_of_the_contract_are_taken(rest: Rest) -> None:
     assert found == []
 
 
-def test_a_difference_would_be_seen() -> None:
+def test_a_difference_would_be_found() -> None:
     """The tests above can fail."""
     shown = {"a": 1, "b": [{"c": "x"}]}
     assert differences({"a": 2.0, "b": [{"c": None}]}, shown, "") == []

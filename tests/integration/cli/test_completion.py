@@ -1,4 +1,4 @@
-"""What the shell completes: names of the running appliance; nothing, and no error, where there is none."""
+"""The shell completes names of the running appliance; without one it completes nothing, without an error."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ WORDS = "words() {\n    event said() /chatter std_msgs/String '{}' { }\n}\n"
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """An appliance with a monitor and two tokens."""
+    """Run an appliance with a monitor and two tokens."""
     with tempfile.TemporaryDirectory(prefix="rosrv-monitors-") as name:
         folder = Path(name)
         folder.chmod(0o755)  # the appliance's users may read it
@@ -27,7 +27,7 @@ def appliance() -> Iterator[Appliance]:
 
 
 def completed(words: str, state: str) -> list[str]:
-    """What bash is told for these words, the last of which is being written."""
+    """Return bash's completions of the last of these words."""
     place = len(words.split(" ")) - 1
     environment = {
         **os.environ, "_ROSRV_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(place),
@@ -39,7 +39,7 @@ def completed(words: str, state: str) -> list[str]:
 
 
 def test_names_of_the_running_appliance(appliance: Appliance) -> None:
-    """Monitors and tokens by what is written of them; one that is given already is not offered again."""
+    """Monitors and tokens are completed from their beginning; a name on the line is not offered again."""
     state = str(appliance.state)
     assert completed("rosrv monitor disable wo", state) == ["words"]
     assert completed("rosrv monitor disable x", state) == []
@@ -48,5 +48,5 @@ def test_names_of_the_running_appliance(appliance: Appliance) -> None:
 
 
 def test_nothing_where_no_appliance_runs(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """No names, no error in the middle of a line."""
+    """Without an appliance there are no names, and no error in the middle of a line."""
     assert completed("rosrv monitor disable ", str(tmp_path_factory.mktemp("nobody"))) == []

@@ -1,4 +1,4 @@
-"""`rosrv selftest` against a running appliance: what works is tried for real, what does not is found."""
+"""`rosrv selftest` against a running appliance tests each part for real, and finds faults."""
 
 import json
 import os
@@ -19,14 +19,14 @@ Rows = dict[str, dict[str, str]]
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """An appliance with REST over TLS; the last test stops it."""
+    """Run an appliance with REST over TLS; the last test stops it."""
     with Appliance(options=("--api", "127.0.0.1:0")) as running:
         running.rest()
         yield running
 
 
 def selftest(appliance: Appliance, way: str = "state") -> tuple[int, Rows]:
-    """The exit status and what was found by check, tried over the state directory or over REST."""
+    """Return the exit status and the findings by check, over the state directory or over REST."""
     env = {key: value for key, value in os.environ.items() if not key.startswith("ROSRV_")}
     command = [ROSRV, "selftest", "--json", "--state", str(appliance.state)]
     if way == "api":
@@ -39,12 +39,12 @@ def selftest(appliance: Appliance, way: str = "state") -> tuple[int, Rows]:
 
 
 def failures(found: Rows) -> list[dict[str, str]]:
-    """What failed."""
+    """Return the failed checks."""
     return [row for row in found.values() if row["outcome"] == "fail"]
 
 
 def test_a_message_really_goes_through(appliance: Appliance) -> None:
-    """Both ways: a call is answered and recorded, a message comes through the relay, and nothing is left behind."""
+    """Both ways a call is answered and recorded, a message passes the relay, and nothing remains."""
     for way in ("state", "api"):
         status, found = selftest(appliance, way)
         assert status == 0, failures(found)
@@ -59,19 +59,19 @@ def test_a_message_really_goes_through(appliance: Appliance) -> None:
     assert {one["resource"] for one in records} == {"/rosrv_selftest"}
 
 
-def test_a_strict_policy_is_no_failure(appliance: Appliance) -> None:
-    """A refusal with its record proves RVMaster; the relay is not tried, which is said, with what would let it be."""
+def test_a_strict_policy_is_not_a_failure(appliance: Appliance) -> None:
+    """A denial with its record proves RVMaster; the relay check is skipped, with the policy that would enable it."""
     appliance.reload(STRICT)
     status, found = selftest(appliance)
     assert status == 0, failures(found)
-    assert "refused by the policy" in found["RVMaster"]["text"]
+    assert "denied by the policy" in found["RVMaster"]["text"]
     assert found["RVMaster"]["text"].endswith("and recorded")
     assert found["relay"]["outcome"] == "skip"
     appliance.reload(OPEN_POLICY)
 
 
-def test_a_relay_that_carries_nothing_is_found(appliance: Appliance) -> None:
-    """A relay that hangs, before its supervisor has noticed: the message does not come, and that is a failure."""
+def test_a_hanging_relay_is_found(appliance: Appliance) -> None:
+    """Before the supervisor notices a hanging relay, the missing message is a failure."""
     pids = appliance.pids("relay")
     supervisor = appliance.pids("supervisor")[0]
     for pid in (supervisor, *pids):
@@ -86,8 +86,8 @@ def test_a_relay_that_carries_nothing_is_found(appliance: Appliance) -> None:
     assert found["relay"]["advice"]
 
 
-def test_where_none_runs_it_is_a_failure(appliance: Appliance) -> None:
-    """An appliance that was named and does not run: the machine is tried, and that it does not run is told."""
+def test_a_missing_appliance_is_a_failure(appliance: Appliance) -> None:
+    """For a named appliance that does not run, the machine is checked, and the missing appliance is reported."""
     appliance.stop()
     status, found = selftest(appliance)
     assert status == 1

@@ -1,4 +1,4 @@
-"""Node APIs that tests register: one server, one path per node and life; what the master calls is kept.
+"""Node APIs that tests register: one server, one path per node and life; it keeps the master's calls.
 
     with FakeNodes() as nodes:
         master.registerPublisher("/talker", "/chatter", "std_msgs/String", nodes.uri("talker"))
@@ -67,29 +67,29 @@ class FakeNodes:
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._calls: list[NodeCalled] = []
-        self._told = 0  # calls ever, but `getPid`
+        self._told = 0  # all calls so far, except `getPid`
         self._server = _Server(self._keep)
         self.base = f"http://127.0.0.1:{self._server.server_address[1]}/"
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
 
     def uri(self, node: str) -> str:
-        """The API URI of a node; another name is another URI."""
+        """Return the API URI of a node; each name has its own URI."""
         return self.base + node
 
     def calls(self, node: str, method: str) -> list[tuple[Any, ...]]:
-        """The parameters of every call of `method` to `node` so far, in order, without the caller's name."""
+        """Return the parameters of every call of `method` to `node` so far, in order, without the caller's name."""
         with self._changed:
             return [one.params[1:] for one in self._calls if (one.node, one.method) == (node, method)]
 
     def all_calls(self) -> list[NodeCalled]:
-        """Every call so far but `getPid` (a look whether the node is there)."""
+        """Return every call so far except `getPid` (a liveness check)."""
         with self._changed:
             return [one for one in self._calls if one.method != "getPid"]
 
     def wait_until(self, wanted: Callable[[], bool], *, timeout: float = LIMIT) -> bool:
-        """Whether `wanted()` came true, looked at whenever a call arrives; false when none came for `timeout` seconds.
+        """Wait until `wanted()` is true, tested after each call; return False after `timeout` seconds without a call.
 
-        Looks whether a node is there come for ever, and are no such call.
+        Liveness checks do not count as calls.
         """
         with self._changed:
             while not wanted():

@@ -1,4 +1,4 @@
-"""The nodes that only these tests need, started as `tests.support.nodes` starts its own."""
+"""Start the nodes that only these tests need, as `tests.support.nodes` starts its own."""
 
 import json
 import subprocess
@@ -12,7 +12,7 @@ HERE = Path(__file__).parent
 
 
 def rospy_node(ros: RosSession, program: str, name: str, *arguments: str, **environment: str) -> Process:
-    """A program of `rospy_nodes/`, once it is registered."""
+    """Start a program of `rospy_nodes/`, and wait until it is registered."""
     command = [PYTHON, str(HERE / "rospy_nodes" / f"{program}.py"), *arguments, f"__name:={name}"]
     process = ros.start(command, label=f"rospy {program}", **environment)
     process.wait_for(event="ready")
@@ -20,7 +20,7 @@ def rospy_node(ros: RosSession, program: str, name: str, *arguments: str, **envi
 
 
 def roscpp_node(ros: RosSession, program: str, name: str, *arguments: str) -> Process:
-    """A program of `roscpp_nodes/`, once it is registered."""
+    """Start a program of `roscpp_nodes/`, and wait until it is registered."""
     target = BUILD / program
     source = HERE / "roscpp_nodes" / f"{program}.cpp"
     subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(source), str(target)], check=True)
@@ -30,7 +30,7 @@ def roscpp_node(ros: RosSession, program: str, name: str, *arguments: str) -> Pr
 
 
 def order(node: Process, do: str, **told: Any) -> dict[str, Any]:
-    """Have `rospy_nodes/orders.py` do something; what it says when it is done."""
+    """Give an order to `rospy_nodes/orders.py`, and return its answer."""
     mark = node.mark()
     node.send(json.dumps({"do": do, **told}))
     return node.wait_for(event="done", do=do, since=mark)

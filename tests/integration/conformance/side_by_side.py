@@ -1,4 +1,4 @@
-"""The same Master API call made to a plain ROSMaster and to RVMaster, and their answers made comparable.
+"""Make the same Master API call to a plain ROS master and to RVMaster, and make their answers comparable.
 
     answers = both.call("registerPublisher", "/talker", "/chatter", "std_msgs/String", Api("talker"))
     assert answers.plain == answers.appliance
@@ -8,6 +8,7 @@ ids. Everything else is left as it came. `Api` and `ServiceApi` stand for URIs o
 has its own.
 """
 
+import itertools
 import re
 import xmlrpc.client
 from collections.abc import Callable, Sequence
@@ -25,6 +26,7 @@ _UNDO = {
     "subscribeParam": ("unsubscribeParam", (0, 1, 2)),
 }
 TESTER = "/conformance"
+_EPOCHS = itertools.count()
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +54,7 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """What the two masters answered, with names for URIs."""
+    """The answers of the two masters, with names for URIs."""
 
     plain: Any
     appliance: Any
@@ -64,20 +66,21 @@ class MasterSide:
     def __init__(self, uri: str, nodes: FakeNodes) -> None:
         self.uri = uri.rstrip("/")
         self.nodes = nodes
-        self.epoch = 0  # told apart in the URIs: a node that was replaced in one test is another in the next
+        # In the URIs: a node that was replaced in one test is a new one in the next.
+        self.epoch = next(_EPOCHS)
         self._server = xmlrpc.client.ServerProxy(uri, allow_none=True)
         rosout = self.call("lookupNode", [TESTER, "/rosout"])[2]
         self._names: dict[str, str] = {rosout: "<rosout>"}
 
     def call(self, method: str, params: Sequence[Any]) -> Any:
-        """The answer as it came, or `Fault`."""
+        """Return the unchanged answer, or `Fault`."""
         try:
             return getattr(self._server, method)(*self.given(params))
         except xmlrpc.client.Fault as fault:
             return Fault(fault.faultCode, fault.faultString)
 
     def given(self, value: Any) -> Any:
-        """Put this master's URIs for `Api` and `ServiceApi`."""
+        """Replace `Api` and `ServiceApi` by this master's URIs."""
         match value:
             case Api():
                 return self.nodes.uri(f"{value.node}-{value.life}-{self.epoch}")
@@ -90,13 +93,13 @@ class MasterSide:
         return value
 
     def last_list(self, api: Api, topic: str) -> list[str] | None:
-        """The publishers of a topic that a node was told last, by name."""
+        """Return the last list of publishers that a node received for a topic, by name."""
         calls = self.nodes.calls(f"{api.node}-{api.life}-{self.epoch}", "publisherUpdate")
         lists = [uris for given, uris in calls if given == topic]
         return list(self.named(lists[-1])) if lists else None
 
     def named(self, value: Any) -> Any:
-        """Put names for URIs, in texts as well."""
+        """Replace URIs by names, also within strings."""
         match value:
             case str():
                 text = _HTTP_URI.sub(lambda found: self._name(found.group()), value)
@@ -127,7 +130,7 @@ class MasterSide:
 
 
 class BothMasters:
-    """The pair; `reset` takes back what was registered and set through it."""
+    """The pair; `reset` undoes registrations and parameters."""
 
     def __init__(self, plain: MasterSide, appliance: MasterSide) -> None:
         self.plain, self.appliance = plain, appliance
@@ -145,7 +148,7 @@ class BothMasters:
         return Answers(self.plain.named(plain), self.appliance.named(appliance))
 
     def calls_made(self, of_interest: Callable[[NodeCalled], bool]) -> Answers:
-        """What each master told its nodes, by node."""
+        """Return the calls of each master to its nodes, by node."""
         return Answers(self._told(self.plain, of_interest), self._told(self.appliance, of_interest))
 
     def _told(self, side: MasterSide, of_interest: Callable[[NodeCalled], bool]) -> dict[str, list[Any]]:
@@ -157,7 +160,7 @@ class BothMasters:
         return told
 
     def reset(self) -> None:
-        """Take everything back."""
+        """Undo everything."""
         for method, params in reversed(self._registered):
             self.plain.call(method, params)
             self.appliance.call(method, params)
@@ -165,14 +168,14 @@ class BothMasters:
         for side in (self.plain, self.appliance):
             side.call("setParam", [TESTER, "/", self._first_tree])
             side.nodes.forget()
-            side.epoch += 1
+            side.epoch = next(_EPOCHS)
 
 
 def differences(answers: Answers) -> list[str]:
-    """What a client library would notice between the two answers: code, type and content of the value, message.
+    """Return the differences that a client library would notice: code, type and content of the value, message.
 
-    The words about a parameter that is not valid may differ; which parameter it is may not. A plain master answers
-    some errors with 0 whatever the call returns, the appliance with an empty value of the type it returns.
+    The text about an invalid parameter may differ; the named parameter may not. A plain master answers some errors with
+    0 whatever the call returns, the appliance with an empty value of the returned type.
     """
     plain, appliance = answers.plain, answers.appliance
     if isinstance(plain, Fault) or isinstance(appliance, Fault):
@@ -191,17 +194,19 @@ def differences(answers: Answers) -> list[str]:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Equal, types and order of keys included (`1` is not `True` or `1.0`; `nan` is `nan`)."""
+    """Whether both are equal, including types and the order of keys (`1` is not `True` or `1.0`; `nan` equals
+    `nan`).
+    """
     if type(one) is not type(other):
         return False
     if isinstance(one, dict):
         return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
     if isinstance(one, list):
         return len(one) == len(other) and all(map(same, one, other))
-    return bool(one == other) or (one != one and other != other)  # noqa: PLR0124 - nan is unlike itself
+    return bool(one == other) or (one != one and other != other)  # noqa: PLR0124 - nan differs from itself
 
 
 def _parameter_in(message: str) -> str:
-    """A message without the words that say what is wrong with a parameter."""
+    """Return a message without the reason why a parameter is invalid."""
     found = re.match(r"ERROR: parameter \[\w+\]", message)
     return found.group() if found else message

@@ -1,8 +1,8 @@
-"""A process of the appliance dies or hangs while a robot works: the robot goes on, no node is started again.
+"""A process of the appliance dies or hangs while a robot works: the robot goes on without restarting a node.
 
-One robot of rospy and roscpp nodes, every publisher heard by every subscriber, every service called by every
-client, parameters watched by both. After each fault everything flows again (the gap is printed, `pytest -rP`),
-nothing that was registered or set is missing, and the audit log is whole.
+The robot has rospy and roscpp nodes: every subscriber hears every publisher, every client calls every service, and
+both libraries watch parameters. After each fault everything flows again (the gap is printed, `pytest -rP`), no
+registration or parameter is missing, and the audit log is complete.
 """
 
 import json
@@ -18,22 +18,22 @@ from xmlrpc.client import ServerProxy
 
 import pytest
 
-from tests.integration.conformance.conftest import need_ros
 from tests.support.appliance import Appliance
-from tests.support.nodes import Client, RosSession
+from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import Process
+from tests.support.requirements import need_root, needs
 from tests.support.rosmaster import await_node
 from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 KILLED = ["control", "relay", "rosmaster", "rosout"]
-LIMIT = 40.0  # seconds; promised are 5 (and 5 more for what hangs), but the machine may be busy
+LIMIT = 40.0  # seconds; the promise is 5 (10 for a hang), but the machine may be busy
 TREE = {"arm": {"speed": 0.5, "joints": [1, 2, 3], "names": {"left": "l", "right": "r"}}, "safe": True}
 
 
 @dataclass
 class RobotAtWork:
-    """The robot, its appliance, and what is looked at."""
+    """The robot, its appliance, and the observed state."""
 
     appliance: Appliance
     voices: dict[str, Process]
@@ -45,7 +45,7 @@ class RobotAtWork:
 
     @classmethod
     def started(cls, appliance: Appliance, ros: RosSession) -> Self:
-        """All nodes, once everybody hears everybody."""
+        """Return all nodes, once every subscriber hears every publisher."""
         voices = {
             f"/{by}_voice": ros.talker(by, "/chatter", "--rate", "50", name=f"{by}_voice") for by in CLIENTS
         }
@@ -72,11 +72,11 @@ class RobotAtWork:
         return robot
 
     def master(self) -> Any:
-        """The Master API, as tools see it."""
+        """Return the Master API, as tools see it."""
         return ServerProxy(self.appliance.master_uri)
 
     def state(self) -> tuple[Any, Any]:
-        """The graph (order aside) and the parameters."""
+        """Return the graph (sorted) and the parameters."""
         with self.master() as master:
             graph = [
                 sorted([name, sorted(nodes)] for name, nodes in rows)
@@ -85,12 +85,12 @@ class RobotAtWork:
             return graph, master.getParam("/test", "/")[2]
 
     def rosout(self) -> str:
-        """The address of the aggregator's node; another life of it has another."""
+        """Return the address of the aggregator's node, which changes with each of its lives."""
         with self.master() as master:
             return str(master.lookupNode("/test", "/rosout")[2])
 
     def flows_again(self) -> dict[str, float]:
-        """Wait until everything works: seconds until each kind of traffic did, for the slowest pair."""
+        """Wait until everything works; return for each kind of traffic the seconds of the slowest pair."""
         start = time.monotonic()
         sent = {name: voice.seen(event="sent")[-1:] for name, voice in self.voices.items()}
         for ear in self.ears:
@@ -116,7 +116,7 @@ def _later(name: str, number: int, event: dict[str, Any]) -> bool:
 
 
 def _ask_until_answered(asker: Process) -> None:
-    """A call that was under way may fail; the next ones are answered."""
+    """Repeat a call: the one in progress may fail, the next ones are answered."""
     deadline = time.monotonic() + LIMIT
     while True:
         mark = asker.mark()
@@ -132,8 +132,9 @@ def _ask_until_answered(asker: Process) -> None:
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotAtWork]:
-    """One appliance and one robot for the whole module: what one fault broke, the next test would see."""
-    need_ros()
+    """Run one appliance and one robot for the whole module, so that damage of one fault shows in the next test."""
+    need_root()
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     home: Path = tmp_path_factory.mktemp("robot")
     with Appliance() as appliance, RosSession(appliance.master_uri, home) as ros:
         await_node(appliance.master_uri, appliance.host, "/rosout")
@@ -142,14 +143,14 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotAtWork]:
 
 @pytest.fixture
 def unharmed(robot: RobotAtWork) -> Iterator[Callable[[str], None]]:
-    """Call it with the name of the fault right after the fault: everything flows, is there, is recorded."""
+    """Return a check to call with the fault's name right after it: everything flows, is registered, is recorded."""
     before, rosout = robot.state(), robot.rosout()
 
     def check(fault: str) -> None:
         gaps = robot.flows_again()
         if "rosout" in fault:
             _wait_for_another_rosout(robot, rosout)
-        print(f"{fault}: " + ", ".join(f"{kind} after {seconds:.2f} s" for kind, seconds in gaps.items()))  # noqa: T201  figures for whoever reads the run
+        print(f"{fault}: " + ", ".join(f"{kind} after {seconds:.2f} s" for kind, seconds in gaps.items()))  # noqa: T201  figures for the reader of the run
         _wait_for_state(robot, before[0])
         assert robot.state()[1] == before[1] | {"watched": str(robot.changes)}, "parameters"
         robot.appliance.rosrv("audit", "verify")
@@ -159,24 +160,24 @@ def unharmed(robot: RobotAtWork) -> Iterator[Callable[[str], None]]:
 
 
 def _wait_for_state(robot: RobotAtWork, wanted: Any) -> None:
-    """Wait until the graph is as it was: a new aggregator registers when it is up."""
+    """Wait until the graph is as before: a new aggregator registers when it is up."""
     await_node(robot.appliance.master_uri, robot.appliance.host, "/rosout")
     eventually(lambda: robot.state()[0] == wanted, lambda: f"{wanted}; it is {robot.state()[0]}")
 
 
 def _wait_for_another_rosout(robot: RobotAtWork, old: str) -> None:
-    """Wait until the registration of the aggregator that died has made place for that of the new one."""
+    """Wait until the registration of a new aggregator has replaced that of the dead one."""
     eventually(lambda: robot.rosout() != old, robot.appliance.story)
 
 
 def processes(robot: RobotAtWork) -> dict[str, int]:
-    """The process of each role by `rosrv status`; nothing while control is away."""
+    """Return the process of each role by `rosrv status`; empty while control is away."""
     said = robot.appliance.rosrv("status", "--json", check=False).stdout
     return {row["role"]: row["pid"] for row in json.loads(said)["processes"]} if said else {}
 
 
 def strike(robot: RobotAtWork, number: signal.Signals, *roles: str) -> None:
-    """Send a signal to the process of each role, as much at once as can be."""
+    """Send a signal to the process of each role, as simultaneously as possible."""
     pids = processes(robot)
     for role in roles:
         os.kill(pids[role], number)
@@ -191,7 +192,7 @@ def test_killed(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) 
 
 @pytest.mark.parametrize("role", ["control", "relay", "rosmaster"])
 def test_killed_twice(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) -> None:
-    """SIGKILL to the next process of the role as well, as soon as it is there."""
+    """SIGKILL also to the successor, as soon as it runs."""
     first = processes(robot)[role]
     os.kill(first, signal.SIGKILL)
 
@@ -221,6 +222,6 @@ def test_killed_at_once(robot: RobotAtWork, unharmed: Callable[[str], None], rol
 
 @pytest.mark.parametrize("role", ["control", "relay", "rosmaster"])
 def test_stopped(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) -> None:
-    """A process that hangs (SIGSTOP) counts as dead after five seconds."""
+    """A hanging process (SIGSTOP) counts as dead after five seconds."""
     strike(robot, signal.SIGSTOP, role)
     unharmed(f"{role} stopped")

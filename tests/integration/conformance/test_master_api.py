@@ -1,6 +1,6 @@
-"""Each call of the Master API, with each kind of argument, answers as a plain ROSMaster does.
+"""Each call of the Master API, with each kind of argument, is answered as by a plain ROS master.
 
-The kinds of cases are those of ROS's own test of its master (ros_comm, test_rosmaster).
+The cases follow ROS's own test of its master (ros_comm, test_rosmaster).
 """
 
 from functools import partial
@@ -238,7 +238,7 @@ SEQUENCES: dict[str, list[Step]] = {
 
 @pytest.mark.parametrize("method", NO_CALLER)
 def test_call_without_a_caller(both: BothMasters, method: str) -> None:
-    """A call without any argument is an error of the caller, with the words every ROS tool knows."""
+    """A call without arguments is an error of the caller, with the text that every ROS tool knows."""
     answers = both.call(method)
     assert differences(answers) == []
     assert answers.appliance[:2] == [-1, "missing required caller_id parameter"]
@@ -254,7 +254,7 @@ def test_wrong_number_of_arguments(both: BothMasters, step: Step) -> None:
 
 @pytest.mark.parametrize("step", WRONG_ARGUMENTS, ids=repr)
 def test_wrong_arguments(both: BothMasters, step: Step) -> None:
-    """An argument that is empty, of a wrong type or form is an error of the caller, and names the argument."""
+    """An empty argument, or one of a wrong type or form, is an error of the caller that names the argument."""
     answers = both.call(*step)
     assert answers.appliance[0] == -1
     assert differences(answers) == []
@@ -262,14 +262,14 @@ def test_wrong_arguments(both: BothMasters, step: Step) -> None:
 
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_sequence(both: BothMasters, name: str) -> None:
-    """Every call of the sequence is answered alike, and the whole state is alike after each."""
+    """Every call of the sequence is answered alike, and the whole state is the same after each."""
     for step in SEQUENCES[name]:
         assert differences(both.call(*step)) == [], step
         assert differences(both.call("getSystemState", TESTER)) == [], f"the state after {step}"
 
 
-def test_nodes_are_told_alike(both: BothMasters) -> None:
-    """Subscribers end with the same lists, watchers of a parameter get the same updates, a replaced node its end."""
+def test_nodes_get_the_same_updates(both: BothMasters) -> None:
+    """Subscribers get the same final lists, watchers of a parameter the same updates, a replaced node its shutdown."""
 
     def of_interest(call: NodeCalled) -> bool:
         return call.method in {"paramUpdate", "shutdown"}
@@ -291,15 +291,15 @@ def test_nodes_are_told_alike(both: BothMasters) -> None:
         ("unregisterPublisher", "/talker", "/chatter", TALKER),
     ):
         assert differences(both.call(*step)) == []
-        # ROSMaster writes what it tells later, in a thread: a change that follows at once is in the value of the one
-        # before.
+        # `rosmaster` sends its updates later, in a thread: a change right afterwards is included in the value of the
+        # earlier one.
         changes += step[0] in {"setParam", "deleteParam"} and step[1] == TESTER
         for side in (both.plain, both.appliance):
             assert side.nodes.wait_until(partial(updated, side, changes))
 
     def settled() -> bool:
         answers = both.calls_made(of_interest)
-        # A plain master tells with three threads: its calls overtake each other, so the order is not compared.
+        # A plain master sends with three threads: its calls overtake each other, so the order is not compared.
         plain, ours = (
             {node: sorted(map(repr, calls)) for node, calls in one.items()}
             for one in (answers.plain, answers.appliance)
@@ -312,7 +312,7 @@ def test_nodes_are_told_alike(both: BothMasters) -> None:
 
 
 def test_own_address(both: BothMasters) -> None:
-    """`getUri` is the address the caller knows the master by; `getPid` a process."""
+    """`getUri` is the address by which the caller knows the master; `getPid` a process id."""
     assert both.call("getUri", TESTER).appliance == [1, "", "<master>"]
     assert both.appliance.call("getUri", [TESTER])[2] == both.appliance.uri + "/"
     answers = both.call("getPid", TESTER)
@@ -320,7 +320,7 @@ def test_own_address(both: BothMasters) -> None:
 
 
 def test_unknown_call_is_denied(both: BothMasters) -> None:
-    """A plain master answers a fault; the appliance a denial that says why, which no client library stumbles over."""
+    """A plain master answers with a fault, the appliance with a denial and its reason; client libraries accept both."""
     for method in ("getNothing", "_shutdown", "done", "reg_manager.nodes", "publisherUpdate"):
         answers = both.call(method, TESTER)
         assert isinstance(answers.plain, Fault)
@@ -329,8 +329,8 @@ def test_unknown_call_is_denied(both: BothMasters) -> None:
         assert "is not a call that is served here" in message
 
 
-def test_parts_of_a_multicall_are_made_in_order(both: BothMasters) -> None:
-    """roslaunch clears and sets parameters in one multicall: each part finds what the part before it left."""
+def test_multicall_parts_run_in_order(both: BothMasters) -> None:
+    """roslaunch clears and sets parameters in one multicall: each part sees the result of the part before it."""
     parts = [
         {"methodName": method, "params": [TESTER, *params]}
         for number in range(200)
@@ -348,7 +348,7 @@ def test_parts_of_a_multicall_are_made_in_order(both: BothMasters) -> None:
 
 
 def test_multicall(both: BothMasters) -> None:
-    """`system.multicall` answers each part as the call by itself; roslaunch sets its parameters so."""
+    """`system.multicall` answers each part like a single call; roslaunch sets its parameters this way."""
     parts = [
         {"methodName": "setParam", "params": [TESTER, "/launch/a", 1]},
         {"methodName": "setParam", "params": [TESTER, "/launch/b", {"c": [True, "x"]}]},
@@ -366,8 +366,8 @@ def test_multicall(both: BothMasters) -> None:
     "given",
     [(), (5,), ([5],), ([{}],), ([{"methodName": "getPid"}],), ([{"methodName": "getPid", "params": 5}],)],
 )
-def test_multicall_of_nonsense(both: BothMasters, given: tuple[Any, ...]) -> None:
-    """What is no list of calls is an error for its sender (whole, or in its part), and for nobody else."""
+def test_multicall_with_malformed_parts(both: BothMasters, given: tuple[Any, ...]) -> None:
+    """A malformed list of calls is an error of its sender (whole, or in one part) only."""
     answers = both.call("system.multicall", *given)
     wrong = answers.appliance[0] == -1 or all("faultCode" in part for part in answers.appliance)
     assert wrong, answers
@@ -395,8 +395,8 @@ def test_multicall_of_nonsense(both: BothMasters, given: tuple[Any, ...]) -> Non
     ],
     ids=repr,
 )
-def test_refused_although_a_plain_master_takes_it(both: BothMasters, step: Step) -> None:
-    """Names outside the ROS grammar and URIs that name no address are the caller's error (docs/limits.md)."""
+def test_calls_that_only_the_appliance_rejects(both: BothMasters, step: Step) -> None:
+    """Names outside the ROS grammar and URIs without an address are an error of the caller (docs/limits.md)."""
     answers = both.call(*step)
     assert answers.plain[0] in (1, -1)
     code, message, value = answers.appliance

@@ -1,6 +1,6 @@
-"""Any sequence of Master API calls is answered as a plain ROSMaster answers it, and leaves the same state.
+"""Any sequence of Master API calls is answered as by a plain ROS master, and leaves the same state.
 
-The sequences are made by hypothesis from few names, so that nodes, topics and keys meet; the seed is fixed.
+Hypothesis makes the sequences from few names, so that nodes, topics and keys collide; the seed is fixed.
 """
 
 from typing import Any
@@ -39,14 +39,14 @@ WRONG: st.SearchStrategy[Any] = st.sampled_from([None, "", 5, True, [], {}, ["/c
 
 @st.composite
 def node_with_api(draw: st.DrawFn) -> tuple[str, Api]:
-    """A node's name and an API URI that is (nearly always) its own."""
+    """Generate a node's name and an API URI that is (nearly always) its own."""
     node = draw(NODES)
     return node, Api(node.rpartition("/")[2])
 
 
 @st.composite
 def registrations(draw: st.DrawFn) -> Step:
-    """A call that changes the graph."""
+    """Generate a call that changes the graph."""
     node, api = draw(node_with_api())
     method = draw(
         st.sampled_from(
@@ -81,7 +81,7 @@ LOOKUPS = st.one_of(
 
 @st.composite
 def misformed(draw: st.DrawFn) -> Step:
-    """A call with an argument too few or too many, or of a wrong kind."""
+    """Generate a call with a missing, superfluous or wrong argument."""
     method, *arguments = draw(st.one_of(registrations(), PARAMETERS, LOOKUPS))
     match draw(st.sampled_from(["fewer", "more", "none", "wrong"])):
         case "fewer":
@@ -91,7 +91,7 @@ def misformed(draw: st.DrawFn) -> Step:
         case "none":
             return (method,)
     position = draw(st.integers(0, len(arguments) - 1))
-    # A caller without a name may only read (docs/limits.md): a difference that test_master_api.py has.
+    # A caller without a name may only read (docs/limits.md); test_master_api.py tests this difference.
     arguments[position] = draw(WRONG.filter(lambda wrong: position > 0 or wrong != ""))
     return method, *arguments
 

@@ -1,7 +1,7 @@
-"""A rospy node is asked the same by whoever finds it through a plain master and through the appliance.
+"""A rospy node answers its callers alike through a plain master and through the appliance.
 
-What must differ by design: URIs and process ids (only their form is compared), the numbers of connections, and the
-words about a parameter that is not valid, as in `side_by_side`.
+Differences by design: URIs and process ids (only their form is compared), the numbers of connections, and the
+text about an invalid parameter, as in `side_by_side`.
 """
 
 import re
@@ -10,13 +10,12 @@ from typing import Any
 
 import pytest
 
-from tests.integration.conformance.conftest import LocalSite
 from tests.integration.conformance.nodes import order, rospy_node
 from tests.integration.conformance.side_by_side import TESTER, Answers, differences
-from tests.support.nodes import RosSession, has_ros
+from tests.support.nodes import RosSession
 from tests.support.processes import ThisMachine
-from tests.support.requirements import need_root, needs
 from tests.support.rosmaster import call_on
+from tests.support.site import Masters
 
 TCPROS = [["TCPROS"]]
 READS = (
@@ -60,16 +59,15 @@ SERVED: tuple[tuple[Any, ...], ...] = (
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
-    """The URIs that a plain master and the appliance tell of a node that publishes /chatter and subscribes /heard."""
-    need_root()
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    homes = [tmp_path_factory.mktemp(mode) for mode in ("plain", "appliance")]
+def pair(masters: Masters, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
+    """Return the URIs by a plain master and by the appliance of a node that publishes /chatter and subscribes
+    /heard.
+    """
     with (
-        LocalSite("plain", homes[0]) as plain,
-        LocalSite("appliance", homes[1]) as appliance,
-        RosSession(plain.master_uri, homes[0]) as one,
-        RosSession(appliance.master_uri, homes[1]) as other,
+        masters.lend("plain", "loopback") as plain,
+        masters.lend("appliance", "loopback") as appliance,
+        RosSession(plain.master_uri, tmp_path_factory.mktemp("plain")) as one,
+        RosSession(appliance.master_uri, tmp_path_factory.mktemp("appliance")) as other,
     ):
         found = []
         for site, session in ((plain, one), (appliance, other)):
@@ -84,7 +82,7 @@ _HERE = ThisMachine()
 
 
 def formed(answer: Any) -> Any:
-    """URIs and process ids as such, ports left out."""
+    """Replace URIs and process ids by placeholders, without ports."""
     if isinstance(answer, list):
         return [formed(one) for one in answer]
     if isinstance(answer, str):
@@ -93,14 +91,14 @@ def formed(answer: Any) -> Any:
 
 
 def asked(pair: tuple[str, str], step: tuple[Any, ...]) -> Answers:
-    """The same call to both, with what differs by design made alike."""
+    """Make the same call to both, and remove differences by design."""
     plain, appliance = (formed(call_on(ThisMachine(), uri, *step)) for uri in pair)
     return Answers(plain, appliance)
 
 
 @pytest.mark.parametrize("step", ERRORS, ids=repr)
 def test_an_error_of_the_caller(pair: tuple[str, str], step: tuple[Any, ...]) -> None:
-    """What the caller did wrong is answered with -1 and an empty value, by the appliance as by rospy."""
+    """An error of the caller is answered with -1 and an empty value, by the appliance as by rospy."""
     answers = asked(pair, step)
     assert answers.plain[0] == -1
     found = differences(answers)
@@ -109,15 +107,15 @@ def test_an_error_of_the_caller(pair: tuple[str, str], step: tuple[Any, ...]) ->
 
 @pytest.mark.parametrize("step", SERVED, ids=repr)
 def test_a_call_that_is_served(pair: tuple[str, str], step: tuple[Any, ...]) -> None:
-    """Whoever asks a node finds the same code, words and value, also a tool without a name."""
+    """Every caller gets the same code, text and value, including a tool without a name."""
     answers = asked(pair, step)
     assert answers.plain[0] == 1
     assert differences(answers) == []
 
 
 @pytest.mark.parametrize("method", ["getBusInfo", "getBusStats"])
-def test_what_is_known_of_connections(pair: tuple[str, str], method: str) -> None:
-    """Connections come and go by themselves; code, words and the form of the value are alike."""
+def test_connection_information(pair: tuple[str, str], method: str) -> None:
+    """Connections change at any time, so code, text and only the form of the value are compared."""
     answers = asked(pair, (method, TESTER))
     assert answers.plain[:2] == answers.appliance[:2]
     assert len(answers.plain) == len(answers.appliance) == 3
@@ -128,8 +126,8 @@ def test_what_is_known_of_connections(pair: tuple[str, str], method: str) -> Non
 
 
 @pytest.mark.parametrize("protocols", [5, [5]], ids=repr)
-def test_protocols_of_no_form(pair: tuple[str, str], protocols: Any) -> None:
-    """The code is rospy's; its words are those of a Python error, the appliance's name the parameter."""
+def test_malformed_protocols(pair: tuple[str, str], protocols: Any) -> None:
+    """The code is rospy's; its text is a Python error, while the appliance names the parameter."""
     answers = asked(pair, ("requestTopic", TESTER, "/chatter", protocols))
     assert (answers.plain[0], answers.plain[2]) == (answers.appliance[0], answers.appliance[2]) == (-1, [])
     assert "[protocols]" in answers.appliance[1]
@@ -137,7 +135,9 @@ def test_protocols_of_no_form(pair: tuple[str, str], protocols: Any) -> None:
 
 @pytest.mark.parametrize("protocols", [[["UDPROS"]], [[]]], ids=repr)
 def test_no_protocol_in_common(pair: tuple[str, str], protocols: list[Any]) -> None:
-    """That is no error of the caller: 0; the appliance says what it carries and what was offered."""
+    """Without a common protocol the answer is 0, not a caller's error; the appliance lists the offered and relayed
+    ones.
+    """
     answers = asked(pair, ("requestTopic", TESTER, "/chatter", protocols))
     assert (answers.plain[0], answers.plain[2]) == (answers.appliance[0], answers.appliance[2]) == (0, [])
     assert "only TCPROS is carried" in answers.appliance[1]

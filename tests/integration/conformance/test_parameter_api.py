@@ -1,6 +1,6 @@
-"""The parameter server answers as a plain ROSMaster's: values, trees, scopes, the upward search, watchers.
+"""The parameter server answers as a plain ROS master: values, trees, scopes, the upward search, watchers.
 
-The kinds of cases are those of ROS's own test of its parameter server (ros_comm, test_rosmaster).
+The cases follow ROS's own test of its parameter server (ros_comm, test_rosmaster).
 """
 
 import math
@@ -40,12 +40,12 @@ VALUES: list[Any] = [
 
 
 def all_names_and_values(both: BothMasters) -> list[Step]:
-    """The whole tree and the list of names; both masters must have the same."""
+    """Return the whole tree and the list of names, which must be the same on both masters."""
     return [("getParam", TESTER, "/"), ("getParamNames", TESTER)]
 
 
 def compare(both: BothMasters, *steps: Step) -> list[Any]:
-    """Make every call to both, compare the answers and the trees after it; the appliance's answers."""
+    """Make every call to both, compare the answers and the final trees, and return the appliance's answers."""
     answers = []
     for step in steps:
         answer = both.call(*step)
@@ -60,7 +60,7 @@ def compare(both: BothMasters, *steps: Step) -> list[Any]:
     "value", VALUES, ids=[f"{type(value).__name__} {number}" for number, value in enumerate(VALUES)]
 )
 def test_value(both: BothMasters, value: Any) -> None:
-    """Every kind of value is kept and comes back as it was, by itself and within its tree."""
+    """Every kind of value is stored and returned unchanged, alone and within its tree."""
     compare(
         both,
         ("setParam", TESTER, "/kept/value", value),
@@ -74,7 +74,7 @@ def test_value(both: BothMasters, value: Any) -> None:
 
 
 def test_tree(both: BothMasters) -> None:
-    """A dictionary is a namespace, a namespace a dictionary; a value in the way becomes a namespace."""
+    """A dictionary is a namespace and vice versa; setting a key below a value turns the value into a namespace."""
     compare(
         both,
         ("setParam", TESTER, "/gains/P", 1),
@@ -104,7 +104,7 @@ def test_tree(both: BothMasters) -> None:
 
 
 def test_scopes(both: BothMasters) -> None:
-    """A relative key is in the caller's namespace, a private one in the caller's name; nothing is searched for."""
+    """A relative key is in the caller's namespace, a private one in the caller's name, without a search."""
     compare(
         both,
         ("setParam", "/down/one/two/node", "depth", 3),
@@ -126,7 +126,7 @@ def test_scopes(both: BothMasters) -> None:
 
 
 def test_search(both: BothMasters) -> None:
-    """`searchParam` looks upwards for the first part of the key and joins the rest, there or not."""
+    """`searchParam` searches upwards for the first part of the key and appends the rest, which need not exist."""
     leaf = {"p1": 1, "p2": {"q": 2}}
     callers = [
         "/root", "/l1/node", "/l1/l2/node", "/l1/l2/l3/l4/node", "/l1/other/l3/node", "/not/l1/l2/node", "/l1",
@@ -149,14 +149,14 @@ def test_search(both: BothMasters) -> None:
 
 
 def test_search_for_a_private_name(both: BothMasters) -> None:
-    """A private name cannot be searched for: an error on both (a plain master calls it its own failure)."""
+    """A private name cannot be searched for: an error on both (a plain master reports an internal error)."""
     answers = both.call("searchParam", TESTER, "~param")
     assert (answers.plain[0], answers.appliance[0]) == (0, -1)
 
 
 @pytest.mark.parametrize("watched", ["/arm", "/arm/", "/arm/speed", "/", "arm/joint", "~own"])
-def test_watchers_are_told_alike(both: BothMasters, watched: str) -> None:
-    """Who subscribed to a key hears of the same changes, with the same values, in the same order."""
+def test_watchers_get_the_same_updates(both: BothMasters, watched: str) -> None:
+    """Subscribers of a key get the same changes, with the same values, in the same order."""
     ear = Api("ear")
     compare(both, ("setParam", TESTER, "/arm/speed", 0), ("subscribeParam", "/ear", ear, "/settled"))
     for number, step in enumerate(
@@ -175,7 +175,7 @@ def test_watchers_are_told_alike(both: BothMasters, watched: str) -> None:
             ("setParam", TESTER, "/arm/speed", 10),
         )
     ):
-        # A plain master sends a tree as it is when it comes to it: let it come to it before the next change.
+        # A plain master sends the current tree when it sends: wait for that before the next change.
         compare(both, step, ("setParam", TESTER, "/settled", number))
         for side in (both.plain, both.appliance):
             assert side.nodes.wait_until(lambda side=side, number=number: _has_settled(side, number))  # type: ignore[misc]  # mypy does not infer a lambda with defaults
@@ -207,8 +207,8 @@ _WATCHES = st.tuples(
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(steps=st.lists(st.one_of(_WATCHES, _WRITES, _WRITES), min_size=3, max_size=12))
-def test_any_sequence_is_told_alike(both: BothMasters, steps: list[Step]) -> None:
-    """Whatever is watched, set and deleted in whatever order: every watcher is told the same of every single write."""
+def test_watchers_get_the_same_updates_of_any_sequence(both: BothMasters, steps: list[Step]) -> None:
+    """For any order of watching, setting and deleting, every watcher gets the same updates of every single write."""
     both.reset()
     for node in ("ear", "eye"):
         both.call("subscribeParam", f"/{node}", Api(node), "/settled")
@@ -228,7 +228,7 @@ def test_any_sequence_is_told_alike(both: BothMasters, steps: list[Step]) -> Non
 
 
 def _is_told(side: MasterSide, node: str, number: int) -> bool:
-    """Whether the node heard that `number` is settled, and so of everything before it."""
+    """Whether the node was told that `number` is settled, which follows everything before it."""
     return any(
         call.node.startswith(f"{node}-") and call.params[1:] == ("/settled/", number)
         for call in side.nodes.all_calls()
@@ -236,7 +236,7 @@ def _is_told(side: MasterSide, node: str, number: int) -> bool:
 
 
 def _sorted(told: dict[str, list[Any]]) -> dict[str, list[str]]:
-    """The updates of one write have no order."""
+    """Sort the updates of one write, which have no order."""
     return {node: sorted(map(repr, calls)) for node, calls in told.items()}
 
 
@@ -245,7 +245,7 @@ def _has_settled(side: MasterSide, number: int) -> bool:
 
 
 def test_ten_thousand_parameters(both: BothMasters) -> None:
-    """A tree of 10,000 parameters is set, listed, read and cleared, whole and one by one."""
+    """A tree of 10,000 parameters is set, listed, read and cleared, as a whole and one by one."""
     tree = {f"group_{group}": {f"p{number}": number for number in range(100)} for group in range(100)}
     compare(
         both,
@@ -262,8 +262,8 @@ def test_ten_thousand_parameters(both: BothMasters) -> None:
     compare(both, ("deleteParam", TESTER, "/large"), ("deleteParam", TESTER, "/many"))
 
 
-def test_any_multicall_in_its_order(both: BothMasters) -> None:
-    """Runs of sets, deletions and questions, between other calls and mistakes, are answered as by a plain master."""
+def test_any_multicall_runs_in_order(both: BothMasters) -> None:
+    """Sequences of sets, deletions and reads, mixed with other calls and errors, are answered as by a plain master."""
     dice = random.Random(20)  # noqa: S311  the same calls in every run
     keys = ["/m/a", "/m/a/b", "/m/a/b/c", "/m/d", "m/relative", "/m", "~private", "/m//x", "/m/bad name"]
     for _ in range(30):
@@ -280,7 +280,7 @@ def test_any_multicall_in_its_order(both: BothMasters) -> None:
         answers = both.call("system.multicall", parts)
         assert len(answers.appliance) == len(answers.plain)
         for part, plain, ours in zip(parts, answers.plain, answers.appliance, strict=True):
-            # A plain master writes its answers when all parts are made: a dictionary it gave shows what came later.
+            # A plain master writes its answers after all parts: a returned dictionary shows later changes.
             if isinstance(plain, list) and part["methodName"] != "getParam":
                 assert differences(Answers(plain[0], ours[0])) == [], (part, parts)
         for look in all_names_and_values(both):

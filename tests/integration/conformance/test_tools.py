@@ -1,4 +1,4 @@
-"""The tools of ROS beyond those of test_stock_tools.py: they say the same of a robot behind the appliance."""
+"""The tools of ROS that test_stock_tools.py leaves out print the same for a robot behind the appliance."""
 
 import json
 import re
@@ -8,16 +8,15 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.integration.conformance.conftest import LocalSite
 from tests.integration.conformance.nodes import order, rospy_node
 from tests.support.nodes import PYTHON, Client, RosSession
+from tests.support.site import Site
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 GRAPH = """\
-import rosgraph.impl.graph, json, time
+import rosgraph.impl.graph, json
 graph = rosgraph.impl.graph.Graph()
-limit = time.monotonic() + 20
-while time.monotonic() < limit and not any("/chatter" in edge.label for edge in graph.nn_edges):
+while not any("/chatter" in edge.label for edge in graph.nn_edges):
     graph.update()
 print(json.dumps({"nodes": sorted(graph.nn_nodes), "bad": sorted(graph.bad_nodes),
                   "edges": sorted({(edge.start, edge.label, edge.end) for edge in graph.nn_edges})}))
@@ -25,7 +24,7 @@ print(json.dumps({"nodes": sorted(graph.nn_nodes), "bad": sorted(graph.bad_nodes
 
 
 def test_rostopic_bw(ros: RosSession) -> None:
-    """`rostopic bw` measures."""
+    """`rostopic bw` measures the bandwidth."""
     ros.talker("roscpp", "/chatter")
     assert "average:" in ros.start(["rostopic", "bw", "/chatter"]).wait_for_text("average:")
 
@@ -38,14 +37,14 @@ def test_rostopic_delay(ros: RosSession) -> None:
 
 
 def test_rostopic_pub_latched(ros: RosSession) -> None:
-    """What `rostopic pub -l` published is there for who comes later, again and again."""
+    """Every later subscriber gets the message of `rostopic pub -l`."""
     ros.start(["rostopic", "pub", "-l", "/told", "std_msgs/String", "data: kept"])
     for to in CLIENTS * 2:
         assert ros.listener(to, "/told").wait_for(event="received")["data"] == "kept"
 
 
 def test_rostopic_echo_of_a_bag_and_of_a_field(ros: RosSession, tmp_path: Path) -> None:
-    """`rostopic echo` prints a field; of a bag, too, that `rosbag record -a` wrote of everything there is."""
+    """`rostopic echo` prints a field, also from a bag that `rosbag record -a` wrote of all topics."""
     ros.talker("roscpp", "/chatter")
     assert "hello" in ros.run("rostopic", "echo", "-n", "1", "/chatter/data").stdout
     bag = tmp_path / "all.bag"
@@ -58,7 +57,7 @@ def test_rostopic_echo_of_a_bag_and_of_a_field(ros: RosSession, tmp_path: Path) 
 
 
 def test_rosnode_of_a_killed_node(ros: RosSession) -> None:
-    """After a crash, `ping -a` and `info` cope; `cleanup` (or the appliance before it) removes what is left."""
+    """After a crash `ping -a` and `info` work; `cleanup` (or the appliance before it) removes the node."""
     voice = ros.talker("rospy", "/chatter", name="voice")
     ros.listener("roscpp", "/chatter", name="ear")
     voice.kill()
@@ -69,8 +68,8 @@ def test_rosnode_of_a_killed_node(ros: RosSession) -> None:
     assert "Publishers: None" in ros.run("rostopic", "info", "/chatter").stdout
 
 
-def test_rosnode_machine_and_list(local: LocalSite, ros: RosSession) -> None:
-    """`rosnode list -a` names the address of every node, `rosnode machine` this machine."""
+def test_rosnode_machine_and_list(local: Site, ros: RosSession) -> None:
+    """`rosnode list -a` prints the address of every node, `rosnode machine` this machine."""
     ros.talker("rospy", "/chatter", name="voice")
     assert re.search(r"http://127\.0\.0\.1:\d+/ \t?\s*/voice", ros.run("rosnode", "list", "-a").stdout)
     assert "127.0.0.1" in ros.run("rosnode", "machine").stdout
@@ -78,7 +77,7 @@ def test_rosnode_machine_and_list(local: LocalSite, ros: RosSession) -> None:
 
 
 def test_rosnode_kill_all(ros: RosSession) -> None:
-    """`rosnode kill -a` ends every node of the robot; the aggregator comes back where it is looked after."""
+    """`rosnode kill -a` ends every node of the robot; the aggregator is restarted where it is supervised."""
     nodes = [
         ros.talker("rospy", "/chatter"),
         ros.listener("roscpp", "/chatter"),
@@ -92,7 +91,7 @@ def test_rosnode_kill_all(ros: RosSession) -> None:
 
 
 def test_rosparam_of_a_namespace(ros: RosSession, tmp_path: Path) -> None:
-    """`rosparam load` and `dump` of a whole file, private and nested names included; `list` of a namespace."""
+    """Use `rosparam load` and `dump` on a whole file with private and nested names, and `list` on a namespace."""
     file = tmp_path / "robot.yaml"
     file.write_text(
         "arm: {joints: [1, 2], 'joint-1.left': {p: 0.5, i: 1e-3}}\nbase: {frame: base_link, enabled: true}\n"
@@ -109,7 +108,7 @@ def test_rosparam_of_a_namespace(ros: RosSession, tmp_path: Path) -> None:
 
 
 def test_rosservice_find_args_uri(ros: RosSession) -> None:
-    """`rosservice find`, `args` and `uri` ask the service itself, by its probe."""
+    """`rosservice find`, `args` and `uri` probe the service itself."""
     ros.service_server("rospy", "/negate", name="server")
     assert "/negate" in ros.run("rosservice", "find", "std_srvs/SetBool").stdout.split()
     assert ros.run("rosservice", "args", "/negate").stdout.strip() == "data"
@@ -118,8 +117,8 @@ def test_rosservice_find_args_uri(ros: RosSession) -> None:
     assert "rosout" in loggers
 
 
-def test_graph_as_rqt_graph_reads_it(local: LocalSite, ros: RosSession) -> None:
-    """The library behind `rqt_graph` finds the nodes, the topics and who is connected to whom, and no node is bad."""
+def test_graph_as_rqt_graph_reads_it(local: Site, ros: RosSession) -> None:
+    """The library behind `rqt_graph` finds the nodes, the topics and the connections, and no bad node."""
     ros.talker("rospy", "/chatter", name="voice")
     ros.listener("roscpp", "/chatter", name="ear").wait_for(event="received")
     found = ros.run(PYTHON, "-c", GRAPH).stdout
@@ -136,7 +135,7 @@ def test_rosgraph(ros: RosSession) -> None:
 
 
 def test_rosbag_play_with_a_clock(ros: RosSession, tmp_path: Path) -> None:
-    """A bag of a latched topic, played with `--clock` and remapped, is heard as recorded."""
+    """A bag of a latched topic, played with `--clock` and remapped, is received as recorded."""
     bag = tmp_path / "map.bag"
     source = rospy_node(ros, "orders", "source")
     order(source, "advertise", topic="/map", latch=True)
@@ -149,10 +148,10 @@ def test_rosbag_play_with_a_clock(ros: RosSession, tmp_path: Path) -> None:
     clock.wait_for_text("secs")
 
 
-@pytest.mark.parametrize("local", ["appliance"], indirect=True)  # behind a plain master it is not reached
+@pytest.mark.parametrize("local", ["appliance"], indirect=True)  # not reached behind a plain master
 @pytest.mark.parametrize(("how", "value"), [("ROS_HOSTNAME", "nowhere.invalid"), ("ROS_IP", "192.0.2.7")])
-def test_node_with_an_address_nobody_reaches(local: LocalSite, tmp_path: Path, how: str, value: str) -> None:
-    """A node that gives a name nobody resolves, or another address, is reached by where it called from."""
+def test_node_with_an_unreachable_address(local: Site, tmp_path: Path, how: str, value: str) -> None:
+    """A node with an unresolvable or wrong address is reached at the address that it called from."""
     with RosSession(local.master_uri, tmp_path) as ros:
         odd = rospy_node(ros, "orders", "odd", **{"ROS_IP": "", how: value})
         order(odd, "advertise", topic="/odd", latch=True)

@@ -12,18 +12,16 @@ from tests.support.requirements import need_root, needs
 
 @pytest.fixture(scope="module")
 def battlefield(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Field]:
-    """The appliance with the policy (and the configuration) of the test file, and its hosts."""
+    """Run the appliance with the policy (and the configuration) of the test file, and its hosts."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    home = tmp_path_factory.mktemp("field")
-    (home / "appliance.yaml").write_text(getattr(request.module, "CONFIGURATION", ""))
-    options = ("--config", str(home / "appliance.yaml"))
-    with Lab("rosrv-test") as lab, Field(lab, home, request.module.POLICY, options) as field:
+    home, settings = tmp_path_factory.mktemp("field"), getattr(request.module, "CONFIGURATION", "")
+    with Lab("rosrv-test") as lab, Field(lab, home, request.module.POLICY, settings) as field:
         yield field
 
 
 @pytest.fixture
 def field(battlefield: Field) -> Iterator[Field]:
-    """The field of one attack: afterwards talker and listener must have gone on as if nothing had been."""
+    """Provide the field for one attack, and assert afterwards that talker and listener went on unharmed."""
     yield battlefield
     battlefield.unharmed()

@@ -1,4 +1,4 @@
-"""Attacks on the graph from another host, by calls: identity, names, parameters, services, addresses, faces.
+"""Attacks on the graph from another host, by calls: identity, names, parameters, services, addresses, endpoints.
 
 After each of them the robot's talker and its operator's listener have gone on (the fixture looks), the caller was
 told why in the shape its library expects, and the audit log has the refusal with the rule it stands on.
@@ -70,7 +70,7 @@ LOOPBACK = "0100007F"  # as /proc/net/tcp writes 127.0.0.1
 
 @pytest.fixture(scope="module", autouse=True)
 def graph(battlefield: Field) -> Iterator[None]:
-    """More of a graph: a secret, a service, a topic that everybody may have."""
+    """Add a secret, a service and a topic for every host to the graph."""
     own = battlefield.ros
     own.run("rosparam", "set", "/secret/key", "4711")
     own.run("rosparam", "set", "/open_key", "1")
@@ -85,8 +85,10 @@ def graph(battlefield: Field) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def nothing_hidden_is_revealed(field: Field) -> Iterator[None]:
-    """In nothing that the rogue is told by a test is a port of the ROSMaster's, of a face it has, or of a real node."""
+def no_hidden_port_is_revealed(field: Field) -> Iterator[None]:
+    """Assert that the answers to the rogue contain no port of `rosmaster`, of a master-side endpoint, or of a real
+    node.
+    """
     since = len(field.answers)
     yield
     hidden = {port for address, port in field.middle.run(_listening) if address == LOOPBACK}
@@ -94,19 +96,21 @@ def nothing_hidden_is_revealed(field: Field) -> Iterator[None]:
     assert hidden and real
     for method, answer in field.answers[since:]:
         text = answer.decode("latin-1") if isinstance(answer, bytes) else str(answer)
-        told = {int(port) for port in re.findall(rf"(?<!{ROGUE}):(\d+)\b", text)}  # what is his own he knows
-        assert not told & (hidden | real), f"{method} told of {told & (hidden | real)}: {text[:500]}"
-        assert not re.search(r"\b[0-9a-f]{32}\b", text), f"{method} told a key: {text[:500]}"
+        told = {
+            int(port) for port in re.findall(rf"(?<!{ROGUE}):(\d+)\b", text)
+        }  # its own URIs are known to it
+        assert not told & (hidden | real), f"{method} revealed {told & (hidden | real)}: {text[:500]}"
+        assert not re.search(r"\b[0-9a-f]{32}\b", text), f"{method} revealed a key: {text[:500]}"
 
 
 def outer(field: Field, node: str) -> str:
-    """Where the rogue is told a node is."""
+    """Return the address of a node as the rogue is told it."""
     code, _text, uri = field.rogue("lookupNode", "/looker", node)
     assert code == 1
     return str(uri)
 
 
-# --- who speaks ---
+# --- identity of the caller ---
 
 
 @pytest.mark.parametrize(
@@ -132,10 +136,10 @@ def outer(field: Field, node: str) -> str:
         ("getPid", (), "command"),
     ],
 )
-def test_speaking_for_another_hosts_node(
+def test_call_in_the_name_of_another_hosts_node(
     field: Field, method: str, parameters: tuple[Any, ...], category: str
 ) -> None:
-    """No call of the Master API can be made in the name of a node that lives on another host."""
+    """Deny every call of the Master API in the name of a node on another host."""
     answer = field.rogue(method, "/voice", *parameters)
     allowed_but_held = {"subscribeParam": "is held by", "unsubscribeParam": "is held by"}
     told = allowed_but_held.get(method, VOICE_TOLD)
@@ -147,55 +151,55 @@ def test_speaking_for_another_hosts_node(
 
 @pytest.mark.parametrize("method", ["registerPublisher", "registerSubscriber"])
 def test_takeover_of_a_running_node(field: Field, method: str) -> None:
-    """A node that runs on another host keeps its name, though the policy grants it to both."""
+    """A node that runs on another host keeps its name, even if the policy grants it to both."""
     answer = field.rogue(method, "/voice", "/shared/talk", "std_msgs/String", API)
     field.denied(answer, "/voice is held by a running node of another host", in_record="node on 10.77.0.10")
     assert answer[2] == []
 
 
-def test_takeover_by_offering_a_service(field: Field) -> None:
-    """Nor is it taken by a service."""
+def test_takeover_by_registering_a_service(field: Field) -> None:
+    """Registering a service does not take over the name of a running node either."""
     answer = field.rogue("registerService", "/voice", "/shared/s", "rosrpc://10.77.0.66:9", API)
     held = "/voice is held by a running node"
     field.denied(answer, f"{held} of another host", in_record=f"{held} on 10.77.0.10", category="offer")
 
 
-def test_name_that_the_policy_keeps(field: Field) -> None:
-    """A free name that `[Nodes]` grants to others cannot be used at all."""
+def test_name_that_the_policy_reserves(field: Field) -> None:
+    """Deny every use of a free name that `[Nodes]` grants to other hosts."""
     answer = field.rogue("registerPublisher", "/guarded_1", "/shared/talk", "std_msgs/String", API)
     field.denied(answer, "/guarded_1", rule="[Nodes] /guarded_*", category="publish")
 
 
 def test_name_of_the_appliances_own_node(field: Field) -> None:
-    """`/rosout` is the appliance's."""
+    """Deny `/rosout`, the name of the appliance's own node."""
     answer = field.rogue("registerPublisher", "/rosout", "/shared/talk", "std_msgs/String", API)
     field.denied(answer, "the name /rosout belongs to the appliance")
 
 
-def test_what_nodes_log_is_collected(field: Field) -> None:
-    """The rosout aggregator hears every node, though the policy names neither it nor this machine."""
+def test_rosout_receives_every_nodes_log(field: Field) -> None:
+    """The rosout aggregator receives every node's log, though the policy names neither it nor this machine."""
     for name in ("voice", "ear"):
         field.recorded(f"is connected to /rosout of /{name}", event="connection opened", caller_id="/rosout")
 
 
 @pytest.mark.parametrize("method", ["getPid", "getName", "getUri", "getMasterUri", "getBusInfo", "getBusStats",
                                     "getSubscriptions", "getPublications"])  # fmt: skip
-def test_speaking_for_a_node_to_a_node(field: Field, method: str) -> None:
-    """On another node's face nobody can use the name of a node of another host either."""
+def test_node_api_call_in_the_name_of_another_hosts_node(field: Field, method: str) -> None:
+    """Deny calls of a node's endpoint in the name of a node on another host."""
     answer = field.rogue(method, "/ear", uri=outer(field, "/shared_voice"))
     record = field.denied(answer, "/ear is held by", in_record="/ear is held by 10.77.0.20", caller_id="/ear")
     assert record["detail"]["node"] == "/shared_voice"
 
 
-def test_asking_for_a_topic_in_anothers_name(field: Field) -> None:
-    """The subscriber's name on `requestTopic` is bound to its host."""
+def test_topic_request_in_another_nodes_name(field: Field) -> None:
+    """The subscriber's name in `requestTopic` is bound to its host."""
     uri = outer(field, "/shared_voice")
     answer = field.rogue("requestTopic", "/ear", "/shared/talk", TCPROS, uri=uri)
     field.denied(answer, "/ear is held by", in_record="/ear is held by 10.77.0.20")
 
 
 def test_late_call_of_a_replaced_node(field: Field) -> None:
-    """A node that was replaced under its name on the same host cannot unregister its successor, nor come back."""
+    """A node that was replaced under its name on the same host can neither unregister its successor nor come back."""
     with (
         Impostor(field.attacker, answering([1, "", 0])) as old,
         Impostor(field.attacker, answering([1, "", 7])) as new,
@@ -204,7 +208,7 @@ def test_late_call_of_a_replaced_node(field: Field) -> None:
             assert (
                 field.rogue("registerPublisher", "/twin", "/shared/twin", "std_msgs/String", one.uri)[0] == 1
             )
-        assert old.called.wait(LIMIT)  # ROSMaster tells it to shut down, through the appliance
+        assert old.called.wait(LIMIT)  # `rosmaster` tells it to shut down, through the appliance
         assert b"shutdown" in old.requests[-1] or old.called.is_set()
         for method in ("unregisterPublisher", "registerPublisher"):
             parameters = (
@@ -217,10 +221,10 @@ def test_late_call_of_a_replaced_node(field: Field) -> None:
 
 
 def test_unregistering_with_the_real_uri_of_the_victim(field: Field) -> None:
-    """Knowing a victim's real URI does not help: the caller is who he is by his address."""
+    """The real URI of a victim does not help an attacker: the caller is identified by its address."""
     uri = field.talker.seen(event="ready")[0]["uri"]
     answer = field.rogue("unregisterPublisher", "/another", "/shared/talk", uri)
-    assert answer[:1] == [1]  # ROSMaster's "not a registered node"
+    assert answer[:1] == [1]  # "not a registered node" of `rosmaster`
     assert "not a registered node" in answer[1]
     answer = field.rogue("unregisterPublisher", "/voice", "/shared/talk2", uri)
     field.denied(answer, VOICE_TOLD, in_record=VOICE_HELD)
@@ -230,12 +234,12 @@ def test_unregistering_with_the_real_uri_of_the_victim(field: Field) -> None:
 
 
 def part(method: str, *params: Any) -> dict[str, Any]:
-    """One part of a multicall."""
+    """Return one part of a multicall."""
     return {"methodName": method, "params": list(params)}
 
 
 def test_multicall_is_decided_part_by_part(field: Field) -> None:
-    """What is allowed does not carry what is not."""
+    """Each part of a multicall is decided separately: allowed parts do not let denied ones pass."""
     answers = field.rogue(
         "system.multicall",
         [
@@ -252,8 +256,8 @@ def test_multicall_is_decided_part_by_part(field: Field) -> None:
     assert field.call(field.robot, "hasParam", "/looker", "/forbidden")[2] is False
 
 
-def test_multicall_inside_a_multicall(field: Field) -> None:
-    """Nesting is refused, recorded, and the parts inside are not carried out."""
+def test_nested_multicall(field: Field) -> None:
+    """A nested multicall is rejected and recorded, and its parts are not carried out."""
     inner = part("system.multicall", [part("setParam", "/mixer", "/shared/nested", 1)])
     [fault] = field.rogue("system.multicall", [inner])
     assert "multicall inside a multicall" in fault["faultString"]
@@ -274,15 +278,15 @@ def test_multicall_inside_a_multicall(field: Field) -> None:
     ],
     ids=repr,
 )
-def test_multicall_of_another_form(field: Field, parts: Any) -> None:
-    """Anything else than a list of calls is an error of its form, not of the appliance."""
+def test_malformed_multicall(field: Field, parts: Any) -> None:
+    """A multicall without a list of calls is an error of the caller."""
     answer = field.rogue("system.multicall", parts)
     assert "multicall" in str(answer)
     field.recorded(event="malformed", host="10.77.0.66", resource="system.multicall")
 
 
 def test_multicall_on_a_nodes_face(field: Field) -> None:
-    """A node serves no multicall; so does its face."""
+    """A node serves no multicall, and neither does its endpoint."""
     answer = field.rogue("system.multicall", [part("getPid", "/x")], uri=outer(field, "/shared_voice"))
     field.denied(answer, "'system.multicall' is not a call that is served here")
 
@@ -300,7 +304,7 @@ def test_multicall_on_a_nodes_face(field: Field) -> None:
     ],
 )
 def test_other_spellings_of_a_topic(field: Field, spelling: str, reason: str) -> None:
-    """Whatever ROSMaster would take for `/chatter` is decided as `/chatter`."""
+    """Every spelling that `rosmaster` takes for `/chatter` is decided as `/chatter`."""
     answer = field.rogue("registerPublisher", "/spell" + spelling.replace("/", "_"), spelling,
                          "std_msgs/String", API)  # fmt: skip
     field.denied(answer, reason, rule="[Publishers] default", resource="/chatter")
@@ -315,7 +319,7 @@ def test_other_spellings_of_a_topic(field: Field, spelling: str, reason: str) ->
 )  # fmt: skip
 @pytest.mark.parametrize("method", ["registerPublisher", "registerSubscriber"])
 def test_names_outside_the_grammar(field: Field, method: str, name: str) -> None:
-    """A name that looks like another, or that ROSMaster would take to pieces, never gets there."""
+    """Reject names that look like other names, or that `rosmaster` would split."""
     answer = field.rogue(method, "/namer", name, "std_msgs/String", API)
     assert (answer[0], answer[2]) == (-1, []), answer
     assert "parameter [topic]" in answer[1]
@@ -341,7 +345,7 @@ def test_names_outside_the_grammar(field: Field, method: str, name: str) -> None
     ids=lambda name: ascii(name)[:24],
 )
 def test_caller_ids_outside_the_grammar(field: Field, caller_id: str) -> None:
-    """A caller_id, which ROSMaster takes as it comes, is a global name or nothing."""
+    """Reject a caller_id that is not a global name; `rosmaster` would accept any."""
     answer = field.rogue("registerPublisher", caller_id, "/shared/talk", "std_msgs/String", API)
     assert (answer[0], answer[2]) == (-1, []), answer
     assert "caller_id" in answer[1]
@@ -349,7 +353,7 @@ def test_caller_ids_outside_the_grammar(field: Field, caller_id: str) -> None:
 
 
 def test_case_is_part_of_a_name(field: Field) -> None:
-    """`/Voice` is another node than `/voice`, and `/Chatter` another topic than `/chatter`."""
+    """`/Voice` and `/voice` are different nodes, `/Chatter` and `/chatter` different topics."""
     assert field.rogue("getPid", "/Voice")[0] == 1
     answer = field.rogue("registerPublisher", "/Voice", "/Chatter", "std_msgs/String", API)
     field.denied(answer, "/Chatter", rule="[Publishers] default", resource="/Chatter")
@@ -357,14 +361,14 @@ def test_case_is_part_of_a_name(field: Field) -> None:
 
 @pytest.mark.parametrize("method", ["GETPID", "getpid", "getPid ", "system.getPid", "__class__", "_dispatch",
                                     "publisherUpdate", "paramUpdate", "x" * 4000, "requestTopic", ""])  # fmt: skip
-def test_calls_that_are_none(field: Field, method: str) -> None:
-    """The method's name is matched exactly; what is not in the table is refused and recorded."""
+def test_unknown_methods(field: Field, method: str) -> None:
+    """Method names are matched exactly; unknown methods are denied and recorded."""
     answer = field.rogue(method or "\u00e9", "/caller")
     field.denied(answer, "is not a call that is served here")
 
 
-def test_very_long_claims_are_cut_in_the_log(field: Field) -> None:
-    """A megabyte where a name should be does not become a megabyte of audit log."""
+def test_very_long_names_are_truncated_in_the_log(field: Field) -> None:
+    """A name of a megabyte does not become a record of a megabyte."""
     answer = field.rogue("noSuchCall", "/" + "A" * 1_000_000)
     record = field.denied(answer, "'noSuchCall' is not a call")
     assert len(record["caller_id"]) <= 1024
@@ -379,8 +383,8 @@ def test_very_long_claims_are_cut_in_the_log(field: Field) -> None:
 
 
 @pytest.mark.parametrize("key", ["/", "", "//", "/secret", "secret/key", "//secret//key/", "/run_id"])
-def test_parameters_of_others(field: Field, key: str) -> None:
-    """The root, and everything that is not granted, can neither be set nor deleted, however it is spelled."""
+def test_parameters_of_other_hosts(field: Field, key: str) -> None:
+    """The root, and every parameter without a rule, can neither be set nor deleted, in any spelling."""
     for method, value in (("setParam", ({"a": 1},)), ("deleteParam", ())):
         answer = field.rogue(method, f"/writer_{key.replace('/', '_')}", key, *value)
         assert answer[0] in (0, -1), answer
@@ -390,8 +394,8 @@ def test_parameters_of_others(field: Field, key: str) -> None:
 
 
 @pytest.mark.parametrize("key", ["/shared/fixed/x", "/shared//fixed/x/y/"])
-def test_a_parameter_is_not_replaced_from_below(field: Field, key: str) -> None:
-    """ROSMaster puts a namespace where something below a value is set: that is a write of the value."""
+def test_a_value_is_not_replaced_by_setting_a_child(field: Field, key: str) -> None:
+    """Setting a parameter below a value needs the right to write the value, because `rosmaster` replaces it."""
     assert field.call(field.robot, "setParam", "/looker", "/shared/fixed", 4711)[0] == 1
     answer = field.rogue("setParam", "/writer_below", key, 0)
     field.denied(answer, "", rule="[Parameters] write /shared/fixed", resource="setParam")
@@ -400,8 +404,10 @@ def test_a_parameter_is_not_replaced_from_below(field: Field, key: str) -> None:
     assert field.call(field.robot, "getParam", "/looker", "/shared/fixed")[2] == 4711
 
 
-def test_a_key_is_no_right_to_a_namespace(field: Field) -> None:
-    """What one may set to a value, one may neither set to a dictionary nor delete while others have something in it."""
+def test_a_right_to_a_key_does_not_cover_its_namespace(field: Field) -> None:
+    """The right to set a key to a value does not cover setting a dictionary or deleting other hosts' parameters
+    below it.
+    """
     assert field.rogue("setParam", "/writer_leaf", "/leaf", 1)[0] == 1
     answer = field.rogue("setParam", "/writer_leaf", "/leaf", {"a": 1})
     field.denied(answer, "", rule="[Parameters] write default", resource="setParam")
@@ -414,7 +420,7 @@ def test_a_key_is_no_right_to_a_namespace(field: Field) -> None:
 
 @pytest.mark.parametrize("key", ["/secret/key", "/secret", "/", "//secret/"])
 def test_reading_a_secret(field: Field, key: str) -> None:
-    """Neither the key nor a namespace that holds it can be read, watched or asked for."""
+    """Neither the key of a secret nor a namespace that contains it can be read, watched or searched for."""
     for method, parameters in (
         ("getParam", (key,)),
         ("hasParam", (key,)),
@@ -427,7 +433,7 @@ def test_reading_a_secret(field: Field, key: str) -> None:
 
 
 def test_secrets_are_not_listed(field: Field) -> None:
-    """`getParamNames` and `searchParam` show what may be read."""
+    """`getParamNames` and `searchParam` list readable parameters only."""
     assert "/secret/key" not in field.rogue("getParamNames", "/lister")[2]
     assert "/open_key" in field.rogue("getParamNames", "/lister")[2]
     for key in ("key", "other"):
@@ -438,7 +444,7 @@ def test_secrets_are_not_listed(field: Field) -> None:
 
 
 def test_keys_with_slashes_inside_a_value(field: Field) -> None:
-    """A dictionary whose keys look like paths stays where it was put; nothing else is reached by it."""
+    """A dictionary with keys that look like paths is stored unchanged and reaches no other parameter."""
     value = {"a/b": 1, "..": 4, "secret/key": 5, "list": [{"/secret/key": 6}]}
     assert field.rogue("setParam", "/writer", "/shared/odd", value)[0] == 1
     assert field.call(field.robot, "getParam", "/looker", "/secret/key")[2] == 4711
@@ -449,7 +455,7 @@ def test_keys_with_slashes_inside_a_value(field: Field) -> None:
 
 @pytest.mark.parametrize("name", ["/limits/speed", "/limits", "~limits", "", "/", "a//b", "a/"])
 def test_a_forged_update(field: Field, name: str) -> None:
-    """A member whose name is no relative name is refused: no node that watches another key hears of it."""
+    """Reject an update with a member that is not a relative name: nodes that watch other keys receive nothing."""
     watcher = field.ros.parameters("rospy", name="cautious")
     watcher.wait_for(event="ready")
     field.call(field.robot, "setParam", "/driver", "/limits/speed", 1)
@@ -473,15 +479,15 @@ def test_a_forged_update(field: Field, name: str) -> None:
 
 
 @pytest.mark.parametrize("value", [None, {"a": None}, [1, [None]], {"a": {"b": [{"c": None}]}}], ids=repr)
-def test_nothing_inside_a_value(field: Field, value: Any) -> None:
-    """`<nil/>`, which would break every answer it is in, is refused for its sender alone."""
+def test_nil_inside_a_value(field: Field, value: Any) -> None:
+    """Reject `<nil/>`, which would break every answer that contains it, for its sender alone."""
     answer = field.rogue("setParam", "/writer", "/shared/nil", value)
     assert answer[0] == -1
     assert field.rogue("getParam", "/writer", "/shared")[0] == 1
 
 
-def test_a_tree_too_deep_to_be_told(field: Field) -> None:
-    """Deep keys and deep values together are bounded: ROSMaster could not answer for the whole tree any more."""
+def test_a_parameter_tree_that_is_too_deep(field: Field) -> None:
+    """The total depth of keys and values is limited: `rosmaster` could not return a deeper tree."""
     value: Any = 1
     for _ in range(90):
         value = {"d": value}
@@ -496,7 +502,7 @@ def test_a_tree_too_deep_to_be_told(field: Field) -> None:
 
 
 def test_integers_beyond_32_bits(field: Field) -> None:
-    """What no ROS client could read back is a fault for its sender; the connection and the others go on."""
+    """An integer that ROS clients cannot read is a fault for its sender; the connection and other callers go on."""
     body = (
         "<?xml version='1.0'?><methodCall><methodName>setParam</methodName><params><param><value>/writer</value>"
         "</param><param><value>/shared/big</value></param><param><value><i4>4294967296</i4></value></param></params>"
@@ -525,13 +531,13 @@ def test_integers_beyond_32_bits(field: Field) -> None:
     ids=lambda value: repr(value)[:20],
 )
 def test_values_that_ros_accepts(field: Field, value: Any) -> None:
-    """Odd values that a plain ROSMaster takes are taken and come back as they were."""
+    """Unusual values that a plain ROS master accepts are stored and returned unchanged."""
     assert field.rogue("setParam", "/writer", "/shared/value", value)[0] == 1
     assert field.call(field.robot, "getParam", "/looker", "/shared/value")[2] == value
 
 
 def test_bytes_and_dates(field: Field) -> None:
-    """Binary values and dates are values, too."""
+    """Binary values and dates are stored and returned."""
     from xmlrpc import client  # noqa: PLC0415 - only here
 
     for value in (client.Binary(b"\x00\xff"), client.DateTime("20250131T23:59:59")):
@@ -539,8 +545,8 @@ def test_bytes_and_dates(field: Field) -> None:
         assert field.call(field.robot, "getParam", "/looker", "/shared/value")[2] == value
 
 
-def test_more_parameters_than_anybody_needs(field: Field) -> None:
-    """All parameters together are bounded; what is there stays readable, and can be deleted."""
+def test_the_total_size_of_parameters_is_limited(field: Field) -> None:
+    """The total size of parameters is limited; existing ones stay readable and can be deleted."""
     refused = None
     for number in range(12):
         answer = field.rogue("setParam", "/hoarder", f"/shared/hoard/p{number}", "x" * 7_000_000)
@@ -549,7 +555,7 @@ def test_more_parameters_than_anybody_needs(field: Field) -> None:
             refused = answer
             break
     assert refused is not None
-    field.denied(refused, "bytes of parameters; the share of one host is", event="limit exceeded")
+    field.denied(refused, "bytes of parameters; the quota of one host is", event="limit exceeded")
     assert field.call(field.robot, "getParam", "/looker", "/open_key")[2] == 1
     assert field.rogue("deleteParam", "/hoarder", "/shared/hoard")[0] == 1
     assert field.rogue("setParam", "/hoarder", "/shared/small", 1)[0] == 1
@@ -559,13 +565,13 @@ def test_more_parameters_than_anybody_needs(field: Field) -> None:
 
 
 def test_forged_provider(field: Field) -> None:
-    """A service of the robot's cannot be offered by anybody else."""
+    """Other hosts cannot offer a service of the robot."""
     answer = field.rogue("registerService", "/forger", "/negate", "rosrpc://10.77.0.66:40405", API)
     field.denied(answer, "/negate", rule="[Services] default", category="offer", resource="/negate")
 
 
-def test_service_that_may_not_be_called(field: Field) -> None:
-    """Who may not call a service does not learn where it is."""
+def test_service_that_the_caller_may_not_call(field: Field) -> None:
+    """A caller without the right to a service does not learn its address."""
     answer = field.rogue("lookupService", "/client", "/negate")
     field.denied(answer, "/negate", rule="[Clients] default", category="call", resource="/negate")
     assert answer[2] == ""
@@ -577,8 +583,8 @@ def test_service_that_may_not_be_called(field: Field) -> None:
      "rosrpc://u:p@10.77.0.66:9", "10.77.0.66:9", "rosrpc://10.77.0.66:9/path", "rosrpc://10.77.0.66:-1", 7],
     ids=repr,
 )  # fmt: skip
-def test_service_uris_that_are_none(field: Field, uri: Any) -> None:
-    """A service's URI has the scheme rosrpc, a host and a port."""
+def test_invalid_service_uris(field: Field, uri: Any) -> None:
+    """A service URI needs the scheme rosrpc, a host and a port."""
     answer = field.rogue("registerService", "/provider", "/shared/mine", uri, API)
     assert (answer[0], answer[2]) == (-1, 0)
     assert "parameter [service_api]" in answer[1]
@@ -592,8 +598,8 @@ def test_service_uris_that_are_none(field: Field, uri: Any) -> None:
      "http://10.77.0.66:40404/\r\nX: y", "file:///etc/passwd", "http://" + "a" * 2000 + ":1/"],
     ids=lambda uri: repr(uri)[:32],
 )  # fmt: skip
-def test_node_uris_that_are_none(field: Field, uri: Any) -> None:
-    """A node's API URI is http, with a host and a port, and nothing that two parsers read in two ways."""
+def test_invalid_node_uris(field: Field, uri: Any) -> None:
+    """A node URI needs the scheme http, a host and a port; ambiguous spellings are rejected."""
     answer = field.rogue("registerPublisher", "/wrong", "/shared/talk", "std_msgs/String", uri)
     assert (answer[0], answer[2]) == (-1, [])
     assert "parameter [caller_api]" in answer[1]
@@ -603,8 +609,8 @@ def test_node_uris_that_are_none(field: Field, uri: Any) -> None:
 
 
 def test_uri_of_a_third_machine(field: Field) -> None:
-    """A URI that names another machine makes nobody call it: the caller's own address is called."""
-    with Impostor(field.stranger, answering([1, "", 0])) as third:
+    """A URI that names a third machine causes no call there: the caller's own address is called."""
+    with Impostor(field.unknown_host, answering([1, "", 0])) as third:
         home = field.attacker.run(lambda: socket.create_server(("10.77.0.66", third.port)))
         with home:
             home.settimeout(LIMIT)
@@ -613,7 +619,7 @@ def test_uri_of_a_third_machine(field: Field) -> None:
             )
             assert answer[0] == 1
             assert third.uri not in answer[2]
-            talker = field.ros.talker("rospy", "/shared/talk", name="second_shared_voice")  # makes an update
+            talker = field.ros.talker("rospy", "/shared/talk", name="second_shared_voice")  # causes an update
             connection, peer = home.accept()
             with connection:
                 assert peer[0] == "10.77.0.2"
@@ -623,9 +629,9 @@ def test_uri_of_a_third_machine(field: Field) -> None:
 
 
 def test_service_of_a_third_machine(field: Field) -> None:
-    """A service URI that names another machine leads to the caller's own host, and to nobody else."""
+    """A service URI that names a third machine leads to the caller's own host only."""
     with (
-        Impostor(field.stranger, answering([1, "", 0])) as third,
+        Impostor(field.unknown_host, answering([1, "", 0])) as third,
         Impostor(field.attacker, answering([1, "", 0])) as node,
     ):
         uri = f"rosrpc://10.77.0.99:{third.port}"
@@ -648,7 +654,7 @@ def test_service_of_a_third_machine(field: Field) -> None:
 
 @pytest.mark.parametrize("name", ["/listener", "/voice", "", "/caller\x1b[2J", "caller", "/other"])
 def test_forged_name_of_a_service_client(field: Field, name: str) -> None:
-    """A client calls under the name that it has looked the service up by; another is refused, and recorded."""
+    """A client must call under the name that it used for the lookup; other names are denied and recorded."""
     code, _text, uri = field.rogue("lookupService", "/caller", "/shared/negate")
     assert code == 1
     port = int(uri.rpartition(":")[2])
@@ -660,8 +666,8 @@ def test_forged_name_of_a_service_client(field: Field, name: str) -> None:
     assert b"callerid=/shared_negator" in answer
 
 
-def test_what_a_service_sees_of_its_client(field: Field) -> None:
-    """The name that was looked up with and ROS's own fields; who probes as another tool does is told the same."""
+def test_header_that_a_service_receives(field: Field) -> None:
+    """A service sees the looked-up name and ROS's own fields; a probe by another tool gets the same answer."""
     with field.robot.run(lambda: socket.create_server(("10.77.0.10", 0))) as home:
         home.settimeout(LIMIT)
         place = f"rosrpc://10.77.0.10:{home.getsockname()[1]}"
@@ -683,7 +689,7 @@ def test_what_a_service_sees_of_its_client(field: Field) -> None:
 
 
 def header(**fields: str) -> bytes:
-    """A TCPROS connection header."""
+    """Return a TCPROS connection header."""
     body = b"".join(
         len(one).to_bytes(4, "little") + one
         for one in (f"{key}={value}".encode() for key, value in fields.items())
@@ -696,7 +702,7 @@ def header(**fields: str) -> bytes:
     "method", ["registerPublisher", "registerSubscriber", "subscribeParam", "registerService"]
 )
 def test_node_on_its_own_loopback(field: Field, method: str, host: str) -> None:
-    """A node started with ROS_IP=localhost is told what is wrong and what to do, not registered and then lost."""
+    """A node started with ROS_IP=localhost is not registered; its error names the cause and the remedy."""
     api = f"http://{host}:40404/"
     parameters = {
         "registerPublisher": ("/shared/talk", "std_msgs/String", api),
@@ -709,7 +715,7 @@ def test_node_on_its_own_loopback(field: Field, method: str, host: str) -> None:
 
 
 def test_real_node_on_its_own_loopback(field: Field) -> None:
-    """An unmodified rospy node with ROS_IP=127.0.0.1 shows the advice to whoever started it."""
+    """An unmodified rospy node with ROS_IP=127.0.0.1 prints this advice."""
     node = field.ros.on(field.attacker).start(
         ["/usr/bin/rostopic", "pub", "/shared/home", "std_msgs/String", "data: x"],
         label="rostopic pub",
@@ -719,7 +725,7 @@ def test_real_node_on_its_own_loopback(field: Field) -> None:
     node.stop()
 
 
-# --- the node API, past the master ---
+# --- the node API, bypassing the master ---
 
 
 @pytest.mark.parametrize(
@@ -727,7 +733,7 @@ def test_real_node_on_its_own_loopback(field: Field) -> None:
     [("publisherUpdate", ("/chatter", ["http://10.77.0.66:40404/"])), ("paramUpdate", ("/x", 1))],
 )
 def test_posing_as_the_master(field: Field, method: str, parameters: tuple[Any, ...]) -> None:
-    """Only the master sends updates: nobody else, by whatever name."""
+    """Deny updates from hosts other than the master, under any name."""
     uri = outer(field, "/ear")
     for name in ("/master", "/rogue_master"):
         answer = field.rogue(method, name, *parameters, uri=uri)
@@ -741,13 +747,13 @@ def test_killing_a_node(field: Field) -> None:
 
 
 def test_stopping_the_master(field: Field) -> None:
-    """`shutdown` of the master is granted to nobody by `default`."""
+    """`default` does not grant `shutdown` of the master."""
     answer = field.rogue("shutdown", "/killer", "die")
     field.denied(answer, "shutdownMaster", resource="shutdownMaster")
 
 
 def test_topic_without_the_right(field: Field) -> None:
-    """`requestTopic` on a node's face is decided like a subscription; no port is told."""
+    """Deny `requestTopic` on a node's endpoint like a subscription, without revealing a port."""
     answer = field.rogue("requestTopic", "/spy", "/chatter", TCPROS, uri=outer(field, "/voice"))
     field.denied(answer, "/chatter", rule="[Subscribers] default", resource="/chatter", category="subscribe")
     assert answer[2] == []
@@ -766,23 +772,23 @@ def test_topic_without_the_right(field: Field) -> None:
     ids=repr,
 )
 def test_other_protocols(field: Field, protocols: Any, code: int, words: str) -> None:
-    """Only TCPROS is carried; who offers something else, or no protocols, is told so as by rospy, and gets nothing."""
+    """Only TCPROS is relayed; a request for other protocols, or for none, is answered as by rospy, without a port."""
     answer = field.rogue("requestTopic", "/udp", "/shared/talk", protocols, uri=outer(field, "/shared_voice"))
     assert (answer[0], answer[2]) == (code, [])
     assert words in answer[1]
 
 
 def test_topic_that_the_node_does_not_publish(field: Field) -> None:
-    """A right to a topic is no right to a node: it must publish it."""
+    """A right to a topic does not make a node publish it."""
     answer = field.rogue("requestTopic", "/asker", "/shared/other", TCPROS, uri=outer(field, "/voice"))
-    assert (answer[0], answer[2]) == (-1, []), "as rospy says it"
+    assert (answer[0], answer[2]) == (-1, []), "as by rospy"
 
 
 # --- the relay's ports ---
 
 
 def relay_port(field: Field) -> int:
-    """The relay port of `/shared_voice`, with a grant for `/taker`."""
+    """Return the relay port of `/shared_voice`, with a permission for `/taker`."""
     code, _text, protocol = field.rogue(
         "requestTopic", "/taker", "/shared/talk", TCPROS, uri=outer(field, "/shared_voice")
     )
@@ -791,7 +797,7 @@ def relay_port(field: Field) -> int:
 
 
 def knock(field: Field, port: int, data: bytes) -> bytes:
-    """What the relay answers a connection header; it ends when the relay closes, or with the first bytes."""
+    """Return the relay's answer to a connection header: until it closes, or the first bytes."""
     with field.connect(port=port) as sock:
         sock.sendall(data)
         with contextlib.suppress(ConnectionResetError):
@@ -803,7 +809,7 @@ STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1
 
 
 def test_granted_topic_arrives(field: Field) -> None:
-    """The tests below fail for the right reason: with the grant, the same connection is served."""
+    """With the permission the connection is served, so the denials below have the intended reason."""
     answer = knock(field, relay_port(field), header(callerid="/taker", topic="/shared/talk", **STRING))
     assert b"callerid=/shared_voice" in answer
 
@@ -822,15 +828,15 @@ def test_granted_topic_arrives(field: Field) -> None:
     ids=lambda fields: " ".join(fields.values()),
 )
 def test_relay_port_without_the_grant(field: Field, fields: dict[str, str]) -> None:
-    """Who knows a relay port gets from it what was granted to his host and name, and nothing else."""
+    """A known relay port serves only topics that were permitted to this host and name."""
     answer = knock(field, relay_port(field), header(**fields, **STRING))
     assert b"callerid=/shared_voice" not in answer
     assert b"hello" not in answer
     field.recorded(event="connection refused", host="10.77.0.66")
 
 
-def test_relay_port_of_a_node_nobody_asked_for(field: Field) -> None:
-    """Guessing the relay port of the victim's node does not help either: it has no grant for this host."""
+def test_guessed_relay_port(field: Field) -> None:
+    """A guessed relay port of a victim's node does not help: it has no permission for this host."""
     uri = outer(field, "/voice")
     port = int(uri.rsplit(":", 1)[1].rstrip("/")) + 1  # two ports each
     answer = knock(field, port, header(callerid="/ear", topic="/chatter", **STRING))
@@ -838,8 +844,8 @@ def test_relay_port_of_a_node_nobody_asked_for(field: Field) -> None:
     assert b"callerid=/voice" not in answer
 
 
-def test_grant_of_another_host(field: Field) -> None:
-    """A grant is the host's that asked: with the same name from another host it is worth nothing."""
+def test_permission_of_another_host(field: Field) -> None:
+    """A permission is bound to the requesting host: the same name on another host is denied."""
     uri = field.call(field.ocu, "lookupNode", "/looker2", "/voice")[2]
     code, _text, protocol = field.call(field.ocu, "requestTopic", "/borrowed", "/chatter", TCPROS, uri=uri)
     assert code == 1
@@ -851,16 +857,16 @@ def test_grant_of_another_host(field: Field) -> None:
     assert any(line.startswith("would be allowed by: /chatter = ") for line in why), why
 
 
-# --- who must not be seen ---
+# --- hidden hosts and ports ---
 
 
 def test_host_that_no_rule_names(field: Field) -> None:
-    """A stranger gets a fault that says so, and is recorded with what he asked for."""
-    answer = field.call(field.stranger, "getPid", "/stranger")
+    """An unknown host gets a fault with the reason, and its request is recorded."""
+    answer = field.call(field.unknown_host, "getPid", "/unknown")
     assert "no rule of the policy names 10.77.0.99" in answer.faultString
-    record = field.recorded(host="10.77.0.99", decision="deny", resource="getPid", caller_id="/stranger")
-    assert record["detail"] == {"call": "getPid", "stranger": True}
-    field.call(field.stranger, "registerPublisher", "/evil", "/shared/x", "std_msgs/String", field.api)
+    record = field.recorded(host="10.77.0.99", decision="deny", resource="getPid", caller_id="/unknown")
+    assert record["detail"] == {"call": "getPid", "unknown_host": True, "stranger": True}
+    field.call(field.unknown_host, "registerPublisher", "/evil", "/shared/x", "std_msgs/String", field.api)
     field.recorded(host="10.77.0.99", category="publish", resource="/shared/x", caller_id="/evil")
     wider = field.home / "wider.ini"
     wider.write_text("[Publishers]\n/shared/x = 10.77.0.99\n[Nodes]\ndefault = *\n")
@@ -869,14 +875,14 @@ def test_host_that_no_rule_names(field: Field) -> None:
     ).stdout
     assert any("/shared/x" in line and "10.77.0.99" in line for line in differs.splitlines()), differs
     face = outer(field, "/voice")
-    answer = field.call(field.stranger, "getPid", "/stranger", uri=face)
+    answer = field.call(field.unknown_host, "getPid", "/unknown", uri=face)
     assert "no rule of the policy names 10.77.0.99" in answer.faultString
 
 
 def test_port_scan(field: Field) -> None:
-    """From outside nothing answers but RVMaster, the nodes' faces and the relay's ports."""
+    """From other hosts only RVMaster, the nodes' endpoints and the relay's ports answer."""
     hidden = {port for address, port in field.middle.run(_listening) if address == LOOPBACK}
-    assert hidden, "the hidden ROSMaster and the inner faces listen somewhere"
+    assert hidden, "rosmaster and the master-side endpoints listen somewhere"
     scanned = field.attacker.run(lambda: scan("10.77.0.2", range(1, 65536), 0.3))
     open_ports = set(scanned.open)
     assert 11311 in open_ports
@@ -885,54 +891,54 @@ def test_port_scan(field: Field) -> None:
 
 
 def _listening() -> set[tuple[str, int]]:
-    """(address, port) of all listening sockets of this namespace, as /proc writes them."""
+    """Return (address, port) of all listening sockets of this namespace, as in /proc."""
     table = Path("/proc/thread-self/net/tcp").read_text(encoding="ascii")
     rows = [line.split() for line in table.splitlines()[1:]]
     return {(row[1].split(":")[0], int(row[1].split(":")[1], 16)) for row in rows if row[3] == "0A"}
 
 
-def test_inner_face_and_own_listener_from_outside(field: Field) -> None:
-    """What listens for ROSMaster and the appliance's own nodes is on loopback: nobody else gets there."""
+def test_loopback_listeners_from_another_host(field: Field) -> None:
+    """Listeners for `rosmaster` and for the appliance's own nodes are on loopback and unreachable from other hosts."""
     hidden = {port for address, port in field.middle.run(_listening) if address == LOOPBACK}
     for port in hidden:
         with pytest.raises(OSError, match=r"timed out|refused|unreachable"):
             field.attacker.run(partial(socket.create_connection, ("10.77.0.2", port), 0.5))
 
 
-# --- peers that lie ---
+# --- dishonest peers ---
 
 
 def silent(_connection: socket.socket, _request: bytes) -> None:
-    """Never answers."""
+    """Never answer."""
     threading.Event().wait(60)
 
 
 def endless(connection: socket.socket, _request: bytes) -> None:
-    """Two gigabytes."""
+    """Send two gigabytes."""
     connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: 2147483648\r\n\r\n")
     for _ in range(2048):
         connection.sendall(b" " * (1 << 20))
 
 
 def twice(connection: socket.socket, _request: bytes) -> None:
-    """Two answers to one question."""
+    """Send two answers to one request."""
     connection.sendall(response([1, "", 1]) + response([1, "", 2]))
 
 
 def rubbish(connection: socket.socket, _request: bytes) -> None:
-    """No HTTP at all."""
+    """Send bytes that are not HTTP."""
     connection.sendall(b"\x00\xff" * 1000)
 
 
 def redirect(connection: socket.socket, _request: bytes) -> None:
-    """Sends the caller to a third machine."""
+    """Redirect the caller to a third machine."""
     connection.sendall(
         b"HTTP/1.1 302 Found\r\nLocation: http://10.77.0.99:4444/\r\nContent-Length: 0\r\n\r\n"
     )
 
 
 def drip(connection: socket.socket, _request: bytes) -> None:
-    """A byte now and then, for ever."""
+    """Send a byte now and then, for ever."""
     connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 100000\r\n\r\n")
     pause = threading.Event()
     for _ in range(600):
@@ -941,7 +947,7 @@ def drip(connection: socket.socket, _request: bytes) -> None:
 
 
 def bomb(connection: socket.socket, _request: bytes) -> None:
-    """XML with an entity that grows."""
+    """Send XML with an entity that expands."""
     body = b'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]><methodResponse/>'
     connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % len(body) + body)
 
@@ -949,9 +955,10 @@ def bomb(connection: socket.socket, _request: bytes) -> None:
 @pytest.mark.parametrize(
     "behave", [silent, endless, twice, rubbish, redirect, drip, bomb], ids=lambda one: one.__name__
 )
-def test_node_that_lies(field: Field, behave: Any) -> None:
-    """A node of the rogue's that misbehaves when it is called costs only himself: who asks it gets a well-formed answer
-    or, where it gives none, the end of the connection, as of a node that is not there."""
+def test_misbehaving_node(field: Field, behave: Any) -> None:
+    """A misbehaving node of the rogue harms only itself: its callers get a well-formed answer or, if it gives none,
+    a closed connection, as of a node that does not exist.
+    """
     before = field.memory()
     with Impostor(field.attacker, behave) as node:
         name, topic = f"/liar_{behave.__name__}", f"/shared/liar_{behave.__name__}"

@@ -1,4 +1,6 @@
-"""Processes killed or stopped in the middle of their work, policies reloaded under load: nothing is lost or halved."""
+"""Processes are killed or stopped while they work, and policies reloaded under load: no confirmed call is lost or
+halved.
+"""
 
 import contextlib
 import os
@@ -11,7 +13,7 @@ from typing import Any
 import pytest
 
 from appliance.channel.admin import PolicyReload
-from appliance.cli.admin_client import AdminSocket
+from appliance.cli.connection.admin_client import AdminSocket
 from tests.support.appliance import OPEN_POLICY
 from tests.support.field import Field, Impostor, answering
 from tests.support.processes import LIMIT
@@ -21,7 +23,7 @@ BURST = 60
 
 
 class Burst:
-    """A node after the other registers from the robot, each with a topic and a parameter, as fast as they are let."""
+    """Register one node after another from the robot, each with a topic and a parameter, as fast as possible."""
 
     def __init__(self, field: Field, name: str, count: int = BURST) -> None:
         self._field, self._name, self._count = field, name, count
@@ -40,7 +42,7 @@ class Burst:
     def _register(self, start: int) -> None:
         for number in range(start, self._count, 4):
             name = f"{self._name}_{number}"
-            while not self._over.is_set():  # a cut connection is tried again, as the client libraries do
+            while not self._over.is_set():  # retry after a broken connection, as the client libraries do
                 with contextlib.suppress(OSError, xmlrpc.client.ProtocolError):
                     with xmlrpc.client.ServerProxy(self._field.master) as server:
                         answer: Any = server.registerPublisher(
@@ -66,13 +68,13 @@ class Burst:
         self.node.__exit__(*exc)
 
     def finish(self) -> None:
-        """Wait until all are through."""
+        """Wait until all registrations are done."""
         for thread in self._threads:
             thread.join(LIMIT)
             assert not thread.is_alive()
 
     def all_there(self) -> None:
-        """Every node that was told that it is registered is registered, with its parameter; none was refused."""
+        """Assert that every confirmed node is registered with its parameter, and that none was refused."""
         assert not self.failed, self.failed[:3]
         assert len(self.registered) == self._count
         state = self._field.call(self._field.robot, "getSystemState", "/looker")[2]
@@ -85,7 +87,7 @@ class Burst:
 
 @pytest.fixture
 def working(battlefield: Field) -> Iterator[Field]:
-    """The field; afterwards messages flow again (some may have been lost meanwhile), and a new node joins."""
+    """Provide the field; afterwards messages flow again (some may have been lost), and a new node can join."""
     yield battlefield
     battlefield.listener.wait_for(event="received", since=battlefield.listener.mark())
     late = battlefield.ros.on(battlefield.ocu).listener("rospy", "/chatter")
@@ -95,7 +97,7 @@ def working(battlefield: Field) -> Iterator[Field]:
 
 @pytest.mark.parametrize("role", ["control", "rosmaster", "relay"])
 def test_killed_in_a_burst_of_registrations(working: Field, role: str) -> None:
-    """`kill -9` in the middle of many registrations: each that was confirmed is there afterwards, and none fails."""
+    """`kill -9` during many registrations: each confirmed one survives, and none fails."""
     pid = working.appliance.pids(role)[0]
     with Burst(working, f"/burst_{role}") as burst:
         os.kill(pid, signal.SIGKILL)
@@ -104,7 +106,7 @@ def test_killed_in_a_burst_of_registrations(working: Field, role: str) -> None:
 
 
 def test_both_killed_at_once(working: Field) -> None:
-    """Control and ROSMaster die together: what was confirmed comes from disk."""
+    """Control and `rosmaster` die together: confirmed registrations are restored from disk."""
     pids = [working.appliance.pids(role)[0] for role in ("rosmaster", "control")]
     with Burst(working, "/burst_both") as burst:
         for pid in pids:
@@ -114,13 +116,13 @@ def test_both_killed_at_once(working: Field) -> None:
 
 
 def test_rosmaster_stopped_for_three_seconds(working: Field) -> None:
-    """A ROSMaster that does not move delays calls; none fails, and it is not killed for it."""
+    """A stopped `rosmaster` delays calls; no call fails, and it is not killed."""
     pid = working.appliance.pids("rosmaster")[0]
     with Burst(working, "/burst_stopped") as burst:
         os.kill(pid, signal.SIGSTOP)
         working.listener.wait_for_count(
             len(working.listener.seen(event="received")) + 150, event="received"
-        )  # three seconds of messages, which do not need it
+        )  # three seconds of messages, which do not need `rosmaster`
         os.kill(pid, signal.SIGCONT)
         burst.finish()
         burst.all_there()
@@ -128,7 +130,7 @@ def test_rosmaster_stopped_for_three_seconds(working: Field) -> None:
 
 
 def test_reloads_under_load(working: Field) -> None:
-    """Two hundred reloads, some broken, while nodes register: each call is decided by one whole policy."""
+    """Two hundred reloads, some invalid, while nodes register: each call is decided by one complete policy."""
     even = POLICY.replace("[Subscribers]", "[Subscribers]\n/even_topic = 10.77.0.66")
     odd = POLICY.replace("[Publishers]", "[Publishers]\n/odd_topic = 10.77.0.66")
     over = threading.Event()
@@ -165,7 +167,7 @@ def test_reloads_under_load(working: Field) -> None:
 
 
 def test_the_whole_appliance_restarts(battlefield: Field) -> None:
-    """`rosrv up` again on the same state, nodes alive: they go on without being restarted, with their parameters."""
+    """After `rosrv up` on the same state, running nodes go on with their parameters, without a restart."""
     field = battlefield
     ears = [
         field.ros.on(field.ocu).listener("rospy", "/chatter", name="python_ear"),

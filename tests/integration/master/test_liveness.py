@@ -1,4 +1,4 @@
-"""Tests of which nodes the appliance takes for gone."""
+"""Decide which nodes are lost."""
 
 import os
 import signal
@@ -19,14 +19,13 @@ CLIENTS: list[Client] = ["rospy", "roscpp"]
 NOBODY = "http://10.77.0.10:1/"
 
 
-def test_what_publishes_for_monitors_is_there_behind_the_firewall(
+def test_the_monitors_publisher_behind_the_firewall_is_not_lost(
     lab: Lab, robot: Host, tmp_path: Path
 ) -> None:
-    """A node whose port refuses is lost; the appliance's own publisher, which the firewall hides, is not."""
-    config = tmp_path / "appliance.yaml"
-    config.write_text("liveness: {interval: 0.1}\n")
-    options = ("--config", str(config), "--monitors", str(MONITORS), "--api", "off")
-    with Appliance(lab.host("appliance", "10.77.0.2/24"), options=options) as appliance:
+    """A node whose port refuses connections is lost; the appliance's own publisher, hidden by the firewall, is not."""
+    middle, settings = lab.host("appliance", "10.77.0.2/24"), "liveness: {interval: 0.1}\n"
+    options = ("--monitors", str(MONITORS), "--api", "off")
+    with Appliance(middle, settings=settings, options=options) as appliance:
 
         def register() -> None:
             with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
@@ -45,14 +44,11 @@ def test_what_publishes_for_monitors_is_there_behind_the_firewall(
         assert [record["caller_id"] for record in appliance.recorded("--event", "node lost")] == ["/brief"]
 
 
-def test_a_dead_node_is_noticed_beside_a_guests_silent_ones(lab: Lab, robot: Host, tmp_path: Path) -> None:
-    """450 nodes of a guest take connections and answer nothing; a node that is gone is lost within some looks."""
+def test_a_dead_node_is_noticed_despite_unresponsive_nodes(lab: Lab, robot: Host, tmp_path: Path) -> None:
+    """With 450 unresponsive nodes of a guest, a dead node is still lost within a few checks."""
     guest = lab.host("guest", "10.77.0.66/24")
-    config = tmp_path / "appliance.yaml"
-    config.write_text("liveness: {interval: 2, silent: 300}\n")
-    with Appliance(
-        lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config), "--api", "off")
-    ) as appliance:
+    middle, settings = lab.host("appliance", "10.77.0.2/24"), "liveness: {interval: 2, silent: 300}\n"
+    with Appliance(middle, settings=settings, options=("--api", "off")) as appliance:
         with guest.entered():
             silent = socket.create_server(("10.77.0.66", 4000), backlog=1024)
 
@@ -75,17 +71,13 @@ def test_a_dead_node_is_noticed_beside_a_guests_silent_ones(lab: Lab, robot: Hos
                 tail.wait_for(event="node lost", caller_id="/brief", timeout=allowed(8))
 
 
-def test_a_subscriber_that_stood_still_for_a_moment_hears_of_who_came(
-    lab: Lab, robot: Host, tmp_path: Path
-) -> None:
-    """Every try to tell it of a new publisher failed, and it was never lost: it is told when it goes on."""
+def test_a_paused_subscriber_is_told_of_a_new_publisher(lab: Lab, robot: Host, tmp_path: Path) -> None:
+    """After failed updates about a new publisher, a subscriber that was never lost gets the update when it goes on."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    config = tmp_path / "appliance.yaml"
-    config.write_text("limits: {node_call_seconds: 0.5}\nliveness: {interval: 1, silent: 120}\n")
+    middle = lab.host("appliance", "10.77.0.2/24")
+    settings = "limits: {node_call_seconds: 0.5}\nliveness: {interval: 1, silent: 120}\n"
     with (
-        Appliance(
-            lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config), "--api", "off")
-        ) as appliance,
+        Appliance(middle, settings=settings, options=("--api", "off")) as appliance,
         RosSession(appliance.master_uri, tmp_path, robot) as ros,
     ):
         listeners = {client: ros.listener(client, "/chatter", name=f"ear_{client}") for client in CLIENTS}

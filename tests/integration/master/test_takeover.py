@@ -1,6 +1,6 @@
-"""A node's machine is away: the node of its name on another host that the policy grants has the name at once.
+"""When a node's machine is gone, a node on another host that the policy allows takes over its name at once.
 
-A ROS 1 node registers once: what is refused is refused until somebody starts the node again.
+A ROS 1 node registers only once: after a refusal, somebody has to start it again.
 """
 
 import itertools
@@ -14,10 +14,10 @@ import pytest
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
-from tests.support.nodes import Client, RosSession, has_ros
+from tests.support.nodes import Client, RosSession
 from tests.support.processes import Process
-from tests.support.requirements import needs
 from tests.support.rosmaster import call_on
+from tests.support.site import Masters
 from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
@@ -39,43 +39,43 @@ class Pair:
     topic: str
 
     def talker(self, client: Client, host: Host) -> Process:
-        """The voice on a host; `ready` when its constructor is done, whatever the master said."""
+        """Start the voice on a host; `ready` when its constructor is done, whatever the master answered."""
         return self.ros.on(host).talker(client, self.topic, "--text", host.name, name=self.voice[1:])
 
     def registered(self) -> Any:
-        """What the voice of the second machine is told when it registers."""
+        """Return the answer to the registration of the voice on the second machine."""
         register = ("registerPublisher", self.voice, self.topic, "std_msgs/String")
         return call_on(self.second, self.appliance.master_uri, *register, f"http://{self.second.address}:9/")
 
 
 @pytest.fixture
-def pair(common_lab: Lab, appliance: Appliance, tmp_path: Path) -> Iterator[Pair]:
-    """An appliance with the default times and a listener; machines, voice and topic are of this test alone."""
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+def pair(masters: Masters, tmp_path: Path) -> Iterator[Pair]:
+    """Provide an appliance with default times and a listener; machines, voice and topic belong to this test alone."""
     number = next(_NUMBERS)
-    hosts = [
-        common_lab.host(f"{name}{number}", f"10.77.0.{number + place}/24")
-        for place, name in enumerate(("first", "second", "third"))
-    ]
     voice, topic = f"/voice{number}", f"/chatter{number}"
-    with RosSession(appliance.master_uri, tmp_path, hosts[2]) as ros:
-        ear = ros.listener("roscpp", topic, name=f"ear{number}")
-        yield Pair(common_lab, appliance, hosts[0], hosts[1], ros, ear, voice, topic)
+    with masters.lend("appliance", "lab") as site:
+        first, second, third = (
+            site.lab.host(f"{name}{number}", f"10.77.0.{number + place}/24")
+            for place, name in enumerate(("first", "second", "third"))
+        )
+        with RosSession(site.master_uri, tmp_path, third) as ros:
+            ear = ros.listener("roscpp", topic, name=f"ear{number}")
+            yield Pair(site.lab, site.appliance, first, second, ros, ear, voice, topic)
 
 
 def unplugged(pair: Pair, _voice: Process) -> None:
-    """The cable is out."""
+    """Unplug the cable."""
     pair.lab.unplug(pair.first)
 
 
 def dropped(pair: Pair, _voice: Process) -> None:
-    """Packets get lost on the way, without a word: as behind a router."""
+    """Drop packets silently, as behind a router."""
     nft = pair.first.popen(["nft", DROPPING])
     assert nft.wait() == 0
 
 
 def deleted(pair: Pair, voice: Process) -> None:
-    """The machine and its network are no more, and said nothing when they went."""
+    """Delete the machine and its network without a goodbye."""
     pair.lab.unplug(pair.first)
     voice.popen.send_signal(signal.SIGKILL)
     voice.wait()
@@ -84,11 +84,11 @@ def deleted(pair: Pair, voice: Process) -> None:
 
 @pytest.mark.parametrize("client", CLIENTS)
 @pytest.mark.parametrize("away", [unplugged, dropped, deleted])
-def test_a_machine_that_vanished_holds_no_name(
+def test_a_vanished_machine_releases_its_names(
     pair: Pair, away: Callable[[Pair, Process], None], client: Client
 ) -> None:
-    """Cable, power, a deleted container: the node on the other machine is heard at its first try, before the silence of
-    the other has lasted so long that it is lost.
+    """After a loss of cable, power or container, the node on the other machine is heard at its first attempt,
+    before the silent node is lost.
     """
     voice = pair.talker("rospy", pair.first)
     pair.ear.wait_for(event="received")
@@ -101,8 +101,10 @@ def test_a_machine_that_vanished_holds_no_name(
     assert [record for record in lost if record["sequence"] < taken["sequence"]] == []
 
 
-def test_a_node_that_hangs_holds_its_name_until_it_is_lost(pair: Pair) -> None:
-    """It takes connections and answers nothing: the refusal says so and when to come again, and then it is granted."""
+def test_a_hanging_node_keeps_its_name_until_it_is_lost(pair: Pair) -> None:
+    """A node that accepts connections without answering keeps its name until it is lost; the refusal says when to
+    retry.
+    """
     voice = pair.talker("rospy", pair.first)
     pair.ear.wait_for(event="received")
     voice.popen.send_signal(signal.SIGSTOP)
@@ -113,12 +115,14 @@ def test_a_node_that_hangs_holds_its_name_until_it_is_lost(pair: Pair) -> None:
         seconds = int(why.partition("unregistered in ")[2].partition(" s")[0])
         assert 0 < seconds <= 25
         eventually(lambda: pair.registered()[0] == 1, why)
+        withdraw = ("unregisterPublisher", pair.voice, pair.topic, f"http://{pair.second.address}:9/")
+        assert call_on(pair.second, pair.appliance.master_uri, *withdraw)[2] == 1
     finally:
         voice.kill()  # it would go on to publish without its name
 
 
-def test_a_node_that_runs_holds_its_name(pair: Pair) -> None:
-    """It answers: the other is refused at once, and goes on talking to nobody."""
+def test_a_running_node_keeps_its_name(pair: Pair) -> None:
+    """A node that answers keeps its name: the other one is refused at once, and publishes to no subscriber."""
     pair.talker("rospy", pair.first)
     pair.ear.wait_for(event="received")
     code, why, _ = pair.registered()

@@ -1,25 +1,22 @@
-"""Monitors come and go, and a relay dies, under a flood: only what was dropped is missing, in order."""
+"""Monitors change and a relay dies under a flood: only dropped messages are missing, and the order is kept."""
 
 import os
 import signal
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from appliance.channel.admin import (
-    A,
-    AdminRequest,
     MonitorLoad,
     MonitorRemove,
     MonitorsWanted,
     MonitorSwitch,
     StatusWanted,
 )
-from appliance.channel.answers.monitor_answers import Replaced
-from appliance.cli.admin_client import AdminSocket
+from appliance.channel.answers.monitor_answers import Replacement
+from appliance.cli.connection.admin_client import AdminSocket
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.processes import Event, Process
@@ -30,7 +27,7 @@ ROUNDS = 25  # of four changes each
 
 
 def tag(version: int) -> str:
-    """Puts its version behind what goes through /flood, and drops nothing."""
+    """Return a monitor that appends its version to messages on /flood, and drops none."""
     return (
         "tag() { event said(std::string text) /flood std_msgs/String '{data:text}'"
         f' {{ text = text + " v{version}"; }} }}'
@@ -38,7 +35,7 @@ def tag(version: int) -> str:
 
 
 def beside(version: int) -> str:
-    """A monitor of another topic and of the latched one, which it changes."""
+    """Return a monitor of another topic and of the latched one, which it changes."""
     return (
         "beside() { event other(std::string text) /elsewhere std_msgs/String '{data:text}' { }"
         f" event map(std::string text) /map std_msgs/String '{{data:text}}' {{ text = text + \" m{version}\"; }} }}"
@@ -47,75 +44,61 @@ def beside(version: int) -> str:
 
 @pytest.fixture
 def appliance() -> Iterator[Appliance]:
-    """Two relays and no monitors."""
+    """Run an appliance with two relays and no monitors."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Appliance(options=("--api", "off"), relays=2) as appliance:
         yield appliance
 
 
-@pytest.fixture
-def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
-    """Nodes of one test."""
-    with RosSession(appliance.master_uri, tmp_path) as session:
-        yield session
-
-
-def ask(appliance: Appliance, request: AdminRequest[A]) -> A:
-    """What a verb of `rosrv` asks, without starting a process for each."""
-    answer = AdminSocket(appliance.state).ask(request)
-    assert answer.ok, answer.error
-    return answer.given()
-
-
 def relays(appliance: Appliance) -> list[int]:
-    """The process ids of the relays; `rosrv status` fails while one is away."""
-    processes = ask(appliance, StatusWanted()).processes
+    """Return the process ids of the relays; `rosrv status` fails while one is away."""
+    processes = appliance.ask(StatusWanted()).processes
     return [row.pid for row in processes if row.role == "relay"]
 
 
-def load(appliance: Appliance, **files: str) -> Replaced:
+def load(appliance: Appliance, **files: str) -> Replacement:
     """Load or replace files of these names."""
-    return ask(appliance, MonitorLoad({f"{name}.rv": text for name, text in files.items()}, {}))
+    return appliance.ask(MonitorLoad({f"{name}.rv": text for name, text in files.items()}, {}))
 
 
 def counted(listener: Process) -> Event:
-    """What a counting listener has had so far."""
+    """Return the messages of a counting listener so far."""
     since = listener.mark()
     listener.send("")
     return listener.wait_for(event="counted", since=since)
 
 
 def caught_up(listener: Process, last: int) -> Event:
-    """The same, when the last message has come."""
+    """Return the messages of a counting listener, once the last one has arrived."""
     eventually(lambda: counted(listener)["last"] == last, f"message {last}", seconds=90)
     return counted(listener)
 
 
 def missing(count: Event) -> int:
-    """How many messages did not come between the first and the last."""
+    """Return the number of missing messages between the first and the last."""
     return sum(after - before - 1 for before, after in count["gaps"])
 
 
 def versions(count: Event) -> list[int]:
-    """The versions of the monitor that messages went through, as they changed; 0 without it."""
+    """Return the monitor versions that processed the messages, in the order of changes; 0 without a monitor."""
     return [int(word.removeprefix("v")) if word else 0 for word, _number in count["words"]]
 
 
 def change(appliance: Appliance, number: int) -> None:
-    """Four changes: replaced, switched off, switched on, and another one loaded or removed."""
+    """Make four changes: replace, disable and enable the monitor, and load or remove another one."""
     load(appliance, tag=tag(number))
-    ask(appliance, MonitorSwitch(["tag"], False))
-    ask(appliance, MonitorSwitch(["tag"], True))
+    appliance.ask(MonitorSwitch(["tag"], False))
+    appliance.ask(MonitorSwitch(["tag"], True))
     if number % 2:
         load(appliance, beside=beside(number))
     else:
-        ask(appliance, MonitorRemove(["beside"]))
+        appliance.ask(MonitorRemove(["beside"]))
 
 
-def test_a_hundred_changes_under_a_flood_with_a_slow_a_stopped_and_a_late_listener(
+def test_monitor_changes_under_a_flood_lose_only_counted_messages(
     appliance: Appliance, ros: RosSession
 ) -> None:
-    """Who keeps up gets everything in order; what the others lack is what was counted as dropped."""
+    """Fast listeners get everything in order; the missing messages of the others equal the counted drops."""
     ros.talker("roscpp", "/map", "--latch", name="map")
     early = ros.listener("roscpp", "/map")
     early.wait_for(event="received", data="hello 1")
@@ -126,7 +109,7 @@ def test_a_hundred_changes_under_a_flood_with_a_slow_a_stopped_and_a_late_listen
         listener.wait_for(event="first")
     stopped.popen.send_signal(signal.SIGSTOP)
     eventually(
-        lambda: ask(appliance, StatusWanted()).dropped > 0, "the stopped one's queue is full", seconds=90
+        lambda: appliance.ask(StatusWanted()).dropped > 0, "the stopped one's queue is full", seconds=90
     )
     slow = ros.node("rospy", "counting_listener", "/flood", "--slow", "0.002", name="slow")
     slow.wait_for(event="first")
@@ -150,7 +133,7 @@ def test_a_hundred_changes_under_a_flood_with_a_slow_a_stopped_and_a_late_listen
     assert seen[-1] == ROUNDS
     lost = missing(counts[slow]) + missing(counts[stopped])
     eventually(
-        lambda: ask(appliance, StatusWanted()).dropped == lost, f"{lost} messages are counted as dropped"
+        lambda: appliance.ask(StatusWanted()).dropped == lost, f"{lost} messages are counted as dropped"
     )
     assert missing(counts[stopped]) > 0
     heard = ros.listener("rospy", "/map").wait_for(event="received")
@@ -158,10 +141,8 @@ def test_a_hundred_changes_under_a_flood_with_a_slow_a_stopped_and_a_late_listen
     assert len(early.seen(event="received")) == 1
 
 
-def test_a_relay_that_is_killed_while_specifications_are_loaded(
-    appliance: Appliance, ros: RosSession
-) -> None:
-    """The load is refused or done, nothing in between: what is said to be in force is, on both relays, afterwards."""
+def test_a_relay_killed_while_specifications_are_loaded(appliance: Appliance, ros: RosSession) -> None:
+    """The load succeeds or fails as a whole: afterwards the reported specifications are in force on both relays."""
     talker = ros.node("rospy", "flood_talker", "/flood", "--rate", "100", "--bytes", "10", name="flood")
     listener = ros.node("rospy", "counting_listener", "/flood", name="ear")
     load(appliance, tag=tag(1))
@@ -177,7 +158,7 @@ def test_a_relay_that_is_killed_while_specifications_are_loaded(
         victim = relays(appliance)[number % 2]
         loading = threading.Thread(target=load_it)
         loading.start()
-        loading.join(0.05 * (number - 2))  # at another moment of the load each time
+        loading.join(0.05 * (number - 2))  # at a different time of the load in each round
         os.kill(victim, signal.SIGKILL)
         loading.join()
         if answers[0].ok:
@@ -194,5 +175,5 @@ def test_a_relay_that_is_killed_while_specifications_are_loaded(
         eventually(settled, f"messages go on, through version {in_force}")
     load(appliance, tag=tag(9))
     eventually(lambda: versions(counted(listener))[-1] == 9, "the next load is in force")
-    assert ask(appliance, MonitorsWanted()).refused == []
+    assert appliance.ask(MonitorsWanted()).refused == []
     talker.send("")

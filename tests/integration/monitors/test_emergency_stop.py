@@ -1,4 +1,4 @@
-"""An emergency stop that is latched stays so through the death of every process, until somebody releases it."""
+"""A latched emergency stop survives the death of every process, until somebody releases it."""
 
 import itertools
 import json
@@ -27,7 +27,7 @@ stop() {
 
 @pytest.fixture(scope="module")
 def stopped(common_lab: Lab) -> Iterator[Appliance]:
-    """An appliance with two relays and the stop loaded."""
+    """Run an appliance with two relays and the stop loaded."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     host = common_lab.host("stopped", "10.77.0.3/24")
     with Appliance(host, options=("--api", "off"), relays=2) as running:
@@ -38,20 +38,20 @@ def stopped(common_lab: Lab) -> Iterator[Appliance]:
 
 
 def monitor(appliance: Appliance) -> dict[str, Any]:
-    """The row of the monitor, as `rosrv monitor list` has it."""
+    """Return the row of the monitor in `rosrv monitor list`."""
     rows = map(json.loads, appliance.rosrv("monitor", "list", "--json").stdout.splitlines())
     found: dict[str, Any] = next(row for row in rows if row["name"] == "stop")
     return found
 
 
 def kill_relays(appliance: Appliance) -> None:
-    """SIGKILL to both relays at once."""
+    """Send SIGKILL to both relays at once."""
     for pid in appliance.pids("relay"):
         os.kill(pid, signal.SIGKILL)
 
 
 def kill_everything(appliance: Appliance) -> None:
-    """SIGKILL to the supervisor, then to whatever of its own is still there; and a new start."""
+    """Send SIGKILL to the supervisor, then to its remaining processes, and start again."""
     assert appliance.process is not None
     processes = sorted(appliance.status()["processes"], key=lambda row: row["role"] != "supervisor")
     for row in processes:
@@ -64,7 +64,7 @@ def kill_everything(appliance: Appliance) -> None:
 
 
 def restart(appliance: Appliance) -> None:
-    """An orderly end, and a new start."""
+    """Stop cleanly and start again."""
     assert appliance.stop() == 0
     appliance.start()
 
@@ -80,7 +80,7 @@ DEATHS: dict[str, Callable[[Appliance], object]] = {
 
 @pytest.mark.parametrize("death", DEATHS)
 def test_a_latched_stop_stays(stopped: Appliance, common_robot: Host, tmp_path: Path, death: str) -> None:
-    """Nothing passes after it, though nobody holds anything; when it is released, all does."""
+    """All messages are dropped after it, until it is released."""
     numbers = itertools.count()
 
     def session() -> RosSession:
@@ -109,7 +109,7 @@ def test_a_latched_stop_stays(stopped: Appliance, common_robot: Host, tmp_path: 
 def test_a_changed_stop_holds_until_it_is_resumed(
     stopped: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
-    """A load that forgets a latched stop lets nothing pass: it says so, and which command lets it."""
+    """A load that loses the state of a latched stop blocks all messages, and reports which command resumes them."""
     with RosSession(stopped.master_uri, tmp_path, common_robot) as ros:
         listener = ros.listener("roscpp", "/chatter")
         ros.talker("roscpp", "/chatter")

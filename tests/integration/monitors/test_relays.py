@@ -1,9 +1,8 @@
-"""Several relay processes: monitors and topics are spread over them, and one knows nothing of another's death."""
+"""With several relay processes, monitors and topics are distributed, and each relay survives the death of another."""
 
 import json
 import os
 import signal
-import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -11,10 +10,9 @@ from pathlib import Path
 import pytest
 
 from tests.support.appliance import Appliance
-from tests.support.nodes import Client, RosSession, has_ros
-from tests.support.processes import Process
+from tests.support.nodes import Client, RosSession, has_ros, numbers, without_gap
 from tests.support.requirements import needs
-from tests.support.rosmaster import PlainMaster
+from tests.support.site import Masters
 from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
@@ -32,59 +30,39 @@ begin NAME() {
 
 
 def specification(name: str, topic: str) -> str:
-    """Numbers what it hears, and publishes an alarm at the third message."""
+    """Return a monitor that numbers its messages, and publishes an alarm at the third."""
     return SPECIFICATION.replace("NAME", name).replace("TOPIC", topic)
 
 
 @pytest.fixture(scope="module")
 def common_appliance() -> Iterator[Appliance]:
-    """Two relays, and a monitor for each: `left` on /left, `right` on /right."""
+    """Run two relays with a monitor each: `left` on /left, `right` on /right."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with tempfile.TemporaryDirectory(prefix="rosrv-relays-") as name:
-        folder = Path(name)
-        folder.chmod(0o755)
-        for one in ("left", "right"):
-            (folder / f"{one}.rv").write_text(specification(one, one))
-        options = ("--monitors", str(folder), "--api", "off")
-        with Appliance(options=options, relays=2) as appliance:
-            yield appliance
+    monitors = {one: specification(one, one) for one in ("left", "right")}
+    with Appliance(monitors=monitors, options=("--api", "off"), relays=2) as appliance:
+        yield appliance
 
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """The same for a test that loads, or ends a process: both monitors begin anew after it, and the log is its own."""
-    common_appliance.leave_out_what_was()
+    """Provide a fresh start for a test that loads or kills: both monitors begin again afterwards, with a separate
+    log.
+    """
+    common_appliance.ignore_earlier_records()
     yield common_appliance
     for name in rows(common_appliance):
         common_appliance.rosrv("monitor", "remove", name)
     common_appliance.rosrv("monitor", "reload")
 
 
-@pytest.fixture
-def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
-    """Nodes of one test."""
-    with RosSession(appliance.master_uri, tmp_path) as session:
-        yield session
-
-
 def rows(appliance: Appliance) -> dict[str, dict[str, object]]:
-    """The rows of `rosrv monitor list`, by name."""
+    """Return the rows of `rosrv monitor list`, by name."""
     lines = appliance.rosrv("monitor", "list", "--json").stdout.splitlines()
     return {row["name"]: row for row in map(json.loads, lines)}
 
 
-def numbers(listener: Process) -> list[int]:
-    """The numbers of the talker's messages that came."""
-    return [int(event["data"].split()[-1]) for event in listener.seen(event="received")]
-
-
-def without_gap(heard: list[int]) -> bool:
-    """Whether nothing is missing between the first and the last, and the order is kept."""
-    return heard == list(range(heard[0], heard[0] + len(heard)))
-
-
 def relay_of(appliance: Appliance, number: int) -> int:
-    """The process id of a relay, counted from 1, by what processes are called."""
+    """Return the process id of a relay, counted from 1, by its process name."""
     name = "rosrv: relay" if number == 1 else f"rosrv: relay-{number}"
     for pid in appliance.pids("relay"):
         if Path(f"/proc/{pid}/cmdline").read_bytes().rstrip(b"\0 ").decode() == name:
@@ -92,8 +70,8 @@ def relay_of(appliance: Appliance, number: int) -> int:
     raise AssertionError(f"no process is called {name}")
 
 
-def test_a_relay_dies_and_the_other_does_not_notice(appliance: Appliance, ros: RosSession) -> None:
-    """The dead one's topics go on as after any restart; the monitors of both keep their state."""
+def test_the_death_of_a_relay_does_not_affect_the_other(appliance: Appliance, ros: RosSession) -> None:
+    """Topics of the dead relay go on as after any restart; the monitors of both keep their state."""
     left, right = ros.listener("rospy", "/left"), ros.listener("roscpp", "/right")
     alarms = [ros.listener("rospy", f"/{one}/alarm") for one in ("left", "right")]
     ros.talker("roscpp", "/left", name="one")
@@ -110,7 +88,7 @@ def test_a_relay_dies_and_the_other_does_not_notice(appliance: Appliance, ros: R
     left.wait_for_count(before + 5, event="received")
     right.wait_for_count(len(right.seen(event="received")) + 5, event="received")
     heard = [event["data"].split() for event in right.seen(event="received")]
-    assert without_gap(numbers(right))
+    assert without_gap(numbers(right.seen(event="received")))
     assert without_gap([int(words[1]) for words in heard])
     assert len(alarms[0].seen(event="received")) == 1  # the third message has come, and never comes again
     assert not appliance.audit(event="monitors restarted")
@@ -118,10 +96,10 @@ def test_a_relay_dies_and_the_other_does_not_notice(appliance: Appliance, ros: R
     assert set(rows(appliance)) == {"left", "right"}
 
 
-def test_loading_a_specification_that_joins_two_relays_moves_as_little_as_it_can(
+def test_loading_a_specification_across_relays_moves_only_one_monitor(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """The monitor that has to move begins anew, which is an alarm; nodes are told to connect again and do."""
+    """Only the monitor that moves is reset, which raises an alarm; nodes are told to reconnect and do."""
     listeners = {
         (one, client): ros.listener(client, f"/{one}")
         for one in ("left", "right")
@@ -146,7 +124,7 @@ def test_loading_a_specification_that_joins_two_relays_moves_as_little_as_it_can
     moved = appliance.recorded(event="topics moved")[0]
     assert moved["detail"]["monitors"] == ["right"]
     assert moved["severity"] == "alarm"
-    assert "right began anew" in done.stdout
+    assert "right started in the initial state" in done.stdout
     stayed = [event["data"].split() for event in listeners["left", "roscpp"].seen(event="received")]
     assert without_gap([int(words[1]) for words in stayed])
     appliance.rosrv("monitor", "remove", "both")
@@ -156,10 +134,10 @@ def test_loading_a_specification_that_joins_two_relays_moves_as_little_as_it_can
     assert set(rows(appliance)) == {"left", "right"}
 
 
-def test_services_are_carried_by_the_relay_of_their_monitor(
+def test_services_use_the_relay_of_their_monitor(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Before and after it was loaded, and after a control that died; what is kept is where it was."""
+    """This holds before and after the load, and after the death of control; stored state stays in place."""
     ros.service_server("rospy", "/mode")
     ros.service_server("roscpp", "/other_mode")
     clients = [ros.service_client("roscpp", "/mode"), ros.service_client("rospy", "/other_mode")]
@@ -185,10 +163,10 @@ def test_services_are_carried_by_the_relay_of_their_monitor(
 def test_one_message_after_waiting_for_a_subscriber_is_not_lost_to_the_monitor(
     common_appliance: Appliance, tmp_path: Path, client: Client
 ) -> None:
-    """Which is connected, and counts as the subscriber the publisher waits for, before the real one is.
+    """The monitor is connected, and counts as the awaited subscriber, before the real one is.
 
-    What comes within a second of the message has it; on a machine that is overloaded a node may need longer, so each
-    listener has to have three of twelve: without that second one of roscpp has none.
+    A message within a second of the first one reaches the listener. On an overloaded machine a node may need longer, so
+    each listener must get three of twelve; without this second, a roscpp listener gets none.
     """
     with RosSession(common_appliance.master_uri, tmp_path) as ros:
         listeners = [ros.listener(client, "/left", name=f"ear{number}") for number in range(2)]
@@ -208,14 +186,13 @@ def test_one_message_after_waiting_for_a_subscriber_is_not_lost_to_the_monitor(
 
 @pytest.mark.parametrize("master", ["plain", "appliance"])
 @pytest.mark.parametrize("client", CLIENTS)
-def test_the_next_subscriber_of_a_stream_gets_nothing_old(
-    request: pytest.FixtureRequest, tmp_path: Path, client: Client, master: str
+def test_a_new_subscriber_gets_no_old_messages(
+    request: pytest.FixtureRequest, masters: Masters, tmp_path: Path, client: Client, master: str
 ) -> None:
-    """Nothing that was said before it was started, behind the appliance as on a plain master: nobody acts on it."""
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    """A new subscriber gets only messages sent after its start, behind the appliance as on a plain master."""
     with ExitStack() as stack:
         if master == "plain":
-            uri = stack.enter_context(PlainMaster(tmp_path)).master_uri
+            uri = stack.enter_context(masters.lend("plain", "loopback")).master_uri
         else:
             uri = request.getfixturevalue("common_appliance").master_uri
         ros = stack.enter_context(RosSession(uri, tmp_path))

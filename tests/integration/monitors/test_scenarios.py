@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,34 +26,34 @@ Record = dict[str, Any]
 
 
 def specification(name: str) -> tuple[Path, ...]:
-    """One shipped file."""
+    """Return one shipped file."""
     return (MONITORS / f"{name}.rv",)
 
 
 @pytest.fixture(scope="module")
 def unguarded() -> Drive:
-    """The mission without monitors."""
+    """Return the mission without monitors."""
     return Simulation().run()
 
 
 @pytest.fixture(scope="module")
 def bag(unguarded: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its recording."""
+    """Return the recording of the mission."""
     path = tmp_path_factory.mktemp("bags") / "drive.bag"
     record(unguarded, path)
     return path
 
 
 def replayed(bag: Path, *files: Path, output: Path | None = None) -> list[Record]:
-    """`rosrv monitor run --json`: its records."""
+    """Return the records of `rosrv monitor run --json`."""
     written = ("--output", str(output)) if output else ()
     done = rosrv("monitor", "run", *map(str, files), "--bag", str(bag), "--json", *written)
     assert done.returncode == 0, done.stderr
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def test_without_monitors_everything_goes_wrong(unguarded: Drive) -> None:
-    """The mission is worth guarding: through the obstacle, out of the zone, a shot at the robot itself."""
+def test_the_mission_fails_without_monitors(unguarded: Drive) -> None:
+    """Without monitors the robot drives through the obstacle, leaves the zone, and shoots at itself."""
     assert unguarded.nearest(OBSTACLE) < 0
     assert unguarded.farthest() > 24
     assert [shot.fired for shot in unguarded.shots] == [True, True, True]
@@ -60,7 +61,7 @@ def test_without_monitors_everything_goes_wrong(unguarded: Drive) -> None:
 
 
 def test_safe_triggering(unguarded: Drive) -> None:
-    """The one shot at the robot itself is dropped; all else is as it was, to the byte."""
+    """Only the shot at the robot itself is dropped; all other messages are unchanged, byte for byte."""
     guarded = Simulation(specification("safe_triggering")).run()
     assert [shot.fired for shot in guarded.shots] == [True, False, True]
     assert guarded.poses == unguarded.poses
@@ -82,7 +83,7 @@ def test_safe_zone(unguarded: Drive) -> None:
 
 
 def test_obstacle_avoidance() -> None:
-    """The robot never touches the obstacle, an alarm is published, and backing up and turning go on."""
+    """The robot never touches the obstacle, an alarm is published, and backing up and turning remain possible."""
     guarded = Simulation(specification("obstacle_avoidance")).run()
     assert 0.3 < guarded.nearest(OBSTACLE) < 1.3
     alarms = [one for one in guarded.messages if one.topic == "/landshark/obstacle_alarm"]
@@ -96,7 +97,7 @@ def test_obstacle_avoidance() -> None:
 @pytest.mark.parametrize("forward", [0.3, 1.0, 2.0])
 @pytest.mark.parametrize("start", [0.0, 0.4])
 def test_no_speed_and_no_course_touches_the_obstacle(forward: float, start: float) -> None:
-    """The distance that must be free follows from the speed."""
+    """The required free distance follows from the speed."""
     mission = (
         Part(start / 0.4 if start else 0.1, turn=0.1 if start else 0.0),
         Part(30 / forward / 2, forward=forward),
@@ -121,8 +122,8 @@ def test_a_blind_laser_is_an_obstacle() -> None:
     assert simulation.drive.poses[-1].x < reached + 1.5
 
 
-def test_all_of_them_together(unguarded: Drive) -> None:
-    """Shipped as they are: each guards its own, none hinders another."""
+def test_all_monitors_together(unguarded: Drive) -> None:
+    """Together each shipped monitor guards its own promise, without interference."""
     guarded = Simulation(SHIPPED).run()
     assert guarded.nearest(OBSTACLE) > 0.3
     assert guarded.farthest() < 20 + SLACK
@@ -132,10 +133,10 @@ def test_all_of_them_together(unguarded: Drive) -> None:
     assert sum(part.fire for part in MISSION) == 3
 
 
-def test_the_recording_is_judged_as_the_drive_would_have_been(
+def test_a_recording_gives_the_same_verdicts_as_the_drive(
     bag: Path, unguarded: Drive, tmp_path: Path
 ) -> None:
-    """`rosrv monitor run` drops what the monitors would have dropped, and writes what would have come through."""
+    """`rosrv monitor run` drops the same messages as the monitors, and writes the remaining ones."""
     output = tmp_path / "guarded.bag"
     records = replayed(bag, *SHIPPED, output=output)
     messages = [one for one in records if "topic" in one]
@@ -155,13 +156,13 @@ def test_the_recording_is_judged_as_the_drive_would_have_been(
 
 
 def test_a_recording_gives_the_same_records_every_time(bag: Path) -> None:
-    """Ticks, throttled lines and silence go by the clock of the recording."""
+    """Ticks, throttled lines and silence follow the clock of the recording."""
     assert replayed(bag, *SHIPPED) == replayed(bag, *SHIPPED)
 
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """An appliance with the shipped monitors."""
+    """Run an appliance with the shipped monitors."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     options = ("--monitors", str(MONITORS), "--api", "off")
     with Appliance(policy=OPEN_POLICY, options=options) as appliance:
@@ -170,7 +171,7 @@ def appliance() -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def robot(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosSession]:
-    """The LandShark's nodes on this machine."""
+    """Run the LandShark's nodes on this machine."""
     with RosSession(appliance.master_uri, tmp_path_factory.mktemp("robot")) as session:
         for program in (["base.py"], ["turret.py"], ["sensors.py", "gps"], ["sensors.py", "laser"]):
             session.start([PYTHON, str(NODES / program[0]), *program[1:]], label=program[-1])
@@ -178,14 +179,14 @@ def robot(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 
 def told(robot: RosSession, *command: str) -> Record:
-    """What `command.py` says."""
+    """Return the output of `command.py`."""
     said = robot.run(PYTHON, str(NODES / "command.py"), *command, timeout=120).stdout
     answer: Record = json.loads(said.splitlines()[-1])
     return answer
 
 
 def test_the_running_robot_shoots_only_in_a_safe_pose(appliance: Appliance, robot: RosSession) -> None:
-    """A shot, none, a shot; the drop is a record in the audit log."""
+    """The second of three shots is dropped, and the drop is recorded in the audit log."""
     for tilt, shots in ((0.2, 1), (-0.7, 1), (0.3, 2)):
         assert told(robot, "aim", "0", str(tilt))["tilt"] == pytest.approx(tilt, abs=0.02)
         assert told(robot, "fire")["shots"] == shots
@@ -195,7 +196,7 @@ def test_the_running_robot_shoots_only_in_a_safe_pose(appliance: Appliance, robo
 
 
 def test_the_running_robot_stops_before_the_obstacle(appliance: Appliance, robot: RosSession) -> None:
-    """Told to drive 10 m at 2 m/s with an obstacle 7 m ahead, and told so again, it does not reach it."""
+    """Ordered twice to drive 10 m at 2 m/s with an obstacle 7 m ahead, the robot does not reach it."""
     alarm = robot.start(["/usr/bin/rostopic", "echo", "-n", "1", "/landshark/obstacle_alarm"])
     there = told(robot, "drive", "2.0", "0", "5")
     assert 3 < there["x"] < 6.9
@@ -208,9 +209,9 @@ def test_the_running_robot_stops_before_the_obstacle(appliance: Appliance, robot
 
 
 def test_a_verdict_is_a_record(appliance: Appliance, robot: RosSession, tmp_path: Path) -> None:
-    """The tutorial's lock, loaded while the robot runs: warned, locked, and every verdict in the audit log."""
+    """With the tutorial's lock loaded while the robot runs, the warning, the lock and every verdict are recorded."""
     page = (ROOT / "docs" / "monitors-tutorial.md").read_text(encoding="utf-8")
-    text = page.rpartition("```cpp\n")[2].partition("```")[0]
+    (text,) = re.findall(r"```cpp\n(gunPose\(.*?)```", page, re.DOTALL)
     (tmp_path / "gun.rv").write_text(text)
     appliance.rosrv("monitor", "load", str(tmp_path / "gun.rv"), "--msg", str(MONITORS / "msg"))
     told(robot, "aim", "0", "-0.7")

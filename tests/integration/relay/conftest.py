@@ -1,4 +1,4 @@
-"""A real relay between real nodes."""
+"""Run a real relay between real nodes."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +12,7 @@ from tests.support.requirements import needs
 
 @pytest.fixture
 def driver() -> Iterator[RelayDriver]:
-    """rosmaster, the relay, and the least of a control."""
+    """Run rosmaster, the relay, and a minimal control."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with RelayDriver() as driver:
         yield driver
@@ -20,6 +20,6 @@ def driver() -> Iterator[RelayDriver]:
 
 @pytest.fixture
 def ros(driver: RelayDriver, tmp_path: Path) -> Iterator[RosSession]:
-    """Nodes of the test, whose master is the driver's."""
+    """Provide nodes of the test with the driver as their master."""
     with RosSession(driver.uri, tmp_path) as session:
         yield session

@@ -15,7 +15,7 @@ BOTH: tuple[Client, Client] = ("rospy", "roscpp")
 
 
 def ask_header(face: Face, fields: dict[str, str]) -> dict[str, str]:
-    """The header a relay port answers this one with."""
+    """Return the header with which a relay port answers this one."""
     with socket.create_connection((LOOPBACK, face.port), timeout=20) as sock:
         sock.sendall(encode_header(fields))
         parser = HeaderParser()
@@ -37,7 +37,7 @@ def _refused(message: object, resource: str) -> bool:
 def test_calls_are_answered(
     driver: RelayDriver, ros: RosSession, server: Client, caller: Client, options: tuple[str, ...]
 ) -> None:
-    """Every pair of client libraries, on a connection per call and on one for all calls."""
+    """Test every pair of client libraries, with a connection per call and with one for all calls."""
     service = ros.service_server(server, "/mode", name="server")
     client = ros.service_client(caller, "/mode", *options, name="client")
     for count, value in enumerate(("true", "false", "true"), start=1):
@@ -51,7 +51,7 @@ def test_calls_are_answered(
         return [m.kind for m in messages if m.caller_id == "/client"]
 
     expected = ["service"] * (1 if options else 3)
-    eventually(lambda: len(opened()) >= len(expected), "control is told of each connection")
+    eventually(lambda: len(opened()) >= len(expected), "control gets a report of each connection")
     assert opened() == expected
 
 
@@ -67,7 +67,7 @@ def test_the_stock_tools_find_type_and_call(driver: RelayDriver, ros: RosSession
 def test_a_probe_is_answered_with_the_services_header(
     driver: RelayDriver, ros: RosSession, server: Client
 ) -> None:
-    """As a client that waits for a service sends it, with an open md5sum."""
+    """The relay accepts a probe with an open md5sum, as of a client that waits for a service."""
     ros.service_server(server, "/mode", name="server")
     fields = {"callerid": "/probe", "service": "/mode", "md5sum": "*", "probe": "1"}
     header = ask_header(driver.faces["/server"], fields)
@@ -75,7 +75,7 @@ def test_a_probe_is_answered_with_the_services_header(
 
 
 @pytest.mark.parametrize("server", BOTH)
-def test_a_service_of_another_type_says_so_itself(
+def test_a_service_of_another_type_answers_with_its_own_error(
     driver: RelayDriver, ros: RosSession, server: Client
 ) -> None:
     """The service's own error header comes back."""
@@ -84,8 +84,8 @@ def test_a_service_of_another_type_says_so_itself(
     assert "md5sum" in ask_header(driver.faces["/server"], fields)["error"]
 
 
-def test_a_failed_call_fails_with_the_services_words(driver: RelayDriver, ros: RosSession) -> None:
-    """A service that raises: its error reply reaches the caller."""
+def test_a_failed_call_returns_the_services_error(driver: RelayDriver, ros: RosSession) -> None:
+    """The error reply of a service that raises reaches the caller."""
     program = (
         "import rospy\n"
         "from std_srvs.srv import SetBool\n"
@@ -102,7 +102,7 @@ def test_a_failed_call_fails_with_the_services_words(driver: RelayDriver, ros: R
 
 
 def test_a_client_without_a_grant_is_refused(driver: RelayDriver, ros: RosSession) -> None:
-    """With an error header, and control is told; services that are not there likewise."""
+    """The client gets an error header, and control a report; missing services are handled the same way."""
     ros.service_server("rospy", "/mode", name="server")
     face = driver.faces["/server"]
     driver.link.send(ClientRevoked(face.key, "/mode", LOOPBACK, "/client"))
@@ -126,8 +126,8 @@ def test_a_revoked_client_loses_its_persistent_connection(driver: RelayDriver, r
     client.wait_for(event="failed")
 
 
-def test_a_service_that_never_answers_holds_its_client_only(driver: RelayDriver, ros: RosSession) -> None:
-    """Others of the same service are answered, and the caller that gives up frees everything."""
+def test_a_service_that_never_answers_blocks_only_its_client(driver: RelayDriver, ros: RosSession) -> None:
+    """Other clients of the same service are answered, and a caller that gives up frees all resources."""
     program = (
         "import rospy, threading\n"
         "from std_srvs.srv import SetBool, SetBoolResponse\n"
@@ -151,8 +151,8 @@ def test_a_service_that_never_answers_holds_its_client_only(driver: RelayDriver,
     driver.link.wait_for(lambda m: isinstance(m, ConnectionClosed) and m.number == opened.number)
 
 
-def test_a_service_whose_node_has_died_is_an_error_not_a_hang(driver: RelayDriver, ros: RosSession) -> None:
-    """The caller is told at once that nobody is there."""
+def test_a_call_of_a_dead_service_fails_at_once(driver: RelayDriver, ros: RosSession) -> None:
+    """The caller gets an error at once."""
     server = ros.service_server("rospy", "/mode", name="server")
     server.kill()
     client = ros.service_client("rospy", "/mode")

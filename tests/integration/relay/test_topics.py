@@ -20,7 +20,7 @@ from appliance.channel.messages import (
     UpstreamLost,
 )
 from roswire.tcpros import HeaderParser, encode_header
-from tests.support.nodes import Client, RosSession
+from tests.support.nodes import Client, RosSession, numbers, without_gap
 from tests.support.relay_driver import LOOPBACK, Face, RelayDriver
 from tests.support.waiting import eventually
 
@@ -29,7 +29,7 @@ STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1
 
 
 def rss(pid: int) -> int:
-    """Resident bytes of a process."""
+    """Return the resident bytes of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
 
 
@@ -54,7 +54,7 @@ def _refused(message: object, resource: str, caller_id: str) -> bool:
 
 
 def read_frame(stream: BinaryIO) -> bytes:
-    """The next frame's body."""
+    """Return the body of the next frame."""
     (length,) = struct.unpack("<I", stream.read(4))
     return stream.read(length)
 
@@ -64,13 +64,12 @@ def read_frame(stream: BinaryIO) -> bytes:
 def test_messages_arrive_with_the_publishers_name(
     driver: RelayDriver, ros: RosSession, publisher: Client, subscriber: Client
 ) -> None:
-    """Every pair of client libraries talks through the relay as it does without, and nothing is dropped."""
+    """Every pair of client libraries communicates as without a relay, and no message is dropped."""
     ros.talker(publisher, "/chatter", name="talker")
     listener = ros.listener(subscriber, "/chatter", name="listener")
     events = listener.wait_for_count(5, event="received")
     assert {event["publisher"] for event in events} == {"/talker"}
-    numbers = [int(event["data"].split()[1]) for event in events]
-    assert numbers == list(range(numbers[0], numbers[0] + 5))
+    assert without_gap(numbers(events))
     opened = driver.link.wait_for(lambda message: isinstance(message, ConnectionOpened))
     assert (opened.resource, opened.kind, opened.caller_id) == ("/chatter", "topic", "/listener")
     listener.stop()
@@ -82,7 +81,7 @@ def test_messages_arrive_with_the_publishers_name(
 def test_a_latched_message_reaches_early_and_late_subscribers_once(
     driver: RelayDriver, ros: RosSession, publisher: Client
 ) -> None:
-    """The first gets it from the publisher, the later ones from the relay's memory."""
+    """The first subscriber gets it from the publisher, later ones from the relay's memory."""
     talker = ros.talker(publisher, "/map", "--latch")
     first = ros.listener("rospy", "/map")
     first.wait_for(event="received")
@@ -96,8 +95,12 @@ def test_a_latched_message_reaches_early_and_late_subscribers_once(
     assert len(talker.seen(event="connected")) == 1, "the publisher sees one connection"
 
 
-def test_a_stopped_subscriber_delays_nobody_and_grows_nothing(driver: RelayDriver, ros: RosSession) -> None:
-    """Its messages are dropped and counted; the other gets all, in order; the relay's memory stays flat."""
+def test_a_stopped_subscriber_neither_delays_others_nor_grows_memory(
+    driver: RelayDriver, ros: RosSession
+) -> None:
+    """Its messages are dropped and counted; the other subscriber gets all, in order; the relay's memory does not
+    grow.
+    """
     ros.talker("roscpp", "/chatter", "--rate", "100", "--text", "x" * 60_000)
     stuck = ros.listener("roscpp", "/chatter", name="stuck")
     stuck.wait_for(event="received")
@@ -115,18 +118,17 @@ def test_a_stopped_subscriber_delays_nobody_and_grows_nothing(driver: RelayDrive
         assert rss(driver.relay.process.pid) < 300 << 20
         mark = well.mark()
         well.wait_for(lambda event: True, since=mark, event="received")
-        numbers = [int(event["data"].split()[1]) for event in well.seen(event="received")]
-        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        assert without_gap(numbers(well.seen(event="received")))
     finally:
         stuck.popen.send_signal(signal.SIGCONT)
     mark = stuck.mark()
     stuck.wait_for(since=mark, event="received")
-    numbers = [int(event["data"].split()[1]) for event in stuck.seen(event="received")]
-    assert numbers == sorted(numbers), "what it got is in order"
+    heard = numbers(stuck.seen(event="received"))
+    assert heard == sorted(heard), "its messages are in order"
 
 
 def test_a_message_of_ten_megabytes_arrives_whole(driver: RelayDriver, ros: RosSession) -> None:
-    """Large messages pass in both directions of small-large-small."""
+    """A large message between small ones arrives, in both directions."""
     program = (
         "import rospy, sys\n"
         "from std_msgs.msg import String\n"
@@ -151,13 +153,13 @@ def test_a_message_of_ten_megabytes_arrives_whole(driver: RelayDriver, ros: RosS
             assert body[4:] == bytes([97 + size % 7]) * size
 
 
-def test_without_a_grant_nobody_is_served(driver: RelayDriver, ros: RosSession) -> None:
-    """Another caller_id, another topic of the same publisher: an error header, and control is told."""
+def test_a_subscriber_without_a_permission_is_not_served(driver: RelayDriver, ros: RosSession) -> None:
+    """Another caller_id or topic of the same publisher gets an error header, and control is told."""
     ros.talker("rospy", "/chatter", name="talker")
     face = driver.faces["/talker"]
     driver.link.send(GrantInstalled(face.key, "/chatter", LOOPBACK, "/listener"))
     for fields, reason in (
-        ({"callerid": "/stranger", "topic": "/chatter"}, "no grant"),
+        ({"callerid": "/unknown", "topic": "/chatter"}, "no grant"),
         ({"callerid": "/listener", "topic": "/rosout"}, "no grant"),
         ({"callerid": "/listener", "topic": "/nothing"}, "not a publisher"),
     ):
@@ -170,8 +172,8 @@ def test_without_a_grant_nobody_is_served(driver: RelayDriver, ros: RosSession) 
         assert (refused.host, refused.count) == (LOOPBACK, 1)
 
 
-def test_a_subscriber_of_another_type_is_told_so(driver: RelayDriver, ros: RosSession) -> None:
-    """As by a publisher of ROS: an error header that names both types."""
+def test_a_subscriber_of_another_type_gets_an_error(driver: RelayDriver, ros: RosSession) -> None:
+    """The error header names both types, as from a ROS publisher."""
     ros.talker("rospy", "/chatter", name="talker")
     face = driver.faces["/talker"]
     driver.link.send(GrantInstalled(face.key, "/chatter", LOOPBACK, "/listener"))
@@ -182,7 +184,7 @@ def test_a_subscriber_of_another_type_is_told_so(driver: RelayDriver, ros: RosSe
 
 
 def test_a_connection_is_for_one_topic(driver: RelayDriver, ros: RosSession) -> None:
-    """A served subscriber that sends a header for another topic is cut."""
+    """A served subscriber that sends a header for another topic is disconnected."""
     ros.talker("rospy", "/chatter", name="talker")
     face = driver.faces["/talker"]
     driver.link.send(GrantInstalled(face.key, "/chatter", LOOPBACK, "/listener"))
@@ -196,10 +198,8 @@ def test_a_connection_is_for_one_topic(driver: RelayDriver, ros: RosSession) -> 
         driver.link.wait_for(lambda message: isinstance(message, ConnectionClosed))
 
 
-def test_traffic_goes_on_without_control_and_through_its_restart(
-    driver: RelayDriver, ros: RosSession
-) -> None:
-    """Control's death interrupts nobody; the next one is told who is connected."""
+def test_traffic_continues_while_control_restarts(driver: RelayDriver, ros: RosSession) -> None:
+    """The death of control interrupts no connection; the next control is told of all of them."""
     ros.talker("roscpp", "/chatter", "--rate", "50")
     listener = ros.listener("roscpp", "/chatter", name="listener")
     listener.wait_for(event="received")
@@ -210,12 +210,13 @@ def test_traffic_goes_on_without_control_and_through_its_restart(
     opened = driver.link.wait_for(lambda message: isinstance(message, ConnectionOpened))
     assert opened.caller_id == "/listener"
     listener.wait_for_count(50, event="received")
-    numbers = [int(event["data"].split()[1]) for event in listener.seen(event="received")]
-    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert without_gap(numbers(listener.seen(event="received")))
 
 
-def test_what_a_new_control_does_not_restate_is_cut(driver: RelayDriver, ros: RosSession) -> None:
-    """A grant that is gone after the restatement takes its connection with it; others stay."""
+def test_a_connection_that_a_new_control_does_not_restate_is_closed(
+    driver: RelayDriver, ros: RosSession
+) -> None:
+    """A permission missing after the restatement ends its connection; other connections stay."""
     ros.talker("rospy", "/chatter")
     out, stays = (
         ros.listener("rospy", "/chatter", name="out"),
@@ -234,8 +235,8 @@ def test_what_a_new_control_does_not_restate_is_cut(driver: RelayDriver, ros: Ro
     assert len(out.seen(event="received")) <= count + 1
 
 
-def test_a_revoked_grant_cuts_its_connection(driver: RelayDriver, ros: RosSession) -> None:
-    """And only its own."""
+def test_a_revocation_closes_its_connection(driver: RelayDriver, ros: RosSession) -> None:
+    """A revocation ends only its own connection."""
     ros.talker("rospy", "/chatter", name="talker")
     face = driver.faces["/talker"]
     ros.listener("roscpp", "/chatter", name="listener").wait_for(event="received")
@@ -245,7 +246,7 @@ def test_a_revoked_grant_cuts_its_connection(driver: RelayDriver, ros: RosSessio
 
 
 def test_a_republished_topic_is_served_again(driver: RelayDriver, ros: RosSession) -> None:
-    """A publisher that was killed and started again is another incarnation; its old subscribers are cut."""
+    """A killed and restarted publisher is another incarnation; its old subscribers are disconnected."""
     first = ros.talker("rospy", "/chatter", name="talker")
     listener = ros.listener("rospy", "/chatter", name="listener")
     listener.wait_for(event="received")
@@ -256,6 +257,6 @@ def test_a_republished_topic_is_served_again(driver: RelayDriver, ros: RosSessio
 
 
 def test_the_stock_tools_read_through_the_relay(driver: RelayDriver, ros: RosSession) -> None:
-    """rostopic echo and rostopic hz need no grant beyond requestTopic's."""
+    """rostopic echo and rostopic hz need no permission beyond requestTopic's."""
     ros.talker("roscpp", "/chatter")
     assert "hello" in ros.run("/usr/bin/rostopic", "echo", "-n", "2", "/chatter").stdout

@@ -1,4 +1,4 @@
-"""A fork of the process that has loaded rospy is what a new process would be."""
+"""A fork of a process with rospy loaded behaves as a new process would."""
 
 import json
 import signal
@@ -39,7 +39,7 @@ sys.exit(3)
 
 
 def looked(host: Host | Forking, command: list[str], environment: Mapping[str, str], folder: Path) -> Any:
-    """What such a program sees, and how it ended."""
+    """Return the program's view of its process, and how it ended."""
     started = host.popen(
         command, env=environment, cwd=str(folder), start_new_session=True, text=True,
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -54,8 +54,8 @@ def looked(host: Host | Forking, command: list[str], environment: Mapping[str, s
 
 @pytest.mark.parametrize("place", ["this machine", "a host"])
 @pytest.mark.parametrize("form", ["-c", "file"])
-def test_a_fork_sees_what_a_new_process_sees(lab: Lab, tmp_path: Path, place: str, form: str) -> None:
-    """Arguments, environment, folder, descriptors, names: all is alike, and so is how it ends."""
+def test_a_fork_looks_like_a_new_process(lab: Lab, tmp_path: Path, place: str, form: str) -> None:
+    """Arguments, environment, folder, descriptors, names and exit status are the same."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     host = ThisMachine() if place == "this machine" else lab.host("robot", "10.77.0.10/24")
     file = tmp_path / "look.py"
@@ -68,8 +68,8 @@ def test_a_fork_sees_what_a_new_process_sees(lab: Lab, tmp_path: Path, place: st
     assert seen[0][1] == 3
 
 
-def test_a_fork_is_told_of_and_ended_as_a_process_is(tmp_path: Path) -> None:
-    """Before and after its end, by a signal and by the limit of a wait."""
+def test_a_fork_ends_as_a_process_does(tmp_path: Path) -> None:
+    """Both report the same before and after their end, by a signal and by a time limit."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     host, program = ThisMachine(), "import signal; print('here'); signal.pause()"
     environment = RosSession("", tmp_path, host).environment(host)
@@ -87,4 +87,4 @@ def test_a_fork_is_told_of_and_ended_as_a_process_is(tmp_path: Path) -> None:
                 fork.wait(0)
             fork.send_signal(number)
             assert fork.wait(LIMIT) == fork.poll() == -number
-            fork.send_signal(number)  # to nobody
+            fork.send_signal(number)  # to no process

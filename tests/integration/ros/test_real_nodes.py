@@ -16,31 +16,29 @@ from roswire.standard import standard_definitions
 from roswire.tcpros import FrameParser, HeaderParser, ServiceReplyParser, encode_frame, encode_header
 from roswire.uris import parse_node_uri, parse_service_uri
 from roswire.xmlrpc import MethodCall, build_call, build_response, parse_call, parse_response
-from tests.support.nodes import Client, RosSession, has_ros
+from tests.support.nodes import Client, RosSession
 from tests.support.processes import LIMIT
-from tests.support.requirements import needs
-from tests.support.rosmaster import PlainMaster
+from tests.support.site import Masters
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 
 
 @pytest.fixture(scope="module")
-def ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosSession]:
-    """Real nodes behind a plain master."""
-    needs(has_ros(), "rospy, roscpp and the stock tools (scripts/setup)")
+def ros(masters: Masters, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosSession]:
+    """Provide real nodes behind a plain master."""
     home = tmp_path_factory.mktemp("ros")
-    with PlainMaster(home) as master, RosSession(master.master_uri, home) as session:
+    with masters.lend("plain", "loopback") as site, RosSession(site.master_uri, home) as session:
         yield session
 
 
 @pytest.fixture(scope="module")
 def standard() -> Definitions:
-    """ROS's own definitions."""
+    """Return ROS's own definitions."""
     return standard_definitions()
 
 
 def call(uri: str, method: str, *params: Any) -> Any:
-    """Make a call in our notation and return what a successful answer carries."""
+    """Make a call in our notation and return the value of a successful answer."""
     target = parse_node_uri(uri)
     connection = http.client.HTTPConnection(target.host, target.port, timeout=LIMIT)
     try:
@@ -54,7 +52,7 @@ def call(uri: str, method: str, *params: Any) -> Any:
 
 
 def receive_header(connection: socket.socket) -> tuple[dict[str, str], bytes]:
-    """Return the fields of the peer's connection header, and what it sent behind it."""
+    """Return the fields of the peer's connection header, and the bytes after it."""
     parser = HeaderParser()
     while (fields := parser.feed(received(connection))) is None:
         pass
@@ -62,7 +60,7 @@ def receive_header(connection: socket.socket) -> tuple[dict[str, str], bytes]:
 
 
 def received(connection: socket.socket) -> bytes:
-    """Return what the peer sent next; it must not have closed."""
+    """Return the peer's next bytes; it must not have closed."""
     data = connection.recv(65536)
     assert data, "the peer closed the connection"
     return data
@@ -70,7 +68,7 @@ def received(connection: socket.socket) -> bytes:
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_a_publisher_is_understood(ros: RosSession, standard: Definitions, client: Client) -> None:
-    """A publisher takes our header; its header, its definition and its message are read."""
+    """A publisher accepts our header; its header, its definition and its message are parsed."""
     topic = f"/{client}_chatter"
     name = f"{client}_talker"
     ros.talker(client, topic, name=name)
@@ -96,7 +94,7 @@ def test_a_publisher_is_understood(ros: RosSession, standard: Definitions, clien
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_a_subscriber_is_understood(ros: RosSession, standard: Definitions, client: Client) -> None:
-    """A subscriber's call and header are read, and it takes our answer, our header and our message."""
+    """A subscriber's call and header are parsed, and it accepts our answer, our header and our message."""
     topic = f"/{client}_heard"
     with (
         socket.create_server((ros.host.address, 0)) as data_port,
@@ -124,7 +122,7 @@ def test_a_subscriber_is_understood(ros: RosSession, standard: Definitions, clie
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_a_service_is_understood(ros: RosSession, standard: Definitions, client: Client) -> None:
-    """A service takes our header and request, with the md5sum of our definition, and its replies are read."""
+    """A service accepts our header and request, with the md5sum of our definition, and its replies are parsed."""
     service = f"/{client}_negate"
     ros.service_server(client, service, name=f"{client}_server")
     target = parse_service_uri(call(ros.master_uri, "lookupService", "/test", service))
@@ -148,7 +146,7 @@ def test_a_service_is_understood(ros: RosSession, standard: Definitions, client:
 
 
 class NodeApi:
-    """A node API that offers TCPROS on one port; `calls` are the calls that it got."""
+    """A node API that offers TCPROS on one port; `calls` are its received calls."""
 
     def __init__(self, address: str, data_port: socket.socket) -> None:
         self.calls: list[MethodCall] = []
@@ -169,7 +167,7 @@ class NodeApi:
                 self.wfile.write(body)
 
             def log_message(self, *_arguments: object) -> None:
-                """Say nothing."""
+                """Log nothing."""
 
         self._server = http.server.ThreadingHTTPServer((address, 0), Handler)
         self._server.daemon_threads = True

@@ -1,7 +1,7 @@
-"""Small processes that keep the contract of the real ones, so that the supervisor can be tested by itself.
+"""Small processes that keep the contract of the real ones, so that the supervisor can be tested alone.
 
-Each prints what it is told as one JSON object per line. The stand-in for control keeps one listening
-socket and answers whoever connects to it with its process id.
+Each prints its messages as one JSON object per line. The actor for control keeps one listening socket and answers
+each connection with its process id.
 """
 
 import asyncio
@@ -39,38 +39,38 @@ CROWD = 2_000  # two for each node of a robot with a thousand
 
 
 def control(lifeline_fd: int, config: Path) -> None:
-    """Stand-in for control. SIGUSR1: it plays supervisor; SIGUSR2: it asks for the end of the appliance."""
+    """Act as control. SIGUSR1: it plays supervisor; SIGUSR2: it asks for the end of the appliance."""
     asyncio.run(_Control(lifeline_fd, load_resolved(config).rosmaster_port).run())
 
 
 def relay(lifeline_fd: int, index: int, config: Path) -> None:
-    """Stand-in for the relay. SIGUSR1 makes it send what only control may send."""
+    """Act as the relay. SIGUSR1 makes it send a message that only control may send."""
     asyncio.run(_Actor("relay", lifeline_fd, RelayLink).run())
 
 
 def crowded(lifeline_fd: int, config: Path) -> None:
-    """A control with as many ports as a large robot needs."""
+    """Act as a control with as many ports as a large robot needs."""
     asyncio.run(_Crowded(lifeline_fd, load_resolved(config).rosmaster_port).run())
 
 
 def signer(lifeline_fd: int, directory: Path, passphrase: int | None) -> None:
-    """Stand-in for the signer."""
+    """Act as the signer."""
     asyncio.run(_Actor("signer", lifeline_fd, SignerLink).run())
 
 
 def stubborn(lifeline_fd: int, index: int, config: Path) -> None:
-    """A relay that does not end when it is asked to, nor by SIGTERM."""
+    """Act as a relay that ends neither when asked nor by SIGTERM."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     asyncio.run(_Stubborn("relay", lifeline_fd, RelayLink).run())
 
 
 def failing(lifeline_fd: int, config: Path) -> None:
-    """A control that finds its policy wrong."""
+    """Act as a control with an invalid policy."""
     asyncio.run(_Failing("control", lifeline_fd, RelayLink).run())
 
 
 def failing_again(lifeline_fd: int, config: Path) -> None:
-    """A control that serves at first, and of whose next lives three cannot (a full disk)."""
+    """Act as a control that serves at first, and fails in three later lives (a full disk)."""
     lives = config.parent.parent / "control" / "lives"
     with lives.open("a") as file:
         file.write(".")
@@ -81,7 +81,7 @@ def failing_again(lifeline_fd: int, config: Path) -> None:
 
 
 def dying(lifeline_fd: int, config: Path) -> None:
-    """A control that dies as soon as it lives."""
+    """Act as a control that dies at its start."""
     sys.exit(3)
 
 
@@ -186,7 +186,7 @@ class _Control(_Actor):
         detail = {
             "master": f"http://127.0.0.1:{port}",
             "revision": 1,
-            # rosout talks to ROSMaster itself here.
+            # rosout talks to rosmaster itself here.
             "rosout_master": f"http://127.0.0.1:{self.rosmaster_port}",
             "inner_port": 1,
             "own_port": 2,

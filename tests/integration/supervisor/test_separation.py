@@ -1,4 +1,4 @@
-"""What each process's user may read and write of the state directory, tried as that user."""
+"""Access of each process's user to the state directory, tested as that user."""
 
 import os
 import shutil
@@ -15,7 +15,7 @@ from tests.support.requirements import need_root
 
 LOG = {"control/audit.db", "control/audit.db-wal", "control/audit.db-shm"}
 NO_SECRET = {"run/config.json", "control/audit.pub"}
-READS = {  # besides what is its own
+READS = {  # besides its own part
     "api": LOG,
     "syslog": LOG,
     "relay": set(),
@@ -31,7 +31,7 @@ USERS = {"control": "rosrv", "rosmaster": "rosmaster"}
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """An appliance that was started by root, and has written everything that it writes at a start."""
+    """Run an appliance that was started by root, and has written all files of a start."""
     need_root()
     with Appliance(options=("--api", "127.0.0.1:0")) as running:
         assert running.rest().get("/v1/audit").status == 200
@@ -39,8 +39,8 @@ def appliance() -> Iterator[Appliance]:
 
 
 @pytest.mark.parametrize("role", READS)
-def test_a_process_reads_its_own_and_little_else(appliance: Appliance, role: str) -> None:
-    """A process that fell to a stranger finds no key and no token of another, and writes its own only."""
+def test_a_process_reads_only_its_own_files(appliance: Appliance, role: str) -> None:
+    """A compromised process finds no key and no token of another, and can write only its own files."""
     user, group = 65534, 65534
     if role != "nobody":
         name = USERS.get(role, f"rosrv-{role}")
@@ -48,7 +48,7 @@ def test_a_process_reads_its_own_and_little_else(appliance: Appliance, role: str
         user, group = account.uid, account.gid
 
     def found(flag: str) -> set[str]:
-        """All files that `test` says this user may read, or write; those of the role's own part are left out."""
+        """Return all files that this user may read, or write, by `test`, except those of the role's own part."""
         files = [path for path in appliance.state.rglob("*") if path.is_file()]
         program = 'for one; do [ "$FLAG" "$one" ] && echo "$one"; done; true'
         command = ["/bin/sh", "-c", program.replace("$FLAG", flag), "sh", *map(str, files)]
@@ -62,14 +62,14 @@ def test_a_process_reads_its_own_and_little_else(appliance: Appliance, role: str
     assert found("-r") - NO_SECRET == READS[role]
 
 
-def test_there_is_something_to_find(appliance: Appliance) -> None:
-    """The keys and tables that must not be found are there, so that not finding them says something."""
+def test_the_hidden_files_exist(appliance: Appliance) -> None:
+    """The keys and tables that must be hidden exist, so that the test above is meaningful."""
     for name in ("signer/ca.key", "signer/audit.key", "api/key.pem", "control/state.db", *LOG):
         assert (appliance.state / name).is_file(), name
 
 
-def test_who_is_ended_first_when_memory_ends(appliance: Appliance) -> None:
-    """What strangers can flood and the others can do without goes first; the supervisor and the signer last."""
+def test_the_order_of_oom_kills(appliance: Appliance) -> None:
+    """Processes that others can flood, and that are not essential, end first; the supervisor and the signer last."""
     scores = {
         role: int(Path(f"/proc/{row['pid']}/oom_score_adj").read_text())
         for role, row in appliance.processes().items()
@@ -79,8 +79,8 @@ def test_who_is_ended_first_when_memory_ends(appliance: Appliance) -> None:
     assert scores["rosmaster"] == scores["signer"] == own
 
 
-def test_nothing_in_a_part_is_run_at_the_next_start(appliance: Appliance) -> None:
-    """Code that a fallen process, or a backup, put where Python looks in a user's home is not loaded by any process."""
+def test_planted_code_is_not_loaded_at_the_next_start(appliance: Appliance) -> None:
+    """Code that a compromised process, or a backup, puts into Python's user folders is not loaded by any process."""
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
     parts = [path for path in appliance.state.iterdir() if path.is_dir() and path.name != "run"]
     assert {path.name for path in parts} >= {"rosmaster", "control", "signer", "relay", "api"}

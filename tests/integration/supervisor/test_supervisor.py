@@ -1,4 +1,4 @@
-"""Real processes, killed, stopped and starved: what the supervisor promises about them."""
+"""The supervisor's promises for real processes that are killed, stopped and starved."""
 
 import contextlib
 import json
@@ -18,10 +18,10 @@ from typing import Any
 
 import pytest
 
-from appliance.supervisor.privileges import SUPERVISORS
+from appliance.supervisor.privileges import SUPERVISOR_CAPABILITIES
 from appliance.supervisor.roles import ROSMASTER, ROSOUT
 from tests.integration.supervisor.actors import CROWD
-from tests.support.processes import Process, ThisMachine
+from tests.support.processes import LIMIT, Process, ThisMachine
 from tests.support.requirements import need_root, needs
 from tests.support.waiting import allowed, eventually
 
@@ -41,30 +41,30 @@ class Running:
         self.process = Process(ThisMachine(), command, env=environment, label="supervisor")
 
     def until_ready(self) -> "Running":
-        """Wait until nodes may connect and everything runs."""
-        self.process.wait_for(event="ready", timeout=60)
+        """Wait until nodes may connect and all processes run."""
+        self.process.wait_for(event="ready", timeout=2 * LIMIT)
         for role in ALL:
             self.pid(role)
         return self
 
     def pid(self, role: str, *, restarts: int = 0) -> int:
-        """The process id of a role's life after this many restarts."""
+        """Return the process id of a role after this many restarts."""
         return int(self.process.wait_for(event="process started", role=role, restarts=restarts)["pid"])
 
     def restarts(self, role: str) -> int:
-        """How often a role was started again until now."""
+        """Return the number of restarts of a role so far."""
         return len(self.process.seen(event="process started", role=role)) - 1
 
     def next_pid(self, role: str, pid: int) -> int:
-        """The process id of the life of a role that follows this one."""
-        lives = [event["pid"] for event in self.process.seen(event="process started", role=role)]
-        return self.pid(role, restarts=lives.index(pid) + 1)
+        """Return the process id of the next life of a role."""
+        starts = [event["pid"] for event in self.process.seen(event="process started", role=role)]
+        return self.pid(role, restarts=starts.index(pid) + 1)
 
     def living(self, role: str) -> int:
-        """The process id of a role's present life, once it is at work and has given up what it must not have."""
+        """Return the present process id of a role, once it works and has dropped its privileges."""
         pid = self.pid(role, restarts=self.restarts(role))
-        # The filter of system calls is the last that it takes upon itself.
-        eventually(partial(_is_filtered, pid), f"{role} is confined")
+        # The system call filter is the last step.
+        eventually(partial(_is_filtered, pid), f"{role} is in its sandbox")
         if role in {"control", "relay"}:
             self.process.wait_for(actor=role, pid=pid)
         if role == "rosout":
@@ -74,18 +74,18 @@ class Running:
         return pid
 
     def echo(self) -> int:
-        """Connect to the socket that control keeps: the process id of the control that answers."""
+        """Connect to the socket that control keeps, and return the process id of the answering control."""
         uri = self.process.wait_for(event="ready")["master"]
         with socket.create_connection(("127.0.0.1", int(uri.rsplit(":", 1)[1])), timeout=20) as connection:
             return int(connection.recv(20))
 
     def children(self) -> list[int]:
-        """Every process that the supervisor started and that is still there."""
+        """Return every running process that the supervisor started."""
         started = [event["pid"] for event in self.process.seen(event="process started")]
         return [pid for pid in started if Path(f"/proc/{pid}").exists()]
 
     def until_childless(self) -> None:
-        """Wait until none of the children is there; fails after ten seconds."""
+        """Wait until none of the children is there; fail after ten seconds."""
         for pid in self.children():
             with _pidfd(pid) as descriptor:
                 if descriptor is not None:
@@ -113,7 +113,7 @@ def _wait(descriptor: int, seconds: float) -> bool:
 
 @contextlib.contextmanager
 def state_directory() -> Iterator[Path]:
-    """A state directory that the users of the roles can reach."""
+    """Return a state directory that the users of the roles can reach."""
     needs(ROSMASTER.exists() and ROSOUT.exists(), "rosmaster and rosout (run `make setup`)")
     directory = Path(tempfile.mkdtemp(prefix="rosrv-supervisor-"))
     directory.chmod(0o755)
@@ -123,14 +123,14 @@ def state_directory() -> Iterator[Path]:
 
 @pytest.fixture
 def state() -> Iterator[Path]:
-    """One of a test."""
+    """Provide a state directory for one test."""
     with state_directory() as state:
         yield state
 
 
 @pytest.fixture
 def start(state: Path) -> Iterator[Any]:
-    """Start a supervisor; ended with the test."""
+    """Start a supervisor; it ends with the test."""
     started: list[Running] = []
 
     def start(*actors: str) -> Running:
@@ -145,7 +145,7 @@ def start(state: Path) -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def common() -> Iterator[Running]:
-    """A supervisor that the tests of this file share which leave all its processes at work."""
+    """Run a supervisor for all tests of this file that leave its processes running."""
     with state_directory() as state:
         running = Running(state)
         yield running.until_ready()
@@ -155,7 +155,7 @@ def common() -> Iterator[Running]:
 
 @pytest.mark.parametrize("role", ALL)
 def test_a_killed_process_is_back_within_a_second(common: Running, role: str) -> None:
-    """Whatever dies is started again within a second of its first death, and control is told the new process."""
+    """A dead process is restarted within a second of its first death, and control is told the new process."""
     old, restarts = common.living(role), common.restarts(role)
     killed = time.monotonic()
     os.kill(old, signal.SIGKILL)
@@ -169,7 +169,7 @@ def test_a_killed_process_is_back_within_a_second(common: Running, role: str) ->
 
 @pytest.mark.parametrize("role", ["control", "rosmaster"])
 def test_a_hanging_process_is_replaced(common: Running, role: str) -> None:
-    """A process that is there but does not answer is killed after five seconds and started again."""
+    """An unresponsive process is killed after five seconds and restarted."""
     hanging = common.living(role)
     os.kill(hanging, signal.SIGSTOP)
     stopped = time.monotonic()
@@ -189,7 +189,7 @@ def test_a_port_of_control_stays_open_while_control_is_dead(common: Running) -> 
 
 
 def test_every_port_of_a_large_robot_survives_control(start: Any) -> None:
-    """Two ports for each of a thousand nodes are given back to the next control, all of them, at once."""
+    """All ports, two for each of a thousand nodes, are handed to the next control at once."""
     running = start("control=crowded").until_ready()
     os.kill(running.pid("control"), signal.SIGKILL)
     began = time.monotonic()
@@ -200,7 +200,7 @@ def test_every_port_of_a_large_robot_survives_control(start: Any) -> None:
 
 
 def test_the_admin_socket_survives_control(common: Running) -> None:
-    """The socket in the state directory stays one that control listens on, whichever control it is."""
+    """Every new control listens on the same socket in the state directory."""
     old = common.living("control")
     os.kill(old, signal.SIGKILL)
     with socket.socket(socket.AF_UNIX) as connection:
@@ -210,7 +210,7 @@ def test_the_admin_socket_survives_control(common: Running) -> None:
 
 @pytest.mark.parametrize("role", ["relay", "control"])
 def test_a_restarted_end_gets_a_fresh_link(common: Running, role: str) -> None:
-    """After the death of either end, control and relay can speak to each other again."""
+    """After the death of either end, control and relay can communicate again."""
     old, relay = common.living(role), common.living("relay")
     common.process.wait_for(actor="relay", pid=relay, link="control", said="StateBegan")
     mark = common.process.mark()
@@ -221,9 +221,9 @@ def test_a_restarted_end_gets_a_fresh_link(common: Running, role: str) -> None:
 
 
 @pytest.mark.parametrize("role", ["relay", "control"])
-def test_a_process_that_says_what_it_may_not_is_replaced(common: Running, role: str) -> None:
-    """A relay cannot have sockets kept, control cannot play supervisor: they are killed for trying."""
-    old = common.living(role)  # it listens to signals before it says anything
+def test_a_process_with_a_forbidden_message_is_replaced(common: Running, role: str) -> None:
+    """A relay cannot have sockets kept, control cannot play supervisor: both are killed for the attempt."""
+    old = common.living(role)  # it handles signals before its first message
     os.kill(old, signal.SIGUSR1)
     common.process.wait_for(event="process is killed", role=role, pid=old)
     common.next_pid(role, old)
@@ -231,7 +231,7 @@ def test_a_process_that_says_what_it_may_not_is_replaced(common: Running, role: 
 
 
 def test_nothing_outlives_a_killed_supervisor(start: Any) -> None:
-    """SIGKILL of the supervisor ends all its processes, and a new start finds nothing in its way."""
+    """SIGKILL of the supervisor ends all its processes, and a new start is not obstructed."""
     running = start().until_ready()
     os.kill(running.pid("relay"), signal.SIGSTOP)  # not even a process that cannot see its lifeline end
     os.kill(running.process.pid, signal.SIGKILL)
@@ -252,8 +252,8 @@ def test_a_clean_end_leaves_nothing(start: Any, state: Path) -> None:
     assert running.process.seen(event="process did not end") == []
 
 
-def test_an_end_while_the_surroundings_are_made_takes_them_away(start: Any, state: Path) -> None:
-    """SIGTERM, Ctrl-C or a terminal that goes away before the first process: an orderly end, nothing is left."""
+def test_an_end_during_the_build_removes_the_surroundings(start: Any, state: Path) -> None:
+    """SIGTERM, Ctrl-C or a closed terminal before the first process: a clean end without leftovers."""
     running = start("interrupted=build")
     assert running.process.wait() == 0
     assert [one["event"] for one in running.process.seen() if one.get("event") in {"built", "removed"}] == [
@@ -266,7 +266,7 @@ def test_an_end_while_the_surroundings_are_made_takes_them_away(start: Any, stat
 
 
 def test_a_second_end_does_not_interrupt_the_first(start: Any, state: Path) -> None:
-    """Who is impatient (Ctrl-C twice) gets the same end: the surroundings are taken away, exit status 0."""
+    """After Ctrl-C twice the surroundings are still removed, with exit status 0."""
     running = start("interrupted=remove").until_ready()
     assert running.process.stop(with_signal=signal.SIGTERM) == 0
     assert running.process.seen(event="removed")
@@ -274,7 +274,7 @@ def test_a_second_end_does_not_interrupt_the_first(start: Any, state: Path) -> N
 
 
 def test_control_may_end_the_appliance(start: Any) -> None:
-    """The `shutdown` call of the Master API, once granted, ends it as SIGTERM would."""
+    """The `shutdown` call of the Master API, if granted, ends it as SIGTERM does."""
     running = start().until_ready()
     os.kill(running.pid("control"), signal.SIGUSR2)
     assert running.process.wait() == 0
@@ -282,7 +282,7 @@ def test_control_may_end_the_appliance(start: Any) -> None:
 
 
 def test_a_stubborn_process_does_not_hold_up_the_end(start: Any) -> None:
-    """What ends neither when asked nor by SIGTERM is killed; the end still comes within five seconds."""
+    """A process that ends neither when asked nor by SIGTERM is killed; the end still takes less than five seconds."""
     running = start("relay=stubborn").until_ready()
     began = time.monotonic()
     assert running.process.stop(with_signal=signal.SIGTERM) == 0
@@ -291,7 +291,7 @@ def test_a_stubborn_process_does_not_hold_up_the_end(start: Any) -> None:
 
 
 def test_a_second_appliance_on_the_same_state_is_refused(common: Running) -> None:
-    """The second start says which process has the state directory, and the first one does not notice."""
+    """The second start names the process that uses the state directory, and the first one is not affected."""
     second = Running(common.state)
     assert second.process.wait() == 1
     reason = second.process.wait_for(event="refused")["reason"]
@@ -300,8 +300,8 @@ def test_a_second_appliance_on_the_same_state_is_refused(common: Running) -> Non
     assert common.echo()
 
 
-def test_why_control_cannot_serve_is_what_the_user_reads(start: Any) -> None:
-    """Every finding of a wrong policy reaches who started the appliance, and nothing is left running."""
+def test_the_user_sees_why_control_cannot_serve(start: Any) -> None:
+    """Every finding of an invalid policy is printed to the user, and no process remains."""
     running = start("control=failing")
     assert running.process.wait() == 1
     reason = running.process.wait_for(event="refused")["reason"]
@@ -309,8 +309,10 @@ def test_why_control_cannot_serve_is_what_the_user_reads(start: Any) -> None:
     running.until_childless()
 
 
-def test_what_cannot_serve_later_is_tried_again_and_ends_nothing(start: Any) -> None:
-    """Nodes are connected: a control that finds the disk full is started again until it finds room, and why is said."""
+def test_a_control_that_fails_later_is_retried(start: Any) -> None:
+    """With nodes connected, a control that finds the disk full is restarted until it succeeds, and the reason is
+    logged.
+    """
     running = start("control=failing_again").until_ready()
     os.kill(running.pid("control"), signal.SIGKILL)
     for restarts in (1, 2, 3):
@@ -323,14 +325,14 @@ def test_what_cannot_serve_later_is_tried_again_and_ends_nothing(start: Any) -> 
 
 
 def test_a_control_that_never_lives_is_an_error(start: Any) -> None:
-    """When control dies again and again before nodes could ever connect, the start fails and says so."""
+    """When control dies repeatedly before nodes could connect, the start fails with an error."""
     running = start("control=dying")
     assert running.process.wait() == 1
     assert "control died 5 times (exit status 3)" in running.process.wait_for(event="refused")["reason"]
 
 
-def test_nothing_is_served_when_others_can_reach_the_hidden_master(start: Any) -> None:
-    """When the probe gets through at the start, the start fails, says what is open, and lets no node in."""
+def test_no_service_while_the_hidden_master_is_reachable(start: Any) -> None:
+    """When the probe succeeds at the start, the start fails, names the open port, and admits no node."""
     running = start("leaky")
     assert running.process.wait() == 1
     assert running.process.wait_for(event="refused")["reason"] == "ROSMaster can be reached by another user"
@@ -354,28 +356,28 @@ def test_each_process_has_a_user_of_its_own_and_no_privilege(common: Running) ->
 
 
 def test_the_supervisor_keeps_few_capabilities(common: Running) -> None:
-    """As root: what it has no use for (kernel modules, raw memory, clock …) it cannot do."""
+    """As root: it lacks unneeded capabilities (kernel modules, raw memory, clock …)."""
     need_root()
-    allowed = sum(1 << number for number in SUPERVISORS.values())
+    allowed = sum(1 << number for number in SUPERVISOR_CAPABILITIES.values())
     status = _status(common.process.pid)
     for name in ("CapEff", "CapPrm", "CapBnd", "CapInh", "CapAmb"):
         assert int(status[name], 16) & ~allowed == 0
 
 
 def test_the_signer_has_no_network(common: Running) -> None:
-    """As root: the signer is alone in a network namespace of its own."""
+    """As root: the signer is alone in a network namespace."""
     need_root()
     own = Path(f"/proc/{os.getpid()}/ns/net").readlink()
     assert Path(f"/proc/{common.living('signer')}/ns/net").readlink() != own
     assert Path(f"/proc/{common.living('relay')}/ns/net").readlink() == own
 
 
-def test_each_part_of_the_state_is_its_owners_only(common: Running) -> None:
-    """Nobody can look around in the state directory, and each part is closed to the other roles."""
+def test_each_part_of_the_state_is_private(common: Running) -> None:
+    """No role can list the state directory, and each part is closed to the other roles."""
     assert stat.S_IMODE(common.state.stat().st_mode) == 0o711
     for part in ("control", "relay", "signer", "rosmaster"):
         found = (common.state / part).stat()
-        # The audit log is readable for the api's group, which may pass through control's part and not look around.
+        # The audit log is readable for the api's group, which may traverse control's part but not list it.
         assert stat.S_IMODE(found.st_mode) == (0o2710 if part == "control" and os.geteuid() == 0 else 0o700)
         assert str(found.st_uid) == _status(common.living(part))["Uid"].split()[0]
     assert stat.S_IMODE((common.state / "admin.sock").stat().st_mode) == 0o600
@@ -391,7 +393,7 @@ def test_a_child_has_only_the_files_it_was_given(common: Running) -> None:
 
 
 def test_the_hidden_master_listens_on_loopback_only(common: Running) -> None:
-    """ROSMaster's port is not reachable by any other address of the machine."""
+    """rosmaster's port is not reachable by any other address of the machine."""
     port = json.loads((common.state / "run" / "config.json").read_text())["rosmaster_port"]
     listening = Path(f"/proc/{common.living('rosmaster')}/net/tcp").read_text().splitlines()
     addresses = {row.split()[1] for row in listening[1:] if row.split()[3] == "0A"}

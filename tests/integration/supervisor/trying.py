@@ -1,4 +1,4 @@
-"""What somebody would try who took over a process: run as its user, in its walls, and told as JSON."""
+"""Attempts of an attacker who took over a process: run as its user, in its sandbox, with results as JSON."""
 
 import ctypes
 import errno
@@ -13,42 +13,41 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from appliance.supervisor.sandbox.seccomp import LIBRARY
-from appliance.supervisor.sandbox.system_calls import FORBIDDEN
+from appliance.supervisor.sandbox.seccomp import FORBIDDEN, LIBRARY
 
 FAMILIES = ("AF_UNIX", "AF_INET", "AF_INET6", "AF_NETLINK", "AF_PACKET", "AF_ALG", "AF_VSOCK", "AF_BLUETOOTH")
 _KINDS = {"AF_NETLINK": socket.SOCK_RAW, "AF_PACKET": socket.SOCK_RAW, "AF_ALG": socket.SOCK_SEQPACKET}
 NEW_USER = 0x10000000
-DIVIDES = bytes.fromhex(  # a module with a memory, and a function `divide` of two integers of 32 bits
+DIVIDES = bytes.fromhex(  # a module with a memory, and a function `divide` of two 32-bit integers
     "0061736d01000000010701 60027f7f017f 03020100 0503010001"
     "0713 02 06 6d656d6f7279 0200 06 646976696465 0000 0a0901 0700200020016d0b"
 )
 _PTRACE_ATTACH = 16
-_ENDS_THE_TRIAL = {"reboot", "vhangup"}  # outside of the walls these would do something
+_ENDS_THE_TRIAL = {"reboot", "vhangup"}  # without the sandbox these would have an effect
 
 
 def main(*_given: Any) -> None:
-    """The entry of a role's stand-in: try everything the file `trial` of its part asks for."""
+    """Make every attempt in the file `trial` of the role's part; the entry of a role's actor."""
     told = sys.stderr  # the launcher has put standard output there
     told.write(json.dumps(tried(json.loads(Path("trial").read_text()))) + "\n")
     told.flush()
 
 
 def run_modules(*_given: Any) -> None:
-    """The entry of a relay's stand-in: run modules, the second when the first has long been at work, and tell of it."""
-    from rosmop.fast.wasm_instance import Machine, MachineTrap, translated  # noqa: PLC0415  within the walls, as a relay loads it
+    """Run modules, the second one much later than the first, and report; the entry of a relay's actor."""
+    from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translated  # noqa: PLC0415  within the sandbox, as a relay loads it
 
     told: dict[str, Any] = {"before": len(_executable()), "results": [], "traps": []}
     machines = []
     for _ in range(2):
-        one = Machine(translated(DIVIDES, 1 << 24), 1 << 24)
+        one = WasmInstance(translated(DIVIDES, 1 << 24), 1 << 24)
         machines.append(one)
         one.reserve(1 << 24)
         one.memory[-1] = 1
         told["results"].append(one.call("divide", 42, 6, fuel=100))
         try:
             one.call("divide", 1, 0, fuel=100)
-        except MachineTrap as trap:
+        except WasmTrap as trap:
             told["traps"].append(trap.reason)
     told["executable"] = _executable()
     told["threads"] = len(list(Path("/proc/self/task").iterdir()))
@@ -57,13 +56,13 @@ def run_modules(*_given: Any) -> None:
 
 
 def _executable() -> list[str]:
-    """The protection of each range of memory that is no file's and may be executed."""
+    """Return the protection of each executable range of anonymous memory."""
     lines = [line.split(maxsplit=5) for line in Path("/proc/self/maps").read_text().splitlines()]
     return [parts[1] for parts in lines if "x" in parts[1] and (len(parts) < 6 or "w" in parts[1])]
 
 
 def tried(wanted: dict[str, Any]) -> dict[str, Any]:
-    """What comes of each attempt: "done", or the name of the error."""
+    """Return the result of each attempt: "done", or the name of the error."""
     return {
         "calls": {name: _call(name) for name in FORBIDDEN if name not in _ENDS_THE_TRIAL},
         "new namespace": _new_namespace(),
@@ -103,7 +102,7 @@ def _connect(port: int) -> None:
 
 
 def _call(name: str) -> str:
-    """A call of the kernel without arguments; one that this machine does not have is not tried."""
+    """Make a system call without arguments; one that this machine lacks is not tried."""
     number = ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(name.encode())
     if number < 0:
         return "not there"
@@ -116,7 +115,7 @@ def _call(name: str) -> str:
 
 
 def _new_namespace() -> str:
-    """By `clone`, as unshare is among the calls: with a namespace of users everything else would be open."""
+    """Use `clone`, as unshare is among the calls: in a user namespace everything else would be open."""
     number = ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(b"clone")
     libc = ctypes.CDLL(None, use_errno=True)
     arguments = (NEW_USER | signal.SIGCHLD, 0, 0, 0, 0)
@@ -141,7 +140,7 @@ def _run(program: str) -> None:
 
 
 def _execute_later() -> None:
-    """What compiled code needs: memory that is written first, and executable then."""
+    """Write memory, then execute it, as compiled code needs."""
     libc = ctypes.CDLL(None, use_errno=True)
     libc.mmap.restype = ctypes.c_void_p
     private_anonymous = 0x22

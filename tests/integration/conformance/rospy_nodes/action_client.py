@@ -1,4 +1,4 @@
-"""An actionlib client of actionlib/Test: one goal that is reached, one that is cancelled."""
+"""Use actionlib/Test as a client: one goal that is reached, one that is cancelled."""
 
 import sys
 import threading
@@ -9,11 +9,12 @@ sys.path.insert(0, str(Path(__file__).parents[3] / "support" / "rospy_nodes"))
 import actionlib
 import rospy
 from actionlib.msg import TestAction, TestGoal
+from actionlib_msgs.msg import GoalStatus
 from report import init_node, report
 
 
 def main():
-    """Ask, report, end."""
+    """Send the goals, report, end."""
     init_node("action_client")
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     client = actionlib.SimpleActionClient("count", TestAction)
@@ -25,6 +26,10 @@ def main():
     client.send_goal(
         TestGoal(goal=100000), feedback_cb=lambda given: (feedback.append(given.feedback), begun.set())
     )
+    # Feedback may overtake the status. If a client cancels before it knows that its goal is accepted, an older status
+    # without the goal makes actionlib's client say LOST. Its active_cb is not called if the status is very fast.
+    while client.get_state() != GoalStatus.ACTIVE and not rospy.is_shutdown():
+        rospy.sleep(0.01)
     begun.wait(30)
     client.cancel_goal()
     client.wait_for_result()

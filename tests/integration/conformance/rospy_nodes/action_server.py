@@ -1,4 +1,4 @@
-"""An actionlib server of actionlib/Test: counts to the goal with feedback, and can be cancelled in between."""
+"""Serve actionlib/Test: count to the goal with feedback; a goal can be cancelled."""
 
 import sys
 from pathlib import Path
@@ -12,11 +12,11 @@ from report import init_node, report
 
 
 def main():
-    """Serve until told to end; a goal over 100 goes on until it is cancelled."""
+    """Serve until terminated; a goal over 100 goes on until it is cancelled."""
     init_node("action_server")
 
     def work(goal):
-        # The client sees its connections before this side has them: what is published in between reaches nobody.
+        # The client sees its connections before this side has them: messages in between reach no subscriber.
         heard = (server.action_server.feedback_pub, server.action_server.result_pub)
         while not all(topic.get_num_connections() for topic in heard) and not rospy.is_shutdown():
             rospy.sleep(0.01)

@@ -1,4 +1,4 @@
-"""A rospy node that works with topics as told on standard input, one JSON object per line.
+"""Work with topics by orders on standard input, one JSON object per line.
 
 {"do": "subscribe" | "unsubscribe" | "advertise" | "unadvertise" | "publish" | "abandoned", "topic": T, "text": X,
 "latch": B},
@@ -17,13 +17,13 @@ from std_msgs.msg import String
 
 
 class Orders:
-    """What it subscribed to and publishes."""
+    """The subscriptions and publications."""
 
     def __init__(self):
         self.subscribers, self.publishers = {}, {}
 
     def subscribe(self, told):
-        """Report every message with the node it is from."""
+        """Report every message with its publisher."""
 
         def heard(message):
             report(
@@ -40,7 +40,7 @@ class Orders:
         self.subscribers.pop(told["topic"]).unregister()
 
     def abandoned(self, told):
-        """Wait until it is connected to nobody: rospy takes a publisher that comes back before that for the old one."""
+        """Wait until it has no connection: rospy takes a publisher that returns earlier for the old one."""
         subscriber = self.subscribers[told["topic"]]
         for _ in range(3000):
             if not subscriber.get_num_connections():
@@ -63,12 +63,12 @@ class Orders:
         self.publishers[told["topic"]].publish(told["text"])
 
     def log(self, told):
-        """Tell rosout."""
+        """Log to rosout."""
         rospy.logwarn(told["text"])
 
 
 def main():
-    """Do what each line says."""
+    """Carry out each line."""
     init_node("orders")
     orders = Orders()
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())

@@ -1,6 +1,6 @@
-"""The walls of each process, tried from inside: as the role's user, in the very walls that its row asks for.
+"""The sandbox of each process, tested from inside: as the role's user, with the settings of its row.
 
-The same is tried by the same user outside of any wall, so that a refusal says something of the walls.
+The same user makes the same attempts without a sandbox, so that a refusal is due to the sandbox.
 """
 
 import json
@@ -19,7 +19,7 @@ import pytest
 
 from appliance.channel.channel import Channel
 from appliance.channel.messages import Lifeline, Walled
-from appliance.supervisor.process_slot import Post
+from appliance.supervisor.process_slot import ProcessSlot
 from appliance.supervisor.roles import Facts, Role, roles_of
 from appliance.supervisor.sandbox import landlock
 from appliance.supervisor.state_directory import StateDirectory
@@ -36,7 +36,7 @@ UNIX, NETWORK, ROUTES = (
     ["AF_UNIX", "AF_INET", "AF_INET6"],
     ["AF_UNIX", "AF_INET", "AF_INET6", "AF_NETLINK"],
 )
-# What each may do of what not all may: families of sockets, listening, connecting to the two ports of the test.
+# Rights that differ by role: families of sockets, listening, connecting to the two ports of the test.
 MAY = {
     "rosmaster": (ROUTES, False, [True, True]),
     "signer": (UNIX, False, [False, False]),
@@ -63,11 +63,11 @@ PROGRAMS = {"rosmaster", "rosout", "charon"}
 
 @pytest.fixture(scope="module")
 def place() -> Iterator["Place"]:
-    """A state directory, two listening ports, and a file that everybody may read and write."""
+    """Provide a state directory, two listening ports, and a file that every user may read and write."""
     need_root()
     needs(landlock.version() >= landlock.SIGNALS, "a kernel with Landlock 6")
-    # Not pytest's folder: that is closed to the users of the processes.
-    with tempfile.TemporaryDirectory(prefix="rosrv-walls-") as name:
+    # pytest's folder is closed to the users of the processes
+    with tempfile.TemporaryDirectory(prefix="rosrv-sandbox-") as name:
         directory = Path(name)
         directory.chmod(0o755)
         with Place(directory) as place:
@@ -75,7 +75,7 @@ def place() -> Iterator["Place"]:
 
 
 class Place:
-    """What the roles are started in."""
+    """The surroundings that the roles are started in."""
 
     def __init__(self, directory: Path) -> None:
         self.roles = {role.name: role for role in roles_of(syslog=True, recorder=True)}
@@ -99,7 +99,7 @@ class Place:
         self.state.close()
 
     def trial(self, role: Role, pid: int) -> dict[str, Any]:
-        """What is to be tried as this role, written where it finds it."""
+        """Write the attempts of this role to the file where it finds them."""
         part = self.state.path / role.part
         (self.theirs / "new").unlink(missing_ok=True)
         wanted = {
@@ -118,15 +118,15 @@ class Place:
         return wanted
 
     def inside(self, role: Role, entry: str = "main") -> tuple[dict[str, Any], Walled]:
-        """What this function of `trying` tells from the role's walls, and what the process says of them."""
+        """Return the results of this function of `trying` inside the role's sandbox, and the process's own report."""
         here, there = socket.socketpair()
         facts = Facts(
             self.state.path, self.state.config, self.ports[0], "http://127.0.0.1:1", syslog_port=self.ports[0]
         )
-        plan = Post(role, 0).plan(facts, there.fileno())
-        walls = replace(plan.walls, reads=(*plan.walls.reads, str(ROOT)))
+        plan = ProcessSlot(role, 0).plan(facts, there.fileno())
+        sandbox = replace(plan.sandbox, reads=(*plan.sandbox.reads, str(ROOT)))
         plan = msgspec.structs.replace(
-            plan, walls=walls, argv=(), entry=f"{trying.__name__}:{entry}", secret=None
+            plan, sandbox=sandbox, argv=(), entry=f"{trying.__name__}:{entry}", secret=None
         )
         with here, there:
             done = subprocess.run(
@@ -140,7 +140,7 @@ class Place:
         return json.loads(done.stderr.splitlines()[-1]), said
 
     def outside(self, role: Role, account: Account) -> dict[str, Any]:
-        """What comes of it for the same user without walls."""
+        """Return the results for the same user without a sandbox."""
         done = subprocess.run(
             [sys.executable, "-P", "-m", trying.__name__],
             user=account.uid, group=account.gid, extra_groups=[], env={"PYTHONPATH": str(ROOT)},
@@ -151,8 +151,8 @@ class Place:
 
 
 @pytest.mark.parametrize("name", MAY)
-def test_what_is_forbidden_is_refused_from_inside(place: Place, name: str) -> None:
-    """Every role is refused what it does not need, by its walls, not for want of privileges; it may what it needs."""
+def test_the_sandbox_denies_forbidden_calls(place: Place, name: str) -> None:
+    """The sandbox denies every role what it does not need, independent of privileges, and allows the rest."""
     role = place.roles[name]
     account = account_of(role.user, role.group)
     families, listens, connects = MAY[name]
@@ -172,8 +172,8 @@ def test_what_is_forbidden_is_refused_from_inside(place: Place, name: str) -> No
     assert {
         call: outcome for call, outcome in found["calls"].items() if outcome not in ("EPERM", "not there")
     } == {}
-    by_the_walls = {call for call in found["calls"] if outside["calls"][call] != found["calls"][call]}
-    assert by_the_walls >= {
+    by_the_sandbox = {call for call in found["calls"] if outside["calls"][call] != found["calls"][call]}
+    assert by_the_sandbox >= {
         "ptrace",
         "unshare",
         "setns",
@@ -201,11 +201,11 @@ def test_what_is_forbidden_is_refused_from_inside(place: Place, name: str) -> No
     assert [one == "done" for one in found["write"].values()] == [True, False, False, True]
     assert found["signal"] == "EPERM"
     for what in ("read", "write"):
-        assert set(outside[what].values()) == {"done"}, "its user may, without the walls"
+        assert set(outside[what].values()) == {"done"}, "allowed to its user without the sandbox"
 
 
-def test_a_relay_runs_modules_within_its_walls(place: Place) -> None:
-    """Also one that comes later: their code is memory that may be executed and not written, and starts no thread."""
+def test_a_relay_runs_modules_in_its_sandbox(place: Place) -> None:
+    """Also a later module runs: its code is in memory that is executable and not writable, and starts no thread."""
     found, said = place.inside(place.roles["relay"], "run_modules")
     assert said == Walled("listed", landlock.version(), [])
     assert (found["results"], found["traps"]) == ([7, 7], ["integer division by zero"] * 2)
@@ -214,43 +214,36 @@ def test_a_relay_runs_modules_within_its_walls(place: Place) -> None:
     assert found["threads"] == 1
 
 
-@pytest.fixture(scope="module")
-def running() -> Iterator[Appliance]:
-    """An appliance with REST."""
-    need_root()
-    with Appliance(options=("--api", "127.0.0.1:0")) as running:
-        yield running
+def test_status_shows_the_sandbox(appliance: Appliance) -> None:
+    """`rosrv status` and REST show the sandbox of each process; nothing is missing on this kernel.
 
-
-def test_status_shows_the_walls(running: Appliance) -> None:
-    """`rosrv status` and REST say of each process what it is in; nothing is lacking on this kernel.
-
-    A relay that has taken a specification has the runtime of its module, and no memory to write code into.
+    A relay with a specification has the runtime of its module, and no writable memory for code.
     """
     needs(landlock.version() >= landlock.SIGNALS, "a kernel with Landlock 6")
-    rows = running.processes()
-    rest = {row["role"]: row for row in running.rest().get("/v1/status").json["processes"]}
-    specification = running.directory / "count.rv"
+    rows = appliance.processes()
+    rest = {row["role"]: row for row in appliance.rest().get("/v1/status").json["processes"]}
+    specification = appliance.directory / "count.rv"
     specification.write_text("count() { int n = 0; event said() /chatter std_msgs/String '{}' { n++; } }\n")
-    running.rosrv("monitor", "load", str(specification))
+    appliance.rosrv("monitor", "load", str(specification))
     memory = Path(f"/proc/{rows['relay']['pid']}/maps").read_text()
+    appliance.rosrv("monitor", "remove", "count")
     abi = landlock.version()
     for name in ("signer", "relay", "control", "api"):
-        assert (rows[name]["walls"], rows[name]["lacks"]) == (f"listed calls, Landlock {abi}", [])
-        assert rest[name]["walls"] == rows[name]["walls"]
+        assert (rows[name]["sandbox"], rows[name]["lacks"]) == (f"listed calls, Landlock {abi}", [])
+        assert rest[name]["sandbox"] == rows[name]["sandbox"]
     for name in ("rosmaster", "rosout"):
-        assert (rows[name]["walls"], rows[name]["lacks"]) == (f"usual calls, Landlock {abi}", [])
-    assert rows["supervisor"]["walls"] == ""
-    assert "_libwasmtime.so" in memory, "the specification has become a module"
+        assert (rows[name]["sandbox"], rows[name]["lacks"]) == (f"usual calls, Landlock {abi}", [])
+    assert rows["supervisor"]["sandbox"] == ""
+    assert "_libwasmtime.so" in memory, "the specification is compiled to a module"
     assert not [line for line in memory.splitlines() if "w" in line.split()[1] and "x" in line.split()[1]]
 
 
-def test_status_shows_how_the_relay_sends(running: Appliance) -> None:
-    """As its own user it gets cubic where the kernel lets everybody have it, else reno."""
+def test_status_shows_the_relays_congestion_control(appliance: Appliance) -> None:
+    """Its user gets cubic where the kernel allows it for all users, else reno."""
 
     def congestion() -> str:
-        said: str = running.processes()["relay"]["congestion"]
+        said: str = appliance.processes()["relay"]["congestion"]
         return said
 
     allowed = Path("/proc/sys/net/ipv4/tcp_allowed_congestion_control").read_text().split()
-    assert eventually(congestion, running.story) == ("cubic" if "cubic" in allowed else "reno")
+    assert eventually(congestion, appliance.story) == ("cubic" if "cubic" in allowed else "reno")

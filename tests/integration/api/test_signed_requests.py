@@ -1,4 +1,4 @@
-"""Signed orders over REST: by `rosrv`, by a script, and what becomes of those that somebody in between touched."""
+"""Signed requests over REST: by `rosrv`, by a script, and manipulated on the way."""
 
 import json
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ from tests.support.waiting import eventually
 
 @pytest.fixture(scope="module")
 def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """An appliance that takes no change for a bare token."""
+    """Run an appliance that accepts no change with a bare token."""
     config = tmp_path_factory.mktemp("strict") / "appliance.yaml"
     config.write_text("api_require_proof: true\n")
     with Appliance(options=("--api", "127.0.0.1:0", "--config", str(config))) as appliance:
@@ -23,7 +23,7 @@ def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 
 
 class Holder:
-    """Somebody who holds a token and shows it to nobody, as a script of his would be written."""
+    """A user's script that holds a token and never sends it."""
 
     def __init__(self, appliance: Appliance) -> None:
         whole = appliance.rest()
@@ -32,7 +32,7 @@ class Holder:
         self.rest = whole.with_token(reading_key(self.token))
 
     def signed(self, method: str, target: str, body: bytes, headers: dict[str, str]) -> dict[str, str]:
-        """The headers of an order, with its proof."""
+        """Return the headers of a request, with its proof."""
         challenge = self.rest.get("/v1/challenge").json["challenge"]
         stated = statement(
             challenge,
@@ -45,18 +45,18 @@ class Holder:
         return headers | {HEADER: proof_of(self.token, challenge, stated)}
 
     def load(self, text: str, target: str = "/v1/policy") -> tuple[dict[str, str], Answer]:
-        """Load a policy; what was sent, and the answer."""
+        """Load a policy; return the request and the answer."""
         headers = self.signed("POST", target, text.encode(), {"If-Match": "*", "Content-Type": "text/plain"})
         return headers, self.rest.request("POST", target, text.encode(), headers)
 
 
 def revisions(rest: Rest) -> int:
-    """The revision in force."""
+    """Return the revision in force."""
     return int(rest.get("/v1/policy").json["revision"])
 
 
-def test_a_script_changes_a_policy_and_shows_its_token_to_nobody(running: Appliance) -> None:
-    """A signed order is carried out, under the token's name; without the proof the same request is refused."""
+def test_a_script_changes_a_policy_without_sending_its_token(running: Appliance) -> None:
+    """A signed request is carried out under the token's name; without the proof it is refused."""
     holder = Holder(running)
     text = running.policy_file.read_text() + "\n# signed\n"
     _headers, answer = holder.load(text)
@@ -66,8 +66,8 @@ def test_a_script_changes_a_policy_and_shows_its_token_to_nobody(running: Applia
     assert (bare.status, "needs its proof" in bare.json["detail"]) == (403, True)
 
 
-def test_what_somebody_in_between_does_to_an_order_is_refused_and_recorded(running: Appliance) -> None:
-    """Sent twice, with another text, address, condition or as another call: 403, and recorded."""
+def test_a_manipulated_request_is_refused_and_recorded(running: Appliance) -> None:
+    """Replayed, or with another text, address, condition or call: 403, and recorded."""
     holder = Holder(running)
     text = running.policy_file.read_text() + "\n# once\n"
     used, answer = holder.load(text, "/v1/policy?confirm_within=600")
@@ -96,7 +96,7 @@ def test_what_somebody_in_between_does_to_an_order_is_refused_and_recorded(runni
 
 
 def test_a_proof_does_not_outlive_rvmaster(running: Appliance) -> None:
-    """An order that was signed, seen and kept back is refused after RVMaster was killed and is back."""
+    """A signed request that was intercepted and withheld is refused after a crash of RVMaster."""
     holder = Holder(running)
     text = running.policy_file.read_text() + "\n# kept back\n"
     kept_back = holder.signed(
@@ -109,7 +109,7 @@ def test_a_proof_does_not_outlive_rvmaster(running: Appliance) -> None:
 
 
 def run(appliance: Appliance, *arguments: str) -> dict[str, Any]:
-    """A verb over REST, whose command must succeed; its answer."""
+    """Run a verb over REST, which must succeed, and return its output."""
     certificate = appliance.state / "api" / "certificate.pem"
     place = ("--api", str(appliance.ready["api"]), "--api-ca", str(certificate))
     done = rosrv(*arguments, "--json", *place, ROSRV_TOKEN=appliance.token)
@@ -118,8 +118,8 @@ def run(appliance: Appliance, *arguments: str) -> dict[str, Any]:
     return answer
 
 
-def test_where_proofs_are_required_a_bare_token_only_looks(strict: Appliance) -> None:
-    """Every change by a bare token is 403 with what to do; looks are as before; `rosrv` over REST works as ever."""
+def test_with_required_proofs_a_bare_token_only_reads(strict: Appliance) -> None:
+    """Every change with a bare token is 403 with the remedy; reading and `rosrv` over REST work as before."""
     rest = strict.rest()
     text = strict.policy_file.read_text()
     for method, path, body in (

@@ -1,4 +1,6 @@
-"""Floods of records from guests and strangers, while the robot works: the log stays small and keeps what counts."""
+"""Floods of records from guests and unknown hosts, while the robot works: the log stays small and complete where it
+matters.
+"""
 
 import xmlrpc.client
 from collections.abc import Iterator
@@ -12,14 +14,14 @@ from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs
 from tests.support.siege import Siege
 
-SLOW = 1.0  # seconds for a call of the robot in a flood, on a machine that does nothing else
+SLOW = 1.0  # seconds for a call of the robot during a flood, on an idle machine
 PARTS = 9000
 LONG = "k" * 900
 
 
 @pytest.fixture(scope="module")
 def siege(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
-    """A robot at work, and a crowd that has not begun."""
+    """Start a robot at work, and a crowd that has not begun."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-test") as lab, Siege(lab, tmp_path_factory.mktemp("siege"), "relays: 2\n") as there:
@@ -27,20 +29,20 @@ def siege(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
 
 
 def log_bytes(siege: Siege) -> int:
-    """What the log takes on the disk."""
+    """Return the size of the log on disk."""
     return sum(one.stat().st_size for one in (siege.appliance.state / "control").glob("audit.db*"))
 
 
 def reads(prefix: str) -> list[dict[str, Any]]:
-    """The parts of a multicall that reads many parameters with long names, each another one."""
+    """Return the parts of a multicall that reads many different parameters with long names."""
     return [
         {"methodName": "hasParam", "params": ["/flooder", f"/{prefix}{number}/{LONG}"]}
         for number in range(PARTS)
     ]
 
 
-def test_reads_with_long_keys_fill_no_disk(siege: Siege) -> None:
-    """A guest that reads without end is served its share of the log and then refused in words; the robot is not."""
+def test_reads_with_long_keys_do_not_fill_the_disk(siege: Siege) -> None:
+    """A guest that reads without end gets its quota of the log, and is then refused with a reason; the robot is not."""
     guest, before = siege.crowd.guests[0], log_bytes(siege)
     denied = siege.crowd.call(guest, "setParam", "/flooder", "/limits/speed", 1)
     assert denied[0] == 0
@@ -59,8 +61,8 @@ def test_reads_with_long_keys_fill_no_disk(siege: Siege) -> None:
     assert siege.appliance.recorded("--deny", host=guest)[-1]["detail"]["key"] == "/limits/speed"
 
 
-def test_the_same_read_again_is_counted(siege: Siege) -> None:
-    """A node that polls a parameter leaves its first read, and a count every ten seconds."""
+def test_repeated_reads_are_counted(siege: Siege) -> None:
+    """A node that polls a parameter leaves one record of its first read, and a count every ten seconds."""
     guest = siege.crowd.guests[1]
     part = {"methodName": "hasParam", "params": ["/poller", "/rosdistro"]}
     answer = siege.crowd.call(guest, "system.multicall", [part] * 2000)
@@ -70,12 +72,14 @@ def test_the_same_read_again_is_counted(siege: Siege) -> None:
     assert summed["decision"] == "allow"
 
 
-def test_strangers_push_no_denial_of_a_named_host_out(siege: Siege) -> None:
-    """A hundred strangers who vary all they can make few records; each denial of a named host is there in full."""
-    strangers, guest = siege.crowd.strangers, siege.crowd.guests[2]
+def test_unknown_hosts_do_not_displace_denials_of_named_hosts(siege: Siege) -> None:
+    """A hundred unknown hosts with varying requests cause few records; each denial of a named host is logged in
+    full.
+    """
+    unknown_hosts, guest = siege.crowd.unknown_hosts, siege.crowd.guests[2]
     for turn in range(4):
-        for number, stranger in enumerate(strangers):
-            fault = siege.crowd.call(stranger, f"call{turn}x{number}", "/n", turn)
+        for number, unknown in enumerate(unknown_hosts):
+            fault = siege.crowd.call(unknown, f"call{turn}x{number}", "/n", turn)
             assert isinstance(fault, xmlrpc.client.Fault | Exception)
     topics = [f"/cmd{number}" for number in range(50)]
     for topic in topics:
@@ -87,9 +91,11 @@ def test_strangers_push_no_denial_of_a_named_host_out(siege: Siege) -> None:
         )
     records = siege.appliance.recorded("--deny", "--host", guest, count=len(topics))
     assert {one["resource"] for one in records if one["event"] == "decision"} >= set(topics)
-    of_strangers = [
-        one for one in siege.appliance.audit("--deny", "--limit", "10000") if one["detail"].get("stranger")
+    of_unknown_hosts = [
+        one
+        for one in siege.appliance.audit("--deny", "--limit", "10000")
+        if one["detail"].get("unknown_host")
     ]
     assert (
-        0 < len(of_strangers) <= 2 * AUDIT_KINDS.bounds.strangers
+        0 < len(of_unknown_hosts) <= 2 * AUDIT_KINDS.bounds.unknown
     )  # on a slow machine a second period begins

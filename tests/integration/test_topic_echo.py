@@ -1,14 +1,12 @@
-"""Looking into the topics of real nodes: over the command line and REST, by whom it is for, and on record."""
+"""Echo topics of real nodes by command and over REST, by role, with a record."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.support.appliance import Appliance
-from tests.support.nodes import Client, RosSession, has_ros
-from tests.support.requirements import needs
+from tests.support.nodes import Client, RosSession
 from tests.support.waiting import eventually
 
 MONITOR = """
@@ -18,37 +16,22 @@ censor() {
 """
 
 
-@pytest.fixture(scope="module")
-def appliance() -> Iterator[Appliance]:
-    """An appliance with REST and no monitors yet; each test has topics of its own."""
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with Appliance(options=("--api", "127.0.0.1:0")) as appliance:
-        yield appliance
-
-
-@pytest.fixture
-def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
-    """Nodes of one test."""
-    with RosSession(appliance.master_uri, tmp_path) as session:
-        yield session
-
-
 def echoed(appliance: Appliance, *arguments: str) -> list[dict[str, object]]:
-    """What `rosrv topic echo --json` shows."""
+    """Return the output of `rosrv topic echo --json`."""
     done = appliance.rosrv("topic", "echo", *arguments, "--json")
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
 @pytest.mark.parametrize("client", ["rospy", "roscpp"])
-def test_what_subscribers_get_is_shown_and_recorded(
+def test_echo_shows_the_subscribers_messages_and_is_recorded(
     appliance: Appliance, ros: RosSession, client: Client, tmp_path: Path
 ) -> None:
-    """Before and after a monitor changes it; nobody subscribes, and the publisher need not."""
+    """It shows messages before and after a monitor changes them, without being a subscriber."""
     topic = f"/{client}_chatter"
     ros.talker(client, topic, "--text", "word", name="voice").wait_for(event="ready")
     shown = echoed(appliance, topic, "-n", "3")
     assert [row["node"] for row in shown] == ["/voice"] * 3
-    echoed(appliance, topic)  # whoever looks on is not recorded again
+    echoed(appliance, topic)  # the same viewer is not recorded again
     assert all("word" in str(row["fields"]) for row in shown)
     [record] = appliance.recorded("--event", "topic looked into", "--topic", topic)
     assert record["detail"] == {"who": "operator", "seconds": 60.0}
@@ -56,17 +39,18 @@ def test_what_subscribers_get_is_shown_and_recorded(
     specification.write_text(MONITOR.replace("/TOPIC", topic))
     appliance.rosrv("monitor", "load", str(specification))
     assert "checked" in str(echoed(appliance, topic, "--field", "data")[0]["fields"])
+    appliance.rosrv("monitor", "remove", "censor")
 
 
 def test_a_latched_message_is_shown_once(appliance: Appliance, ros: RosSession) -> None:
-    """However many more are waited for; what comes after it is a new one."""
+    """It is shown once, however many more are awaited; a later message counts as new."""
     ros.talker("rospy", "/map", "--latch", "--count", "1", name="server").wait_for(event="ready")
     done = appliance.rosrv("topic", "echo", "/map", "-n", "3", "--seconds", "1", "--json", check=False)
     assert (done.returncode, len(done.stdout.splitlines())) == (1, 1)
 
 
 def test_over_rest_it_is_for_operators(appliance: Appliance, ros: RosSession) -> None:
-    """A viewer is told so; the answer names type, publishers and subscribers; bounds and unknown topics are refused."""
+    """A viewer is refused; the answer names type, publishers and subscribers; limits and unknown topics are errors."""
     ros.talker("rospy", "/chatter", name="voice").wait_for(event="ready")
     ros.listener("roscpp", "/chatter", name="ear").wait_for(event="ready")
     rest = appliance.rest()
@@ -83,10 +67,11 @@ def test_over_rest_it_is_for_operators(appliance: Appliance, ros: RosSession) ->
     assert len(body["messages"]) == 2
     assert rest.get("/v1/messages?topic=/nobody").status == 404
     assert rest.get("/v1/messages?topic=/chatter&messages=21").status == 422
+    appliance.rosrv("token", "revoke", "eve")
 
 
-def test_silence_ends_and_holds_nobody_up(appliance: Appliance, ros: RosSession) -> None:
-    """A topic that nobody publishes on: status 1 after the time; meanwhile others are answered."""
+def test_a_silent_topic_ends_and_blocks_no_other_request(appliance: Appliance, ros: RosSession) -> None:
+    """A silent topic ends with status 1 after the time; meanwhile other requests are answered."""
     ros.listener("roscpp", "/quiet", name="ear").wait_for(event="ready")
     eventually(
         lambda: appliance.rosrv("topic", "info", "/quiet", check=False).returncode == 0, lambda: "no topic"

@@ -1,7 +1,8 @@
-"""Two hundred addresses take all they can of what is finite, and the robot notices nothing.
+"""Two hundred addresses take all they can of every limited resource, and the robot does not notice.
 
-Each test attacks a row of docs/shares.md. A hundred guests may do everything below `/guest`; a hundred strangers may do
-nothing. Meanwhile the robot publishes, calls services and the master, starts a node, and the policy is read again.
+Each test attacks a row of docs/reference/quotas.md. A hundred guests may do everything below `/guest`; a hundred
+unknown hosts may do nothing. Meanwhile the robot publishes, calls services and the master, and starts a node, and the
+policy is reloaded.
 """
 
 import contextlib
@@ -27,20 +28,20 @@ relay: {connections: 3000, connections_per_host: 1500}
 limits: {parameter_bytes: 16777216}
 api: 10.77.0.2:8443
 api_networks: [10.77.0.0/16]
-"""  # less than by default, so that it is taken in seconds; strangers' and kept parts as by default or in proportion
+"""  # lower than by default, to reach the limits within seconds; quotas for unknown hosts and reserves in proportion
 LONG_HEADER = struct.pack("<I", 60_000) + bytes(50_000)  # of 60,000 bytes that never come
-SLOW = 1.0  # seconds for a call of the robot in a flood, on a machine that does nothing else
+SLOW = 1.0  # seconds for a call of the robot during a flood, on an idle machine
 
 
 def http_request(method: str, *parameters: str) -> bytes:
-    """A call as bytes."""
+    """Return a call as bytes."""
     body = xmlrpc.client.dumps(parameters, method).encode()
     return b"POST / HTTP/1.1\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body)
 
 
 @pytest.fixture(scope="module")
 def siege(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
-    """A robot at work, and a crowd that has not begun."""
+    """Start a robot at work, and a crowd that has not begun."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-test") as lab, Siege(lab, tmp_path_factory.mktemp("siege"), CONFIGURATION) as there:
@@ -49,19 +50,21 @@ def siege(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
 
 
 @pytest.fixture(autouse=True)
-def crowd_leaves(siege: Siege) -> Iterator[None]:
-    """Each attack begins with nobody."""
+def close_connections_first(siege: Siege) -> Iterator[None]:
+    """Start each attack without open connections."""
     yield
     siege.crowd.leave()
 
 
 def test_connections_of_two_hundred_addresses(siege: Siege) -> None:
-    """Idle connections to RVMaster, more than there are slots: twelve guests with a full share each, and everybody."""
+    """Open more idle connections to RVMaster than there are slots: twelve guests with a full quota each, and all
+    others.
+    """
     crowd = siege.crowd
 
     def attack() -> None:
         assert crowd.hold(crowd.guests[:12], 11311, each=520) > 4096
-        crowd.hold(crowd.strangers, 11311, each=20)
+        crowd.hold(crowd.unknown_hosts, 11311, each=20)
         crowd.hold(crowd.guests, 11311, each=10, data=b"POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\n<")
 
     siege.throughout(attack, slowest=SLOW)
@@ -69,20 +72,22 @@ def test_connections_of_two_hundred_addresses(siege: Siege) -> None:
 
 
 def test_requests_of_two_hundred_addresses(siege: Siege) -> None:
-    """Every guest asks on three connections, twice and without reading, and begins bodies that never end."""
+    """Send requests from every guest on three connections, twice and without reading, and begin endless bodies."""
     crowd = siege.crowd
     ask = http_request("getSystemState", "/guest/asker")
     begun = b"POST / HTTP/1.1\r\nContent-Length: 8000000\r\n\r\n" + bytes(60_000)
 
     def attack() -> None:
         crowd.hold(crowd.guests, 11311, each=3, data=ask * 2)
-        crowd.hold([*crowd.guests, *crowd.strangers], 11311, each=2, data=begun)
+        crowd.hold([*crowd.guests, *crowd.unknown_hosts], 11311, each=2, data=begun)
 
-    siege.throughout(attack, slowest=3 * SLOW)  # a thousand at once, behind which the first call stands
+    siege.throughout(attack, slowest=3 * SLOW)  # a thousand at once, ahead of the first call
 
 
 def test_connections_to_the_relay(siege: Siege) -> None:
-    """Guests take every place, served and not; strangers send half a header: who has a grant finds room."""
+    """Guests take every slot of the relay, served or not, and unknown hosts send half a header: permitted hosts
+    connect.
+    """
     crowd = siege.crowd
     port = max(crowd.subscribe(guest, "/guest/ear", "/voice", "/chatter") for guest in crowd.guests[:12])
     header = encode_header({
@@ -92,14 +97,14 @@ def test_connections_to_the_relay(siege: Siege) -> None:
     def attack() -> None:
         crowd.hold(crowd.guests[:12], port, each=20, data=header)
         assert crowd.hold(crowd.guests[:3], port, each=1200) > 3000
-        crowd.hold(crowd.strangers, port, each=5, data=header[:-1])
+        crowd.hold(crowd.unknown_hosts, port, each=5, data=header[:-1])
         crowd.hold(crowd.guests[12:], port, each=2, data=LONG_HEADER)
 
     siege.throughout(attack, slowest=SLOW)
 
 
 def test_handshakes_with_rest(siege: Siege) -> None:
-    """Five thousand connections that say nothing: who shows a token is served, and the process does not grow."""
+    """With five thousand silent connections, a client with a token is served, and the process does not grow."""
     crowd, rest = siege.crowd, siege.ocu.run(siege.appliance.rest)
     before = siege.memory("api")
 
@@ -110,9 +115,9 @@ def test_handshakes_with_rest(siege: Siege) -> None:
 
     def attack() -> None:
         crowd.hold(crowd.guests[:1], 8443, each=1000)
-        crowd.hold([*crowd.guests, *crowd.strangers], 8443, each=20)
+        crowd.hold([*crowd.guests, *crowd.unknown_hosts], 8443, each=20)
         assert max(looks() for _ in range(10)) < allowed(SLOW)
-        assert looks(siege.robot) < allowed(SLOW)  # whose first request it is
+        assert looks(siege.robot) < allowed(SLOW)  # its first request
 
     looks()
     siege.throughout(attack, slowest=SLOW)
@@ -121,7 +126,7 @@ def test_handshakes_with_rest(siege: Siege) -> None:
 
 
 def test_parameters_of_two_hundred_addresses(siege: Siege) -> None:
-    """Guests fill all that they can get, and read all of it again and again: the robot sets, overwrites and reads."""
+    """Guests set and read as many parameters as they can, repeatedly: the robot sets, overwrites and reads."""
     crowd, ending, trees = siege.crowd, threading.Event(), list[int]()
     large, small = "x" * (1 << 18), {f"p{number}": number for number in range(2750)}
 
@@ -134,8 +139,8 @@ def test_parameters_of_two_hundred_addresses(siege: Siege) -> None:
             assert answer[0] == 1 or "bytes of parameters" in answer[1]
             assert crowd.call(guest, "setParam", "/guest/n", f"/guest/{number % 30 & ~1}/map", large)[0] == 1
         assert refused > 50
-        for stranger in crowd.strangers[:20]:
-            answer = crowd.call(stranger, "setParam", "/guest/n", "/guest/stranger", 1)
+        for unknown in crowd.unknown_hosts[:20]:
+            answer = crowd.call(unknown, "setParam", "/guest/n", "/guest/unknown", 1)
             assert isinstance(answer, FaultReceived)
 
     def read(guest: str) -> None:
@@ -166,7 +171,7 @@ def test_parameters_of_two_hundred_addresses(siege: Siege) -> None:
 
 
 def test_ports_and_names(siege: Siege) -> None:
-    """Guests register nodes as long as they may, and then give up all they had: the robot's nodes still come."""
+    """Guests register as many nodes as they may, then unregister all: the robot's nodes still register."""
     crowd = siege.crowd
     with Impostor(crowd.host, answering([1, "", 4711]), address="0.0.0.0") as nodes:
 
@@ -189,9 +194,11 @@ def test_ports_and_names(siege: Siege) -> None:
                 taken.append(next(number for number in range(600) if not register(guest, number)))
 
         siege.throughout(attack, slowest=SLOW)
-        assert 1650 < sum(taken) <= 1750, "a node has three ports here, and guests three quarters of 7000"
+        assert 1650 < sum(taken) <= 1750, (
+            "a node has three ports here, and guests have three quarters of 7000"
+        )
         assert not register(crowd.guests[50], 0)
         for number in range(taken[0]):
             name, address, uri = each(crowd.guests[0], number)
             assert crowd.call(address, "unregisterPublisher", name, "/guest/topic", uri)[0] == 1
-        assert register(crowd.guests[50], 0), "who has nothing left did not make room at once"
+        assert register(crowd.guests[50], 0), "a host with nothing left did not free its slots at once"
