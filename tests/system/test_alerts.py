@@ -1,4 +1,4 @@
-"""The alert rules that are shipped, by Prometheus's own tool, and the scrape configuration by Prometheus itself."""
+"""Check the shipped alert rules with Prometheus's tool, and the scrape configuration with Prometheus itself."""
 
 import shutil
 import subprocess
@@ -10,7 +10,7 @@ FOLDER = Path(__file__).parents[2] / "examples" / "prometheus"
 
 
 def promtool(*arguments: str, folder: Path = FOLDER) -> subprocess.CompletedProcess[str]:
-    """Run it in the folder with the rules."""
+    """Run promtool in the folder with the rules."""
     program = shutil.which("promtool")
     assert program is not None, "promtool is missing: apt install prometheus (packages-system.txt)"
     return subprocess.run(
@@ -18,15 +18,15 @@ def promtool(*arguments: str, folder: Path = FOLDER) -> subprocess.CompletedProc
     )
 
 
-def test_the_rules_are_right() -> None:
-    """Prometheus takes the rules as they are."""
+def test_the_rules_are_valid() -> None:
+    """Prometheus accepts the rules unchanged."""
     done = promtool("check", "rules", "alerts.yaml")
     assert done.returncode == 0, done.stderr
     assert "SUCCESS" in done.stdout
 
 
-def test_the_scrape_configuration_is_right() -> None:
-    """Prometheus takes the scrape configuration as it is."""
+def test_the_scrape_configuration_is_valid() -> None:
+    """Prometheus accepts the scrape configuration unchanged."""
     done = promtool("check", "config", "--syntax-only", "prometheus.yml")
     assert done.returncode == 0, done.stderr
 
@@ -46,8 +46,8 @@ def test_each_alert_fires_when_it_should_and_not_before() -> None:
         ("rosrv_process_restarts_total[10m]", "rosrv_process_restarts_total[2m]"),
     ],
 )
-def test_the_cases_would_notice(tmp_path: Path, was: str, now: str) -> None:
-    """A rule that was changed for the worse does not pass its cases."""
+def test_the_cases_find_a_fault(tmp_path: Path, was: str, now: str) -> None:
+    """A rule with a fault fails its cases."""
     rules = (FOLDER / "alerts.yaml").read_text()
     assert was in rules
     (tmp_path / "alerts.yaml").write_text(rules.replace(was, now))

@@ -1,4 +1,4 @@
-"""`rosrv demo`, the first thing a newcomer runs: it works, tells the truth, and leaves nothing behind."""
+"""`rosrv demo`, a newcomer's first command, works, tells the truth, and leaves nothing behind."""
 
 import json
 import os
@@ -22,25 +22,25 @@ LIMIT = 280
 
 @pytest.fixture(autouse=True)
 def machine() -> None:
-    """The demonstration needs root and ROS."""
+    """Require root and ROS."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
 
 
 def present() -> set[str]:
-    """The namespaces and folders of demonstrations on this machine."""
+    """Return the namespaces and folders of demonstrations on this machine."""
     folders = {str(path) for path in Path("/tmp").glob("rosrv-demo-*")}
     return {namespace.name for namespace in namespaces("rosrv-demo.")} | folders
 
 
 @pytest.fixture
 def before() -> set[str]:
-    """What was there before this test."""
+    """Return those that existed before this test."""
     return present()
 
 
 def test_demo(tmp_path: Path, before: set[str]) -> None:
-    """The robot obeys its operator, every attack is refused by a rule, and the exit status says so."""
+    """The robot obeys only its operator, a rule denies every attack, and the exit status is 0."""
     picture = tmp_path / "drive.svg"
     command = [ROSRV, "demo", "--json", "--picture", str(picture)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
@@ -52,15 +52,15 @@ def test_demo(tmp_path: Path, before: set[str]) -> None:
     assert all(result["good"] and result["what"] and result["remark"] for result in results)
     assert "fired one shot" in said
     for line in (
-        "refused   take over the operator",
-        "refused   forge the trigger",
-        "refused   kill a node",
-        "refused   try every port",
-        "refused   go past the master",
+        "denied    take over the operator",
+        "denied    forge the trigger",
+        "denied    kill a node",
+        "denied    try every port",
+        "blocked   go past the master",
         "[Commands] default (landshark-demo.ini:",
         "allowed   watch the battery",
         "without a monitor the robot hits itself: 1 shot",
-        "with the monitor it does not: 0 shots",
+        "with the monitor it does not hit itself: 0 shots",
         "without a monitor it runs into the obstacle",
         "without a monitor it leaves its zone",
         "with the monitor it stops before the obstacle",
@@ -72,8 +72,8 @@ def test_demo(tmp_path: Path, before: set[str]) -> None:
     assert present() <= before
 
 
-def test_the_console_of_the_demo_is_reached_from_this_machine() -> None:
-    """The address that is printed answers on this machine, over TLS, to the token beside it."""
+def test_the_console_of_the_demo_is_reachable_from_this_machine() -> None:
+    """The printed address answers on this machine, over TLS, to the printed token."""
     with Process(ThisMachine(), [ROSRV, "demo"], env=os.environ, label="rosrv demo") as demo:
         demo.wait_for_text("A LandShark of unmodified", timeout=LIMIT)
         said = demo.story()
@@ -90,7 +90,7 @@ def test_the_console_of_the_demo_is_reached_from_this_machine() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
 def test_demo_interrupted(number: signal.Signals, before: set[str]) -> None:
-    """Interrupted in the middle, it ends at once and leaves no host, no process and no folder."""
+    """Interrupted, it ends at once and leaves no host, no process and no folder."""
     with Process(ThisMachine(), [ROSRV, "demo"], env=os.environ, label="rosrv demo") as demo:
         demo.wait_for_text("drove", timeout=LIMIT)
         assert demo.stop(with_signal=number, timeout=30) == 130, demo.story()
@@ -98,7 +98,7 @@ def test_demo_interrupted(number: signal.Signals, before: set[str]) -> None:
 
 
 def test_demo_without_root() -> None:
-    """Who is not root is told so, in words, before anything is started."""
+    """Without root, an error says so before anything starts."""
     command = ["/usr/bin/setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", ROSRV, "demo"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
     assert done.returncode == 1

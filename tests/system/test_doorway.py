@@ -1,4 +1,4 @@
-"""`examples.landshark.doorway`: a loopback port of this machine that comes out on a host of a lab."""
+"""Test `examples.landshark.doorway`: a loopback port of this machine that leads to a host of a lab."""
 
 import socket
 import threading
@@ -15,7 +15,7 @@ LIMIT = 30.0
 
 @pytest.fixture
 def host() -> Iterator[Host]:
-    """A host that this machine has no link to."""
+    """Return a host without a link to this machine."""
     need_root()
     with Lab("rosrv-door") as lab:
         yield lab.host("behind", "10.77.0.2/24")
@@ -23,7 +23,7 @@ def host() -> Iterator[Host]:
 
 @pytest.fixture
 def echo(host: Host) -> Iterator[tuple[str, int]]:
-    """A server on the host's loopback that sends back what it gets, until its peer ends."""
+    """Run an echo server on the host's loopback, until its peer ends."""
     listener = host.run(lambda: socket.create_server(("127.0.0.1", 0)))
 
     def serve() -> None:
@@ -46,7 +46,7 @@ def echo(host: Host) -> Iterator[tuple[str, int]]:
 
 
 def receive_all(connection: socket.socket) -> bytes:
-    """What comes until the other side ends."""
+    """Return all bytes until the other side ends."""
     pieces = []
     while piece := connection.recv(65536):
         pieces.append(piece)
@@ -54,7 +54,7 @@ def receive_all(connection: socket.socket) -> bytes:
 
 
 def test_bytes_pass_both_ways(host: Host, echo: tuple[str, int]) -> None:
-    """A megabyte goes in and comes back; the end of one direction is the end at the other side."""
+    """A megabyte goes in and comes back; the end of one direction is passed on."""
     sent = bytes(range(256)) * 4096
     with Doorway(host, echo) as door, socket.create_connection(("127.0.0.1", door.port), LIMIT) as client:
 
@@ -68,19 +68,19 @@ def test_bytes_pass_both_ways(host: Host, echo: tuple[str, int]) -> None:
         writer.join(LIMIT)
 
 
-def test_nobody_behind_it(host: Host) -> None:
-    """Where nothing listens the caller's connection ends, and the next is served again."""
+def test_no_listener_behind_it(host: Host) -> None:
+    """Without a listener the caller's connection ends, and a later one is served again."""
     unused = host.run(lambda: socket.create_server(("127.0.0.1", 0)))
     target = unused.getsockname()
     unused.close()
     with Doorway(host, target) as door:
-        for _ in range(CONNECTIONS + 1):  # none of them keeps its place
+        for _ in range(CONNECTIONS + 1):  # none of them keeps its slot
             with socket.create_connection(("127.0.0.1", door.port), LIMIT) as client:
                 assert client.recv(1) == b""
 
 
-def test_closing_ends_what_is_open(host: Host, echo: tuple[str, int]) -> None:
-    """The door shuts with its connections; afterwards nobody listens there."""
+def test_closing_ends_open_connections(host: Host, echo: tuple[str, int]) -> None:
+    """The doorway closes with its connections; afterwards its port is closed."""
     with Doorway(host, echo) as door:
         client = socket.create_connection(("127.0.0.1", door.port), LIMIT)
         client.sendall(b"hello")

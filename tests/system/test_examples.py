@@ -1,7 +1,7 @@
-"""The Ansible role and the cloud-init example, read by the programs they are for, in a Debian that is made for it.
+"""The Ansible role and the cloud-init example, run by their own programs in a Debian made for the test.
 
-Ansible carries the role out there, too: apt installs a package, files are checked by the real `rosrv` before they are
-in place. What is not there is systemd: a program in its place notes what it is asked, and `selftest` is only noted.
+Ansible carries out the role there: apt installs a package, and the real `rosrv` checks files before they are put in
+place. systemd is replaced by a program that logs its calls, and `selftest` is only logged.
 """
 
 import json
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.timeout(1200)  # the Debian is made
 
 @pytest.fixture(scope="module")
 def debian(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A tree with both programs and the examples."""
+    """Return a tree with both programs and the examples."""
     tree = make_base(
         tmp_path_factory.mktemp("debian") / "tree", ["ansible-core", "cloud-init", "python3-apt"]
     )
@@ -29,14 +29,14 @@ def debian(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def run(tree: Path, *command: str) -> str:
-    """What a program in the tree says; it must succeed."""
+    """Return the output of a program in the tree; it must succeed."""
     done = tried(tree, *command)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout + done.stderr
 
 
 def tried(tree: Path, *command: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """A program in the tree, with a /proc of its own, and this checkout where it is here, to read only."""
+    """Run a program in the tree, with its own /proc, and this checkout mounted read-only."""
     script = """
         tree=$1 root=$2; shift 2
         mount -t proc proc "$tree/proc"
@@ -66,8 +66,8 @@ def tried(tree: Path, *command: str, **environment: str) -> subprocess.Completed
     )
 
 
-def test_ansible_reads_the_role(debian: Path) -> None:
-    """Every task is of a module that there is, with parameters that are a task's."""
+def test_ansible_accepts_the_role(debian: Path) -> None:
+    """Every task uses an existing module with valid parameters."""
     said = run(debian, "ansible-playbook", "--syntax-check", "-i", "robots,", "/examples/ansible/site.yml")
     assert "playbook: /examples/ansible/site.yml" in said
     listed = run(debian, "ansible-playbook", "--list-tasks", "-i", "robots,", "/examples/ansible/site.yml")
@@ -92,7 +92,7 @@ echo "rosrv $1" >> /srv/asked
 """
 _CONTROL = """\
 Package: rosrv
-Version: 0.1.0
+Version: 0.2.0
 Architecture: all
 Maintainer: nobody <nobody@example.org>
 Description: a stand-in
@@ -101,7 +101,7 @@ _POLICY = "[Groups]\nvehicle = 10.0.0.5\n[Nodes]\ndefault = vehicle\n"
 
 
 class Robot:
-    """A robot's machine, as far as the role sees it; it and the machine that runs Ansible are one."""
+    """A robot's machine, as far as the role sees it; Ansible runs on the same machine."""
 
     def __init__(self, tree: Path) -> None:
         self.tree = tree
@@ -110,7 +110,7 @@ class Robot:
         self._write(package / "usr/bin/rosrv", _ROSRV, executable=True)
         self._write(package / "etc/rosrv/policies/default.ini", _POLICY)
         self._write(tree / "usr/bin/systemctl", _SYSTEMCTL, executable=True)
-        run(tree, "dpkg-deb", "--root-owner-group", "--build", "/srv/package", "/srv/rosrv_0.1.0_all.deb")
+        run(tree, "dpkg-deb", "--root-owner-group", "--build", "/srv/package", "/srv/rosrv_0.2.0_all.deb")
 
     @staticmethod
     def _write(path: Path, text: str, *, executable: bool = False) -> None:
@@ -119,11 +119,11 @@ class Robot:
         path.chmod(0o755 if executable else 0o644)
 
     def play(self, **given: object) -> tuple[subprocess.CompletedProcess[str], list[str]]:
-        """The playbook on this robot with these variables; and what systemd and `rosrv` were asked meanwhile."""
+        """Run the playbook on this robot with these variables; return the calls of systemd and `rosrv`."""
         asked = self.tree / "srv/asked"
         asked.write_text("")
         settings = {
-            "rosrv_package": "/srv/rosrv_0.1.0_all.deb",
+            "rosrv_package": "/srv/rosrv_0.2.0_all.deb",
             "ansible_connection": "local",
             "ansible_python_interpreter": "/usr/bin/python3",
             "ansible_become": False,  # it is root
@@ -135,7 +135,7 @@ class Robot:
 
 
 def test_ansible_makes_a_robot_an_appliance(debian: Path) -> None:
-    """Package and service; a second run changes nothing; a new policy is reloaded, a wrong one refused."""
+    """Package and service; a second run changes nothing; a new policy is reloaded, an invalid one refused."""
     robot = Robot(debian)
     policy = debian / "etc/rosrv/policies/default.ini"
 
@@ -173,6 +173,6 @@ def test_ansible_makes_a_robot_an_appliance(debian: Path) -> None:
 
 
 def test_cloud_init_knows_every_key(debian: Path) -> None:
-    """By its own schema."""
+    """The example is valid by cloud-init's own schema."""
     said = run(debian, "cloud-init", "schema", "--config-file", "/examples/cloud-init/user-data.yaml")
     assert "Valid" in said

@@ -1,4 +1,4 @@
-"""docs/first-hour.md, followed command by command on three machines: what it shows is what happens."""
+"""docs/first-hour.md, followed command by command on three machines: the page shows the real output."""
 
 import os
 import re
@@ -25,7 +25,7 @@ _STEP = re.compile(
 
 @dataclass(frozen=True)
 class Step:
-    """One block of commands: where, whether it fails or stays, and what it shows."""
+    """One block of commands: the machine, whether it fails or keeps running, and its output."""
 
     host: str
     how: str | None
@@ -34,7 +34,7 @@ class Step:
 
 
 def steps() -> list[Step]:
-    """The blocks of the page, in order."""
+    """Return the blocks of the page, in order."""
     found = [
         Step(one["host"], one["how"], one["script"], tuple((one["shown"] or "").splitlines()))
         for one in _STEP.finditer(PAGE.read_text())
@@ -45,7 +45,7 @@ def steps() -> list[Step]:
 
 @pytest.fixture
 def hosts() -> Iterator[dict[str, Host]]:
-    """The three machines of the page."""
+    """Return the three machines of the page."""
     need_root()
     with own_namespace(), Lab("rosrv-hour") as lab:
         yield {
@@ -57,7 +57,7 @@ def hosts() -> Iterator[dict[str, Host]]:
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """A working directory that the appliance's users may pass through."""
+    """Return a working directory that the appliance's users may traverse."""
     folder = Path(f"/tmp/rosrv-hour-{os.getpid()}")
     folder.mkdir(mode=0o755)
     yield folder
@@ -65,7 +65,7 @@ def folder() -> Iterator[Path]:
 
 
 def test_the_page_is_true(hosts: dict[str, Host], folder: Path) -> None:
-    """Every block ends as it says, and prints what it says."""
+    """Every block ends and prints as the page says."""
     staying: list[Process] = []
     environment = {
         "PATH": f"{Path(ROSRV).parent}:{os.environ['PATH']}",

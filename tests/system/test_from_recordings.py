@@ -1,4 +1,4 @@
-"""docs/from-recordings.md, followed command by command: what it shows is what happens."""
+"""docs/from-recordings.md, followed command by command: the page shows the real output."""
 
 import os
 import re
@@ -12,7 +12,7 @@ _STEP = re.compile(r"```sh\n(?P<script>.*?)```\n```text\n(?P<shown>.*?)```\n", r
 
 
 def test_the_page_is_true(tmp_path: Path) -> None:
-    """Every block ends well, and prints what it says."""
+    """Every block succeeds, and prints as the page says."""
     for name in ("examples", "monitors"):
         (tmp_path / name).symlink_to(ROOT / name)
     environment = {

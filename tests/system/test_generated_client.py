@@ -1,7 +1,7 @@
-"""A client generated from the contract, as an integrator makes one, calls every operation and reads every answer.
+"""A client generated from the contract, as an integrator makes one, calls every operation and parses every answer.
 
-The generator lives in an environment of its own (`generated-client.lock`): its dependencies are not ours. Bodies are
-those that the contract shows; hosts are enrolled, and one of them asks through its tunnel.
+The generator has its own environment (`generated-client.lock`): its dependencies are not ours. Bodies are the
+contract's examples; hosts are enrolled, and one of them sends requests through its tunnel.
 """
 
 import base64
@@ -32,8 +32,8 @@ from tests.support.tunnels import need_strongswan
 
 LOCK = Path(__file__).with_name("generated-client.lock")
 UV = Path(sys.executable).with_name("uv")
-# What the page has for the generator: how answers that are no JSON are read.
-PAGE = (Path(__file__).parents[2] / "docs/rest.md").read_text()
+# settings of the page for the generator: parsing answers that are not JSON
+PAGE = (Path(__file__).parents[2] / "docs/reference/rest.md").read_text()
 OVERRIDES = re.findall(r"^```yaml\n(content_type_overrides:.*?)^```", PAGE, re.MULTILINE | re.DOTALL)[0]
 CONFIG = f"""\
 api: 0.0.0.0:{API}
@@ -42,8 +42,7 @@ api_names: [{MIDDLE}, {OWN}]
 recorder: {{enabled: true, memory: 16MiB, disk: 512MiB, triggers: []}}
 """
 NAME = EXAMPLES["NewHost"]["name"]
-# One call of the generated client a line; what it made of the answer, and what the answer said. Of a stream, the
-# first event.
+# One call of the generated client per line: the parsed answer and the raw answer. Of a stream, the first event.
 DRIVER = """
 import base64, enum, importlib, json, pkgutil, sys, typing
 folder, url, certificate = sys.argv[1:]
@@ -82,14 +81,14 @@ for line in sys.stdin:
     said = json.loads(answer.content) if json_said else None
     print(json.dumps([int(answer.status_code), kind, made, said]), flush=True)
 """
-Done = dict[str, Any]  # operation -> what its answer was read as
+Done = dict[str, Any]  # operation -> type of its parsed answer
 
 
 @dataclass(frozen=True)
 class Call:
-    """How an operation is called: arguments, and what of its body is another than in the contract's example.
+    """A call of an operation: arguments, and changes of the contract's example of the body.
 
-    Both are made of what was answered before. `inside`: by a host through its tunnel.
+    Both are made from earlier answers. `inside`: by a host through its tunnel.
     """
 
     arguments: Callable[[Done], dict[str, Any]] = lambda _done: {}
@@ -98,22 +97,22 @@ class Call:
 
 
 def of(**arguments: Any) -> Call:
-    """A call with these arguments."""
+    """Return a call with these arguments."""
     return Call(lambda _done: arguments)
 
 
 def refusal(done: Done) -> dict[str, Any]:
-    """The record of what was refused."""
+    """Return the record of a denial."""
     return {"record_id": str(done["search_audit"]["records"][0]["sequence"])}
 
 
 def saved(done: Done) -> dict[str, Any]:
-    """The recording of what was in memory."""
+    """Return the recording that was saved from memory."""
     return {"recording_id": done["recording_of_memory"]["id"]}
 
 
 def renewal(done: Done) -> dict[str, Any]:
-    """A request for a new key, signed with the present one."""
+    """Return a request for a new key, signed with the present one."""
     asked = signing_request(make_key(), NAME)
     present = load_pem_private_key(done["key"], password=None)
     assert isinstance(present, ec.EllipticCurvePrivateKey)
@@ -122,11 +121,11 @@ def renewal(done: Done) -> dict[str, Any]:
 
 
 def reached(_done: Done) -> dict[str, Any]:
-    """Where a host finds the appliance."""
+    """Return the address at which a host finds the appliance."""
     return {"endpoint": MIDDLE}
 
 
-# In this order. A monitor and its talker are there, and a host's publication was refused.
+# In this order. A monitor and its talker exist, and a host's publication was denied.
 CALLS = {
     "live": of(), "ready": of(), "live_v1": of(), "ready_v1": of(), "status": of(), "inventory": of(), "metrics": of(),
     "metrics_v1": of(), "history": of(points=2), "whoami": of(), "challenge": of(), "live_state": of(graph=False),
@@ -167,7 +166,7 @@ FOR_INVESTIGATORS = {"recording_of_memory", "recording_messages", "recording_bag
 
 @pytest.fixture
 def generator(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the programs of an environment with the generator."""
+    """Return the folder of programs of an environment with the generator."""
     place = tmp_path_factory.mktemp("generator") / "venv"
     for command in (["venv", str(place)], ["pip", "sync", "--python", str(place / "bin/python"), str(LOCK)]):
         subprocess.run([UV, "--quiet", *command], check=True, timeout=240)
@@ -176,7 +175,7 @@ def generator(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[TunnelSite]:
-    """An appliance with a monitor and a recorder, which hosts may join and a robot's node talks through."""
+    """Run an appliance with a monitor and a recorder, which hosts may join and a robot's node uses."""
     need_root()
     need_strongswan()
     needs(has_ros(), "ROS 1 (run `make setup`)")
@@ -199,7 +198,7 @@ def site(tmp_path: Path) -> Iterator[TunnelSite]:
 
 
 def register() -> Any:
-    """What a node is answered that wants to publish what no rule lets it."""
+    """Return the answer to a node that registers a publication without a rule."""
     with xmlrpc.client.ServerProxy(MASTER) as master:
         return master.registerPublisher("/joy", "/cmd_vel", "geometry_msgs/Twist", f"http://{ROBOT}:1/")
 
@@ -215,7 +214,7 @@ class Client:
         )
 
     def ask(self, *call: Any) -> Any:
-        """One call: status, kind of what was read, what was read, what JSON said."""
+        """Make one call; return status, type of the parsed answer, parsed answer, raw JSON."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
@@ -226,12 +225,12 @@ class Client:
         raise AssertionError(f"{call[1]}: {self._process.communicate()[1]}")
 
     def close(self) -> None:
-        """End it."""
+        """Stop it."""
         self._process.communicate()
 
 
 def generate(generator: Path, contract: Any, folder: Path) -> None:
-    """Make the client, with nothing left out but bodies that are no JSON."""
+    """Generate the client completely, except for bodies that are not JSON."""
     (folder / "openapi.json").write_text(json.dumps(contract))
     (folder / "overrides.yaml").write_text(OVERRIDES)
     made = subprocess.run(
@@ -245,7 +244,7 @@ def generate(generator: Path, contract: Any, folder: Path) -> None:
 
 
 def same(read: Any, said: Any) -> bool:
-    """Whether nothing of a JSON answer was lost; moments have fewer digits."""
+    """Whether a JSON answer was parsed without loss; timestamps have fewer digits."""
     if isinstance(read, dict) and isinstance(said, dict):
         return read.keys() == said.keys() and all(same(read[name], said[name]) for name in said)
     if isinstance(read, list) and isinstance(said, list):
@@ -255,10 +254,10 @@ def same(read: Any, said: Any) -> bool:
     return bool(read == said)
 
 
-def test_every_operation_is_called_and_its_answer_read(
+def test_every_operation_is_called_and_its_answer_parsed(
     generator: Path, site: TunnelSite, tmp_path: Path
 ) -> None:
-    """An operation without a call here fails it, and so does one whose answer is not what the contract says."""
+    """Every operation of the contract must have a call here, with an answer as in the contract."""
     rest = site.rest()
     contract = site.attacker.run(lambda: rest.get("/v1/openapi.json")).json
     assert not [name for name in contract["components"]["schemas"] if "." in name], "no module's name leaks"
@@ -286,14 +285,14 @@ def test_every_operation_is_called_and_its_answer_read(
 
 
 def kit_of(done: Done, folder: Path) -> Path:
-    """The newest kit, as a file."""
+    """Return the newest kit, as a file."""
     kit = folder / "kit.tar.gz"
     kit.write_bytes(base64.b64decode(done["new_host_kit"]))
     return kit
 
 
 def asked(client: Client, token: str, operation: dict[str, Any], call: Call, done: Done) -> Any:
-    """Call an operation; what it was answered, which has to be what the contract promises."""
+    """Call an operation; return its answer, which must be as the contract promises."""
     arguments = call.arguments(done)
     if any(one["name"] == "If-Match" for one in operation.get("parameters", ())):
         arguments = arguments | {"if_match": "*"}
@@ -322,5 +321,5 @@ def asked(client: Client, token: str, operation: dict[str, Any], call: Call, don
 
 
 def kind_of(content: dict[str, Any]) -> str:
-    """The name of the kind of a body or an answer; empty where it has none."""
+    """Return the name of the type of a body or an answer; empty where it has none."""
     return str(content["schema"].get("$ref", "")).rpartition("/")[2]

@@ -1,6 +1,6 @@
-"""What is learnt from drives of the simulated LandShark is judged by other drives and by faults put into them.
+"""Monitors learnt from drives of the simulated LandShark judge other drives and injected faults.
 
-It computes for a quarter of a minute, and so is not in `make test`, where tests/unit/learning says what is learnt.
+It computes for a quarter of a minute, and so is not in `make test`; tests/unit/learning tests the learning.
 """
 
 from benchmarks.learning import KINDS, judge

@@ -1,4 +1,4 @@
-"""REST does what its own contract says: fuzzed from its OpenAPI document, with the real appliance behind it."""
+"""REST keeps its own contract: fuzzed from its OpenAPI document, with the real appliance behind it."""
 
 import json
 import subprocess
@@ -15,7 +15,7 @@ SCHEMATHESIS = str(Path(sys.executable).parent / "schemathesis")
 SECONDS = 60
 WITHOUT_TOKEN = {
     "GET /healthz", "GET /readyz", "GET /v1/healthz", "GET /v1/readyz",
-    # A host brings a one-time token, or asks through its tunnel; lists and certificates of an authority are public.
+    # A host has a one-time token, or uses its tunnel; lists and certificates of an authority are public.
     "POST /v1/enrol", "POST /v1/hosts/{name}/renew", "POST /v1/hosts/{name}/renewed", "GET /v1/revocations",
     "GET /v1/authority",
 }  # fmt: skip
@@ -28,7 +28,7 @@ api_limits: {requests_per_second: 100000, burst: 1000000, failures_per_minute: 1
 
 @pytest.fixture
 def appliance(tmp_path: Path) -> Iterator[Appliance]:
-    """An appliance that does not slow the fuzzer down."""
+    """Run an appliance without rate limits for the fuzzer."""
     config = tmp_path / "appliance.yaml"
     config.write_text(CONFIG)
     with Appliance(options=("--config", str(config))) as running:
@@ -36,13 +36,13 @@ def appliance(tmp_path: Path) -> Iterator[Appliance]:
 
 
 def shown(said: str) -> str:
-    """What the fuzzer said, with lines that can be read: it repeats what it sent, whatever that was."""
+    """Return the readable lines of the fuzzer's output, which repeats its arbitrary input."""
     return "\n".join(
         line if len(line) < 300 else f"{line[:280]} ... ({len(line)})" for line in said.splitlines()
     )
 
 
-# A body beyond the limit of its size is refused before anybody looks at its form.
+# A body beyond the size limit is refused before its form is checked.
 REFUSED = """\
 [checks.negative_data_rejection]
 expected-statuses = ["400", "401", "403", "404", "405", "406", "409", "413", "415", "422", "428", "429", "5xx"]
@@ -50,7 +50,7 @@ expected-statuses = ["400", "401", "403", "404", "405", "406", "409", "413", "41
 
 
 def fuzz(rest: Rest, directory: Path, *flags: str) -> subprocess.CompletedProcess[str]:
-    """One run of schemathesis; its own folder keeps what it remembers."""
+    """Run schemathesis once, in its own folder."""
     (directory / "schemathesis.toml").write_text(REFUSED)
     command = [
         SCHEMATHESIS,
@@ -75,11 +75,11 @@ def fuzz(rest: Rest, directory: Path, *flags: str) -> subprocess.CompletedProces
 
 
 def test_the_contract_is_true(appliance: Appliance, tmp_path: Path) -> None:
-    """No answer is a failure of the server, or has a status, type, header or form the contract does not name; what
-    breaks the contract is refused; nothing works without a token; and nobody was started again.
+    """No answer is a server error, or has a status, type, header or form outside the contract; requests that break the
+    contract are refused; every operation needs a token; and no process was restarted.
 
-    Left out: whether whatever fits the form is accepted, because a form cannot say what a right policy is; the
-    stream, which does not end by itself; and the end of a token, which the fuzzer would give its own.
+    Not covered: acceptance of every well-formed request, because a schema cannot define a valid policy; the stream,
+    which does not end; and the revocation of a token, because the fuzzer would revoke its own.
     """
     rest = appliance.rest()
     assert rest.get("/healthz").status == 200
@@ -94,8 +94,8 @@ def test_the_contract_is_true(appliance: Appliance, tmp_path: Path) -> None:
     assert rest.get("/v1/status").status == 200
 
 
-def test_the_fuzzer_would_notice(appliance: Appliance, tmp_path: Path) -> None:
-    """The same run against a contract that promises something else fails: the test above can fail."""
+def test_the_fuzzer_finds_a_difference(appliance: Appliance, tmp_path: Path) -> None:
+    """The same run against another contract fails, so the test above can fail."""
     rest = appliance.rest()
     contract = rest.get("/v1/openapi.json").json
     contract["paths"] = {"/v1/status": contract["paths"]["/v1/status"]}
@@ -110,7 +110,7 @@ def test_the_fuzzer_would_notice(appliance: Appliance, tmp_path: Path) -> None:
 
 
 def test_every_operation_is_described(appliance: Appliance) -> None:
-    """Each has an id, a summary, its token, and for errors the form of a problem; none is missing."""
+    """Each operation has an id, a summary, its token, and problems as errors; no operation is missing."""
     document = appliance.rest().get("/v1/openapi.json").json
     operations = {
         f"{method.upper()} {path}": one
@@ -132,9 +132,7 @@ def test_every_operation_is_described(appliance: Appliance) -> None:
         assert one.get("description"), name
         assert ("security" in one) == (name not in WITHOUT_TOKEN), name
         for status, response in one["responses"].items():
-            if (
-                status == "400"
-            ):  # what the server says where there is no request yet, so no application either
+            if status == "400":  # the server's own answers, which have no request yet, and so no application
                 assert "text/plain" in response["content"], name
             elif int(status) > 400:
                 assert list(response["content"]) == ["application/problem+json"], (name, status)

@@ -1,4 +1,4 @@
-"""Who reaches REST over the network: the firewall's rule for its port, in a container's namespace and in its own."""
+"""Access to REST over the network: the firewall's rule for its port, in a container's namespace and in its own."""
 
 import http.client
 import ssl
@@ -16,14 +16,14 @@ from tests.support.requirements import need_root
 
 @pytest.fixture
 def lab() -> Iterator[Lab]:
-    """An Ethernet of our own."""
+    """Make an Ethernet."""
     need_root()
     with Lab("rosrv-rest") as lab:
         yield lab
 
 
 def status(certificate: str, address: str, port: int) -> str:
-    """What `GET /healthz` says at an address, over TLS with only this certificate trusted."""
+    """Return the status of `GET /healthz` at an address, over TLS with only this certificate trusted."""
     connection = http.client.HTTPSConnection(
         address, port, timeout=5, context=ssl.create_default_context(cadata=certificate)
     )
@@ -37,28 +37,28 @@ def status(certificate: str, address: str, port: int) -> str:
 
 
 def certificate_of(appliance: Appliance, host: Host, port: int) -> str:
-    """The certificate that is served, once it is there."""
+    """Return the served certificate, once it is there."""
     return host.run(partial(ssl.get_server_certificate, ("127.0.0.1", port), timeout=30))
 
 
-def test_only_the_networks_that_were_named_reach_it(lab: Lab, tmp_path: Path) -> None:
-    """Isolation container: a host of `api_networks` and the machine itself are answered, any other is refused."""
+def test_only_configured_networks_reach_it(lab: Lab, tmp_path: Path) -> None:
+    """Isolation container: hosts of `api_networks` and the machine itself are answered, others are refused."""
     machine = lab.host("machine", "10.82.0.2/24")
-    manager, stranger = lab.host("manager", "10.82.0.10/24"), lab.host("stranger", "10.82.0.66/24")
+    manager, unknown = lab.host("manager", "10.82.0.10/24"), lab.host("unknown", "10.82.0.66/24")
     config = tmp_path / "appliance.yaml"
     config.write_text("api: 0.0.0.0:8443\napi_networks: [10.82.0.10/32]\n")
     options = ("--config", str(config), "--listen", "0.0.0.0:11311")
     with Appliance(machine, isolation="container", options=options) as appliance:
-        assert appliance.master_uri == "http://10.82.0.2:11311", "there is no default route, but one network"
+        assert appliance.master_uri == "http://10.82.0.2:11311", "without a default route, the only network"
         certificate = certificate_of(appliance, machine, 8443)
         assert machine.run(partial(status, certificate, "127.0.0.1", 8443)) == "200"
-        assert stranger.run(partial(status, certificate, "10.82.0.2", 8443)) == "ConnectionRefusedError"
-        # The certificate is for the machine's own names; the manager reaches it and is told so.
+        assert unknown.run(partial(status, certificate, "10.82.0.2", 8443)) == "ConnectionRefusedError"
+        # The certificate has only the machine's own names, so the manager sees a wrong name.
         assert manager.run(partial(status, certificate, "10.82.0.2", 8443)) == "SSLCertVerificationError"
 
 
-def test_an_address_that_is_given_is_in_the_certificate(lab: Lab, tmp_path: Path) -> None:
-    """`--api ADDRESS:PORT`: who trusts the certificate is answered at that address."""
+def test_a_given_address_is_in_the_certificate(lab: Lab, tmp_path: Path) -> None:
+    """`--api ADDRESS:PORT`: a client that trusts the certificate is answered at that address."""
     machine, manager = lab.host("machine", "10.82.0.2/24"), lab.host("manager", "10.82.0.10/24")
     config = tmp_path / "appliance.yaml"
     config.write_text("api_networks: [10.82.0.0/24]\n")
@@ -70,19 +70,19 @@ def test_an_address_that_is_given_is_in_the_certificate(lab: Lab, tmp_path: Path
 
 
 def test_in_a_namespace_of_its_own_the_machine_reaches_it(lab: Lab, tmp_path: Path) -> None:
-    """Isolation netns: REST answers on the machine's loopback, as it is printed; a stranger is refused."""
-    machine, stranger = lab.host("machine", "10.82.0.2/24"), lab.host("stranger", "10.82.0.66/24")
+    """Isolation netns: REST answers at the printed loopback address; an unknown host is refused."""
+    machine, unknown = lab.host("machine", "10.82.0.2/24"), lab.host("unknown", "10.82.0.66/24")
     with Appliance(machine, isolation="netns", options=("--api", "127.0.0.1:8443")) as appliance:
         assert appliance.ready["api"] == "https://127.0.0.1:8443"
         certificate = certificate_of(appliance, machine, 8443)
         assert machine.run(partial(status, certificate, "127.0.0.1", 8443)) == "200"
-        assert stranger.run(partial(status, certificate, "10.82.0.2", 8443)) in (
+        assert unknown.run(partial(status, certificate, "10.82.0.2", 8443)) in (
             "ConnectionRefusedError", "TimeoutError",
         )  # fmt: skip
 
 
-def test_a_port_that_is_taken_is_told(lab: Lab) -> None:
-    """Whoever asks for a port that another program has gets an error with its name, not another port."""
+def test_a_port_in_use_is_an_error(lab: Lab) -> None:
+    """A port used by another program is an error with that program's name, and no other port is taken."""
     machine = lab.host("machine", "10.82.0.2/24")
     program = (
         "import socket; s = socket.create_server(('127.0.0.1', 8443)); print('here', flush=True); s.accept()"

@@ -1,4 +1,4 @@
-"""`rosrv selftest` where the appliance really is: in a container's namespace, and in one of its own on a bare host."""
+"""Test `rosrv selftest` with isolation container (a container's namespace) and netns (its own on a bare host)."""
 
 import json
 import subprocess
@@ -13,7 +13,7 @@ from tests.support.requirements import need_root
 
 @pytest.mark.parametrize("isolation", ["container", "netns"])
 def test_a_message_goes_through_behind_the_firewall(isolation: str) -> None:
-    """As root on the machine: kernel, firewall, probe, RVMaster, log and relay are tried, and nothing fails."""
+    """As root on the machine: kernel, firewall, probe, RVMaster, log and relay are tested, and nothing fails."""
     need_root()
     with Lab("rosrv-self") as lab:
         machine = lab.host("machine", "10.84.0.2/24")
@@ -25,5 +25,5 @@ def test_a_message_goes_through_behind_the_firewall(isolation: str) -> None:
             assert process.returncode == 0, (said, [row for row in rows.values() if row["outcome"] == "fail"])
             for check in ("namespaces", "firewall", "ports", "status", "audit log", "RVMaster", "relay"):
                 assert rows[check]["outcome"] == "ok", rows[check]
-            assert "probe of the ROS Master passed" in rows["status"]["text"]
+            assert "probe of the ROS master passed" in rows["status"]["text"]
             assert "a message came through" in rows["relay"]["text"]

@@ -1,4 +1,4 @@
-"""The browser, and an appliance whose console it opens."""
+"""Start the browser, and an appliance whose console it opens."""
 
 import json
 import os
@@ -37,34 +37,34 @@ CONFIG = "api: 127.0.0.1:0\napi_tls: off\napi_limits: {requests_per_second: 500,
 
 @pytest.fixture(scope="session")
 def chromium() -> str:
-    """The browser's program."""
+    """Return the path of the browser."""
     return need_program("chromium", "chromium")
 
 
 @pytest.fixture(scope="module")  # it has an event loop: other tests of this process want none
 def playwright() -> Iterator[Playwright]:
-    """What drives browsers: one for the tests of a file."""
+    """Start Playwright for the tests of a file."""
     with sync_playwright() as driver:
         yield driver
 
 
 @pytest.fixture(scope="module")
 def browser(chromium: str, playwright: Playwright) -> Iterator[Browser]:
-    """A browser of this machine, for the tests of a file."""
+    """Start this machine's browser for the tests of a file."""
     started = launch(playwright, chromium)
     yield started
     started.close()
 
 
 def launch(playwright: Playwright, program: str) -> Browser:
-    """A browser without a window; as root it cannot have a sandbox of its own."""
+    """Start a browser without a window; as root it cannot have its own sandbox."""
     arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
     return playwright.chromium.launch(executable_path=program, args=arguments)
 
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """An appliance for the tests of a file, with the monitors of the repository."""
+    """Run an appliance with the monitors of the repository, for the tests of a file."""
     config = tmp_path_factory.mktemp("console") / "appliance.yaml"
     config.write_text(CONFIG)
     options = ("--config", str(config), "--monitors", str(REPOSITORY / "monitors"))
@@ -74,7 +74,7 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 
 @pytest.fixture
 def token(appliance: Appliance) -> Callable[..., str]:
-    """Makes a token of a role."""
+    """Return a function that makes a token of a role."""
 
     def make(role: str, name: str | None = None, expires: str = "1d") -> str:
         made = appliance.rosrv(
@@ -87,7 +87,7 @@ def token(appliance: Appliance) -> Callable[..., str]:
 
 @pytest.fixture
 def opened(browser: Browser, appliance: Appliance) -> Iterator[Callable[..., Reader]]:
-    """Opens windows on the appliance's console, by default with the first token, an admin's."""
+    """Return a function that opens the console, by default with the first token, an admin's."""
     with ExitStack() as stack:
 
         def open_window(token: str | None = None, **look: Any) -> Reader:
@@ -99,7 +99,7 @@ def opened(browser: Browser, appliance: Appliance) -> Iterator[Callable[..., Rea
 
 @pytest.fixture
 def attempt(appliance: Appliance) -> Callable[..., Any]:
-    """Makes a call of the Master API as a node would."""
+    """Return a function that makes a call of the Master API as a node would."""
 
     def call(method: str, *arguments: Any) -> Any:
         with xmlrpc.client.ServerProxy(appliance.master_uri, allow_none=True) as master:

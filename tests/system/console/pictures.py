@@ -1,15 +1,20 @@
-"""Makes the console's pictures in docs/pictures anew: `python -m tests.system.console.pictures`, as root.
+"""Make the console's pictures in docs/pictures: `python -m tests.system.console.pictures [MINUTES]`, as root.
 
-An appliance with a robot of a hundred nodes, in whose name an operator's machine tries to command the arm; and the
-demonstration, whose attacker is at work. A browser of 1280 by 800 pixels, in light colours.
+The first pictures show an appliance with a robot of a hundred nodes; an operator's machine tries to command the arm.
+The README's picture shows this robot after MINUTES (an hour). The others show the demonstration and its attacker.
+The browser has 1280 by 800 pixels and light colours.
 """
 
 import base64
+import itertools
+import math
 import os
 import re
 import signal
 import subprocess
+import sys
 import tempfile
+import time
 from pathlib import Path
 
 from playwright.sync_api import Browser, Page, expect, sync_playwright
@@ -36,8 +41,8 @@ default = *
 [Commands]
 default = *
 """
-_STRANGERS = ("/operator/bridge", "/camera/bridge")
-# As it is where somebody has installed it, whose paths are in the pictures.
+_UNKNOWN_NODES = ("/operator/bridge", "/camera/bridge")
+# The pictures contain the paths of an installed appliance.
 _DEMO = (
     "unshare", "--mount", "sh", "-ec",
     'mount -t tmpfs tmpfs /opt; mkdir /opt/rosrv; mount --bind "$1" /opt/rosrv; cd /opt/rosrv;'
@@ -52,23 +57,26 @@ with xmlrpc.client.ServerProxy(sys.argv[1]) as master:
 
 
 def main() -> None:
-    """Start all of it, and take the pictures."""
+    """Start both robots, and take the pictures."""
+    minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         config = Path(folder) / "appliance.yaml"
         config.write_text(CONFIG)
         options = ("--config", str(config), "--monitors", str(REPOSITORY / "monitors"))
         browser = launch(driver, need_program("chromium", "chromium"))
         with Appliance(policy=_POLICY, options=options) as appliance, Robot(appliance.master_uri) as robot:
-            for node in _STRANGERS:
+            for node in _UNKNOWN_NODES:
                 robot.call(node, "registerPublisher", "/arm/command", "std_msgs/Float64", robot.api(node))
             place, token = str(appliance.ready["api"]), str(appliance.ready["token"])
             with Reader(browser, place, token, width=1280, height=800) as reader:
                 _robot(reader)
-                _now(reader)
                 _audit(reader)
                 _one_topic(reader)
             with Reader(browser, place, token, width=390, height=844) as narrow:
                 _narrow(narrow)
+            _work(robot, minutes)
+            with Reader(browser, place, token, width=1280, height=800) as reader:
+                _now(reader)
         with Process(ThisMachine(), _DEMO, env=dict(os.environ), label="demo") as demo:
             _demonstration(browser, demo)
             demo.stop(with_signal=signal.SIGTERM, timeout=60)
@@ -76,7 +84,7 @@ def main() -> None:
 
 
 def _demonstration(browser: Browser, demo: Process) -> None:
-    """The demonstration's robot, once all of it was shown: an incident, and what else there is to look at."""
+    """Wait for the end of the demonstration, repeat its attack, and take the pictures of its robot."""
     demo.wait_for_text("Be the attacker:", timeout=_DEMO_SECONDS)
     said = "\n".join(str(event.get("text")) for event in demo.events)
     ((attacker, master),) = re.findall(
@@ -84,16 +92,16 @@ def _demonstration(browser: Browser, demo: Process) -> None:
     )
     there = ["nsenter", "--mount", f"--target={demo.pid}", *attacker.split()]
     subprocess.run([*there, "python3", "-c", _ATTACK, master], check=True)
-    ((place, token),) = re.findall(r"console: +(\S+?)/? .*?token for it: +(\S+)", said, re.DOTALL)
+    ((place, token),) = re.findall(r"console: +(\S+?)/? .*?its token: +(\S+)", said, re.DOTALL)
     with Reader(browser, place, token, width=1280, height=800) as reader:
         _incident(reader)
         _others(reader)
 
 
 def _incident(reader: Reader) -> None:
-    """docs/review-an-incident.md, up to the tighter policy on trial."""
+    """Take the pictures of docs/review-an-incident.md, up to the tighter policy with commit-confirm."""
     page = reader.go("now")
-    refused = page.get_by_role("region", name="Refused lately")
+    refused = page.get_by_role("region", name="Recently denied")
     expect(refused.get_by_role("listitem").first).to_contain_text("/landshark_control/trigger")
     _take(page, "incident-now")
     refused.get_by_role("link", name=re.compile("landshark_control")).first.click()
@@ -107,7 +115,7 @@ def _incident(reader: Reader) -> None:
     reader.write(re.sub(r"^/?tablet.*\n| tablet\b(?! shows)", "", policy, flags=re.MULTILINE))
     page.get_by_role("button", name="Load", exact=True).click()
     page.get_by_label("Comment").fill("incident: the tablet tried to fire")
-    page.get_by_label("If you lock yourself out").select_option("300")
+    page.get_by_label("Commit-confirm").select_option("300")
     _take(page, "incident-load")
     page.get_by_role("button", name="Not yet").click()
     reader.write(policy.replace("/rosout               = vehicle ocu", "/rosout               = vehicle oku"))
@@ -129,20 +137,35 @@ def _robot(reader: Reader) -> None:
     page = reader.go("graph")
     expect(page.locator(".box.many")).to_have_count(10)
     expect(page.locator(".line.flowing").first).to_be_attached()
-    expect(page.locator("g.attempt")).to_have_count(len(_STRANGERS))
+    expect(page.locator("g.attempt")).to_have_count(len(_UNKNOWN_NODES))
     _take(page, "console-robot")
+
+
+def _work(robot: Robot, minutes: float) -> None:
+    """Let nodes read parameters at a varying rate; every half minute an intruder tries to command the arm."""
+    end = time.monotonic() + 60 * minutes
+    intruders = itertools.cycle(_UNKNOWN_NODES)
+    for second in itertools.count():
+        for _ in range(6 + round(4 * math.sin(second / 40))):
+            robot.call("/arm/driver", "hasParam", f"/arm/limit_{second % 7}")
+        if second % 30 == 0:
+            node = next(intruders)
+            robot.call(node, "registerPublisher", "/arm/command", "std_msgs/Float64", robot.api(node))
+        if time.monotonic() > end:
+            return
+        time.sleep(1)  # noqa: TID251  # the pace of the traffic
 
 
 def _now(reader: Reader) -> None:
     page = reader.go("now")
-    expect(page.locator(".event")).to_have_count(len(_STRANGERS))
+    expect(page.locator(".event").first).to_be_visible()
     expect(page.locator("path.curve.c3[d*=L]")).to_be_attached()  # a line begins with the second sample
     _take(page, "console-now")
 
 
 def _audit(reader: Reader) -> None:
     page = reader.go("audit")
-    page.get_by_role("row", name=_STRANGERS[0]).first.click()
+    page.get_by_role("row", name=_UNKNOWN_NODES[0]).first.click()
     expect(page.locator(".excerpt-line.here")).to_be_visible()
     _take(page, "console-audit")
 
@@ -158,7 +181,7 @@ def _one_topic(reader: Reader) -> None:
 
 
 def _narrow(reader: Reader) -> None:
-    """Three views beside each other."""
+    """Compose three views side by side."""
     shots = []
     for view in ("now", "graph", "audit"):
         page = reader.go(view)
@@ -166,7 +189,7 @@ def _narrow(reader: Reader) -> None:
             page.locator({"now": ".event", "graph": ".box.many", "audit": "tbody tr"}[view]).first
         ).to_be_visible()
         if view == "graph":
-            expect(page.locator("g.attempt")).to_have_count(len(_STRANGERS))
+            expect(page.locator("g.attempt")).to_have_count(len(_UNKNOWN_NODES))
         shots.append(page.screenshot(animations="disabled"))
     images = "".join(
         f'<img src="data:image/png;base64,{base64.b64encode(shot).decode()}" style="border:1px solid #8894a3">'

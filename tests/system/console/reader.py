@@ -1,11 +1,11 @@
-"""Somebody who reads the console in a real browser, and notices what no page of the appliance may do.
+"""Use the console in a real browser, and check that the page does nothing that it must not do.
 
     with Reader(browser, appliance, token) as reader:
         reader.go("audit")
         reader.page.get_by_role("button", name="Verify").click()
 
-On leaving the block it is an error when the page asked another host for anything, broke its own content security
-policy, left a script error, or set a cookie.
+Leaving the block fails if the page requested anything from another host, violated its own content security policy,
+raised a script error, or set a cookie.
 """
 
 import urllib.parse
@@ -16,7 +16,10 @@ from typing import Any, Self
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, ConsoleMessage, Locator, Page, Request, Response, expect
 
-LIMIT = 30_000  # milliseconds; an answer that is not there by then is not coming
+from tests.support.processes import LIMIT as SECONDS
+from tests.support.waiting import eventually
+
+LIMIT = 2000 * SECONDS  # milliseconds to wait for an answer
 expect.set_options(timeout=LIMIT)
 _TELL_VIOLATIONS = """
 addEventListener("securitypolicyviolation", (event) =>
@@ -28,12 +31,12 @@ if (!sessionStorage.getItem("begun")) {
   sessionStorage.setItem("rosrv.token", "TOKEN");
 }
 """
-# What the browser itself says of an answer that is no success; the tests look at what the page says of it.
-_OF_THE_BROWSER = ("Failed to load resource", "net::ERR_")
+# The browser's own messages about failed requests; tests check the page's messages instead.
+_BROWSER_MESSAGES = ("Failed to load resource", "net::ERR_")
 
 
 class Reader:
-    """One browser window, of this width and theme; without a token it stands at the door."""
+    """A browser window with a width and a theme; without a token it shows the sign-in page."""
 
     def __init__(
         self,
@@ -66,7 +69,7 @@ class Reader:
         self.page.on("response", self._answered)
 
     def go(self, view: str = "now", *, heading: str | None = None) -> Page:
-        """Open a view by its address; returns when its heading is there."""
+        """Open a view by its URL and wait for its heading."""
         self.page.goto(f"{self.url}/console/{view}")
         name = heading or view.partition("?")[0].partition("/")[0].capitalize()
         expect(self.page.get_by_role("heading", level=1, name=name, exact=heading is None)).to_be_visible(
@@ -75,32 +78,33 @@ class Reader:
         return self.page
 
     def editor(self) -> Locator:
-        """The lines of the (first) editor."""
+        """Return the text area of the first editor."""
         return self.page.locator("[data-editor] .cm-content").first
 
     def write(self, text: str) -> None:
-        """Replace all that is in the editor."""
+        """Replace the editor's text."""
         self.editor().click()
         self.page.keyboard.press("Control+a")
         self.page.keyboard.insert_text(text)
 
     def toast(self, text: str) -> Locator:
-        """What the page says was done."""
+        """Return a notification by its text."""
         return self.page.locator(".toasts").get_by_text(text)
 
     def settle(self) -> None:
-        """Wait until what the view shows is there, and no colour is on its way to another."""
+        """Wait until the view is loaded and no animation runs."""
         expect(self.page.locator(".skeleton")).to_have_count(0)
-        self.page.wait_for_function(
-            "document.fonts.status === 'loaded' && document.getAnimations().every(one => one.playState !== 'running')"
+        wait_until(
+            self.page,
+            "document.fonts.status === 'loaded' && document.getAnimations().every(one => one.playState !== 'running')",
         )
 
     def fits(self) -> None:
-        """Wait until the page is no wider than its window; fails when it stays wider."""
-        self.page.wait_for_function("document.documentElement.scrollWidth <= innerWidth")
+        """Wait until the page is at most as wide as its window."""
+        wait_until(self.page, "document.documentElement.scrollWidth <= innerWidth")
 
     def axe(self) -> list[str]:
-        """What axe-core finds against WCAG 2.2 AA and its good practices, when the view stands still."""
+        """Return the violations of WCAG 2.2 AA and best practices that axe-core finds in the settled view."""
         self.settle()
         found = Axe().run(
             self.page,
@@ -123,12 +127,12 @@ class Reader:
         cookies = self.context.cookies()
         self.context.close()
         if kind is None:
-            assert self.foreign() == [], f"the page asked elsewhere: {self.foreign()}"
-            assert self.said == [], f"the page complained: {self.said}"
-            assert cookies == [], f"the page has cookies: {cookies}"
+            assert self.foreign() == [], f"the page made requests to other hosts: {self.foreign()}"
+            assert self.said == [], f"the page logged errors: {self.said}"
+            assert cookies == [], f"the page set cookies: {cookies}"
 
     def foreign(self) -> list[str]:
-        """Requests to anywhere else."""
+        """Return the URLs of requests to other hosts."""
         own = urllib.parse.urlsplit(self.url).netloc
         return [
             url
@@ -138,7 +142,9 @@ class Reader:
         ]
 
     def _heard(self, message: ConsoleMessage) -> None:
-        if message.type in ("error", "warning") and not any(word in message.text for word in _OF_THE_BROWSER):
+        if message.type in ("error", "warning") and not any(
+            word in message.text for word in _BROWSER_MESSAGES
+        ):
             self.said.append(f"{message.type}: {message.text}")
 
     def _asked(self, request: Request) -> None:
@@ -150,5 +156,13 @@ class Reader:
 
 
 def texts(locators: Iterable[Any]) -> list[str]:
-    """What stands in each."""
+    """Return the text of each element."""
     return [str(one.inner_text()) for one in locators]
+
+
+def wait_until(page: Page, condition: str) -> None:
+    """Wait until a JavaScript expression or function is true.
+
+    `Page.wait_for_function` evaluates it inside the page, where the content security policy forbids that.
+    """
+    eventually(lambda: page.evaluate(condition), condition)

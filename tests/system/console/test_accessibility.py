@@ -1,4 +1,4 @@
-"""Everybody can use it: axe finds nothing in any view and theme, and all of it goes by keys."""
+"""The console is accessible: axe finds nothing in any view and theme, and every function works by keyboard."""
 
 import re
 from collections.abc import Callable
@@ -24,7 +24,7 @@ VIEWS = [
 
 @pytest.fixture(autouse=True)
 def refused(attempt: Callable[..., Any]) -> None:
-    """Something is there to be shown."""
+    """Make records for the views to show."""
     attempt("registerPublisher", "/intruder", "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
 
 
@@ -55,7 +55,7 @@ def test_axe_finds_nothing(theme: str, width: int, opened: Callable[..., Reader]
 
 
 def test_words_of_the_navigation_have_room(opened: Callable[..., Reader]) -> None:
-    """On a telephone, too: none touches its neighbour or the edge of the window."""
+    """Also on a telephone, none touches its neighbour or the edge of the window."""
     page = opened(width=390).go("now")
     words = """() => [...document.querySelectorAll(".nav a > span:not(.key, .count)")].map((word) => {
       const range = document.createRange();
@@ -69,7 +69,7 @@ def test_words_of_the_navigation_have_room(opened: Callable[..., Reader]) -> Non
 
 
 def test_the_door_is_accessible(browser: Browser, appliance: Appliance) -> None:
-    """The page for the token, too, in both themes."""
+    """The sign-in page has no violation in either theme."""
     for theme in ("light", "dark"):
         with Reader(browser, str(appliance.ready["api"]), theme=theme) as reader:
             reader.page.goto(reader.url)
@@ -78,7 +78,7 @@ def test_the_door_is_accessible(browser: Browser, appliance: Appliance) -> None:
 
 
 def test_it_goes_by_keys(opened: Callable[..., Reader]) -> None:
-    """The first Tab leads past the navigation; digits change the view; ? lists the keys; t the theme; focus is seen."""
+    """The first Tab skips the navigation, digits change views, ? lists the keys, t changes the theme; focus shows."""
     reader = opened()
     page = reader.go("now")
     page.keyboard.press("Tab")
@@ -114,7 +114,7 @@ def test_it_goes_by_keys(opened: Callable[..., Reader]) -> None:
 
 
 def test_the_theme_is_the_readers_until_he_chooses(opened: Callable[..., Reader]) -> None:
-    """It follows the system's theme; the switch overrides it, over a reload too."""
+    """It follows the system's theme; the switch overrides it, also after a reload."""
     reader = opened(theme="dark")
     page = reader.go("now")
     assert page.evaluate("document.documentElement.dataset.theme") == "dark"

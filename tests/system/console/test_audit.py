@@ -1,4 +1,4 @@
-"""Audit: a record is found and followed to the line that decided; the log is followed, proven, taken along."""
+"""Test the view Audit: find a record and the line that decided it; follow, verify and export the log."""
 
 import json
 import re
@@ -13,14 +13,14 @@ from tests.system.console.reader import Reader
 
 
 def refuse(attempt: Callable[..., Any], node: str) -> None:
-    """An attempt that the policy denies."""
+    """Make an attempt that the policy denies."""
     assert attempt("registerPublisher", node, "/guarded", "std_msgs/String", "http://127.0.0.1:1/")[0] != 1
 
 
 def test_a_record_leads_to_the_line_that_decided(
     opened: Callable[..., Reader], attempt: Callable[..., Any]
 ) -> None:
-    """From the list to the record, its rule with the lines around it, and on to that line in the policy."""
+    """The list leads to the record, its rule with the lines around it, and that line in the policy."""
     refuse(attempt, "/follow_me")
     reader = opened()
     page = reader.go("audit?decision=deny")
@@ -36,13 +36,13 @@ def test_a_record_leads_to_the_line_that_decided(
 def test_records_come_while_it_is_followed(
     opened: Callable[..., Reader], attempt: Callable[..., Any], appliance: Appliance
 ) -> None:
-    """With `Follow live`, what is recorded from then on appears at the top, and only what the filter lets through."""
+    """With `Follow live`, new records that match the filter appear at the top."""
     reader = opened()
     page = reader.go("audit?decision=deny&caller_id=/live_*")
     expect(page.get_by_text("No record matches")).to_be_visible()
 
     def made_before(route: Route) -> None:
-        """The stream begins once there are records that the list did not have."""
+        """Return whether the stream has begun, which is when there are records that the list did not have."""
         refuse(attempt, "/other")
         refuse(attempt, "/live_1")
         appliance.recorded("--deny", caller_id="/live_1")
@@ -57,7 +57,7 @@ def test_records_come_while_it_is_followed(
 
 
 def test_pages_go_back_to_the_beginning(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
-    """A hundred at a time; `Older records` goes on where the page ended, without a gap and without a double."""
+    """A page has a hundred records; `Older records` continues after it without a gap or a repetition."""
     for number in range(120):
         attempt("getParam", f"/reader_{number}", "/nothing")
     reader = opened()
@@ -71,7 +71,7 @@ def test_pages_go_back_to_the_beginning(opened: Callable[..., Reader], attempt: 
 
 
 def test_what_falls_off_the_list_can_be_fetched(opened: Callable[..., Reader]) -> None:
-    """A list that is followed for long drops its oldest records, and goes on from the last one that it has."""
+    """A list that is followed for long drops its oldest records; `Older records` continues after the last one shown."""
     page = opened().go("audit")
     added = """async (state) => {
       const { added } = await import("/console/static/js/audit/records.js");
@@ -87,7 +87,7 @@ def test_what_falls_off_the_list_can_be_fetched(opened: Callable[..., Reader]) -
 
 
 def test_numbers_of_records_are_told_whole(opened: Callable[..., Reader]) -> None:
-    """What a record is looked up by is never rounded, however long the log."""
+    """Numbers of records are shown in full, never rounded."""
     page = opened().go("audit")
     answer = {
         "ok": True, "log": "ab" * 16, "records": 1_234_567, "first": 400_001, "last": 1_634_567, "removed": 400_000,
@@ -102,7 +102,7 @@ def test_numbers_of_records_are_told_whole(opened: Callable[..., Reader]) -> Non
 
 
 def test_the_log_is_proven_and_exported(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
-    """Verify says that the chain is whole; Export gives what the filter finds as a file of JSON lines."""
+    """Verify reports that the chain is complete; Export saves the records that match the filter as JSON lines."""
     refuse(attempt, "/exported")
     reader = opened()
     page = reader.go("audit?decision=deny&caller_id=/exported")
@@ -114,15 +114,19 @@ def test_the_log_is_proven_and_exported(opened: Callable[..., Reader], attempt: 
     assert {line["caller_id"] for line in lines} == {"/exported"}
     assert download.value.suggested_filename.endswith(".ndjson")
     page.get_by_role("button", name="Verify").click()
-    expect(page.get_by_role("dialog")).to_contain_text("The chain is whole")
+    expect(page.get_by_role("dialog")).to_contain_text(
+        re.compile("The log is (complete and unchanged|consistent, but nothing is signed yet)")
+    )
 
 
 def test_evidence_of_a_time_is_exported(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
-    """Once a time is chosen; the file is a bundle."""
+    """After a time is chosen, the export is an evidence bundle."""
     refuse(attempt, "/evident")
     reader = opened()
     page = reader.go("audit")
-    expect(page.get_by_role("button", name="Evidence")).to_have_attribute("title", "Choose first since when")
+    expect(page.get_by_role("button", name="Evidence")).to_have_attribute(
+        "title", "Choose a start time first"
+    )
     page = reader.go("audit?since=1h")
     with page.expect_download() as download:
         page.get_by_role("button", name="Evidence").click()
@@ -131,14 +135,14 @@ def test_evidence_of_a_time_is_exported(opened: Callable[..., Reader], attempt: 
 
 
 def test_a_record_that_is_not_there_is_said(opened: Callable[..., Reader]) -> None:
-    """An address with an unknown record shows what the appliance says of it, and the list beside it."""
+    """A URL with an unknown record shows the appliance's error, and the list beside it."""
     page = opened().go("audit/ffffffffffffffffffff")
     expect(page.get_by_role("alert")).to_contain_text("there is no record")
     expect(page.locator("tbody tr").first).to_be_visible()
 
 
 def test_times_are_the_readers_and_utc_on_hover(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """A time is shown in the reader's zone and carries UTC, to the nanosecond, as its title."""
+    """A time is shown in the reader's zone; its title is UTC to the nanosecond."""
     page = opened().go("audit")
     moment = page.locator("tbody time").first
     expect(moment).to_have_attribute("title", re.compile(r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{9} UTC$"))
@@ -165,7 +169,7 @@ def test_the_list_goes_by_keys(opened: Callable[..., Reader], attempt: Callable[
 def test_the_readers_own_looks_are_not_what_is_shown_first(
     opened: Callable[..., Reader], attempt: Callable[..., Any]
 ) -> None:
-    """After views were opened the newest record is what a host did; the looks are there when they are asked for."""
+    """The newest record shown is a host's act; the console's own queries appear only on request."""
     reader = opened()
     refuse(attempt, "/before_the_looks")
     for view in ("monitors", "hosts", "policy"):
@@ -180,7 +184,7 @@ def test_the_readers_own_looks_are_not_what_is_shown_first(
 
 
 def test_short_names_stand_in_one_line(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
-    """On a wide screen no column is so narrow that a name of a dozen letters is broken, whatever the others hold."""
+    """On a wide screen no column breaks a name of a dozen letters, whatever the others contain."""
     refuse(attempt, "/a_dozen_let")
     page = opened().go("audit")
     expect(page.get_by_role("row", name="/a_dozen_let").first).to_be_visible()
@@ -193,7 +197,7 @@ def test_short_names_stand_in_one_line(opened: Callable[..., Reader], attempt: C
 
 
 def test_it_opens_on_what_matters(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
-    """A refusal is in sight and a lookup is not; one press shows all, one what people changed; a search is kept."""
+    """Denials are shown and lookups are not; one press shows all, another people's changes; a search can be saved."""
     refuse(attempt, "/matters")
     refuse(attempt, "/matters_too")  # the time line has marks from the first to the last
     attempt("getParam", "/matters_not", "/nothing")
@@ -204,7 +208,7 @@ def test_it_opens_on_what_matters(opened: Callable[..., Reader], attempt: Callab
     searches = page.get_by_role("group", name="Searches")
     searches.get_by_role("button", name="All", exact=True).click()
     expect(page.get_by_role("row", name="/matters_not").first).to_be_visible()
-    searches.get_by_role("button", name="Refused").click()
+    searches.get_by_role("button", name="Denied").click()
     expect(page.locator("tbody tr").first).to_contain_text("deny")
     page.get_by_label("Text").fill("matters")
     searches.get_by_role("button", name="Keep this search").click()
@@ -215,7 +219,7 @@ def test_it_opens_on_what_matters(opened: Callable[..., Reader], attempt: Callab
 
 
 def test_changes_by_people(opened: Callable[..., Reader], appliance: Appliance) -> None:
-    """Who switched a monitor is found, and named where a node would be."""
+    """The person who switched a monitor can be found, and is shown in the node's column."""
     name = json.loads(appliance.rosrv("monitor", "list", "--json").stdout.splitlines()[0])["name"]
     appliance.rosrv("monitor", "disable", name)
     appliance.recorded("--who", "*", event="monitor disabled")
@@ -227,7 +231,7 @@ def test_changes_by_people(opened: Callable[..., Reader], appliance: Appliance) 
 def test_grant_this_leads_to_the_editor(
     opened: Callable[..., Reader], attempt: Callable[..., Any], appliance: Appliance
 ) -> None:
-    """The smallest change is shown beside the record, and stands in the editor after a click; nothing is loaded."""
+    """The smallest change is shown beside the record; a click puts it into the editor and loads nothing."""
     attempt("registerPublisher", "/eager", "/guarded", "std_msgs/String", "http://127.0.0.1:4002/")
     [record, *_] = appliance.recorded(
         "--event", "decision", "--deny", resource="/guarded", caller_id="/eager"
@@ -236,7 +240,7 @@ def test_grant_this_leads_to_the_editor(
     expect(page.get_by_text("would be allowed by: /guarded = 10.9.9.9 robot")).to_be_visible()
     page.get_by_role("button", name="Grant this").click()
     expect(page.get_by_role("region", name="What would grant it")).to_contain_text(
-        "+/guarded = 10.9.9.9 robot"
+        "added: /guarded = 10.9.9.9 robot"
     )
     page.get_by_role("button", name="Open in the editor").click()
     expect(page.locator(".cm-content")).to_contain_text("/guarded = 10.9.9.9 robot")
@@ -246,7 +250,7 @@ def test_grant_this_leads_to_the_editor(
 def test_grant_this_does_not_take_the_place_of_a_text_that_is_written(
     opened: Callable[..., Reader], attempt: Callable[..., Any], appliance: Appliance
 ) -> None:
-    """The text in the editor stays until the person says that it may go."""
+    """The text in the editor stays until the person agrees to discard it."""
     attempt("registerPublisher", "/hasty", "/guarded", "std_msgs/String", "http://127.0.0.1:4002/")
     appliance.recorded("--event", "decision", "--deny", resource="/guarded", caller_id="/hasty")
     reader = opened()

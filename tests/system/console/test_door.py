@@ -1,4 +1,4 @@
-"""Who may come in: tokens that are wrong, right, of a lesser role, revoked; nothing of them stays behind."""
+"""Test the sign-in with tokens that are wrong, valid, of a lesser role, or revoked; none leaves anything behind."""
 
 from collections.abc import Callable
 
@@ -11,13 +11,13 @@ from tests.system.console.reader import Reader
 def test_a_wrong_token_stays_outside_and_a_right_one_shows_its_role(
     browser: Browser, appliance: Appliance, token: Callable[..., str]
 ) -> None:
-    """The door says what was wrong with a token; the right one opens, and its name and role are shown."""
+    """The sign-in page says what is wrong with a token; a valid one is accepted, and its name and role are shown."""
     with Reader(browser, str(appliance.ready["api"])) as reader:
         page = reader.page
         page.goto(reader.url)
         page.get_by_label("Access token").fill("rosrv_000000000000_nothing")
         page.get_by_role("button", name="Sign in").click()
-        expect(page.get_by_role("alert")).to_contain_text("wrong, or was revoked")
+        expect(page.get_by_role("alert")).to_contain_text("wrong or revoked")
         page.get_by_label("Access token").fill(token("viewer", "reader-1"))
         page.get_by_role("button", name="Sign in").click()
         expect(page.get_by_role("heading", level=1, name="Now")).to_be_visible()
@@ -27,7 +27,7 @@ def test_a_wrong_token_stays_outside_and_a_right_one_shows_its_role(
 
 
 def test_the_token_is_forgotten(browser: Browser, appliance: Appliance) -> None:
-    """Not kept: a reload asks again. Kept for the tab: a reload does not. Signed out: it is nowhere."""
+    """A token that is not kept is lost on reload, one kept for the tab is not; after signing out neither is stored."""
     with Reader(browser, str(appliance.ready["api"])) as reader:
         page = reader.page
         for keep in (False, True):
@@ -53,7 +53,7 @@ def test_the_token_is_forgotten(browser: Browser, appliance: Appliance) -> None:
 def test_a_revoked_token_ends_the_session_at_once(
     appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
 ) -> None:
-    """Revoked while the page is open: the reader stands at the door and is told why, without touching anything."""
+    """If the token is revoked while the page is open, the sign-in page appears automatically, with the reason."""
     reader = opened(token("operator", "leaver"))
     reader.go("now")
     expect(reader.page.locator("[data-standing=live]")).to_be_visible()
@@ -64,7 +64,7 @@ def test_a_revoked_token_ends_the_session_at_once(
 
 
 def test_an_expired_token_ends_the_session(token: Callable[..., str], opened: Callable[..., Reader]) -> None:
-    """A token that ends while the page is open takes the reader to the door, who is told what to do."""
+    """If the token expires while the page is open, the sign-in page appears and says what to do."""
     reader = opened(token("viewer", "short", "12h"))
     reader.page.clock.install()
     reader.go("now")
@@ -77,7 +77,7 @@ def test_an_expired_token_ends_the_session(token: Callable[..., str], opened: Ca
 def test_a_page_that_nobody_uses_is_locked_and_loses_nothing(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """The token is forgotten, nothing is shown or asked, no key opens it; the same token finds all as it was."""
+    """A locked page forgets the token, shows and requests nothing, and ignores keys; the same token restores it."""
     reader = opened()
     reader.page.clock.install()
     page = reader.go("policy")
@@ -89,9 +89,7 @@ def test_a_page_that_nobody_uses_is_locked_and_loses_nothing(
     page.clock.fast_forward("14:00")
     expect(page.get_by_label("Comment")).to_be_visible()
     page.clock.fast_forward("15:00")
-    expect(page.get_by_role("status").filter(has_text="Locked")).to_contain_text(
-        "first was doing is still here"
-    )
+    expect(page.get_by_role("status").filter(has_text="Locked")).to_contain_text("The work of first is kept")
     expect(page.get_by_label("Comment")).to_be_hidden()
     expect(reader.editor()).to_be_hidden()
     assert page.evaluate("sessionStorage.getItem('rosrv.token')") is None
@@ -111,7 +109,7 @@ def test_a_page_that_nobody_uses_is_locked_and_loses_nothing(
 
 
 def test_a_tab_that_is_loaded_anew_after_hours_asks_for_the_token(opened: Callable[..., Reader]) -> None:
-    """A browser may put a tab away: the time in which nobody used it counts."""
+    """The time in which the browser had unloaded a tab counts as time without input."""
     reader = opened()
     page = reader.go("now")
     expect(page.locator("[data-standing=live]")).to_be_visible()
@@ -125,7 +123,7 @@ def test_a_tab_that_is_loaded_anew_after_hours_asks_for_the_token(opened: Callab
 def test_a_locked_page_is_nobody_elses(
     appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
 ) -> None:
-    """Whoever comes with another token begins anew: what the first one wrote is gone."""
+    """A sign-in with another token shows none of the drafts that were written under the first."""
     reader = opened()
     reader.page.clock.install()
     page = reader.go("policy")
@@ -142,7 +140,7 @@ def test_a_locked_page_is_nobody_elses(
 def test_what_a_viewer_may_not_do_is_said_and_not_done(
     appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
 ) -> None:
-    """A viewer's buttons that change something are off and name the role they are for; and REST refuses them too."""
+    """For a viewer, buttons that change something are disabled and name the required role; REST also denies them."""
     viewer = token("viewer")
     reader = opened(viewer)
     page = reader.go("policy")

@@ -1,4 +1,4 @@
-"""Graph: what is connected, what was refused and by which rule; and a robot of a thousand topics."""
+"""Test the view Graph: connections, denied attempts with their rules, and a robot of a thousand topics."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -20,7 +20,7 @@ class _Quiet(ThreadingMixIn, SimpleXMLRPCServer):
 
 @pytest.fixture(scope="module")
 def node_api() -> Iterator[str]:
-    """The API of a node that agrees to everything; all nodes of a test share it."""
+    """Serve the API of a node that accepts every call; all nodes of a test share it."""
     server = _Quiet(("127.0.0.1", 0), logRequests=False, allow_none=True)
 
     class Agree:
@@ -39,7 +39,7 @@ def node_api() -> Iterator[str]:
 def test_a_refused_attempt_is_red_and_leads_to_its_rule(
     opened: Callable[..., Reader], attempt: Callable[..., Any], node_api: str
 ) -> None:
-    """Nodes and topics are drawn, mediated ones marked; an attempt appears in red by itself; a click names the line."""
+    """Nodes and topics are drawn, relayed ones marked; a denied attempt appears in red, and a click names the line."""
     assert attempt("registerPublisher", "/talker", "/chatter", "std_msgs/String", node_api)[0] == 1
     assert attempt("registerSubscriber", "/listener", "/chatter", "std_msgs/String", node_api)[0] == 1
     reader = opened()
@@ -53,10 +53,22 @@ def test_a_refused_attempt_is_red_and_leads_to_its_rule(
     assert page.locator('[data-key="t/chatter"]').get_attribute("transform") == before
     line.focus()
     page.keyboard.press("Enter")
-    details = page.get_by_role("region", name="Refused")
+    details = page.get_by_role("region", name="Denied")
     expect(details).to_contain_text("[Publishers] /guarded")
     details.get_by_role("link", name="line 7").click()
     expect(page.locator(".cm-lineNumbers .cm-activeLineGutter")).to_have_text("7")
+
+
+def test_the_self_test_is_not_an_attempt(opened: Callable[..., Reader]) -> None:
+    """Only the self-test's own topic is hidden: a node that takes its name and tries another topic is shown."""
+    page = opened().go("graph")
+    attempts = """async (denials) => {
+      const { attempts } = await import("/console/static/js/graph/model.js");
+      return attempts(denials).map((one) => one.records[0].resource);
+    }"""
+    caller = {"host": "10.0.0.9", "caller_id": "/rosrv_selftest_publisher", "category": "publish"}
+    denials = [{**caller, "resource": "/rosrv_selftest"}, {**caller, "resource": "/cmd_vel"}]
+    assert page.evaluate(attempts, denials) == ["/cmd_vel"]
 
 
 def test_a_thousand_topics(opened: Callable[..., Reader], attempt: Callable[..., Any], node_api: str) -> None:

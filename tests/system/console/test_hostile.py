@@ -1,4 +1,4 @@
-"""What strangers send is shown as text: it runs nothing, hides nothing, reorders nothing, breaks no layout."""
+"""Text from unknown hosts is shown as text: it runs nothing, hides nothing, reorders nothing, breaks no layout."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,7 +17,7 @@ LONG = "/" + "n" * 10_000
 
 @pytest.fixture(autouse=True)
 def sent(attempt: Callable[..., Any]) -> None:
-    """Every one of them was tried as the name of a node and of a topic."""
+    """Try each hostile text as the name of a node and of a topic."""
     for name in (MARKUP, REORDERING, INVISIBLE, CONTROL, LONG):
         attempt("registerPublisher", name, "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
         attempt("registerPublisher", "/somebody", name, "std_msgs/String", "http://127.0.0.1:1/")
@@ -26,7 +26,7 @@ def sent(attempt: Callable[..., Any]) -> None:
 
 @pytest.mark.parametrize("view", ["now", "graph", "audit", "audit?text=img", "audit?severity=warning"])
 def test_names_are_text(view: str, opened: Callable[..., Reader]) -> None:
-    """No name becomes markup, in no view; the page is no wider than its window."""
+    """No name becomes markup in any view, and the page is not wider than its window."""
     reader = opened(width=1280)
     page = reader.go(view)
     expect(page.locator("[data-standing=live]")).to_be_visible()
@@ -39,7 +39,7 @@ def test_names_are_text(view: str, opened: Callable[..., Reader]) -> None:
 
 
 def test_what_cannot_be_seen_is_shown(opened: Callable[..., Reader]) -> None:
-    """Directions, invisible and control characters stand there by their code; a long name says how long it is."""
+    """Direction, invisible and control characters are shown by their codes, and a long name with its length."""
     reader = opened()
     page = reader.go("audit?text=safe")
     expect(page.locator("tbody").get_by_text("RLO").first).to_be_visible()
@@ -55,7 +55,7 @@ def test_what_cannot_be_seen_is_shown(opened: Callable[..., Reader]) -> None:
 
 
 def test_the_record_itself_is_harmless(opened: Callable[..., Reader]) -> None:
-    """Opened, with its details and its JSON, a hostile record still is nothing but text."""
+    """A hostile record is only text, also when its details and its JSON are open."""
     reader = opened()
     page = reader.go("audit?text=onerror")
     page.locator("tbody tr").first.click()

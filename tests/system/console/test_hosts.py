@@ -1,4 +1,4 @@
-"""Hosts: let in by a kit and by a token, seen, let out; with the appliance in a network of its own."""
+"""Test the view Hosts: enrol by kit and by token, list and revoke; the appliance has its own network."""
 
 import json
 import tarfile
@@ -18,7 +18,7 @@ from tests.system.console.reader import Reader
 
 @pytest.fixture
 def appliance(tmp_path: Path) -> Iterator[Appliance]:
-    """An appliance on a host of a lab."""
+    """Run an appliance on a host of a lab."""
     need_root()
     need_strongswan()
     config = tmp_path / "appliance.yaml"
@@ -33,7 +33,7 @@ def appliance(tmp_path: Path) -> Iterator[Appliance]:
 
 @pytest.fixture
 def inside(appliance: Appliance, playwright: Playwright, chromium: str, tmp_path: Path) -> Iterator[Browser]:
-    """A browser on that host: the console is served on its loopback only."""
+    """Start a browser on that host, because the console is served on its loopback only."""
     host = appliance.host
     assert isinstance(host, Host)
     program = tmp_path / "chromium"
@@ -57,7 +57,7 @@ def test_a_host_is_enrolled_and_revoked(appliance: Appliance, inside: Browser) -
         dialog.get_by_label("How").select_option("kit")
         dialog.get_by_label("Address of the appliance").fill("10.84.0.2")
         with page.expect_download() as download:
-            dialog.get_by_role("button", name="Make the kit").click()
+            dialog.get_by_role("button", name="Create the kit").click()
         with tarfile.open(download.value.path()) as kit:
             assert [name for name in kit.getnames() if "/private/" in name], kit.getnames()
         row = page.locator("[data-host=ocu-1]")
@@ -66,7 +66,7 @@ def test_a_host_is_enrolled_and_revoked(appliance: Appliance, inside: Browser) -
         page.get_by_role("button", name="Enrol a host").click()
         dialog.get_by_label("Name").fill("ocu-2")
         dialog.get_by_label("Address of the appliance").fill("10.84.0.2")
-        dialog.get_by_role("button", name="Make the token").click()
+        dialog.get_by_role("button", name="Create the token").click()
         made = page.get_by_role("dialog", name="ocu-2 may enrol itself")
         expect(made.locator("[data-token]").last).to_contain_text("rosrv-enrol_")
         with page.expect_download() as script:

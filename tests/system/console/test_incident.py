@@ -1,4 +1,4 @@
-"""An incident in the console by keys alone, as docs/review-an-incident.md has it; a recording; a trial's page."""
+"""Review an incident in the console by keyboard, as in docs/review-an-incident.md; a recording; a shadow monitor."""
 
 import json
 import re
@@ -47,7 +47,7 @@ NAME() {
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """An appliance with a flight recorder, and monitors that drop what is said on /rude and on /loud."""
+    """Run an appliance with a flight recorder, and monitors that drop messages on /rude and on /loud."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with tempfile.TemporaryDirectory(prefix="rosrv-incident-") as name:
         folder = Path(name)
@@ -64,13 +64,15 @@ def appliance() -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def recording(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """/lout says something rude amid what /voice says; the monitor drops it, and the recorder has it."""
+    """Let /lout publish something rude while /voice publishes; the monitor drops it, and the recorder records it."""
     with RosSession(appliance.master_uri, tmp_path_factory.mktemp("ros")) as ros:
         ear = ros.listener("rospy", "/chatter", name="ear")
         ros.listener("rospy", "/rude", name="prude")
         ros.talker("rospy", "/chatter", name="voice")
         ear.wait_for_count(5, event="received")
-        ros.talker("rospy", "/rude", "--text", "<b>bad</b>", name="lout")
+        ros.talker(
+            "rospy", "/rude", "--latch", "--text", "<b>bad</b>", name="lout"
+        )  # one message: one record
         appliance.recorded(event="message dropped")
 
     def closed() -> dict[str, Any] | None:
@@ -82,9 +84,11 @@ def recording(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def press(locator: Locator, key: str = "Enter") -> None:
-    """What a reader does who has no pointer."""
-    locator.focus()
-    locator.page.keyboard.press(key)
+    """Press a key on an element, as a user without a pointer does.
+
+    One action of the browser's driver: between two, the live view may replace the focused element.
+    """
+    locator.press(key)
 
 
 def come_in(page: Page, token: str) -> None:
@@ -100,10 +104,11 @@ def come_in(page: Page, token: str) -> None:
 def test_an_incident_by_keys(
     recording: dict[str, Any], appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str]
 ) -> None:
-    """From Now to the drop, its record, the time line, what was said, the evidence; then the right is taken away."""
+    """Keys lead from Now to the drop, its record, the time line, messages and evidence; then to a tighter policy."""
     reader = opened(token("investigator", "carol"))
     page = reader.go("now")
-    press(page.get_by_role("region", name="Done by monitors lately").get_by_role("link").nth(1))
+    actions = page.get_by_role("region", name="Recent actions of monitors").get_by_role("listitem")
+    press(actions.filter(has_text="/rude").get_by_role("link"))
     panel = page.locator(".record")
     expect(panel).to_contain_text("/lout")
     press(panel.get_by_role("link", name="Time line"))
@@ -148,7 +153,7 @@ def test_an_incident_by_keys(
 def test_who_may_not_read_is_told_why(
     recording: dict[str, Any], opened: Callable[..., Reader], token: Callable[..., str]
 ) -> None:
-    """A viewer sees the list and the time line, and whom the messages are for; nothing is wider than the window."""
+    """A viewer sees the list, the time line, and which role may read the messages; nothing is wider than the window."""
     reader = opened(token("viewer"), width=390, height=844)
     page = reader.go("recordings")
     press(page.locator(f'tbody a[href$="{recording["id"]}"]'))
@@ -162,10 +167,10 @@ def test_who_may_not_read_is_told_why(
     assert recording["id"] in page.url
 
 
-def test_a_monitor_on_trial_says_what_it_would_drop_and_is_promoted(
+def test_a_monitor_in_shadow_mode_says_what_it_would_drop_and_is_promoted(
     appliance: Appliance, opened: Callable[..., Reader], tmp_path: Path
 ) -> None:
-    """Its page counts and lists what it would have dropped while nothing is; promoted, it drops."""
+    """In shadow mode its page counts and lists what it would have dropped, and it drops nothing; promoted, it drops."""
     appliance.rosrv("monitor", "disable", "hush")
     page = opened().go("monitors/hush", heading="hush")
     press(page.get_by_role("button", name="Try"))
@@ -176,7 +181,7 @@ def test_a_monitor_on_trial_says_what_it_would_drop_and_is_promoted(
         ear.wait_for_count(3, event="received")
         count = page.locator(".figures div").filter(has_text="Would have dropped").locator("dd")
         expect(count).to_have_text(re.compile("[1-9]"))
-        expect(page.get_by_role("region", name="What it did last")).to_contain_text("/loud")
+        expect(page.get_by_role("region", name="Latest actions")).to_contain_text("/loud")
         press(page.get_by_role("button", name="Promote"))
         expect(page.get_by_role("switch", name="hush enabled")).to_have_attribute("aria-checked", "true")
         appliance.recorded(event="message dropped", resource="/loud")

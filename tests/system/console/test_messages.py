@@ -1,4 +1,4 @@
-"""Looking into a topic in the console: the messages of a real node, by whom it is for, and never as markup."""
+"""Look into a topic in the console: a real node's messages, for the permitted roles, and never as markup."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,7 +14,7 @@ from tests.system.console.reader import LIMIT, Reader
 
 @pytest.fixture
 def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
-    """Nodes of one test."""
+    """Return the nodes of one test."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with RosSession(appliance.master_uri, tmp_path) as session:
         yield session
@@ -23,7 +23,7 @@ def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
 def test_the_last_message_is_shown_and_the_look_recorded(
     appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str], ros: RosSession
 ) -> None:
-    """By keyboard; the text of a message is text; a viewer is told why he may not; the record has the token's name."""
+    """It works by keyboard; messages are only text; a viewer sees the required role; the record has the name."""
     ros.talker("rospy", "/chatter", "--text", "<b>said</b>", name="voice").wait_for(event="ready")
     reader = opened(token("operator", "olga"))
     page = reader.go("graph")

@@ -1,4 +1,4 @@
-"""Monitors: switched, read, written wrongly and rightly, replaced, removed."""
+"""Test the view Monitors: switch, read, write with and without errors, replace, remove."""
 
 import threading
 from collections.abc import Callable
@@ -21,13 +21,13 @@ counting() {
 
 
 def state(appliance: Appliance, name: str) -> Any:
-    """The row of a monitor; None when there is none."""
+    """Return the row of a monitor; None if it does not exist."""
     rows = appliance.rest().get("/v1/monitors").json["monitors"]
     return next((row for row in rows if row["name"] == name), None)
 
 
 def test_a_monitor_is_switched(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """The switch is what the appliance has, both ways, and who did it is in the audit log."""
+    """The switch shows the appliance's state and changes it; the audit log has who did it."""
     reader = opened()
     page = reader.go("monitors")
     switch = page.get_by_role("switch", name="safeZone enabled")
@@ -45,7 +45,7 @@ def test_a_monitor_is_switched(appliance: Appliance, opened: Callable[..., Reade
 
 @pytest.mark.parametrize("width", [390, 1280, 1920])
 def test_a_name_is_broken_between_its_words_only(opened: Callable[..., Reader], width: int) -> None:
-    """Names of monitors, files, events and types: behind a slash or underscore, never in the middle of a word."""
+    """Names of monitors, files, events and types break after a slash or underscore, never inside a word."""
     reader = opened(width=width, height=800)
     for view, heading in (("monitors", None), ("monitors/obstacleAvoidance", "obstacleAvoidance")):
         page = reader.go(view, heading=heading)
@@ -61,7 +61,7 @@ def test_a_name_is_broken_between_its_words_only(opened: Callable[..., Reader], 
 
 
 def test_two_clicks_at_once_are_both_made(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """The second is meant for what the first one made, whose ETag nobody has yet when it is clicked."""
+    """Both clicks take effect, although the page does not have the first one's ETag at the second."""
     page = opened().go("monitors")
     names = ("safeZone", "safeTrigger")
     switches = [page.get_by_role("switch", name=f"{name} enabled") for name in names]
@@ -78,13 +78,13 @@ def test_two_clicks_at_once_are_both_made(appliance: Appliance, opened: Callable
             expect(switch).to_have_attribute("aria-checked", str(on).lower())
         assert [state(appliance, name)["enabled"] for name in names] == wanted
         before = wanted
-    expect(page.get_by_text("Somebody else was quicker")).to_have_count(0)
+    expect(page.get_by_text("Changed by someone else")).to_have_count(0)
 
 
 def test_a_switch_that_somebody_else_was_quicker_with_says_so(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """What the page has not seen yet is not overwritten; then it shows what is."""
+    """A change that the page has not shown yet is not overwritten; then the page shows it."""
     reader = opened()
     deaf = threading.Event()  # it hears nothing of what others do, nor what it has asked for by then
 
@@ -104,7 +104,7 @@ def test_a_switch_that_somebody_else_was_quicker_with_says_so(
     appliance.rosrv("monitor", "disable" if before else "enable", "safeZone")
     other = state(appliance, "safeTrigger")["enabled"]
     page.get_by_role("switch", name="safeTrigger enabled").click()
-    expect(reader.toast("Somebody else was quicker")).to_be_visible()
+    expect(reader.toast("Changed by someone else")).to_be_visible()
     assert state(appliance, "safeTrigger")["enabled"] is other
     deaf.clear()
     page.reload()
@@ -116,7 +116,7 @@ def test_a_switch_that_somebody_else_was_quicker_with_says_so(
 def test_a_specification_is_loaded_replaced_and_removed(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """An error stands at its line and loads nothing; mended, it is loaded; then it is replaced, and removed."""
+    """An error is shown at its line and loads nothing; the corrected text is loaded, replaced, and removed."""
     reader = opened()
     page = reader.go("monitors")
     page.get_by_role("button", name="Load a specification").click()

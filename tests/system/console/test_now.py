@@ -1,4 +1,4 @@
-"""Now: what happens is seen as it happens, and the page says when it does not know."""
+"""Test the view Now: events appear as they happen, and the page reports when it has no data."""
 
 import re
 from collections.abc import Callable
@@ -11,11 +11,11 @@ from tests.system.console.reader import LIMIT, Reader
 
 
 def test_a_refusal_is_seen_live(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
-    """A node that the policy denies appears under `Refused lately` without a reload, and leads to its record."""
+    """A node that the policy denies appears under `Recently denied` without a reload, and leads to its record."""
     reader = opened()
     page = reader.go("now")
-    refused = page.get_by_role("region", name="Refused lately")
-    expect(refused).to_contain_text("Nothing was refused")
+    refused = page.get_by_role("region", name="Recently denied")
+    expect(refused).to_contain_text("Nothing was denied")
     assert (
         attempt("registerPublisher", "/intruder", "/guarded", "std_msgs/String", "http://127.0.0.1:1/")[0]
         != 1
@@ -40,7 +40,7 @@ def test_health_says_what_the_appliance_says(appliance: Appliance, opened: Calla
 
 
 def test_processes_of_one_role_are_told_apart(opened: Callable[..., Reader]) -> None:
-    """Several relay processes are numbered as `rosrv status` numbers them; who is alone is not."""
+    """Several relay processes are numbered as in `rosrv status`; a single process is not."""
     page = opened().go("now")
     named = """async (processes) => {
       const { numbered } = await import("/console/static/js/now/view.js");
@@ -64,10 +64,51 @@ def test_rates_are_of_more_than_a_moment(opened: Callable[..., Reader]) -> None:
     assert page.evaluate(growth, [*samples, {"time": 112, "count": 0}])[-1] is None
 
 
+def sample(time: float, denied: int = 0, **drops: int) -> dict[str, Any]:
+    """Return a sample with these denials, and the drops of these monitors."""
+    return {"time": time, "denied": denied, "monitors": {name: [0, drops[name], 0, 0] for name in drops}}
+
+
+def test_drops_and_denials_of_the_last_minute_are_warnings(opened: Callable[..., Reader]) -> None:
+    """Each monitor that dropped messages, and ten denials or more, give a warning; earlier ones do not count."""
+    page = opened().go("now")
+    activity = """async (samples) => {
+      const { activity } = await import("/console/static/js/now/activity.js");
+      return activity(samples).map((one) => [one.severity, one.text, one.about]);
+    }"""
+    samples = [sample(0, limit=3), sample(50, 5, limit=3), sample(100, 14, limit=3, zone=2)]
+    assert page.evaluate(activity, samples) == [
+        ["warning", "zone dropped 2 messages in the last minute", "monitors"]
+    ]
+    assert page.evaluate(activity, [*samples, sample(102, 15, limit=4, zone=2)]) == [
+        ["warning", "limit dropped 1 message in the last minute", "monitors"],
+        ["warning", "zone dropped 2 messages in the last minute", "monitors"],
+        ["warning", "10 requests denied in the last minute", "audit"],
+    ]
+    assert page.evaluate(activity, [*samples, sample(300, 15, limit=4, zone=2)]) == []
+    assert page.evaluate(activity, []) == []
+
+
+def test_many_denials_turn_the_state_to_a_warning(
+    opened: Callable[..., Reader], attempt: Callable[..., Any]
+) -> None:
+    """The first card gives the reason and leads to the denials."""
+    page = opened().go("now")
+    for number in range(12):
+        attempt(
+            "registerPublisher", f"/intruder{number}", "/guarded", "std_msgs/String", "http://127.0.0.1:1/"
+        )
+    card = page.get_by_role("region", name="Health").get_by_role("link").first
+    expect(card).to_contain_text("In service, with warnings")
+    expect(card).to_contain_text(re.compile(r"\d+ requests denied in the last minute"))
+    card.click()
+    expect(page).to_have_url(re.compile("/console/audit.*decision=deny"))
+
+
 def test_the_page_says_that_it_is_not_live_and_comes_back(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """When the api process dies the page says so at once, tries again by itself, and is live again."""
+    """When the api process dies, the page reports it at once, reconnects automatically, and is live again."""
     reader = opened()
     page = reader.go("now")
     expect(page.locator("[data-standing=live]")).to_be_visible()
@@ -80,16 +121,16 @@ def test_the_page_says_that_it_is_not_live_and_comes_back(
 def test_an_alarm_is_open_until_its_cause_is_gone(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """A policy that goes back unless confirmed is an open alarm, with the way to it; confirmed, it is none."""
+    """A policy that waits for confirmation is an open alarm with a link to it; confirmed, it is not."""
     page = opened().go("now")
     alarms = page.get_by_role("region", name="Open alarms")
-    expect(alarms).to_contain_text("Nothing is open")
+    expect(alarms).not_to_contain_text("unless confirmed")
     rest = appliance.rest()
     current = rest.get("/v1/policy")
     loaded = rest.post(
         "/v1/policy?confirm_within=600", current.json["text"] + "\n# later\n", match=current.etag
     )
     assert loaded.status == 200, loaded.body
-    expect(alarms).to_contain_text("goes back by itself unless it is confirmed")
+    expect(alarms).to_contain_text(" s unless confirmed")
     assert rest.post("/v1/policy/confirm", match=loaded.etag).status == 200
-    expect(alarms).not_to_contain_text("goes back by itself")
+    expect(alarms).not_to_contain_text("unless confirmed")

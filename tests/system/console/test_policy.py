@@ -1,7 +1,9 @@
-"""Policy: written wrongly and rightly, asked, tested, loaded on trial, taken back; two engineers at once."""
+"""Test the view Policy: edit, explain, test, load with commit-confirm, roll back; two engineers at once."""
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import expect
@@ -21,7 +23,7 @@ cases:
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """An appliance whose policy has tests."""
+    """Run an appliance whose policy has tests."""
     config = tmp_path_factory.mktemp("console") / "appliance.yaml"
     config.write_text(CONFIG)
     running = Appliance(policy=POLICY, options=("--config", str(config)))
@@ -31,14 +33,14 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 
 
 def revision(appliance: Appliance) -> int:
-    """The one in force."""
+    """Return the policy in force."""
     return int(appliance.rest().get("/v1/policy").json["revision"])
 
 
 def test_an_error_is_shown_at_its_line_and_changes_nothing(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """While a wrong line is written its error appears, at the line, with a mark in the margin; nothing is loaded."""
+    """The error of a wrong line appears at the line while it is typed, with a mark in the margin; nothing is loaded."""
     before = revision(appliance)
     reader = opened()
     page = reader.go("policy")
@@ -54,7 +56,7 @@ def test_an_error_is_shown_at_its_line_and_changes_nothing(
 
 
 def test_what_is_typed_stands_there(opened: Callable[..., Reader]) -> None:
-    """Typed quickly, key by key, over several lines, taken back and done again: the text is what was typed."""
+    """After quick typing over several lines, undo and redo, the text is exactly what was typed."""
     reader = opened()
     page = reader.go("policy")
     first = reader.editor().inner_text()
@@ -72,7 +74,7 @@ def test_what_is_typed_stands_there(opened: Callable[..., Reader]) -> None:
 
 
 def test_a_right_text_is_loaded_with_its_comment(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """A dry run says what would change; loading it makes a new revision with author and comment; the diff is shown."""
+    """A dry run shows the changes and the diff; loading makes a new revision with author and comment."""
     before = revision(appliance)
     reader = opened()
     page = reader.go("policy")
@@ -91,26 +93,44 @@ def test_a_right_text_is_loaded_with_its_comment(appliance: Appliance, opened: C
     assert appliance.rest().get("/v1/policy").json["who"] == "first"
 
 
-def test_a_policy_on_trial_is_kept_or_taken_back(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """Loaded with a time to confirm, it says how long is left; one click goes back, and the text is the old one."""
+def test_commit_confirm_keeps_or_rolls_back_a_policy(
+    appliance: Appliance, opened: Callable[..., Reader]
+) -> None:
+    """With commit-confirm the page shows the time left; one click rolls back to the old text."""
     reader = opened()
     page = reader.go("policy")
     first = appliance.rest().get("/v1/policy").json["text"]
     reader.write(first + "\n# on trial\n")
     page.get_by_role("button", name="Load", exact=True).click()
-    page.get_by_role("dialog").get_by_label("If you lock yourself out").select_option("300")
+    page.get_by_role("dialog").get_by_label("Commit-confirm").select_option("300")
     page.get_by_role("dialog").get_by_role("button", name="Load the policy").click()
-    expect(page.get_by_text("unless it is confirmed")).to_be_visible()
-    page.get_by_role("button", name="Go back now").click()
-    expect(page.get_by_text("unless it is confirmed")).to_have_count(0)
-    expect(reader.editor()).not_to_contain_text("on trial")
+    expect(page.get_by_text(re.compile("rolls back in .* unless confirmed"))).to_be_visible()
+    page.get_by_role("button", name="Roll back now").click()
+    expect(page.get_by_text(re.compile("rolls back in .* unless confirmed"))).to_have_count(0)
+    expect(reader.editor()).not_to_contain_text("shadow")
     assert appliance.rest().get("/v1/policy").json["text"] == first
+
+
+def test_a_policy_that_ends_connections_rolls_back_unless_confirmed(
+    appliance: Appliance, opened: Callable[..., Reader], attempt: Callable[..., Any]
+) -> None:
+    """The dialog preselects five minutes, also for a person who does not wait for the dry run."""
+    assert attempt("registerPublisher", "/loud", "/free", "std_msgs/String", "http://127.0.0.1:1/")[0] == 1
+    reader = opened()
+    page = reader.go("policy")
+    first = appliance.rest().get("/v1/policy").json["text"]
+    reader.write(first.replace("[Publishers]\n", "[Publishers]\n/free = 10.9.9.9\n"))
+    page.get_by_role("button", name="Load", exact=True).click()
+    page.get_by_role("dialog").get_by_role("button", name="Load the policy").click()
+    expect(page.get_by_text(re.compile("rolls back in .* unless confirmed"))).to_be_visible()
+    page.get_by_role("button", name="Roll back now").click()
+    expect(page.get_by_text(re.compile("rolls back in .* unless confirmed"))).to_have_count(0)
 
 
 def test_two_engineers_do_not_overwrite_each_other(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """Who began from an older revision is refused, told so, and can take his text over the new one knowingly."""
+    """A text based on an older revision is rejected with the reason; the author can then load it over the new one."""
     reader = opened()
     page = reader.go("policy")
     rest = appliance.rest()
@@ -121,7 +141,7 @@ def test_two_engineers_do_not_overwrite_each_other(
     expect(page.get_by_text("came into force while you wrote")).to_be_visible()
     page.get_by_role("button", name="Load", exact=True).click()
     page.get_by_role("dialog").get_by_role("button", name="Load the policy").click()
-    expect(page.get_by_role("dialog").get_by_text("Somebody else was quicker")).to_be_visible()
+    expect(page.get_by_role("dialog").get_by_text("Changed by someone else")).to_be_visible()
     assert "# theirs" in rest.get("/v1/policy").json["text"]
     page.get_by_role("dialog").get_by_role("button", name="Not yet").click()
     page.get_by_role("button", name="Keep my text, show the difference").click()
@@ -130,7 +150,7 @@ def test_two_engineers_do_not_overwrite_each_other(
 
 
 def test_it_explains_and_leads_to_the_line(opened: Callable[..., Reader]) -> None:
-    """Why a request is refused: the rule, its line, and what the node's name is worth."""
+    """An explanation shows the rule that denies a request, its line, and the right to the node's name."""
     reader = opened()
     page = reader.go("policy?tab=explain")
     page.get_by_label("Host").fill("10.0.0.9")
@@ -138,14 +158,14 @@ def test_it_explains_and_leads_to_the_line(opened: Callable[..., Reader]) -> Non
     page.get_by_label("What").fill("/guarded")
     page.get_by_role("button", name="Explain").click()
     found = page.locator("[data-explained]").first
-    expect(found).to_contain_text("The request is refused")
+    expect(found).to_contain_text("The request is denied")
     expect(found).to_contain_text("[Publishers] /guarded")
     found.get_by_role("button", name="line 7").first.click()
     expect(page.locator(".cm-lineNumbers .cm-activeLineGutter")).to_have_text("7")
 
 
 def test_the_tests_of_the_policy_are_run_on_the_draft(opened: Callable[..., Reader]) -> None:
-    """All pass on the policy in force; a draft that breaks one says which, and what it expects."""
+    """All cases pass on the policy in force; for a draft that fails one, the case and its expectation are shown."""
     reader = opened()
     page = reader.go("policy?tab=tests")
     page.get_by_role("button", name="Run the tests").click()
@@ -157,7 +177,7 @@ def test_the_tests_of_the_policy_are_run_on_the_draft(opened: Callable[..., Read
 
 
 def test_an_older_revision_comes_back(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """The list of revisions shows what differs before it goes back, and the rollback is a revision of its own."""
+    """The list of revisions shows the differences before a rollback, which becomes a new revision."""
     rest = appliance.rest()
     assert rest.post("/v1/policy", POLICY + "\n# to be undone\n", match="*").status == 200
     before = revision(appliance)

@@ -1,4 +1,4 @@
-"""Recordings in the console: from their record an investigator takes the messages, and a bundle that proves itself."""
+"""Test recordings in the console: from a record, an investigator fetches the messages and an evidence bundle."""
 
 import json
 import zipfile
@@ -20,7 +20,7 @@ recorder: {enabled: true, memory: 16MiB, disk: 512MiB, triggers: []}
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """An appliance with a flight recorder."""
+    """Run an appliance with a flight recorder."""
     config = tmp_path_factory.mktemp("console") / "appliance.yaml"
     config.write_text(CONFIG)
     with Appliance(options=("--config", str(config))) as running:
@@ -30,7 +30,7 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 def test_an_investigator_takes_a_recording_from_its_record(
     appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str]
 ) -> None:
-    """The bag and the bundle come as files; an admin is told whom they are for."""
+    """The bag and the bundle are downloaded as files; an admin sees which role they are for."""
     order = appliance.rosrv("record", "now", "--before", "1s", "--after", "1s", "--json")
     recording = json.loads(order.stdout)["id"]
     [record] = appliance.recorded("--event", "recording closed")

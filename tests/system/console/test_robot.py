@@ -1,4 +1,4 @@
-"""A robot of a hundred nodes and two hundred topics: read at a glance, opened where it stands, found by name."""
+"""Show a robot of a hundred nodes and two hundred topics: readable at a glance, opened in place, found by name."""
 
 from collections.abc import Callable, Iterator
 from itertools import combinations
@@ -9,7 +9,7 @@ from playwright.sync_api import Locator, Page, expect
 
 from tests.support.appliance import Appliance
 from tests.support.robot import Robot, nodes
-from tests.system.console.reader import Reader
+from tests.system.console.reader import Reader, wait_until
 
 WIDE, NARROW = (1280, 800), (390, 844)
 SMALLEST_NAME = 11  # pixels on the screen
@@ -19,7 +19,7 @@ _ALL_IN_FRAME = """() => {
     frame.left <= box.left && box.right <= frame.right && frame.top <= box.top && box.bottom <= frame.bottom);
 }"""
 
-# Of each line of what was refused: the boxes that it runs behind, but for those of its ends.
+# For each line of a denied attempt, the boxes that it runs behind, except those at its ends.
 _BEHIND = """() => {
   const boxes = [...document.querySelectorAll(".box")].map((one) => [one.dataset.key, one.querySelector(".shape")]);
   return [...document.querySelectorAll("g.attempt path.line")].map((line) => {
@@ -38,7 +38,7 @@ _BEHIND = """() => {
 
 @pytest.fixture(scope="module")
 def robot(appliance: Appliance) -> Iterator[Robot]:
-    """The robot; a node of another machine has tried to command its arm."""
+    """Run the robot; a node of another machine has tried to command its arm."""
     with Robot(appliance.master_uri) as robot:
         refused = robot.call(
             "/operator/bridge",
@@ -54,10 +54,10 @@ def robot(appliance: Appliance) -> Iterator[Robot]:
 @pytest.mark.usefixtures("robot")
 @pytest.mark.parametrize("size", [WIDE, NARROW])
 def test_all_of_it_is_in_the_picture(opened: Callable[..., Reader], size: tuple[int, int]) -> None:
-    """Ten namespaces, none cut off, none over another, every name whole, and as large as one reads."""
+    """Ten namespaces are shown: none is cut off or overlaps another, and every name is complete and readable."""
     page = _graph(opened(width=size[0], height=size[1]))
     expect(page.locator('[data-key="gnode:/arm/*"]')).to_contain_text("/arm")
-    page.wait_for_function(_ALL_IN_FRAME)  # it is fitted once it is drawn
+    wait_until(page, _ALL_IN_FRAME)  # it is fitted once it is drawn
     boxes = [_place(one) for one in page.locator(".box .shape").all()]
     assert not [pair for pair in combinations(boxes, 2) if _overlap(*pair)]
     assert _smallest_name(page) >= SMALLEST_NAME
@@ -70,7 +70,7 @@ def test_all_of_it_is_in_the_picture(opened: Callable[..., Reader], size: tuple[
 
 @pytest.mark.usefixtures("robot")
 def test_a_group_opens_where_it_stands(opened: Callable[..., Reader]) -> None:
-    """The parts of /arm stand in its place, nothing over another; what stood above it has not moved."""
+    """The parts of /arm replace it without overlaps, and the boxes above it have not moved."""
     page = _graph(opened(width=WIDE[0], height=WIDE[1]))
     group = page.locator('[data-key="gnode:/arm/*"]')
     at = _corner(group)
@@ -91,7 +91,7 @@ def test_a_group_opens_where_it_stands(opened: Callable[..., Reader]) -> None:
 
 @pytest.mark.usefixtures("robot")
 def test_groups_by_host(opened: Callable[..., Reader]) -> None:
-    """The machines of the robot, and who talks to whom among them."""
+    """The robot's machines are shown with the connections between them."""
     page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
     page.get_by_label("Groups", exact=True).select_option("host")
     expect(page.locator(".box.many")).to_have_count(4)
@@ -100,7 +100,7 @@ def test_groups_by_host(opened: Callable[..., Reader]) -> None:
 
 @pytest.mark.usefixtures("robot")
 def test_who_talks_to_the_arm(opened: Callable[..., Reader]) -> None:
-    """Its name and Enter: publishers, subscribers; in the table who was refused, too."""
+    """A topic's name and Enter show its publishers and subscribers, and a denied attempt on it."""
     page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
     search = page.get_by_label("Search the graph")
     search.fill("/arm/command")
@@ -128,7 +128,7 @@ def test_numbers_agree(opened: Callable[..., Reader], appliance: Appliance) -> N
 def test_a_refusal_runs_behind_no_box(
     appliance: Appliance, robot: Robot, opened: Callable[..., Reader]
 ) -> None:
-    """Backwards, too, it goes around what stands between its ends: else it would seem to be another's."""
+    """A line, also a backward one, goes around the boxes between its ends, so that it does not seem to be theirs."""
     policy = appliance.policy_file.read_text()
     appliance.reload(policy.replace("[Publishers]\n", "[Publishers]\n/arm/command = 127.0.0.11\n"))
     for node in ("/operator/bridge", "/camera/bridge"):
@@ -137,13 +137,13 @@ def test_a_refusal_runs_behind_no_box(
         )
     page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
     expect(page.locator("g.attempt")).to_have_count(3)
-    page.wait_for_function(_ALL_IN_FRAME)
+    wait_until(page, _ALL_IN_FRAME)
     assert not [keys for keys in page.evaluate(_BEHIND) if keys]
     appliance.reload(policy)
 
 
 def _graph(reader: Reader) -> Page:
-    """The graph, when all of it is there: groups, and the attempt that was refused."""
+    """Return the graph when it is complete: groups, and the denied attempt."""
     page = reader.go("graph")
     expect(page.locator(".box.many")).to_have_count(10)
     expect(page.locator("g.attempt")).to_have_count(1)
@@ -151,7 +151,7 @@ def _graph(reader: Reader) -> Page:
 
 
 def _corners(page: Page) -> dict[str, tuple[float, float]]:
-    """The upper left corner of each box in the drawing, however it is looked at."""
+    """Return the upper left corner of each box in the drawing, independent of zoom and position."""
     return {str(one.get_attribute("data-key")): _corner(one) for one in page.locator(".box").all()}
 
 
@@ -171,7 +171,7 @@ def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, 
 
 
 def _smallest_name(page: Page) -> float:
-    """The size of the smallest name, in pixels on the screen."""
+    """Return the size of the smallest name, in pixels on the screen."""
     return float(
         page.evaluate(
             "Math.min(...[...document.querySelectorAll('.box-name')].map((one) =>"

@@ -1,4 +1,4 @@
-"""What a site has of its own: a notice at the door, and signatures without which nothing is loaded."""
+"""Test a site's settings: a notice on the sign-in page, and required signatures."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -18,7 +18,7 @@ SPECIFICATION = "count() { event said() /chatter std_msgs/String '{}' { } }\n"
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """An appliance with a key of the site, and its notice."""
+    """Run an appliance with a site key and a notice."""
     config = tmp_path_factory.mktemp("console") / "appliance.yaml"
     config.write_text(f"{CONFIG}site_keys: [{LINE}]\napi_notice: {json.dumps(NOTICE)}\n")
     running = Appliance(policy=POLICY, options=("--config", str(config)))
@@ -30,10 +30,10 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 def test_the_notice_of_the_site_is_shown_before_a_token_is_given(
     browser: Browser, appliance: Appliance
 ) -> None:
-    """As it was written, line by line; what looks like markup is text."""
+    """The notice is shown as written, line by line; markup in it is only text."""
     with Reader(browser, str(appliance.ready["api"])) as reader:
         reader.page.goto(reader.url)
-        notice = reader.page.get_by_role("note", name="Notice of the site")
+        notice = reader.page.get_by_role("note", name="Site notice")
         expect(notice).to_be_visible()
         assert notice.inner_text() == NOTICE
         expect(reader.page.get_by_label("Access token")).to_be_visible()
@@ -43,7 +43,7 @@ def test_the_notice_of_the_site_is_shown_before_a_token_is_given(
 def test_a_policy_is_loaded_with_its_signature_only(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """Without it the dialog says what is missing, and stays; with it the policy is loaded."""
+    """Without a signature the dialog says what is missing and stays open; with it the policy is loaded."""
     text = POLICY + "# another\n"
     reader = opened()
     page = reader.go("policy")
@@ -51,7 +51,7 @@ def test_a_policy_is_loaded_with_its_signature_only(
     page.get_by_role("button", name="Load", exact=True).click()
     dialog = page.get_by_role("dialog")
     expect(dialog.get_by_role("alert")).to_contain_text("it has no signature of the site")
-    dialog.get_by_label("Signature of the site").fill(signed(text))
+    dialog.get_by_label("Site signature").fill(signed(text))
     expect(dialog.get_by_role("alert")).to_have_count(0)
     dialog.get_by_role("button", name="Load the policy").click()
     expect(reader.toast("Revision 2 is in force")).to_be_visible()
@@ -61,7 +61,7 @@ def test_a_policy_is_loaded_with_its_signature_only(
 def test_a_specification_is_loaded_with_its_signature_only(
     appliance: Appliance, opened: Callable[..., Reader], tmp_path: Path
 ) -> None:
-    """File and signature are chosen together; the one without the other is refused."""
+    """File and signature are chosen together; one without the other is rejected."""
     file, beside = tmp_path / "count.rv", tmp_path / "count.rv.sig"
     file.write_text(SPECIFICATION)
     beside.write_text(signed(SPECIFICATION))
@@ -73,7 +73,7 @@ def test_a_specification_is_loaded_with_its_signature_only(
     dialog.get_by_role("button", name="Load", exact=True).click()
     expect(dialog).to_contain_text("it has no signature of the site")
     dialog.get_by_label("Take it from files").set_input_files([file, beside])
-    expect(dialog.get_by_label("Signature of the site")).to_have_value(signed(SPECIFICATION))
+    expect(dialog.get_by_label("Site signature")).to_have_value(signed(SPECIFICATION))
     dialog.get_by_role("button", name="Load", exact=True).click()
     expect(dialog).to_have_count(0)
     assert appliance.rest().get("/v1/monitors").json["monitors"][0]["name"] == "count"

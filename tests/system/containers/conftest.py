@@ -1,4 +1,4 @@
-"""A machine of the lab with a Docker engine, a laptop on its network, and the product running there as containers."""
+"""A machine of the lab with a Docker engine, a laptop on its network, and the product there as containers."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,20 +21,20 @@ class Site:
     laptop: Host
 
     def story(self) -> str:
-        """What the engine said, for the message of a failure."""
+        """Return the engine's output, for the message of a failure."""
         return self.engine.story()
 
 
 @pytest.fixture(scope="session")
 def images() -> None:
-    """The images, built from this checkout."""
+    """Build the images from this checkout."""
     need_root()
     build_images()
 
 
 @pytest.fixture(scope="module")
 def site(images: None) -> Iterator[Site]:
-    """The engine, with the images; its data is for one, so it ends with the module."""
+    """Run the engine with the images; its data is for one engine, so it ends with the module."""
     with Lab("rosrv-engine") as lab:
         machine, laptop = lab.host("machine", "10.79.0.1/24"), lab.host("laptop", "10.79.0.50/24")
         with Engine(machine) as engine:
@@ -43,7 +43,7 @@ def site(images: None) -> Iterator[Site]:
 
 @pytest.fixture(scope="module")
 def demo(site: Site, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Compose]:
-    """`docker compose --profile demo up`: the appliance, the LandShark, its operator and a visitor."""
+    """Run `docker compose --profile demo up`: the appliance, the LandShark, its operator and a visitor."""
     compose = site.engine.compose(project(tmp_path_factory.mktemp("project")), "demo")
     try:
         compose("--profile", "demo", "up", "--detach", "--no-build")
@@ -54,7 +54,7 @@ def demo(site: Site, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Compo
 
 @pytest.fixture
 def alone(site: Site, tmp_path: Path) -> Iterator[Compose]:
-    """`docker compose up`: the appliance alone, healthy."""
+    """Run `docker compose up`: the appliance alone, healthy."""
     compose = site.engine.compose(project(tmp_path), "alone")
     try:
         compose("up", "--detach", "--no-build")
@@ -65,7 +65,7 @@ def alone(site: Site, tmp_path: Path) -> Iterator[Compose]:
 
 
 def without(alone: Compose, right: str) -> None:
-    """Start it again with all rights but one."""
+    """Start it again with all capabilities except one."""
     text = yaml.safe_load((alone.directory / "compose.yaml").read_text())
     text["services"]["appliance"]["cap_add"].remove(right)
     text["services"]["appliance"]["restart"] = "no"

@@ -1,4 +1,4 @@
-"""Tests of `docker compose --profile demo up`: real nodes in containers, and what can be reached from where."""
+"""Test `docker compose --profile demo up`: real nodes in containers, and the reachable ports of each network."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from tests.support.docker import ROOT, Compose, namespace_of
 from tests.support.rest import Rest
 from tests.system.containers.conftest import Site
 
-pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are built
+pytestmark = pytest.mark.timeout(1500)  # for the first test: the images are built
 
 MACHINE = "10.79.0.1"
 ROBOT_SIDE, OPERATOR_SIDE, OUTSIDE = "172.29.77.2", "172.29.78.2", "172.29.76.2"
@@ -27,7 +27,7 @@ LAST_ATTACK = "stop the master"
 
 @pytest.fixture(scope="module")
 def attacks(demo: Compose) -> dict[str, dict[str, Any]]:
-    """What the visitor tried, once he has tried everything and the operator has driven, aimed and fired."""
+    """Return the visitor's attempts, once all are made and the operator has driven, aimed and fired."""
     demo.wait_for_log("ocu", '"fired"', timeout=120)
     demo.wait_for_log("visitor", LAST_ATTACK, timeout=180)
     lines = demo("logs", "--no-color", "visitor").stdout.splitlines()
@@ -36,12 +36,12 @@ def attacks(demo: Compose) -> dict[str, dict[str, Any]]:
 
 
 def ports_open(where: Namespace, address: str, ports: range) -> tuple[int, ...]:
-    """Which of the ports take a connection from there."""
+    """Return the ports that accept a connection from there."""
     return where.run(lambda: scan(address, ports, seconds=3.0)).open
 
 
 def reaches(where: Namespace, address: str, port: int, family: int = socket.AF_INET) -> str:
-    """What a connection from there comes to."""
+    """Return the result of a connection from there."""
 
     def attempt() -> str:
         with socket.socket(family, socket.SOCK_STREAM) as client:
@@ -65,8 +65,8 @@ def test_unmodified_nodes_work_through_the_appliance(demo: Compose) -> None:
     assert {"/ocu", "/landshark_base", "/landshark_radar"} <= nodes
 
 
-def test_all_that_nodes_are_told_is_the_master(demo: Compose) -> None:
-    """Of the appliance a node's container knows ROS_MASTER_URI, nothing else."""
+def test_nodes_have_no_setting_but_the_master(demo: Compose) -> None:
+    """ROS_MASTER_URI is the only setting of a node's container that refers to the appliance."""
     for service in ("landshark", "ocu"):
         told = demo.engine.inspect(demo.container(service))["Config"]["Env"]
         assert [one for one in told if one.startswith(("ROS_", "ROSRV"))] == [
@@ -75,8 +75,8 @@ def test_all_that_nodes_are_told_is_the_master(demo: Compose) -> None:
         ]
 
 
-def test_a_visitor_is_refused_by_name_of_the_rule(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
-    """Of all that he tries nothing succeeds but what the policy grants; each refusal is recorded with its rule."""
+def test_denials_of_the_visitor_name_the_rule(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
+    """Of the visitor's attempts only those succeed that the policy grants; each denial is recorded with its rule."""
     succeeded = {name for name, one in attacks.items() if one["succeeded"]}
     assert succeeded <= {"watch the battery"}
     assert len(attacks) >= 12
@@ -86,10 +86,10 @@ def test_a_visitor_is_refused_by_name_of_the_rule(attacks: dict[str, dict[str, A
     assert files == {"/etc/rosrv/policies/containers.ini"}
 
 
-def test_the_appliance_sees_who_really_speaks(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
-    """Source addresses are preserved: what registers under a name is recorded with its container's address.
+def test_source_addresses_are_preserved(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
+    """Source addresses are preserved: a registration is recorded with its container's address.
 
-    Whoever may read parameters may do so under any name that nobody holds.
+    A host that may read parameters may do so under any unused name.
     """
     assert attacks
     decided = demo.audit("--allow", "--event", "decision")
@@ -104,7 +104,7 @@ def test_the_appliance_sees_who_really_speaks(attacks: dict[str, dict[str, Any]]
     assert {host for name, host in hosts.items() if name.startswith("/landshark")} == {LANDSHARK}
 
 
-def test_only_what_is_named_is_published(site: Site, demo: Compose) -> None:
+def test_only_documented_ports_are_published(site: Site, demo: Compose) -> None:
     """The engine publishes IKE and, on this machine, the console; for the robot's containers nothing."""
     published = {}
     for service in ("appliance", "landshark", "ocu"):
@@ -123,7 +123,7 @@ def test_only_what_is_named_is_published(site: Site, demo: Compose) -> None:
 def test_this_machine_reaches_the_console_and_the_laptop_does_not(
     site: Site, demo: Compose, tmp_path: Path
 ) -> None:
-    """127.0.0.1:8443 answers over TLS on the machine, by the first token; from its network nobody gets there."""
+    """127.0.0.1:8443 answers over TLS on the machine to the first token; hosts on its network cannot connect."""
     token = demo.exec("appliance", "cat", "/var/lib/rosrv/first-token").stdout.strip()
     certificate = tmp_path / "certificate.pem"
 
@@ -138,7 +138,7 @@ def test_this_machine_reaches_the_console_and_the_laptop_does_not(
 
 
 def test_an_operator_reaches_the_appliance_only(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
-    """From the operators' network: RVMaster and the nodes' stand-ins; no console, no ROS Master, no robot."""
+    """The operators' network reaches RVMaster and the proxy endpoints, but no console, no `rosmaster`, no robot."""
     assert attacks
     here = namespace_of(demo.engine, demo.container("ocu"))
     found = ports_open(here, OPERATOR_SIDE, range(1, 65536))
@@ -147,12 +147,12 @@ def test_an_operator_reaches_the_appliance_only(attacks: dict[str, dict[str, Any
     for address in (ROBOT_SIDE, OUTSIDE, LANDSHARK):
         assert ports_open(here, address, range(1, 65536, 199)) == ()
         for port in (8443, 11311):
-            assert reaches(here, address, port) not in ("reached", "ConnectionRefusedError")  # nobody answers
+            assert reaches(here, address, port) not in ("reached", "ConnectionRefusedError")  # no answer
     assert attacks["go past the master"]["answer"][1].startswith("0 of ")
 
 
-def test_a_stranger_on_the_outer_network_gets_nothing(demo: Compose) -> None:
-    """A container that somebody starts beside the appliance reaches neither REST nor the ROS Master."""
+def test_an_unknown_container_reaches_nothing(demo: Compose) -> None:
+    """Another container beside the appliance reaches neither REST nor `rosmaster`."""
     name = demo.engine.docker(
         "run", "--detach", "--rm", "--network", "demo_outside", "--entrypoint", "sleep", "rosrv/demo", "300"
     ).stdout.strip()
@@ -167,19 +167,19 @@ def test_a_stranger_on_the_outer_network_gets_nothing(demo: Compose) -> None:
 
 
 def test_nothing_listens_on_ipv6(demo: Compose) -> None:
-    """The networks have no IPv6, and no socket of the appliance is on an IPv6 address that could be reached."""
+    """The networks have no IPv6, and no socket of the appliance is on a reachable IPv6 address."""
     listening = demo.exec("appliance", "ss", "-Htln6").stdout
     assert listening == ""
 
 
 def documented_rights() -> dict[str, tuple[str, frozenset[str]]]:
-    """The table of processes in the documentation: user and capabilities of each."""
+    """Return the table of processes in the documentation: user and capabilities of each."""
     rows = re.findall(r"^\| `([a-z]+)` \| `([a-z-]+)` \| ([^|]*) \|", PAGE.read_text(), re.MULTILINE)
     return {name: (user, frozenset(re.findall(r"[A-Z][A-Z_]+", rights))) for name, user, rights in rows}
 
 
-def test_every_process_has_the_rights_that_are_documented(demo: Compose) -> None:
-    """User and capabilities of each process are those of the table, and there is no other process."""
+def test_every_process_has_the_documented_rights(demo: Compose) -> None:
+    """User and capabilities of each process match the table, and there is no other process."""
     numbers = {"NET_ADMIN": 12, "NET_BIND_SERVICE": 10, "SETUID": 7, "SETGID": 6, "KILL": 5, "CHOWN": 0}
     documented = documented_rights()
     seen = {row["role"]: row["pid"] for row in demo.status()["processes"]}
@@ -203,7 +203,7 @@ def test_every_process_has_the_rights_that_are_documented(demo: Compose) -> None
 
 
 def test_the_root_file_system_is_read_only(demo: Compose) -> None:
-    """Of the file systems only the volume, /tmp and /run can be written, and from the latter two nothing runs."""
+    """Only the volume, /tmp and /run are writable, and the latter two do not allow execution."""
     mounts = demo.exec("appliance", "cat", "/proc/mounts").stdout.splitlines()
     kinds = {line.split()[1]: line.split()[2:4] for line in mounts}
     assert "ro" in kinds["/"][1].split(",")
@@ -221,13 +221,13 @@ def test_the_root_file_system_is_read_only(demo: Compose) -> None:
         assert "ro" in kinds[f"/etc/rosrv/{folder}"][1].split(",")
 
 
-def test_packets_do_not_pass_from_one_network_to_the_other(demo: Compose) -> None:
-    """The appliance does not forward: an operator's packet that is sent to it for the robot ends there."""
+def test_packets_are_not_forwarded_between_networks(demo: Compose) -> None:
+    """The appliance does not forward: an operator's packet for the robot ends there."""
     assert demo.exec("appliance", "cat", "/proc/sys/net/ipv4/ip_forward").stdout.strip() == "0"
 
 
 def test_a_policy_is_changed_while_the_robot_runs(demo: Compose) -> None:
-    """Edit policies/ on the machine, reload through `docker compose exec`: what is no longer granted is taken back."""
+    """After an edit of policies/ on the machine and a reload through `docker compose exec`, lost rights are revoked."""
     file = demo.directory / "policies" / "containers.ini"
     before = file.read_text()
     file.write_text(

@@ -1,4 +1,4 @@
-"""Tests of compose.host.yaml: the nodes run on the machine itself, the appliance in its container beside them."""
+"""Test compose.host.yaml: the nodes run on the machine itself, the appliance beside them in its container."""
 
 import subprocess
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
 from tests.system.containers.conftest import Site
 
-pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are built
+pytestmark = pytest.mark.timeout(1500)  # for the first test: the images are built
 
 APPLIANCE, MACHINE = "172.29.76.2", MachineInside.address
 LOCAL_PORTS = range(32768, 61000)
@@ -20,7 +20,7 @@ LOCAL_PORTS = range(32768, 61000)
 
 @pytest.fixture
 def beside(site: Site, tmp_path: Path) -> Iterator[Compose]:
-    """`docker compose -f compose.yaml -f compose.host.yaml up`."""
+    """Run `docker compose -f compose.yaml -f compose.host.yaml up`."""
     compose = site.engine.compose(project(tmp_path), "host", "compose.yaml", "compose.host.yaml")
     try:
         compose("up", "--detach", "--no-build")
@@ -33,7 +33,7 @@ def beside(site: Site, tmp_path: Path) -> Iterator[Compose]:
 def test_nodes_of_the_machine_work_and_its_ports_are_closed(
     site: Site, beside: Compose, tmp_path: Path
 ) -> None:
-    """By the three commands of the file's head: nodes talk, the appliance sees the machine, strangers see no port."""
+    """With the three commands of the file's head, nodes communicate, and unknown hosts see no port of the machine."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     rules = beside.exec("appliance", "rosrv", "protect", "--appliance", APPLIANCE).stdout
 
@@ -64,7 +64,7 @@ def test_nodes_of_the_machine_work_and_its_ports_are_closed(
             site.machine.run(lambda: nft("delete", "table", "inet", "rosrv_protect"))
 
 
-def test_without_the_machines_own_grant_nobody_is_let_in(site: Site, beside: Compose) -> None:
+def test_without_the_machines_own_rule_every_host_is_denied(site: Site, beside: Compose) -> None:
     """The policy of this topology names the machine only: the operator's network of compose.yaml has no rights."""
     assert beside.status()["policy"]["file"] == "/etc/rosrv/policies/default.ini"
     said = beside.exec(

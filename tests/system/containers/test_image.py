@@ -1,4 +1,4 @@
-"""Tests of the images: what is in them, what is not, and where they refuse to run."""
+"""Test the images: their contents, and the environments in which they refuse to run."""
 
 import io
 import json
@@ -14,7 +14,7 @@ from appliance.supervisor.users import NUMERIC_IDS
 from tests.support.docker import APPLIANCE, BASE, DEMO, ROOT
 from tests.system.containers.conftest import Site
 
-pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are built
+pytestmark = pytest.mark.timeout(1500)  # for the first test: the images are built
 
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 TOOLS = re.compile(
@@ -23,12 +23,12 @@ TOOLS = re.compile(
 CACHES = ("/var/lib/apt/lists/", "/var/cache/apt/", "/root/.cache/", "/tmp/")
 SECRET = re.compile(rb"-----BEGIN [A-Z ]*PRIVATE KEY-----\s+[A-Za-z0-9+/=\s]{60}")
 MOST_MEGABYTES = (
-    420  # of the appliance's image, the base of the tests (without Debian's own trimming) included
+    420  # for the appliance's image, including the base of the tests (without Debian's own trimming)
 )
 
 
 def members(site: Site, image: str) -> Iterator[tuple[str, tarfile.TarInfo, bytes]]:
-    """Every file of every layer of an image, deleted ones included: path, entry, the first megabyte."""
+    """Yield every file of every layer of an image, deleted ones included: path, entry, the first megabyte."""
     saved = site.engine.directory / "image.tar"
     site.engine.docker("save", "--output", str(saved), image, timeout=300)
     try:
@@ -45,24 +45,24 @@ def members(site: Site, image: str) -> Iterator[tuple[str, tarfile.TarInfo, byte
 
 @pytest.fixture(scope="module")
 def contents(site: Site) -> list[tuple[str, tarfile.TarInfo, bool]]:
-    """Every file of the appliance's image: path, entry, whether there is a private key in it."""
+    """Return every file of the appliance's image: path, entry, whether it contains a private key."""
     return [(path, entry, bool(SECRET.search(data))) for path, entry, data in members(site, APPLIANCE)]
 
 
 def run(site: Site, *command: str, image: str = APPLIANCE) -> str:
-    """What a program says in a fresh container of the image."""
+    """Return the output of a program in a new container of the image."""
     return site.engine.docker("run", "--rm", "--entrypoint", command[0], image, *command[1:]).stdout
 
 
 def test_the_base_image_is_pinned_by_digest() -> None:
-    """Whoever builds the image today and in a year begins with the same bytes."""
+    """Builds of the image always begin with the same bytes."""
     bases = re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)
     assert set(bases) == {"${BASE}", "appliance"}
     assert re.search(r"^ARG BASE=debian:12-slim@sha256:[0-9a-f]{64}$", DOCKERFILE, re.MULTILINE)
 
 
-def test_debian_packages_have_their_reasons_in_one_place() -> None:
-    """What the image takes from Debian is in packages.txt, but for what only a container needs."""
+def test_debian_packages_are_those_of_the_list() -> None:
+    """The image's Debian packages are in packages.txt, except those for containers only."""
     text = DOCKERFILE.partition("AS appliance\n")[2].partition("&& apt-get clean")[0]
     taken = set(re.findall(r"^ {8}([a-z0-9.+-]+) \\$", text, re.MULTILINE))
     assert len(taken) > 5
@@ -73,7 +73,7 @@ def test_debian_packages_have_their_reasons_in_one_place() -> None:
 def test_there_is_no_compiler_and_no_way_to_fetch_programs(
     contents: list[tuple[str, tarfile.TarInfo, bool]],
 ) -> None:
-    """No layer of the image has a compiler, pip, or what fetches from the network (but apt, which Debian needs)."""
+    """No layer of the image has a compiler, pip, or a download tool (except apt, which Debian needs)."""
     tools = [
         path for path, entry, _ in contents if entry.isfile() and entry.mode & 0o111 and TOOLS.search(path)
     ]
@@ -82,7 +82,7 @@ def test_there_is_no_compiler_and_no_way_to_fetch_programs(
 
 
 def test_nothing_of_the_build_is_left(contents: list[tuple[str, tarfile.TarInfo, bool]]) -> None:
-    """No package lists, no caches, nothing of the checkout but what runs."""
+    """No package lists, no caches, and only running parts of the checkout remain."""
     left = [path for path, entry, _ in contents if entry.isfile() and entry.size and path.startswith(CACHES)]
     assert left == []
     ours = [path for path, _, _ in contents if re.search(r"/(tests|\.git|requirements\.lock)(/|$)", path)]
@@ -90,23 +90,23 @@ def test_nothing_of_the_build_is_left(contents: list[tuple[str, tarfile.TarInfo,
 
 
 def test_there_is_no_private_key(contents: list[tuple[str, tarfile.TarInfo, bool]]) -> None:
-    """Keys are made at the first start, in the volume: no two appliances share one."""
+    """Keys are made at the first start, in the volume: no two appliances have the same."""
     assert [path for path, _, secret in contents if secret] == []
     assert not any(
         path.startswith("/var/lib/rosrv/") and path != "/var/lib/rosrv/" for path, _, _ in contents
     )
 
 
-def test_no_program_gives_its_caller_more_rights(site: Site) -> None:
-    """Nothing is set-user-id or set-group-id, and no program has capabilities of its own."""
+def test_no_program_raises_privileges(site: Site) -> None:
+    """No program is set-user-id or set-group-id, or has file capabilities."""
     found = run(site, "find", "/", "-xdev", "-type", "f", "-perm", "/6000")
     assert found == ""
 
 
-def test_what_runs_can_be_changed_by_nobody_but_root(
+def test_only_root_can_change_files(
     contents: list[tuple[str, tarfile.TarInfo, bool]],
 ) -> None:
-    """Every file belongs to root and only he may write it."""
+    """Every file belongs to root and is writable for root only."""
     open_to_others = [
         path
         for path, entry, _ in contents
@@ -117,7 +117,7 @@ def test_what_runs_can_be_changed_by_nobody_but_root(
 
 
 def test_every_process_finds_its_user(site: Site) -> None:
-    """The users of the processes have the numbers that are theirs everywhere, and nobody can log in as one."""
+    """The users of the processes have their fixed numbers, and none can log in."""
     lines = run(site, "getent", "passwd").splitlines()
     users = {fields[0]: fields for fields in (line.split(":") for line in lines)}
     assert {name: int(users[name][2]) for name in NUMERIC_IDS} == NUMERIC_IDS
@@ -125,13 +125,13 @@ def test_every_process_finds_its_user(site: Site) -> None:
 
 
 def test_the_configuration_of_the_image_is_right(site: Site) -> None:
-    """The file in the image has no mistake and says `container`."""
+    """The file in the image is valid and has the isolation `container`."""
     shown = run(site, "rosrv", "config", "show")
     assert "isolation: container" in shown
     run(site, "rosrv", "config", "check", "/etc/rosrv/appliance.yaml")
 
 
-def test_the_demonstration_has_nothing_of_the_appliance(site: Site) -> None:
+def test_the_demonstration_contains_no_part_of_the_appliance(site: Site) -> None:
     """The robot's image has unmodified ROS nodes only, and the appliance's image none of them."""
     assert run(site, "find", "/opt", "/usr", "-name", "appliance*", image=DEMO) == ""
     assert "rospy" in run(site, "/usr/bin/python3", "-c", "import rospy; print(rospy.__name__)", image=DEMO)
@@ -139,13 +139,13 @@ def test_the_demonstration_has_nothing_of_the_appliance(site: Site) -> None:
 
 
 def test_the_image_stays_small(site: Site) -> None:
-    """The size that the documentation names is not exceeded."""
+    """The documented size is not exceeded."""
     whole, base = (int(site.engine.inspect(name)["Size"]) for name in (APPLIANCE, BASE))
     assert whole - base < MOST_MEGABYTES * 1e6
 
 
 def test_the_machines_own_network_is_refused(site: Site) -> None:
-    """In a container that shares the machine's network it does not start, says why, and leaves no rule there."""
+    """In a container on the machine's own network the start fails with the reason, and leaves no rule."""
     rights = (
         "--cap-drop",
         "ALL",
@@ -163,7 +163,7 @@ def test_the_machines_own_network_is_refused(site: Site) -> None:
 
 
 def test_too_few_rights_are_named(site: Site) -> None:
-    """Started as anybody would first try it, without a capability, it says what it needs."""
+    """A start without capabilities, as a newcomer's first attempt, names the missing ones."""
     done = site.engine.docker("run", "--rm", APPLIANCE, check=False, timeout=60)
     assert done.returncode == 1
     assert "NET_ADMIN" in done.stderr

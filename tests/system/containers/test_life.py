@@ -1,4 +1,4 @@
-"""Tests of the life of the container: started, stopped, killed, started again, removed, and what each right is for."""
+"""Test the life of the container: start, stop, kill, restart, removal, and the need for each capability."""
 
 import json
 import subprocess
@@ -13,14 +13,14 @@ from tests.support.docker import APPLIANCE, Compose, project
 from tests.support.waiting import allowed, eventually
 from tests.system.containers.conftest import Site, without
 
-pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are built
+pytestmark = pytest.mark.timeout(1500)  # for the first test: the images are built
 
 STOP_SECONDS = 5.0
 
 
 @pytest.fixture
 def talking(site: Site, tmp_path: Path) -> Iterator[Compose]:
-    """The robot and its operator beside the appliance, and both have connected."""
+    """Run the robot and its operator beside the appliance, both connected."""
     compose = site.engine.compose(project(tmp_path), "life")
     try:
         compose("--profile", "demo", "up", "--detach", "--no-build", "landshark", "ocu")
@@ -31,17 +31,17 @@ def talking(site: Site, tmp_path: Path) -> Iterator[Compose]:
 
 
 def drives_on(compose: Compose) -> None:
-    """The operator, never started again, hears where the robot is, from now on."""
+    """Wait until the operator, never restarted, receives the robot's position from now on."""
     moment = compose.engine.docker("info", "--format", "{{.SystemTime}}").stdout.strip()
     compose.wait_for_log("ocu", '"position"', since=moment, timeout=90)
     assert compose.engine.inspect(compose.container("ocu"))["RestartCount"] == 0
 
 
 def test_a_stop_is_clean_and_quick(alone: Compose) -> None:
-    """`docker stop` ends it in order within five seconds; on a busy machine a process may need a second word."""
+    """`docker stop` ends it cleanly within five seconds; on a busy machine a second attempt is allowed."""
     container = alone.container("appliance")
     eventually(
-        lambda: all(row["walls"] for row in alone.status()["processes"] if row["role"] != "supervisor"),
+        lambda: all(row["sandbox"] for row in alone.status()["processes"] if row["role"] != "supervisor"),
         alone.story,
     )
     begun = alone.engine.inspect(container)["State"]["StartedAt"]
@@ -59,7 +59,7 @@ def test_a_stop_is_clean_and_quick(alone: Compose) -> None:
 
 
 def test_nodes_go_on_after_stop_start_and_kill(talking: Compose) -> None:
-    """Stopped and started, killed and restarted by its engine: nodes that still run go on."""
+    """After a stop and start, and after a kill and restart by the engine, running nodes go on."""
     container = talking.container("appliance")
     talking("stop", "appliance")
     talking("start", "appliance")
@@ -73,8 +73,8 @@ def test_nodes_go_on_after_stop_start_and_kill(talking: Compose) -> None:
     assert verified.returncode == 0, verified.stdout + verified.stderr
 
 
-def test_the_robot_may_come_and_go(talking: Compose) -> None:
-    """The robot's container is killed and started again while the appliance runs: the operator hears it again."""
+def test_the_robot_may_restart(talking: Compose) -> None:
+    """The robot's container is killed and restarted while the appliance runs: the operator hears it again."""
     talking("kill", "landshark")
     talking("--profile", "demo", "up", "--detach", "--no-build", "landshark")
     drives_on(talking)
@@ -84,7 +84,7 @@ def test_the_robot_may_come_and_go(talking: Compose) -> None:
     drives_on(talking)
 
 
-def test_a_down_leaves_nothing(site: Site, tmp_path: Path) -> None:
+def test_down_leaves_nothing(site: Site, tmp_path: Path) -> None:
     """After `down --volumes`, from a running appliance or a killed one, the machine is as it was."""
     compose = site.engine.compose(project(tmp_path), "gone")
 
@@ -107,8 +107,8 @@ def test_a_down_leaves_nothing(site: Site, tmp_path: Path) -> None:
         assert machine() == before
 
 
-def test_the_state_is_copied_and_taken_back(alone: Compose, tmp_path: Path) -> None:
-    """By the commands in docs/next-to-your-robot.md: an appliance with the copy is the one that was copied."""
+def test_the_state_is_copied_and_restored(alone: Compose, tmp_path: Path) -> None:
+    """With the commands of docs/next-to-your-robot.md, an appliance on the copy continues as the original."""
 
     def tar(what: str) -> None:
         volumes = ("--volume", "alone_state:/state", "--volume", f"{tmp_path}:/copy")
@@ -140,7 +140,7 @@ def test_the_state_is_copied_and_taken_back(alone: Compose, tmp_path: Path) -> N
 
 
 def test_backup_and_restore_as_documented(alone: Compose, tmp_path: Path) -> None:
-    """By the commands of docs/upgrade-and-backup.md: taken while it runs, put back into a new volume, it goes on."""
+    """With the commands of docs/operating.md, a backup of the running appliance is restored into a new volume."""
     container, entry = alone.container("appliance"), ("--entrypoint", "rosrv", APPLIANCE)
     folder = ("--volume", f"{tmp_path}:/backup")
     backup = ("--cap-add", "DAC_OVERRIDE", "--volumes-from", container, *folder, *entry, "backup")
@@ -164,15 +164,15 @@ def _said(*command: str) -> str:
 
 
 def rights(compose: Compose) -> list[str]:
-    """The capabilities in compose.yaml."""
+    """Return the capabilities in compose.yaml."""
     text = yaml.safe_load((compose.directory / "compose.yaml").read_text())
     granted: list[str] = text["services"]["appliance"]["cap_add"]
     return granted
 
 
 @pytest.mark.parametrize("right", ["NET_ADMIN", "SETUID", "SETGID", "CHOWN"])
-def test_it_does_not_start_without(right: str, site: Site) -> None:
-    """Each of the rights that a start needs is needed: without it there is no start, and a reason is given."""
+def test_no_start_without_a_required_capability(right: str, site: Site) -> None:
+    """A start without any one of the required capabilities fails with a reason."""
     given = [f"--cap-add={one}" for one in ("NET_ADMIN", "SETUID", "SETGID", "CHOWN", "KILL") if one != right]
     done = site.engine.docker(
         "run",
@@ -191,7 +191,7 @@ def test_it_does_not_start_without(right: str, site: Site) -> None:
 
 
 def hung_relay_ends(compose: Compose, seconds: float) -> bool:
-    """Stop the relay process as a hanging one stops; whether the supervisor ends it in time."""
+    """Hang the relay process by a stop, and return whether the supervisor ends it in time."""
     pid = next(row["pid"] for row in compose.status()["processes"] if row["role"] == "relay")
     compose(
         "exec", "-T", "--user", "rosrv-relay", "appliance", "python", "-c", f"import os; os.kill({pid}, 19)"
@@ -204,16 +204,18 @@ def hung_relay_ends(compose: Compose, seconds: float) -> bool:
     return False
 
 
-def test_a_hanging_process_is_ended_by_the_right_to_kill(alone: Compose) -> None:
-    """KILL is for processes of other users: with it a hanging relay is replaced, without it it hangs on."""
+def test_a_hanging_process_is_ended_with_the_kill_capability(alone: Compose) -> None:
+    """KILL is for processes of other users: with it a hanging relay is replaced, without it the relay hangs on."""
     assert hung_relay_ends(alone, 30)
     without(alone, "KILL")
     alone.wait_healthy()
     assert not hung_relay_ends(alone, 15)
 
 
-def test_no_other_right_is_given(alone: Compose) -> None:
-    """The list in compose.yaml is exactly what these tests prove to be needed, the engine gives no more; nor memory."""
+def test_no_other_capability_is_given(alone: Compose) -> None:
+    """compose.yaml lists exactly the capabilities that these tests need; the engine adds none, and memory is
+    limited.
+    """
     proven = {
         "NET_ADMIN",
         "SETUID",

@@ -1,4 +1,4 @@
-"""Tests of a host behind a tunnel to the appliance in its container: enrolled, heard, revoked."""
+"""Test a host behind a tunnel to the appliance in its container: enrolled, heard, revoked."""
 
 import os
 import subprocess
@@ -11,7 +11,7 @@ from tests.support.nodes import RosSession
 from tests.support.tunnels import JoinedHost, need_strongswan
 from tests.system.containers.conftest import Site, without
 
-pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are built
+pytestmark = pytest.mark.timeout(1500)  # for the first test: the images are built
 
 MACHINE = "10.79.0.1"
 POLICY = """\
@@ -30,7 +30,9 @@ ENROL = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE, "--out", "/tm
 
 
 def enrolled_as_documented(alone: Compose, kit: Path) -> Path:
-    """By the commands of docs/next-to-your-robot.md: the endpoint in `.env`, the kit through standard output."""
+    """Enrol with the commands of docs/next-to-your-robot.md: the endpoint in `.env`, the kit through standard
+    output.
+    """
     (alone.directory / ".env").write_text(f"ROSRV_ENDPOINT={MACHINE}\n")
     alone("up", "--detach", "--no-build")
     alone.wait_healthy()
@@ -49,7 +51,7 @@ def enrolled_as_documented(alone: Compose, kit: Path) -> Path:
 
 
 def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp_path: Path) -> None:
-    """By its kit a laptop on the machine's network has a tunnel through the published ports, until it is revoked."""
+    """With its kit a laptop on the machine's network has a tunnel through the published ports, until it is revoked."""
     need_strongswan()
     kit = enrolled_as_documented(alone, tmp_path / "laptop.tar.gz")
     (alone.directory / "policies" / "containers.ini").write_text(POLICY)
@@ -69,7 +71,7 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
                 "Read-only file system; name another: --out FILE, or --out - > FILE"
                 in nowhere_to_write.stderr
             )
-            assert not alone.audit("--event", "host renewed"), "it kept its certificate, and its tunnel"
+            assert not alone.audit("--event", "host renewed"), "its certificate and its tunnel were kept"
             assert "up" in alone.exec("appliance", "rosrv", "host", "list").stdout
             alone.exec("appliance", "rosrv", "host", "revoke", "laptop")
             assert alone.audit("--event", "host revoked")
@@ -78,11 +80,13 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
             with pytest.raises(AssertionError, match="5 s passed"):
                 listener.wait_for(event="received", since=cut + 20, timeout=5)
             for node in (listener, talker):
-                node.kill()  # it cannot say good-bye to anybody
+                node.kill()  # it cannot close the tunnel with a message
 
 
-def test_a_token_is_not_given_for_nothing(alone: Compose) -> None:
-    """REST is published for this machine only, so no host could bring a token: it is said, and nobody is awaited."""
+def test_no_token_is_made_that_no_host_can_use(alone: Compose) -> None:
+    """REST is published for this machine only, so no host could use a token: the command says so, and expects no
+    host.
+    """
     add = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE)
     done = alone.exec("appliance", *add, "--token", "--out", "-", check=False)
     assert done.returncode == 1
@@ -91,8 +95,8 @@ def test_a_token_is_not_given_for_nothing(alone: Compose) -> None:
     assert "laptop" not in alone.exec("appliance", "rosrv", "host", "list").stdout
 
 
-def test_low_ports_are_for_who_has_the_right(alone: Compose) -> None:
-    """Without NET_BIND_SERVICE charon cannot have port 500: a host cannot be enrolled, and that is said."""
+def test_low_ports_need_the_capability(alone: Compose) -> None:
+    """Without NET_BIND_SERVICE charon cannot open port 500: enrolling a host fails with this reason."""
     without(alone, "NET_BIND_SERVICE")
     alone.wait_healthy()
     done = alone.exec("appliance", *ENROL, check=False)

@@ -1,4 +1,4 @@
-"""What somebody tries who has no tunnel, or has one and wants more: all of it on the wire, against real tunnels."""
+"""Attacks on the wire by hosts without a tunnel, and by tunnelled hosts that want more, against real tunnels."""
 
 import contextlib
 import os
@@ -25,12 +25,12 @@ from tests.support.tunnels import JoinedHost, need_strongswan
 from tests.support.wire import Capture, Frame, send_frames, udp_packet
 
 OTHER = "10.88.0.30"
-STRANGER = 61055  # a user that nothing else here has
+OTHER_USER = 61055  # a user without other processes
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """One appliance for all tests here."""
+    """Run one appliance for all tests here."""
     need_root()
     need_strongswan()
     need_program("nft", "nftables")
@@ -40,24 +40,24 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
 
 @pytest.fixture(scope="module")
 def kit(site: TunnelSite) -> Path:
-    """The kit of `ocu-1`, which the policy trusts."""
+    """Return the kit of `ocu-1`, which the policy trusts."""
     return site.kit()
 
 
 @pytest.fixture(scope="module")
 def other(site: TunnelSite) -> Host:
-    """Another host."""
+    """Return another host."""
     return site.lab.host("other", f"{OTHER}/24")
 
 
 @pytest.fixture(scope="module")
 def others_kit(site: TunnelSite) -> Path:
-    """The kit of `ocu-2`, enrolled as well, which the policy trusts with nothing."""
+    """Return the kit of `ocu-2`, which is enrolled as well, but without rights."""
     return site.kit("add", "ocu-2")
 
 
 class Datagrams:
-    """What arrives at a UDP port of the appliance's address in the tunnels: data and sender."""
+    """Datagrams that arrive at a UDP port of the appliance's address in the tunnels: data and sender."""
 
     def __init__(self, host: Host) -> None:
         with host.entered():
@@ -68,7 +68,7 @@ class Datagrams:
         threading.Thread(target=self._read, daemon=True).start()
 
     def next(self) -> tuple[bytes, str]:
-        """The next one."""
+        """Return the next one."""
         return self._arrived.get(timeout=LIMIT)
 
     def _read(self) -> None:
@@ -77,13 +77,13 @@ class Datagrams:
                 self._arrived.put((data[0], data[1][0]))
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         self._socket.close()
 
 
 @pytest.fixture
 def datagrams(site: TunnelSite, kit: Path) -> Iterator[Datagrams]:
-    """A port that takes everything, so that what the tunnel lets through is seen."""
+    """Open a port that accepts all datagrams, to see what the tunnel lets through."""
     host = site.appliance.host
     assert isinstance(host, Host)
     listening = Datagrams(host)
@@ -92,26 +92,26 @@ def datagrams(site: TunnelSite, kit: Path) -> Iterator[Datagrams]:
 
 
 def send(joined: JoinedHost, port: int, data: bytes) -> None:
-    """One datagram through a tunnel."""
+    """Send one datagram through a tunnel."""
     with joined.outer.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.bind((joined.address, 0))
         sender.sendto(data, (OWN, port))
 
 
 def lab_host(site: TunnelSite) -> Host:
-    """The appliance's host."""
+    """Return the appliance's host."""
     assert isinstance(site.appliance.host, Host)
     return site.appliance.host
 
 
 def esp_is_charons(site: TunnelSite) -> bool:
-    """Whether ESP runs in user space, where charon sees what is dropped."""
+    """Return whether ESP runs in user space, where charon sees dropped packets."""
     return USER_SPACE_INTERFACE in interfaces.links(lab_host(site).namespace)
 
 
 @contextlib.contextmanager
 def deaf(host: Host) -> Iterator[None]:
-    """Nothing of ESP in UDP reaches the host's programs; what arrives is seen on the wire all the same."""
+    """Block ESP in UDP for the host's programs; arriving packets are still captured on the wire."""
     table = "add table ip hold; add chain ip hold in { type filter hook prerouting priority -400; };"
     _nft(host, table + "add rule ip hold in udp dport 4500 drop")
     try:
@@ -126,8 +126,9 @@ def _nft(host: Host, command: str) -> None:
 
 
 def test_replayed_packets_are_refused(site: TunnelSite, kit: Path, datagrams: Datagrams) -> None:
-    """A packet of a tunnel that is sent again, or changed, from anywhere, does not arrive a second time; the log
-    has how many were sent again, where charon sees them."""
+    """A replayed or changed packet of a tunnel does not arrive a second time, from any source; the log counts the
+    replays, where charon sees them.
+    """
     before = site.mark
     with site.joined(kit) as joined, Capture(lab_host(site).namespace) as wire:
         send(joined, datagrams.port, b"first")
@@ -136,7 +137,7 @@ def test_replayed_packets_are_refused(site: TunnelSite, kit: Path, datagrams: Da
             mark = len(wire.frames)
             send(joined, datagrams.port, b"second")
             taken = wire.wait_for(lambda frame: frame.esp and frame.source == OCU, since=mark)
-        # That what the attacker sends can arrive is shown by a packet that has not yet been there.
+        # A packet that has not arrived yet shows that the attacker's packets can arrive.
         again = taken.with_payload(taken.udp_payload)
         send_frames(site.attacker, [again])
         assert datagrams.next() == (b"second", joined.address)
@@ -154,15 +155,15 @@ def test_replayed_packets_are_refused(site: TunnelSite, kit: Path, datagrams: Da
             assert site.recorded(before, event="packets refused", host=OCU)["detail"]["packets"] > 0
 
 
-def test_the_wire_shows_ike_and_esp_only(site: TunnelSite, kit: Path) -> None:
-    """On the outside nothing is seen of a tunnelled host but UDP 500 and 4500, and of its messages nothing at all."""
+def test_only_ike_and_esp_are_on_the_wire(site: TunnelSite, kit: Path) -> None:
+    """Outside the tunnel only UDP 500 and 4500 of the host are visible, and no part of its messages."""
     with (
         Capture(site.ocu.namespace) as wire,
         site.joined(kit) as joined,
         site.talking(joined) as (_, listener),
     ):
         listener.wait_for_count(20, event="received")
-    # A charon that has ended has the kernel send back what still comes for it: of IKE and ESP, too, and nothing else.
+    # A charon that has ended makes the kernel return its late packets: these are also IKE and ESP only.
     packets = [frame.returned or frame for frame in wire.frames if frame.ipv4]
     strange = [frame.data.hex() for frame in packets if frame.protocol != socket.IPPROTO_UDP]
     assert strange == []
@@ -170,7 +171,7 @@ def test_the_wire_shows_ike_and_esp_only(site: TunnelSite, kit: Path) -> None:
     assert all(set(frame.ports) & {500, 4500} for frame in packets)
     assert len([frame for frame in packets if frame.esp]) > 20
     assert not any(b"hello" in frame.data for frame in wire.frames)
-    # What is neither IPv4 nor ARP is the kernel's own talk with its IPv6 neighbours.
+    # Packets other than IPv4 and ARP are the kernel's own IPv6 neighbour discovery.
     rest = [frame for frame in wire.frames if not frame.ipv4 and not frame.arp]
     assert all(frame.data[12:14] == b"\x86\xdd" and frame.data[20] in (0, 58) for frame in rest)
 
@@ -178,7 +179,7 @@ def test_the_wire_shows_ike_and_esp_only(site: TunnelSite, kit: Path) -> None:
 def test_a_host_in_a_tunnel_cannot_send_as_another(
     site: TunnelSite, kit: Path, other: Host, others_kit: Path, datagrams: Datagrams
 ) -> None:
-    """With the keys of one's own tunnel one can seal any packet; those from another's address do not arrive."""
+    """Packets with another host's address, sealed with the keys of the own tunnel, do not arrive."""
     with site.joined(kit) as trusted, site.joined(others_kit, other, log="chd = 4") as dishonest:
         assert dishonest.charon is not None
         keys = initiators_keys(dishonest.charon)
@@ -202,10 +203,10 @@ def test_a_host_in_a_tunnel_cannot_send_as_another(
             assert site.recorded(mark, event="packets refused", host=trusted.address)["decision"] == "deny"
 
 
-def test_a_host_cannot_ask_for_anothers_address(
+def test_a_host_cannot_request_anothers_address(
     site: TunnelSite, kit: Path, other: Host, others_kit: Path
 ) -> None:
-    """Who asks for another's virtual address is given his own; who insists in his selectors gets no tunnel."""
+    """A host that requests another's virtual address gets its own; with narrow selectors it gets no tunnel."""
     insisting = site.join(others_kit, other)
     conf = insisting.folder / "swanctl" / "swanctl.conf"
     theirs = site.join(kit).address
@@ -223,8 +224,10 @@ def test_a_host_cannot_ask_for_anothers_address(
     assert "traffic that is not allowed" in refused["reason"]
 
 
-def test_a_name_must_be_the_certificates(site: TunnelSite, kit: Path, other: Host, others_kit: Path) -> None:
-    """With one's own certificate under another's name one is refused, and the log says so."""
+def test_the_name_must_match_the_certificate(
+    site: TunnelSite, kit: Path, other: Host, others_kit: Path
+) -> None:
+    """The own certificate under another name is refused, and the log says so."""
     thief = site.join(others_kit, other)
     conf = thief.folder / "swanctl" / "swanctl.conf"
     conf.write_text(conf.read_text().replace("id = fqdn:ocu-2", "id = fqdn:ocu-1"))
@@ -235,9 +238,10 @@ def test_a_name_must_be_the_certificates(site: TunnelSite, kit: Path, other: Hos
     assert site.state() == "down"
 
 
-def test_the_right_address_without_a_tunnel_is_nobody(site: TunnelSite, kit: Path) -> None:
+def test_a_trusted_address_without_a_tunnel_is_denied(site: TunnelSite, kit: Path) -> None:
     """The trusted host itself is refused in clear text: under its own address by the policy, under its virtual
-    one by the firewall."""
+    one by the firewall.
+    """
     with site.joined(kit) as joined:
         virtual = joined.address
     interfaces.add_address(site.ocu.namespace, INTERFACE, f"{virtual}/32")
@@ -282,7 +286,7 @@ with socket.socket() as client:
 
 
 def _ask(host: Host, source: str, target: str, *, user: int | None = None, free: bool = False) -> str:
-    """What comes of a connection to RVMaster from this source address."""
+    """Return the result of a connection to RVMaster from this source address."""
     asking = host.popen(
         [sys.executable, "-c", ASK, source, target, "11311", "free" if free else "plain"],
         stdout=subprocess.PIPE,
@@ -293,20 +297,20 @@ def _ask(host: Host, source: str, target: str, *, user: int | None = None, free:
     return str(asking.communicate(timeout=LIMIT)[0]).strip()
 
 
-def test_a_program_on_the_appliances_machine_is_no_tunnelled_host(site: TunnelSite, kit: Path) -> None:
-    """Beside the appliance, as another user or as root, an address of the tunnels opens nothing."""
+def test_a_local_program_is_not_a_tunnelled_host(site: TunnelSite, kit: Path) -> None:
+    """On the appliance's machine an address of the tunnels gives no rights, neither to another user nor to root."""
     host = lab_host(site)
     with site.joined(kit) as joined:
-        assert _ask(host, MIDDLE, MIDDLE, user=STRANGER) == "answered", "the way there is open"
-        assert _ask(host, joined.address, OWN, user=STRANGER) == "not bound"
-        assert _ask(host, joined.address, OWN, user=STRANGER, free=True) == "nothing"
+        assert _ask(host, MIDDLE, MIDDLE, user=OTHER_USER) == "answered", "the destination is reachable"
+        assert _ask(host, joined.address, OWN, user=OTHER_USER) == "not bound"
+        assert _ask(host, joined.address, OWN, user=OTHER_USER, free=True) == "nothing"
         assert _ask(host, joined.address, MIDDLE, free=True) == "nothing"
-        assert _ask(host, OWN, OWN, user=STRANGER) == "nothing"
+        assert _ask(host, OWN, OWN, user=OTHER_USER) == "nothing"
         assert _ask(host, OWN, MIDDLE) == "nothing"
 
 
 def test_two_hosts_with_one_certificate(site: TunnelSite, kit: Path) -> None:
-    """A copied kit takes the tunnel from its owner, never beside him; the log has both addresses."""
+    """A copied kit replaces its owner's tunnel, never adds one; the log has both addresses."""
     with site.joined(kit) as owner:
         mark = site.mark
         thief = site.join(kit, site.attacker)
@@ -327,7 +331,7 @@ def _up_from(remote: str) -> Callable[[Event], bool]:
 
 
 def test_an_expired_certificate_ends_its_tunnel(site: TunnelSite, other: Host) -> None:
-    """When its certificate ends, a host's tunnel is closed, and it is let in no more; the log says why."""
+    """At the end of its certificate a host's tunnel is closed, and new ones are refused; the log has the reason."""
     mark = site.mark
     expiring = site.kit("add", "visitor", "--days", str(20 / 86400))
     with site.join(expiring, other) as visitor:
@@ -340,21 +344,21 @@ def test_an_expired_certificate_ends_its_tunnel(site: TunnelSite, other: Host) -
 
 
 def charon_of(site: TunnelSite) -> int:
-    """The process id of the appliance's charon itself."""
+    """Return the process id of the appliance's charon itself."""
     (parent,) = site.appliance.pids("charon")
     (child,) = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
     return int(child)
 
 
 def kilobytes(pid: int) -> int:
-    """The memory a process holds."""
+    """Return the memory of a process."""
     found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())
     assert found is not None
     return int(found[1])
 
 
 def test_garbage_on_the_ports_of_ike(site: TunnelSite, kit: Path, other: Host, others_kit: Path) -> None:
-    """Garbage, huge packets and a flood of begun handshakes: charon lives, does not grow, and tunnels come and stay."""
+    """After garbage, huge packets and a flood of half-open handshakes charon runs without growth, and tunnels work."""
     with (
         Capture(lab_host(site).namespace) as wire,
         site.joined(kit) as joined,
@@ -382,7 +386,7 @@ def _throw_garbage(host: Host) -> None:
         for port in (500, 4500):
             for size in [*range(1, 1400, 3), 9000, 30000, 65507, 65507]:
                 noise = secrets.token_bytes(size)
-                # As it is, and behind a header of IKEv2 (an IKE_SA_INIT request) that names a length of its own.
+                # Raw, and behind an IKEv2 header (an IKE_SA_INIT request) with a length of its own.
                 marker = bytes(4) if port == 4500 else b""
                 header = os.urandom(8) + bytes(8) + bytes([33, 0x20, 34, 8]) + bytes(4)
                 for length in (size + 28, 0, 28, 0xFFFFFFFF):
@@ -392,7 +396,7 @@ def _throw_garbage(host: Host) -> None:
 
 
 def _begin_handshakes(host: Host, first: Frame, count: int) -> None:
-    """The first packet of a real handshake again and again, each from another address and with another SPI."""
+    """Repeat the first packet of a real handshake, each time from another address and with another SPI."""
     start = first.header
     frames = []
     for number in range(count):

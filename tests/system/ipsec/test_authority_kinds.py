@@ -1,4 +1,4 @@
-"""An authority with an Ed25519 key that is encrypted: real tunnels, and what a wrong passphrase does."""
+"""An authority with an encrypted Ed25519 key: real tunnels, and the effect of a wrong passphrase."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from tests.support.tunnels import need_strongswan
 
 
 def test_an_encrypted_ed25519_authority(tmp_path: Path) -> None:
-    """Tunnels stand on its certificates, revocation holds; without the right passphrase the appliance says so."""
+    """Its certificates open tunnels, and revocation works; with a wrong passphrase the appliance reports it."""
     need_root()
     need_strongswan()
     passphrase = tmp_path / "passphrase"
@@ -30,7 +30,7 @@ def test_an_encrypted_ed25519_authority(tmp_path: Path) -> None:
                 assert site.refused(mark)["decision"] == "deny"
             site.appliance.stop()
             passphrase.write_text("wrong\n")
-            said = start_in_vain(site)
+            said = error_of_start(site)
             assert "the passphrase is wrong" in said
             assert "ca_passphrase_file" in said
             passphrase.write_text("correct horse battery staple\n")
@@ -38,11 +38,11 @@ def test_an_encrypted_ed25519_authority(tmp_path: Path) -> None:
             assert site.state() == "revoked"
 
 
-def start_in_vain(site: TunnelSite) -> str:
-    """What is said by an appliance that does not start."""
+def error_of_start(site: TunnelSite) -> str:
+    """Return the error of an appliance that does not start."""
     try:
         site.appliance.start()
     except AssertionError as error:
         site.appliance.stop()
         return str(error)
-    raise AssertionError("it started")
+    raise AssertionError("it started unexpectedly")

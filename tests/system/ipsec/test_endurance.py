@@ -1,4 +1,4 @@
-"""Tunnels in everyday trouble: hosts that move, ends that restart in either order, new keys under traffic."""
+"""Tunnels in everyday trouble: hosts that move, ends that restart in either order, new keys during traffic."""
 
 import contextlib
 import signal
@@ -32,7 +32,7 @@ connections {
 
 @pytest.fixture
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """An appliance."""
+    """Run an appliance."""
     need_root()
     need_strongswan()
     with Lab("rosrv-endure") as lab, TunnelSite(lab, tmp_path_factory.mktemp("endure")) as one:
@@ -40,7 +40,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
 
 
 def up_again(joined: JoinedHost, since: int) -> None:
-    """The tunnel stands again, as the host sees it."""
+    """Wait until the tunnel is up again on the host's side."""
     assert joined.charon is not None
     joined.charon.wait_for(
         lambda event: "CHILD_SA ros" in str(event.get("text")) and "established" in str(event.get("text")),
@@ -50,7 +50,7 @@ def up_again(joined: JoinedHost, since: int) -> None:
 
 
 def test_a_host_moves(site: TunnelSite) -> None:
-    """A host whose address changes keeps its tunnel and its connections, and the log says where it is now."""
+    """A host whose address changes keeps its tunnel and its connections, and the log has the new address."""
     roamer = site.lab.host("roamer", "10.88.0.40/24")
     roamer.namespace.sysctl("net.ipv4.conf.all.promote_secondaries", "1")
     with site.joined(site.kit(), roamer) as joined, site.talking(joined) as (_, listener):
@@ -63,11 +63,11 @@ def test_a_host_moves(site: TunnelSite) -> None:
         assert [one["remote"] for one in site.hosts()] == ["10.88.0.41"]
         assert site.trail.seen(event="tunnel down") == []
         heard = numbers(listener)
-        assert heard == list(range(heard[0], heard[0] + len(heard))), "no message was lost on the way"
+        assert heard == list(range(heard[0], heard[0] + len(heard))), "messages were lost"
 
 
 def test_new_keys_under_traffic(site: TunnelSite) -> None:
-    """While keys are changed every few seconds, of ESP and of IKE, not one message is lost."""
+    """While ESP and IKE keys are changed every few seconds, no message is lost."""
     with (
         site.joined(site.kit(), settings=SHORT_LIVES) as joined,
         site.talking(joined, rate=100) as (talker, listener),
@@ -84,7 +84,7 @@ def test_new_keys_under_traffic(site: TunnelSite) -> None:
 
 
 def _told(charon: Process, text: str, count: int) -> None:
-    """Wait until charon has said this so many times."""
+    """Wait until charon has logged this so many times."""
     position = 0
     for _ in range(count):
         found = charon.wait_for(lambda event: text in str(event.get("text")), since=position, timeout=LONG)
@@ -93,7 +93,7 @@ def _told(charon: Process, text: str, count: int) -> None:
 
 @contextlib.contextmanager
 def restarted(site: TunnelSite, how: int) -> Iterator[None]:
-    """The appliance ends by this signal, something happens, and it is there again."""
+    """End the appliance with this signal, run the block, and start it again."""
     site.trail.stop()
     assert site.appliance.process is not None
     site.appliance.process.stop(with_signal=how)
@@ -104,12 +104,12 @@ def restarted(site: TunnelSite, how: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_both_ends_restart(site: TunnelSite, how: int) -> None:
-    """Whatever order the two ends restart in, orderly or not, the tunnel and what flows in it are back."""
+    """Whatever order the two ends restart in, cleanly or not, the tunnel and its traffic return."""
     kit = site.kit()
     host = site.join(kit)
     with host:
         host.wait_until_up()
-        # The appliance alone, while its host stays.
+        # the appliance alone, while its host stays
         assert host.charon is not None
         mark = host.charon.mark()
         with restarted(site, how):
@@ -117,12 +117,12 @@ def test_both_ends_restart(site: TunnelSite, how: int) -> None:
         up_again(host, mark)
         with site.talking(host):
             pass
-        # The host alone, without a word to the appliance.
+        # the host alone, without notice to the appliance
         host.charon.kill()
         host.stop()
         host.start()
         host.wait_until_up()
-        # Both: the host comes back first and asks nobody; then the other way round.
+        # both: the host returns first and gets no answer; then the other way round
         with restarted(site, how):
             host.stop()
             host.start()
@@ -137,8 +137,8 @@ def test_both_ends_restart(site: TunnelSite, how: int) -> None:
         site.is_up()
 
 
-def test_an_end_leaves_nothing(site: TunnelSite) -> None:
-    """Stopped in order with a tunnel up, the appliance leaves no rule, route, interface or address."""
+def test_a_clean_stop_leaves_nothing(site: TunnelSite) -> None:
+    """After a clean stop with a tunnel up, no rule, route, interface or address remains."""
     host = site.appliance.host
     assert isinstance(host, Host)
     with site.join(site.kit()) as joined:

@@ -1,7 +1,7 @@
-"""A host enrols itself by a one-time token, with the kit's own scripts run for real: join, renew, leave.
+"""A host enrols with a one-time token, using the kit's own scripts: join, renew, leave.
 
 The laptop is a network namespace with its own /etc and /run, without systemd; strongSwan, nft, curl and openssl are
-Debian's. REST is reached before the tunnel from the management network.
+Debian's. Before the tunnel is up, REST is reached from the management network.
 """
 
 import contextlib
@@ -41,7 +41,7 @@ api_names: [{MIDDLE}]
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """An appliance whose REST the lab's network may reach."""
+    """Run an appliance whose REST the lab's network may reach."""
     need_root()
     need_strongswan()
     for program, package in (("nft", "nftables"), ("curl", "curl"), ("openssl", "openssl")):
@@ -57,13 +57,13 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
 
 @pytest.fixture
 def laptop(site: TunnelSite, tmp_path: Path) -> Iterator[ScriptHost]:
-    """A machine that nobody knows."""
+    """Return an unknown machine."""
     with ScriptHost(site.ocu, tmp_path / "laptop") as host:
         yield host
 
 
 def awaited(site: TunnelSite, name: str, out: Path, *options: str, verb: str = "add") -> str:
-    """A one-time token; its script is in `out`."""
+    """Return a one-time token; its script is in `out`."""
     done = site.appliance.rosrv(
         "host", verb, name, "--appliance", MIDDLE, "--token", "--out", str(out), "--json", *options
     )
@@ -71,12 +71,12 @@ def awaited(site: TunnelSite, name: str, out: Path, *options: str, verb: str = "
 
 
 def row(site: TunnelSite, name: str) -> dict[str, Any]:
-    """A host by `rosrv host list`."""
+    """Return a host in `rosrv host list`."""
     return next(one for one in site.hosts() if one["name"] == name)
 
 
 def test_a_laptop_joins_renews_and_leaves(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """By token and script: its key is made there, nodes talk, the certificate is renewed, leaving leaves nothing."""
+    """With token and script the key is made there, nodes communicate, the certificate is renewed, leaving cleans up."""
     script = tmp_path / "join.sh"
     before = laptop.files()
     token = awaited(site, "laptop", script)
@@ -101,7 +101,7 @@ def test_a_laptop_joins_renews_and_leaves(site: TunnelSite, laptop: ScriptHost, 
 
 
 def nodes_talk(site: TunnelSite, laptop: ScriptHost, address: str) -> None:
-    """Unmodified nodes of both sides hear each other."""
+    """Assert that unmodified nodes of both sides hear each other."""
     laptop.address = address
     with (
         RosSession(MASTER, site.home, site.robot) as on_robot,
@@ -112,7 +112,7 @@ def nodes_talk(site: TunnelSite, laptop: ScriptHost, address: str) -> None:
 
 
 def closed(site: TunnelSite, laptop: ScriptHost) -> None:
-    """Its ROS ports are closed to a neighbour; what an operator's check saw is shown."""
+    """Assert that its ROS ports are closed to a neighbour, and that the result of an operator's check is shown."""
     rules = laptop.run("nft", "list", "table", "inet", "rosrv_protect").stdout
     assert OWN in rules
     assert row(site, "laptop")["ports"]["state"] == "unknown"
@@ -137,29 +137,29 @@ def closed(site: TunnelSite, laptop: ScriptHost) -> None:
 
 
 def forged(site: TunnelSite, laptop: ScriptHost) -> None:
-    """A datagram from the wire with the appliance's tunnel address is dropped: it counts in the tunnel only."""
+    """Assert that a datagram from the wire with the appliance's tunnel address is dropped."""
     before = dropped(laptop)
-    stranger = site.attacker.namespace
-    interfaces.add_address(stranger, "lo", f"{OWN}/32")
+    unknown = site.attacker.namespace
+    interfaces.add_address(unknown, "lo", f"{OWN}/32")
     try:
-        with stranger.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        with unknown.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.bind((OWN, 0))
             sock.sendto(b"forged", (OCU, 40_000))
         deadline = time.monotonic() + LIMIT
         while dropped(laptop) == before:
             assert time.monotonic() < deadline, "the forged datagram passed the laptop's firewall"
     finally:
-        interfaces.delete_address(stranger, "lo", f"{OWN}/32")
+        interfaces.delete_address(unknown, "lo", f"{OWN}/32")
 
 
 def dropped(laptop: ScriptHost) -> int:
-    """The datagrams that the laptop's firewall has dropped."""
+    """Return the datagrams that the laptop's firewall has dropped."""
     rules = laptop.run("nft", "list", "table", "inet", "rosrv_protect").stdout
     return int(re.findall(r"udp dport .* counter packets (\d+) bytes \d+ drop", rules)[0])
 
 
 def again(site: TunnelSite, laptop: ScriptHost, script: Path) -> None:
-    """The script run again changes nothing and needs no token."""
+    """Assert that a second run of the script changes nothing and needs no token."""
     serial = row(site, "laptop")["serial"]
     mark = site.mark
     done = laptop.run("sh", str(script))
@@ -169,7 +169,7 @@ def again(site: TunnelSite, laptop: ScriptHost, script: Path) -> None:
 
 
 def renew(site: TunnelSite, laptop: ScriptHost) -> None:
-    """Nothing to do while most of its life is left; with --now a new key and certificate, the one before revoked."""
+    """Renewal has no effect early; with --now there is a new key and certificate, and the old one is revoked."""
     assert "nothing to do" in laptop.run("/etc/rosrv/renew.sh").stdout
     key = laptop.run("cat", "/etc/swanctl/private/rosrv.key").stdout
     before = row(site, "laptop")["serial"]
@@ -193,7 +193,7 @@ def renew(site: TunnelSite, laptop: ScriptHost) -> None:
 
 
 def leave(site: TunnelSite, laptop: ScriptHost, before: list[str]) -> None:
-    """Nothing that joining made is left: no file, no rule, no process."""
+    """Assert that leaving removes every file, rule and process of joining."""
     mark = site.mark
     laptop.run("/etc/rosrv/leave.sh")
     site.recorded(mark, event="tunnel down")
@@ -208,7 +208,7 @@ def leave(site: TunnelSite, laptop: ScriptHost, before: list[str]) -> None:
     assert [one for one in commands if b"sleep infinity" not in one and b"nsenter" not in one] == []
 
 
-def test_somebody_in_between_gets_nothing(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
+def test_a_man_in_the_middle_gets_nothing(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
     """A server with another key is refused before the token is sent, and so is another authority's answer."""
     script = tmp_path / "join.sh"
     token = awaited(site, "other", script)
@@ -230,7 +230,7 @@ def test_somebody_in_between_gets_nothing(site: TunnelSite, laptop: ScriptHost, 
 
 
 def test_everything_over_rest(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """A kit joins, under an odd name; a later one has no key; a new one closes the tunnel; revoked, it is out."""
+    """A kit joins under an unusual name; a later kit has no key; a new one closes the tunnel; a revoked host is out."""
     rest, ask = site.rest(), site.attacker.run
     seen = ask(lambda: rest.get("/v1/hosts"))
     new = {"name": "re.st_e-D", "endpoint": MIDDLE, "how": "kit"}
@@ -270,7 +270,7 @@ def join_kit(laptop: ScriptHost, folder: Path, kit: bytes) -> None:
 
 
 def test_through_the_tunnel_rest_only_renews(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """A host in its tunnel sees neither console nor API there, good token or not: only renewal and lists."""
+    """In its tunnel a host reaches neither console nor API, even with a valid token: only renewal and lists."""
     script = tmp_path / "join.sh"
     laptop.run("sh", str(script), awaited(site, "narrow", script))
     curl = ("curl", "--silent", "--insecure", "-o", "/dev/null", "-w", "%{http_code}")
@@ -286,13 +286,15 @@ def test_through_the_tunnel_rest_only_renews(site: TunnelSite, laptop: ScriptHos
     site.appliance.rosrv("host", "revoke", "narrow")
 
 
-def test_a_short_life_is_renewed_in_time(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """A certificate of a minute and a half warns, is renewed without --now when its time has come, and lives on."""
+def test_a_short_lived_certificate_is_renewed_in_time(
+    site: TunnelSite, laptop: ScriptHost, tmp_path: Path
+) -> None:
+    """A certificate of a minute and a half causes a warning, is renewed without --now when due, and works."""
     script = tmp_path / "join.sh"
     mark = site.mark
     laptop.run("sh", str(script), awaited(site, "brief", script, "--days", str(90 / 86_400)))
     first = site.is_up("brief")
-    # The kit's script looks at the certificate, which is dated an hour back: its last third has begun already.
+    # The kit's script checks the certificate, which is backdated by an hour: its last third has already begun.
     assert "in force" in laptop.run("/etc/rosrv/renew.sh").stdout
     site.recorded(mark, event="host renewed")
     second = row(site, "brief")
@@ -309,7 +311,7 @@ def test_a_short_life_is_renewed_in_time(site: TunnelSite, laptop: ScriptHost, t
 
 
 def test_two_hundred_hosts_beside_a_tunnel(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """charon takes two hundred enrolled hosts, and the one that comes gets its own address among them."""
+    """With two hundred enrolled hosts, a new tunnel still gets its own address."""
     rest, ask = site.rest(), site.attacker.run
     request = signing_request(make_key(), "many").decode()
 
@@ -332,13 +334,13 @@ def test_two_hundred_hosts_beside_a_tunnel(site: TunnelSite, laptop: ScriptHost,
 
 
 def seconds_of(record: dict[str, Any]) -> float:
-    """The moment of a record, in seconds since the epoch."""
+    """Return the time of a record, in seconds since the epoch."""
     return datetime.datetime.fromisoformat(str(record["time"])[:26] + "+00:00").timestamp()
 
 
 @contextlib.contextmanager
 def endless(laptop: ScriptHost, commands: str) -> Iterator[None]:
-    """These shell commands on the laptop, again and again, whatever they say."""
+    """Repeat these shell commands on the laptop, ignoring failures."""
     loop = laptop.popen(["sh", "-c", f"while :; do {commands}; done >/dev/null 2>&1"], start_new_session=True)
     try:
         yield
@@ -347,8 +349,8 @@ def endless(laptop: ScriptHost, commands: str) -> Iterator[None]:
         loop.wait()
 
 
-def test_revoked_in_the_middle_of_rekeying(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """While keys are made anew without pause, by the host's own will: within a second it is out, and stays out."""
+def test_revocation_while_rekeying(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
+    """A host that rekeys without pause is out within a second of its revocation, and stays out."""
     script = tmp_path / "join.sh"
     joined = laptop.run("sh", str(script), awaited(site, "other", script))
     laptop.address = re.findall(r"ROS_IP=(\S+)", joined.stdout)[0]
@@ -370,15 +372,15 @@ def test_revoked_in_the_middle_of_rekeying(site: TunnelSite, laptop: ScriptHost,
                 down = site.recorded(mark, event="tunnel down")
                 assert max(seconds_of(closed), seconds_of(down)) - seconds_of(revoked) < allowed(1.0)
                 heard = len(listener.seen(event="received"))
-            # It goes on trying, each time from nothing: what it had begun before may wait for its answer for minutes.
+            # It keeps trying, each time from the start: an earlier attempt may wait minutes for its answer.
             anew = "swanctl --terminate --ike rosrv --force; swanctl --initiate --child ros --timeout 2"
             with endless(laptop, anew):
-                # The first count may have begun before, with another host of this machine.
+                # The first count may have begun earlier, with another host of this machine.
                 site.recorded(mark, event="denials folded", host=OCU)
                 site.recorded(site.mark, event="denials folded", host=OCU)
             assert len(listener.seen(event="received")) == heard
             assert row(site, "other")["state"] == "revoked"
             assert row(site, "other")["remote"] is None
         finally:
-            talker.kill()  # it cannot say good-bye to anybody
+            talker.kill()  # it cannot close the tunnel with a message
     laptop.run("/etc/rosrv/leave.sh")

@@ -1,4 +1,4 @@
-"""A long list of revoked certificates, with real charons at both ends: as long as there can be."""
+"""The longest possible list of revoked certificates, with real charons at both ends."""
 
 import sqlite3
 import subprocess
@@ -8,18 +8,20 @@ from pathlib import Path
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from appliance.ipsec.certificate_authority import Authority
+from appliance.ipsec.certificate_authority import CertificateAuthority
 from examples.landshark.lab import Lab
 from tests.support.processes import LIMIT
 from tests.support.requirements import need_root
 from tests.support.tunnel_site import LONG, OCU, TunnelSite
 from tests.support.tunnels import JoinedHost, need_strongswan
 
-_FIRST = 1 << 70  # serial numbers are as long as the authority makes them
+_FIRST = 1 << 70  # as long as the authority's serial numbers
 
 
-def test_tunnels_stand_with_thousands_of_revoked_certificates(tmp_path: Path) -> None:
-    """Of an enrolled host 2,000, of others 3,000: the latest certificate opens the tunnel, the one before does not."""
+def test_tunnels_work_with_thousands_of_revoked_certificates(tmp_path: Path) -> None:
+    """With 2,000 of an enrolled host and 3,000 of others revoked, the latest certificate opens the tunnel, the last
+    does not.
+    """
     need_root()
     need_strongswan()
     with Lab("rosrv-list") as lab, TunnelSite(lab, tmp_path) as site:
@@ -45,7 +47,7 @@ def test_tunnels_stand_with_thousands_of_revoked_certificates(tmp_path: Path) ->
 
 
 def revoke_many(state: Path) -> None:
-    """As if hosts had renewed their certificates for months."""
+    """Revoke as if hosts had renewed their certificates for months."""
     now = time.time()
     names = ["ocu-1"] * 2_000 + ["gone"] * 3_000
     rows = [
@@ -58,9 +60,11 @@ def revoke_many(state: Path) -> None:
 
 
 def takes_such_a_list_itself(joined: JoinedHost, directory: Path) -> None:
-    """swanctl on a host loads a list of the same length."""
+    """Assert that swanctl on a host loads a list of the same length."""
     (directory / "ca").mkdir()
-    signed = Authority(directory / "ca").revocations((f"{_FIRST + one:x}", 1.0) for one in range(2_200))
+    signed = CertificateAuthority(directory / "ca").revocations(
+        (f"{_FIRST + one:x}", 1.0) for one in range(2_200)
+    )
     lists = joined.folder / "swanctl" / "x509crl"
     lists.mkdir()
     (lists / "rosrv.crl").write_bytes(x509.load_pem_x509_crl(signed).public_bytes(Encoding.DER))

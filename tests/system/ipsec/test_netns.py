@@ -1,4 +1,4 @@
-"""A tunnel to an appliance in a namespace of its own on a bare host, which forwards IKE and ESP to it."""
+"""A tunnel to an appliance in its own namespace on a bare host, which forwards IKE and ESP to it."""
 
 import json
 import subprocess
@@ -28,11 +28,11 @@ default = trusted
 
 
 def test_the_host_forwards_the_tunnel(tmp_path: Path) -> None:
-    """Nodes behind the tunnel and in clear text hear each other; what is told to the tunnelled one is in the tunnel."""
+    """Nodes behind the tunnel and in clear text hear each other; traffic to the tunnelled one is in the tunnel."""
     need_root()
     need_strongswan()
     with Lab("rosrv-ipsecn") as lab:
-        # A default route, as real hosts have one: it also leads to the virtual addresses, and must not be taken.
+        # A default route, as on real hosts: it also leads to the virtual addresses, and must not be used for them.
         bare = lab.host("bare", f"{BARE}/24", gateway="10.89.0.1")
         robot, ocu = lab.host("robot", f"{ROBOT}/24"), lab.host("ocu", f"{OCU}/24")
         with Appliance(bare, policy=POLICY, isolation="netns") as appliance:
@@ -60,7 +60,7 @@ mount --make-rprivate / && mount -t tmpfs tmpfs /dev/net && mknod -m 600 /dev/ne
 
 
 def test_a_device_that_only_root_may_open_carries_the_tunnel() -> None:
-    """On a machine without udev `/dev/net/tun` has mode 0600: charon's user is let in, and the tunnel works as well."""
+    """Without udev `/dev/net/tun` has mode 0600: charon's user gets access, and the tunnel works as well."""
     need_root()
     need_strongswan()
     mine = f"{Path(__file__).resolve()}::{test_the_host_forwards_the_tunnel.__name__}"
@@ -73,7 +73,7 @@ def test_a_device_that_only_root_may_open_carries_the_tunnel() -> None:
 
 
 def authority_seen_from(joined: JoinedHost) -> str:
-    """What REST answers in the tunnel, where certificates are renewed, without any setting for it."""
+    """Return REST's answer in the tunnel, where certificates are renewed, without extra settings."""
     asked = joined.popen(
         [
             "curl",
@@ -93,7 +93,7 @@ def authority_seen_from(joined: JoinedHost) -> str:
 
 
 def test_a_host_enrols_itself_through_the_forwarding(tmp_path: Path) -> None:
-    """From a network that was named, to the bare host's own address; from any other REST is not there at all."""
+    """A host enrols from a named network at the bare host's own address; from other networks REST is unreachable."""
     need_root()
     need_strongswan()
     config = tmp_path / "appliance.yaml"
@@ -106,13 +106,13 @@ def test_a_host_enrols_itself_through_the_forwarding(tmp_path: Path) -> None:
         with (
             Appliance(bare, policy=POLICY, isolation="netns", options=options) as appliance,
             ScriptHost(ocu, tmp_path / "ocu") as laptop,
-            ScriptHost(robot, tmp_path / "robot") as stranger,
+            ScriptHost(robot, tmp_path / "robot") as unknown,
         ):
             done = appliance.rosrv(
                 "host", "add", "ocu-1", "--appliance", BARE, "--token", "--out", str(script), "--json"
             )
             token = json.loads(done.stdout)["token"]
-            refused = stranger.run("sh", str(script), token, check=False)
+            refused = unknown.run("sh", str(script), token, check=False)
             assert refused.returncode == 1
             assert "no answer from the appliance" in refused.stderr
             assert "the tunnel is up" in laptop.run("sh", str(script), token).stdout

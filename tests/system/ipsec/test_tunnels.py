@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.ipsec.certificate_authority import Authority
+from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.network import interfaces
 from examples.landshark.lab import INTERFACE, Lab
@@ -25,7 +25,7 @@ from tests.support.tunnels import JoinedHost, need_strongswan
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """One appliance for all tests here; no host is enrolled in the beginning."""
+    """Run one appliance for all tests here, without enrolled hosts at first."""
     need_root()
     need_strongswan()
     with Lab("rosrv-ipsec") as lab, TunnelSite(lab, tmp_path_factory.mktemp("ipsec")) as one:
@@ -34,19 +34,19 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
 
 @pytest.fixture(scope="module")
 def kit(site: TunnelSite) -> Path:
-    """The kit of `ocu-1`, enrolled once."""
+    """Return the kit of `ocu-1`, enrolled once."""
     return site.kit()
 
 
 @pytest.fixture
 def joined(site: TunnelSite, kit: Path) -> Iterator[JoinedHost]:
-    """`ocu` with its tunnel up."""
+    """Return `ocu` with its tunnel up."""
     with site.joined(kit) as host:
         yield host
 
 
 def test_without_a_host_there_is_no_tunnel(site: TunnelSite) -> None:
-    """Before anybody is enrolled neither charon runs nor a port of IKE is open; what `host:` names is nobody."""
+    """Before the first enrolment charon does not run and IKE ports are closed; `host:` matches no host."""
     status = site.appliance.status()
     assert "charon" not in [row["role"] for row in status["processes"]]
     assert status["ipsec"]["esp"] is None
@@ -54,7 +54,7 @@ def test_without_a_host_there_is_no_tunnel(site: TunnelSite) -> None:
 
 
 def test_nodes_talk_through_the_tunnel(site: TunnelSite, joined: JoinedHost) -> None:
-    """Nodes of both sides find and hear each other; the host is its virtual address; list, status and log show it."""
+    """Nodes of both sides find and hear each other; the host has its virtual address in list, status and log."""
     assert joined.master == f"http://{OWN}:11311"
     with (
         RosSession(MASTER, site.home, site.robot) as on_robot,
@@ -79,7 +79,7 @@ def test_nodes_talk_through_the_tunnel(site: TunnelSite, joined: JoinedHost) -> 
 
 
 def test_a_forged_address_gets_nowhere(site: TunnelSite, kit: Path) -> None:
-    """Packets in clear text from the trusted address are dropped before anything answers, tunnel or no tunnel."""
+    """Packets in clear text from the trusted address are dropped, with or without a tunnel."""
     forged = "10.113.11.2"
     interfaces.add_address(site.attacker.namespace, INTERFACE, f"{forged}/32")
     interfaces.add_route(site.attacker.namespace, f"{OWN}/32", MIDDLE)
@@ -105,9 +105,11 @@ def test_a_forged_address_gets_nowhere(site: TunnelSite, kit: Path) -> None:
 
 
 def test_a_foreign_certificate_is_refused(site: TunnelSite, kit: Path) -> None:
-    """A certificate in the right name, of another authority, opens no tunnel; the log says who tried and why."""
+    """A certificate with the correct name from another authority opens no tunnel; the log has the sender and the
+    reason.
+    """
     site.home.joinpath("foreign").mkdir()
-    foreign, key = Authority(site.home / "foreign"), make_key()
+    foreign, key = CertificateAuthority(site.home / "foreign"), make_key()
     thief = site.join(kit, site.attacker)
     made = foreign.issue(signing_request(key, "ocu-1"), "ocu-1", 90)
     (thief.folder / "swanctl/x509/rosrv.pem").write_bytes(made.certificate)
@@ -121,8 +123,8 @@ def test_a_foreign_certificate_is_refused(site: TunnelSite, kit: Path) -> None:
     assert refused["decision"] == "deny"
 
 
-def test_a_tunnel_that_was_cut_comes_back(site: TunnelSite, joined: JoinedHost) -> None:
-    """With the cable out the tunnel is down within half a minute, and the host is nobody; with it in, all is back."""
+def test_an_interrupted_tunnel_recovers(site: TunnelSite, joined: JoinedHost) -> None:
+    """Unplugged, the tunnel is down within half a minute and the host has no rights; plugged in, it recovers."""
     with (
         RosSession(MASTER, site.home, site.robot) as on_robot,
         RosSession(joined.master, site.home, joined) as on_ocu,
@@ -140,8 +142,8 @@ def test_a_tunnel_that_was_cut_comes_back(site: TunnelSite, joined: JoinedHost) 
         listener.wait_for(event="received", since=len(listener.events), timeout=LONG)
 
 
-def test_charon_that_dies_is_started_again(site: TunnelSite, joined: JoinedHost) -> None:
-    """Killed, it is back by itself with every tunnel it had, and the one before has left nothing running."""
+def test_a_dead_charon_is_restarted(site: TunnelSite, joined: JoinedHost) -> None:
+    """After a kill it restarts with every tunnel, and its predecessor leaves no process."""
     mark = site.mark
     before = site.appliance.kill("charon")
     site.recorded(mark, event="tunnel down")
@@ -151,7 +153,7 @@ def test_charon_that_dies_is_started_again(site: TunnelSite, joined: JoinedHost)
 
 
 def test_a_replaced_certificate_is_revoked(site: TunnelSite, kit: Path, joined: JoinedHost) -> None:
-    """`host kit` gives a new certificate; the one before is on the list of revoked ones and opens nothing."""
+    """`host kit` issues a new certificate; the old one is on the revocation list and opens no tunnel."""
     mark = site.mark
     new = site.kit("kit")
     site.recorded(mark, event="tunnel down")
@@ -167,7 +169,7 @@ def test_a_replaced_certificate_is_revoked(site: TunnelSite, kit: Path, joined: 
 
 
 def revoke_while_it_talks(site: TunnelSite, joined: JoinedHost) -> None:
-    """Revoked, a host loses its registrations, connections and tunnel within a second, and gets none again."""
+    """Assert that a revoked host loses registrations, connections and tunnel within a second, and gets none again."""
     with (
         RosSession(MASTER, site.home, site.robot) as on_robot,
         RosSession(joined.master, site.home, joined) as on_ocu,
@@ -187,17 +189,17 @@ def revoke_while_it_talks(site: TunnelSite, joined: JoinedHost) -> None:
         refused = site.refused(mark, OCU)
         assert refused["decision"] == "deny"
         assert site.state() == "revoked"
-        talker.kill()  # it cannot say good-bye to anybody
+        talker.kill()  # it cannot close the tunnel with a message
 
 
 def _seconds(record: Event) -> float:
-    """The moment of a record within its day; a test over midnight is a second off, which no assertion bears."""
+    """Return the time of a record within its day; a test over midnight is a second off, which no assertion notices."""
     hours, minutes, seconds = str(record["time"]).split("T")[1].rstrip("Z").split(":")
     return int(hours) * 3600 + int(minutes) * 60 + float(seconds)
 
 
-def test_scripts_of_a_kit_are_shell(site: TunnelSite, kit: Path) -> None:
-    """join.sh, leave.sh and keep.sh are understood by the shell, and a kit is for its owner only."""
+def test_the_shell_accepts_the_scripts_of_a_kit(site: TunnelSite, kit: Path) -> None:
+    """The shell accepts join.sh, leave.sh and keep.sh, and a kit is readable for its owner only."""
     assert kit.stat().st_mode & 0o777 == 0o600
     folder = site.join(kit).folder
     for script in ("join.sh", "leave.sh", "keep.sh"):

@@ -1,48 +1,43 @@
-"""Tests of `appliance.network.public_address`: hosts of the lab with the addresses and routes that machines have."""
-
-from collections.abc import Iterator
+"""Test `appliance.network.public_address` on hosts of the lab with the addresses and routes of real machines."""
 
 import pytest
 
 from appliance.network import interfaces
 from appliance.network.namespaces import NetworkError
-from appliance.network.public_address import Endpoint, only_address, outward_address
+from appliance.network.public_address import PublicAddress, only_address, outward_address
 from examples.landshark.lab import INTERFACE, Lab
-from tests.support.requirements import need_root
 
 ROUTE = "this machine's address towards its default route"
 ONLY = "the only address here"
 LO = ("lo",)
 
 
-@pytest.fixture
-def lab() -> Iterator[Lab]:
-    """A lab of these tests."""
-    need_root()
-    with Lab("rosrv-endp") as one:
-        yield one
-
-
 def test_the_default_route_decides_between_addresses(lab: Lab) -> None:
-    """The address on its way out is taken, whatever others the machine has; IPv6 only where IPv4 leads nowhere."""
+    """The source address of the default route is used, whatever others the machine has; IPv6 only without an IPv4
+    route.
+    """
     both = lab.host("both", "10.78.0.2/24", "fd78::2/64", gateway="10.78.0.1").namespace
     interfaces.add_address(both, INTERFACE, "10.79.0.2/24")
-    assert outward_address(both, without=LO) == Endpoint("10.78.0.2", ROUTE)
+    assert outward_address(both, without=LO) == PublicAddress("10.78.0.2", ROUTE)
     six = lab.host("six", "fd78::3/64", gateway="fd78::1").namespace
-    assert outward_address(six, without=LO) == Endpoint("fd78::3", ROUTE)
+    assert outward_address(six, without=LO) == PublicAddress("fd78::3", ROUTE)
 
 
 def test_without_a_default_route_the_only_address_is_taken(lab: Lab) -> None:
-    """Loopback does not count, nor does what is on an interface that is left out; IPv4 goes before IPv6."""
+    """Loopback and excluded interfaces do not count; IPv4 is preferred to IPv6."""
     host = lab.host("alone", "10.78.0.4/24", "fd78::4/64").namespace
     interfaces.add_address(host, "lo", "10.113.11.1/32")
-    assert outward_address(host, without=LO) == only_address(host, without=LO) == Endpoint("10.78.0.4", ONLY)
+    assert (
+        outward_address(host, without=LO)
+        == only_address(host, without=LO)
+        == PublicAddress("10.78.0.4", ONLY)
+    )
     with pytest.raises(NetworkError, match=r"several addresses here \(10\.78\.0\.4, 10\.113\.11\.1\)"):
         only_address(host, without=())
 
 
-def test_of_several_addresses_none_is_guessed(lab: Lab) -> None:
-    """All of them are named; a machine without any says so."""
+def test_several_addresses_are_an_error(lab: Lab) -> None:
+    """The error lists all addresses, or says that there is none."""
     host = lab.host("two", "10.78.0.5/24", "10.79.0.5/24", gateway="10.78.0.1").namespace
     with pytest.raises(NetworkError, match=r"10\.78\.0\.5, 10\.79\.0\.5"):
         only_address(host, without=LO)

@@ -1,4 +1,4 @@
-"""Tests of the firewall against the kernel, with both back ends."""
+"""Test the firewall against the kernel, with both back ends."""
 
 import contextlib
 import itertools
@@ -18,16 +18,16 @@ from appliance.network.firewall.firewall import BackendChoice, Firewall
 from appliance.network.firewall.firewall_rules import (
     Chain,
     FirewallSettings,
+    PacketRule,
+    PacketVerdict,
     PortRange,
     RateLimit,
-    Rule,
-    Verdict,
 )
 from appliance.network.firewall.iptables import IptablesBackend
 from appliance.network.firewall.nft import NftBackend
-from appliance.network.probe import PROBE_UID, Outcome, probe_port
+from appliance.network.probe import PROBE_UID, ConnectOutcome, probe_port
 from examples.landshark.lab import INTERFACE, Host, Lab
-from tests.support.requirements import need_program, need_root
+from tests.support.requirements import need_program
 from tests.system.network.test_isolation import serving
 
 CONTROL, ROSMASTER, OTHER = 61011, 61012, 61055
@@ -52,32 +52,11 @@ for target in sys.argv[1:]:
 
 @pytest.fixture(autouse=True)
 def _machine() -> None:
-    need_root()
-    need_program("nft", "nftables")
     need_program("iptables-legacy", "iptables")
 
 
-@pytest.fixture
-def lab() -> Iterator[Lab]:
-    """A lab of the firewall's tests."""
-    with Lab("rosrv-fw") as one:
-        yield one
-
-
-@pytest.fixture
-def protected(lab: Lab) -> Host:
-    """The host that the firewall protects."""
-    return lab.host("protected", "10.77.0.2/24", "fd77::2/64")
-
-
-@pytest.fixture
-def attacker(lab: Lab) -> Host:
-    """Another host of the network."""
-    return lab.host("attacker", "10.77.0.66/24", "fd77::66/64")
-
-
 def connect(host: Host, uid: int, *targets: tuple[str, int]) -> list[str]:
-    """Try to connect from a host as a local user; return what each attempt came to."""
+    """Try to connect from a host as a local user; return the result of each attempt."""
     process = host.popen(
         [sys.executable, "-I", "-S", "-c", CLIENT, *(f"{address}/{port}" for address, port in targets)],
         user=uid,
@@ -104,7 +83,7 @@ def listening(host: Host, address: str = "::", port: int = 0) -> Iterator[int]:
 
 
 def settings(port: int, **others: Any) -> FirewallSettings:
-    """Return settings that protect `port` as the ROSMaster port."""
+    """Return settings that protect `port` as the port of rosmaster."""
     return FirewallSettings(
         control_uid=CONTROL,
         rosmaster_uid=ROSMASTER,
@@ -128,7 +107,7 @@ def ruleset(host: Host) -> str:
 def test_only_control_opens_connections_to_rosmaster(
     protected: Host, attacker: Host, backend: BackendChoice
 ) -> None:
-    """The ROSMaster port is refused to other users, root included, and to other hosts, on both families."""
+    """rosmaster's port is closed to other users, root included, and to other hosts, on both families."""
     firewall = Firewall(protected.namespace, backend)
     own = (protected.address, protected.address6)
     with listening(protected) as port:
@@ -144,10 +123,10 @@ def test_only_control_opens_connections_to_rosmaster(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_the_inner_face_is_for_rosmaster_only(
+def test_only_rosmaster_reaches_the_master_side_endpoint(
     protected: Host, attacker: Host, backend: BackendChoice
 ) -> None:
-    """The inner node face, known only later, is added by an update; then rosmaster alone may connect."""
+    """The master-side endpoint, known only later, is added by an update; then rosmaster alone may connect."""
     firewall = Firewall(protected.namespace, backend)
     with listening(protected) as port, listening(protected) as inner:
         firewall.install(settings(port))
@@ -162,8 +141,8 @@ def test_the_inner_face_is_for_rosmaster_only(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_open_connections_and_other_ports_live_on(protected: Host, backend: BackendChoice) -> None:
-    """A connection from before the rules still carries data, and ports that nobody named stay reachable."""
+def test_open_connections_and_other_ports_stay_usable(protected: Host, backend: BackendChoice) -> None:
+    """A connection from before the rules still carries data, and unlisted ports stay reachable."""
     firewall = Firewall(protected.namespace, backend)
     with protected.entered():
         server = socket.create_server(("127.0.0.1", 0))
@@ -180,7 +159,7 @@ def test_open_connections_and_other_ports_live_on(protected: Host, backend: Back
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_port_opened_by_notrack_rules_stays_closed(protected: Host, backend: BackendChoice) -> None:
-    """A foreign rule that keeps loopback from the connection tracker does not open the ROSMaster port."""
+    """A foreign rule that exempts loopback from connection tracking does not open rosmaster's port."""
     run_in(protected, "iptables-legacy -t raw -A OUTPUT -o lo -j NOTRACK")
     run_in(protected, "iptables-legacy -t raw -A PREROUTING -i lo -j NOTRACK")
     firewall = Firewall(protected.namespace, backend)
@@ -198,7 +177,7 @@ def run_in(host: Host, command: str) -> None:
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_foreign_rules_are_not_touched(protected: Host, backend: BackendChoice) -> None:
-    """Installing twice leaves one set; removing leaves exactly the rules that were there before."""
+    """A second installation leaves one set; the removal leaves exactly the earlier rules."""
     run_in(protected, "iptables-legacy -A INPUT -p tcp --dport 9 -m comment --comment foreign -j DROP")
     run_in(protected, "ip6tables-legacy -A OUTPUT -p udp --dport 9 -m length --length 1:50 -j DROP")
     run_in(protected, "nft add table inet foreign")
@@ -210,7 +189,7 @@ def test_foreign_rules_are_not_touched(protected: Host, backend: BackendChoice) 
     firewall.install(settings(11312, api_port=8443))
     assert ruleset(protected) == once
     Firewall(protected.namespace, backend).install(settings(11312, api_port=8443))
-    assert ruleset(protected) == once, "another life of the appliance"
+    assert ruleset(protected) == once, "after a restart of the appliance"
     assert all(line in once for line in before.splitlines())
     firewall.remove()
     assert ruleset(protected) == before
@@ -232,21 +211,23 @@ def test_leftovers_of_the_other_back_end_are_replaced(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_the_rest_port_is_for_the_networks_named(lab: Lab, protected: Host, backend: BackendChoice) -> None:
-    """Loopback and the management networks reach the REST port; every other host is refused."""
+def test_only_management_networks_reach_the_rest_port(
+    lab: Lab, protected: Host, backend: BackendChoice
+) -> None:
+    """Loopback and the management networks reach the REST port; other hosts are refused."""
     manager = lab.host("manager", "10.77.0.5/24", "fd77::5/64")
-    stranger = lab.host("stranger", "10.77.0.6/24", "fd77::6/64")
+    unknown = lab.host("unknown", "10.77.0.6/24", "fd77::6/64")
     firewall = Firewall(protected.namespace, backend)
     with listening(protected) as api:
         firewall.install(settings(11312, api_port=api, api_networks=("10.77.0.5", "fd77::5/128")))
         targets = [(address, api) for address in (protected.address, protected.address6)]
         assert connect(manager, OTHER, *targets) == ["reached"] * 2
-        assert connect(stranger, OTHER, *targets) == ["refused"] * 2
+        assert connect(unknown, OTHER, *targets) == ["refused"] * 2
         assert connect(protected, OTHER, ("127.0.0.1", api)) == ["reached"]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_tunnelled_host_in_clear_text_gets_nowhere(
+def test_clear_text_packets_of_a_tunnelled_host_are_dropped(
     lab: Lab, protected: Host, backend: BackendChoice
 ) -> None:
     """Packets from and to the virtual address of a host that must use its tunnel are dropped outside it."""
@@ -266,10 +247,10 @@ def test_a_tunnelled_host_in_clear_text_gets_nowhere(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_flood_of_one_host_is_slowed_and_others_are_not(
+def test_only_the_flooding_host_is_slowed_down(
     lab: Lab, protected: Host, attacker: Host, backend: BackendChoice
 ) -> None:
-    """Above the limit new connections of a host are held up on all ports together; those of another come through."""
+    """Above the limit new connections of a host are delayed on all ports together; those of another get through."""
     honest = lab.host("honest", "10.77.0.10/24", "fd77::10/64")
     firewall = Firewall(protected.namespace, backend)
     limit = RateLimit(per_second=1, burst=5)
@@ -285,10 +266,10 @@ def test_a_flood_of_one_host_is_slowed_and_others_are_not(
         assert sum(rule.packets for rule in dropped) >= 30
 
 
-def test_hosts_beyond_those_that_are_counted_share_one_limit(
+def test_hosts_without_a_bucket_have_one_common_limit(
     lab: Lab, protected: Host, attacker: Host, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """nft: when every bucket is taken, further hosts have one together; who has one keeps it."""
+    """nft: when every bucket is in use, further hosts share one; a host with a bucket keeps it."""
     monkeypatch.setattr("appliance.network.firewall.nft._METER_SIZE", 1)
     others = [lab.host(f"other{number}", f"10.77.0.{number}/24", f"fd77::{number}/64") for number in (11, 12)]
     firewall = Firewall(protected.namespace, "nft")
@@ -306,7 +287,7 @@ def test_hosts_beyond_those_that_are_counted_share_one_limit(
 
 
 def flood(host: Host, address: str, servers: tuple[socket.socket, ...], rounds: int) -> int:
-    """Open connections to all servers at once; how many came through at the first try (a SYN-ACK again takes 1 s)."""
+    """Open connections to all servers at once; return how many succeeded at the first attempt (a second takes 1 s)."""
     with contextlib.ExitStack() as stack, host.entered():
         for server in servers * rounds:
             target = (address, server.getsockname()[1])
@@ -315,7 +296,7 @@ def flood(host: Host, address: str, servers: tuple[socket.socket, ...], rounds: 
 
 
 def waiting(server: socket.socket, host: Host) -> int:
-    """Accept and close what waits at a server; how many of them are the host's."""
+    """Accept and close waiting connections of a server; return the number of the host's."""
     server.settimeout(0.3)
     found = 0
     with contextlib.suppress(TimeoutError):
@@ -329,9 +310,9 @@ def waiting(server: socket.socket, host: Host) -> int:
 def test_legacy_xtables_are_in_force_on_a_kernel_without_ipv6(
     protected: Host, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every rule is in the one family that there is: the report is intact, until one is taken away."""
+    """With one address family, the report is intact until a rule is removed."""
     monkeypatch.setattr("appliance.network.firewall.iptables._families", lambda: (4,))
-    protected.namespace.sysctl("net.ipv6.conf.all.disable_ipv6", "1")  # nobody can listen on it either
+    protected.namespace.sysctl("net.ipv6.conf.all.disable_ipv6", "1")  # no listener is possible on it either
     firewall = Firewall(protected.namespace, "iptables")
     firewall.install(settings(11312, tunnel_only=("10.77.0.9", "fd77::9")))
     assert firewall.report().intact
@@ -341,8 +322,8 @@ def test_legacy_xtables_are_in_force_on_a_kernel_without_ipv6(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_the_report_counts_and_misses_what_was_taken_away(protected: Host, backend: BackendChoice) -> None:
-    """The report names the rules with their packets, and is no longer intact once someone flushes them."""
+def test_the_report_counts_packets_and_misses_removed_rules(protected: Host, backend: BackendChoice) -> None:
+    """The report names the rules with their packets, and is not intact once they are flushed."""
     firewall = Firewall(protected.namespace, backend)
     assert firewall.report().backend is None
     with listening(protected) as port:
@@ -362,10 +343,10 @@ def test_the_report_counts_and_misses_what_was_taken_away(protected: Host, backe
         assert firewall.report().intact
 
 
-def test_auto_takes_what_the_kernel_enforces(
+def test_auto_selects_a_back_end_that_the_kernel_enforces(
     protected: Host, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A back end that accepts every rule and enforces none is not taken, and the report says why."""
+    """A back end that accepts every rule and enforces none is not used, and the report says why."""
     assert Firewall(protected.namespace).install(settings(11312)) == "nft"
     pretender = tmp_path / "nft"
     pretender.write_text("#!/bin/sh\ncat >/dev/null\necho '{\"nftables\": []}'\n")
@@ -377,14 +358,14 @@ def test_auto_takes_what_the_kernel_enforces(
         assert firewall.install(settings(port)) == "iptables"
         assert "nft: a port of our own on 127.0.0.1 was reached" in firewall.report().not_used[0]
         assert connect(protected, OTHER, ("127.0.0.1", port)) == ["refused"]
-    with pytest.raises(FirewallError, match=r"no firewall can be had .* nft: a port of our own"):
+    with pytest.raises(FirewallError, match=r"no firewall works .* nft: a port of our own"):
         Firewall(protected.namespace, "nft").install(settings(11312))
 
 
-def test_auto_takes_the_one_that_takes_every_rule(
+def test_auto_selects_a_back_end_that_accepts_every_rule(
     protected: Host, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A back end that enforces the proof but lacks a part that the rules need is passed over, leaving nothing."""
+    """A back end that passes the trial but lacks a required feature is skipped without leftovers."""
     real = need_program("nft", "nftables")
     partial = tmp_path / "nft"
     partial.write_text(
@@ -426,10 +407,10 @@ except NetworkError as error:
         ("auto", "+setuid", "the firewall needs CAP_NET_ADMIN"),
     ],
 )
-def test_a_container_needs_no_more_than_it_is_given(
+def test_the_firewall_needs_only_few_capabilities(
     protected: Host, backend: str, capabilities: str, words: str
 ) -> None:
-    """The firewall and the probe work with few capabilities; without those the error names one."""
+    """The firewall and the probe work with few capabilities; without them the error names the missing one."""
     need_program("setpriv", "util-linux")
     with listening(protected) as port:
         process = protected.popen(
@@ -445,7 +426,7 @@ def test_a_container_needs_no_more_than_it_is_given(
 
 
 def test_without_any_back_end_there_is_no_firewall(protected: Host, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With no nft program and no libiptc, installing fails and says what to install."""
+    """Without nft and libiptc, installing fails and names the packages."""
     monkeypatch.setenv("PATH", "/nonexistent")
     monkeypatch.setitem(sys.modules, "iptc", None)
     with pytest.raises(FirewallError, match=r"apt install nftables.*apt install iptables"):
@@ -454,50 +435,50 @@ def test_without_any_back_end_there_is_no_firewall(protected: Host, monkeypatch:
 
 @pytest.mark.parametrize("kind", [NftBackend, IptablesBackend])
 def test_the_proof_leaves_nothing(protected: Host, kind: type[NftBackend] | type[IptablesBackend]) -> None:
-    """Proving a back end leaves the rules of the namespace as they were."""
+    """The trial of a back end leaves the rules of the namespace unchanged."""
     before = ruleset(protected)
     prove(kind(protected.namespace), protected.namespace)
     assert ruleset(protected) == before
 
 
-def test_a_refused_transaction_keeps_the_old_rules(protected: Host) -> None:
-    """When nft refuses new rules, the ones before stay in force."""
+def test_a_rejected_transaction_keeps_the_old_rules(protected: Host) -> None:
+    """When nft rejects new rules, the earlier ones stay in force."""
     backend = NftBackend(protected.namespace)
     firewall = Firewall(protected.namespace, "nft")
     firewall.install(settings(11312))
     before = ruleset(protected)
-    with pytest.raises(FirewallError, match="nft refused the rules"):
+    with pytest.raises(FirewallError, match="nft rejected the rules"):
         backend.install((broken_rule(),))
     assert ruleset(protected) == before
 
 
-def broken_rule() -> Rule:
-    """Return a rule whose comment is longer than nft takes."""
-    return Rule(chain=Chain.IN, purpose="x" * 500, verdict=Verdict.DROP)
+def broken_rule() -> PacketRule:
+    """Return a rule with a comment that is too long for nft."""
+    return PacketRule(chain=Chain.IN, purpose="x" * 500, verdict=PacketVerdict.DROP)
 
 
-def test_the_probe_sees_a_closed_and_an_open_port(protected: Host) -> None:
-    """Another local user is refused while the rules stand and gets through without; the probe says so."""
+def test_the_probe_reports_closed_and_open_ports(protected: Host) -> None:
+    """Another local user is refused while the rules are in force, and connects without; the probe reports both."""
     firewall = Firewall(protected.namespace)
     with listening(protected) as port:
         firewall.install(settings(port))
         result = probe_port(protected.namespace, port)
         assert result.closed
         assert result.listening
-        assert [one.outcome for one in result.attempts] == [Outcome.REFUSED] * 2
+        assert [one.outcome for one in result.attempts] == [ConnectOutcome.REFUSED] * 2
         assert result.listening_outside == ("::",)
         firewall.remove()
         result = probe_port(protected.namespace, port)
         assert not result.closed
-        assert [one.outcome for one in result.attempts] == [Outcome.REACHED] * 2
+        assert [one.outcome for one in result.attempts] == [ConnectOutcome.REACHED] * 2
     assert not probe_port(protected.namespace, port).listening
     with listening(protected, "127.0.0.1") as port:
         assert probe_port(protected.namespace, port).listening == ("127.0.0.1",)
         assert probe_port(protected.namespace, port).listening_outside == ()
 
 
-def test_the_probe_is_the_user_it_says(protected: Host) -> None:
-    """The probe is refused where root alone may pass, and gets through where its own user may."""
+def test_the_probe_runs_as_its_user(protected: Host) -> None:
+    """The probe is refused where only root may connect, and connects where its own user may."""
     firewall = Firewall(protected.namespace)
     with listening(protected) as port:
         for uid, closed in ((0, True), (PROBE_UID, False)):
@@ -506,14 +487,14 @@ def test_the_probe_is_the_user_it_says(protected: Host) -> None:
 
 
 def test_the_probe_refuses_to_be_root(protected: Host) -> None:
-    """A probe as root would prove nothing and is an error."""
+    """A probe as root proves nothing and is an error."""
     with pytest.raises(ValueError, match="unprivileged"):
         probe_port(protected.namespace, 11312, uid=0)
 
 
-def test_iptables_says_that_it_does_not_translate_addresses(protected: Host) -> None:
-    """A rule for address translation given to the iptables back end is an error, not a rule left out."""
-    rule = Rule(chain=Chain.NAT, purpose="forward", verdict=Verdict.DNAT, to="10.1.1.1")
+def test_iptables_rejects_rules_for_address_translation(protected: Host) -> None:
+    """A rule for address translation in the iptables back end is an error, and not ignored."""
+    rule = PacketRule(chain=Chain.NAT, purpose="forward", verdict=PacketVerdict.DNAT, to="10.1.1.1")
     with pytest.raises(BackendMissingError, match="forward"):
         IptablesBackend(protected.namespace).install((rule,))
 

@@ -1,18 +1,17 @@
-"""First packets under somebody else's address, thousands a second: who is named goes on as if there were none."""
+"""Thousands of forged SYNs a second under the address of a named host do not affect that host."""
 
 import socket
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
 
 import pytest
 
 from appliance.network.firewall.firewall import BackendChoice, Firewall
 from appliance.network.firewall.firewall_rules import FirewallSettings, PortRange
-from examples.landshark.lab import Host, Lab
+from examples.landshark.lab import Host
 from tests.support.forged_syns import flood_command
-from tests.support.requirements import need_program, need_root
+from tests.support.requirements import need_program
 from tests.support.translators import load
 from tests.system.network.test_protect import close
 
@@ -28,36 +27,13 @@ _SILENT = """table inet own {
 MASTER, NODE, REST = 11311, 20000, 8443
 
 
-@pytest.fixture
-def lab() -> Iterator[Lab]:
-    """A lab of these tests."""
-    need_root()
-    need_program("nft", "nftables")
+@pytest.fixture(autouse=True)
+def _machine() -> None:
     need_program("iptables-legacy", "iptables")
-    with Lab("rosrv-flood") as one:
-        yield one
-
-
-@pytest.fixture
-def protected(lab: Lab) -> Host:
-    """Where the flood goes to."""
-    return lab.host("protected", "10.77.0.2/24", "fd77::2/64")
-
-
-@pytest.fixture
-def robot(lab: Lab) -> Host:
-    """The host that is named, and has calls to make."""
-    return lab.host("robot", "10.77.0.10/24", "fd77::10/64")
-
-
-@pytest.fixture
-def attacker(lab: Lab) -> Host:
-    """The host that writes the robot's address."""
-    return lab.host("attacker", "10.77.0.66/24", "fd77::66/64")
 
 
 def calls_during(flood: "subprocess.Popen[str]", robot: Host, server: socket.socket) -> list[float]:
-    """Seconds that each call of the robot took while the flood went on; a call that is not answered raises."""
+    """Return the seconds of each call of the robot during the flood; an unanswered call raises."""
     address, pause = server.getsockname()[:2], threading.Event()
     took = []
     while flood.poll() is None:
@@ -74,21 +50,21 @@ def calls_during(flood: "subprocess.Popen[str]", robot: Host, server: socket.soc
 
 
 def accepted(server: socket.socket, port: int) -> socket.socket:
-    """The connection from this port; a SYN cookie that comes twice makes a second one, which is let go."""
+    """Return the connection from this port; a repeated SYN cookie makes a second one, which is closed."""
     for _ in range(100):
         peer, (_, seen, *_) = server.accept()
         if seen == port:
             peer.settimeout(10)
             return peer
         peer.close()
-    raise AssertionError("a hundred connections came from elsewhere")
+    raise AssertionError("a hundred connections came from other hosts")
 
 
 def unharmed(robot: Host, attacker: Host, protected: Host, ports: tuple[int, ...], backlog: int) -> None:
-    """Flood each port under the robot's address, on both families; the robot's calls are answered at once.
+    """Flood each port under the robot's address, on both families; assert that the robot's calls are answered at once.
 
-    A forged packet that is half-open in the kernel's memory with the very port that the robot then chooses costs
-    that call a second: a hundredth of the calls may meet one.
+    A forged half-open connection on the very port that the robot then chooses costs that call a second: a hundredth of
+    the calls may meet one.
     """
     for target, named in ((protected.address, robot.address), (protected.address6, robot.address6)):
         for port in ports:
@@ -107,7 +83,7 @@ def unharmed(robot: Host, attacker: Host, protected: Host, ports: tuple[int, ...
 
 @pytest.fixture(params=[False, True], ids=["resets", "silent"])
 def silent(request: pytest.FixtureRequest, robot: Host) -> bool:
-    """Whether the robot's own firewall drops the answers to what it has not asked for: they stay half-open then."""
+    """Whether the robot's own firewall drops unexpected answers: forged connections then stay half-open."""
     if request.param:
         load(robot.namespace, "nft", _SILENT)
     return bool(request.param)
@@ -118,7 +94,7 @@ def silent(request: pytest.FixtureRequest, robot: Host) -> bool:
 def test_the_named_host_is_served(
     protected: Host, robot: Host, attacker: Host, backend: BackendChoice
 ) -> None:
-    """RVMaster's port, a node's or relay's, and REST's: 3,000 forged first packets a second count for nobody."""
+    """On the ports of RVMaster, nodes, relay and REST, 3,000 forged SYNs a second have no effect."""
     Firewall(protected.namespace, backend).install(
         FirewallSettings(
             control_uid=61011,
@@ -134,6 +110,6 @@ def test_the_named_host_is_served(
 
 @pytest.mark.usefixtures("silent")
 def test_the_appliance_reaches_protected_ports(protected: Host, robot: Host, attacker: Host) -> None:
-    """The same on a machine of nodes under `rosrv protect`, with the few places that rospy asks the kernel for."""
+    """The same holds on a machine of nodes under `rosrv protect`, with rospy's small backlog."""
     close(protected, robot)
     unharmed(robot, attacker, protected, (40007,), backlog=5)

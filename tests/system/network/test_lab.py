@@ -1,4 +1,4 @@
-"""Tests of the lab: hosts that are network namespaces."""
+"""Test the lab, whose hosts are network namespaces."""
 
 import asyncio
 import os
@@ -49,8 +49,8 @@ def test_popen_runs_the_program_itself_on_the_host() -> None:
             robot.popen(["/nonexistent/program"])
 
 
-def test_a_thread_in_a_namespace_leaves_the_others_where_they_are() -> None:
-    """After work inside a namespace the calling thread is where it was, even when the work fails."""
+def test_a_thread_in_a_namespace_does_not_move_others() -> None:
+    """After work inside a namespace the calling thread is back in its own, even when the work fails."""
     before = Path("/proc/thread-self/ns/net").readlink()
     with Lab("rosrv-lab") as lab:
         robot = lab.host("robot", "10.77.0.10/24")
@@ -70,7 +70,7 @@ def test_works_under_a_running_event_loop() -> None:
         with Lab("rosrv-lab") as lab:
             return interfaces.links(lab.host("robot", "10.77.0.10/24").namespace)
 
-    with ThreadPoolExecutor() as thread:  # this one may have a loop: that of the tests in a browser
+    with ThreadPoolExecutor() as thread:  # this thread may have a loop: that of the tests in a browser
         assert sorted(thread.submit(asyncio.run, main()).result()) == ["eth0", "lo"]
 
 
@@ -90,7 +90,7 @@ def test_closing_ends_every_process_and_leaves_nothing() -> None:
     assert [space for space in namespaces("rosrv-lab.") if f".{os.getpid()}." in space.name] == []
 
 
-def test_what_a_crashed_lab_left_is_cleared_away() -> None:
+def test_leftovers_of_a_crashed_lab_are_removed() -> None:
     """The next lab of the same prefix ends the processes and deletes the namespaces of a killed one."""
     program = (
         "import sys; from examples.landshark.lab import Lab\n"
@@ -119,8 +119,8 @@ def test_what_a_crashed_lab_left_is_cleared_away() -> None:
     assert namespaces("rosrv-labcrash.") == []
 
 
-def test_an_unplugged_host_is_not_reached() -> None:
-    """Taking the cable out loses packets; putting it back in lets them pass again."""
+def test_an_unplugged_host_is_unreachable() -> None:
+    """An unplugged host loses packets; plugging it in restores the connection."""
     with Lab("rosrv-lab") as lab:
         robot = lab.host("robot", "10.77.0.10/24")
         operator = lab.host("operator", "10.77.0.11/24")
@@ -137,7 +137,7 @@ def test_an_unplugged_host_is_not_reached() -> None:
 
 
 def test_a_namespace_is_made_once_and_deleted_for_good() -> None:
-    """Making a second one of the same name is an error that names it; deleting twice is none."""
+    """Making a second one of the same name is an error that names it; deleting twice is not an error."""
     space = Namespace(f"rosrv-once.{os.getpid()}")
     space.create()
     try:

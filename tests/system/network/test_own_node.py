@@ -1,4 +1,4 @@
-"""rosout behind the firewall: who reaches it, and what it (or whoever took it over) reaches."""
+"""Access to rosout behind the firewall, and the access of a compromised rosout."""
 
 import contextlib
 import json
@@ -11,7 +11,7 @@ import pytest
 
 from appliance.channel.rosout_address import ADDRESS
 from appliance.network.firewall.firewall import BackendChoice, Firewall
-from appliance.network.firewall.firewall_rules import FirewallSettings, OwnNode, PortRange
+from appliance.network.firewall.firewall_rules import FirewallSettings, OwnNodeAccess, PortRange
 from appliance.supervisor.users import account_of
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
@@ -49,17 +49,14 @@ print(json.dumps([getattr(master, name)(*given) for name, *given in json.loads(s
 
 
 @pytest.fixture
-def host() -> Iterator[Host]:
-    """The machine of the appliance."""
-    need_root()
-    need_program("nft", "nftables")
+def host(lab: Lab) -> Host:
+    """Return the machine of the appliance."""
     need_program("iptables-legacy", "iptables")
-    with Lab("rosrv-own") as lab:
-        yield lab.host("appliance", "10.77.0.2/24")
+    return lab.host("appliance", "10.77.0.2/24")
 
 
 def run(host: Host, uid: int, program: str, *arguments: str) -> str:
-    """What a Python program prints that runs on a host as this user."""
+    """Return the output of a Python program that runs on a host as this user."""
     process = host.popen(
         [sys.executable, "-I", "-S", "-c", program, *arguments],
         user=uid, group=uid, extra_groups=[], cwd="/", stdout=subprocess.PIPE, text=True,
@@ -68,14 +65,14 @@ def run(host: Host, uid: int, program: str, *arguments: str) -> str:
 
 
 def connect(host: Host, uid: int, *targets: tuple[str, int]) -> list[str]:
-    """What comes of connecting to these addresses as this user."""
+    """Return the result of connections to these addresses as this user."""
     found: list[str] = json.loads(run(host, uid, CONNECT, json.dumps(targets)))
     return found
 
 
 @contextlib.contextmanager
 def rosout(host: Host, port: int) -> Iterator[int]:
-    """Something that listens as rosout does, under its user: messages at `port`; yields the port of its API."""
+    """Run a listener like rosout, under its user: messages at `port`; yield the port of its API."""
     process = host.popen(
         [sys.executable, "-I", "-S", "-c", SERVE, str(port)],
         user=ROSOUT, group=ROSOUT, extra_groups=[], cwd="/",
@@ -92,8 +89,8 @@ def rosout(host: Host, port: int) -> Iterator[int]:
 def test_only_control_calls_it_and_only_the_relay_gets_its_messages(
     host: Host, backend: BackendChoice
 ) -> None:
-    """With either back end no other user, root and ROSMaster's included, gets an answer of it at any address."""
-    node = OwnNode(uid=ROSOUT, relay_uid=RELAY, address=ADDRESS, ports=PORTS)
+    """With either back end other users, root and rosmaster's included, get no answer at any address."""
+    node = OwnNodeAccess(uid=ROSOUT, relay_uid=RELAY, address=ADDRESS, ports=PORTS)
     with rosout(host, PORTS.first) as api:
         everywhere = [(ADDRESS, api), ("127.0.0.1", api), (host.address, api), ("127.0.0.1", PORTS.first)]
         assert connect(host, OTHER, *everywhere) == ["reached"] * 4, "without rules"
@@ -107,8 +104,8 @@ def test_only_control_calls_it_and_only_the_relay_gets_its_messages(
             assert "reached" not in found, (uid, found)
 
 
-def test_a_fallen_rosout_and_a_fallen_rosmaster_get_nowhere() -> None:
-    """As rosout's user one is `/rosout` and nothing more, as ROSMaster's nobody; neither reaches another port."""
+def test_a_compromised_rosout_or_rosmaster_reaches_nothing() -> None:
+    """rosout's user can act as `/rosout` only, rosmaster's user as no node; neither reaches another port."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-own") as lab:
@@ -152,7 +149,7 @@ def test_a_fallen_rosout_and_a_fallen_rosmaster_get_nowhere() -> None:
 
 @contextlib.contextmanager
 def listening(host: Host) -> Iterator[int]:
-    """Something on another machine that takes every connection; yields its port."""
+    """Listen on another machine and accept every connection; yield the port."""
     with host.entered():
         server = socket.create_server((host.address, 0))
     with server:

@@ -1,4 +1,4 @@
-"""Tests of `rosrv protect` on hosts of a lab, with real listeners and a real scan from outside."""
+"""Test `rosrv protect` on hosts of a lab, with real listeners and a real scan from outside."""
 
 import contextlib
 import json
@@ -13,44 +13,19 @@ import pytest
 
 from appliance.network import interfaces
 from examples.landshark.lab import Host, Lab
-from tests.support.requirements import need_program, need_root
+from tests.support.requirements import need_program
 from tests.support.translators import TRANSLATORS, guest_behind, load
 from tests.system.network.test_isolation import serving, source_seen
 
 COMMAND = "import sys, typer; from appliance.cli.protect_verb import protect; sys.argv[0] = 'rosrv'; typer.run(protect)"
-FEW = "40000-40099"  # a range that is scanned fast
+FEW = "40000-40099"  # a small range, for a quick scan
 INSIDE, KEPT, OUTSIDE = 40007, 40022, 39000
-
-
-@pytest.fixture(autouse=True)
-def _machine() -> None:
-    need_root()
-    need_program("nft", "nftables")
-
-
-@pytest.fixture
-def lab() -> Iterator[Lab]:
-    """A lab of these tests."""
-    with Lab("rosrv-protect") as one:
-        yield one
-
-
-@pytest.fixture
-def robot(lab: Lab) -> Host:
-    """The machine that the nodes run on."""
-    return lab.host("robot", "10.77.0.10/24", "fd77::10/64")
 
 
 @pytest.fixture
 def gateway(lab: Lab) -> Host:
-    """The appliance, as another machine."""
+    """Return the appliance, as another machine."""
     return lab.host("gateway", "10.77.0.2/24", "fd77::2/64")
-
-
-@pytest.fixture
-def attacker(lab: Lab) -> Host:
-    """Any other machine."""
-    return lab.host("attacker", "10.77.0.66/24", "fd77::66/64")
 
 
 def protect(host: Host, *arguments: str, status: int = 0, **environment: str) -> str:
@@ -87,7 +62,7 @@ def listening(host: Host, *ports: int) -> Iterator[None]:
 
 
 def reaches(host: Host, address: str, port: int) -> bool:
-    """Tell whether a TCP connection can be opened; a refusal must be a refusal, not silence."""
+    """Return whether a TCP connection can be opened; a refusal must be explicit, not silence."""
     with host.entered():
         try:
             socket.create_connection((address, port), timeout=10).close()
@@ -103,7 +78,7 @@ def rules(host: Host) -> str:
 
 
 def test_only_the_appliance_reaches_the_ports(robot: Host, gateway: Host, attacker: Host) -> None:
-    """Node ports are refused to other machines; to the appliance and the machine itself they stay open."""
+    """Node ports are closed to other machines; to the appliance and the machine itself they stay open."""
     with listening(robot, INSIDE, KEPT, OUTSIDE):
         assert reaches(attacker, robot.address, INSIDE)
         close(robot, gateway, "--open", f"tcp/{KEPT}")
@@ -118,10 +93,10 @@ def test_only_the_appliance_reaches_the_ports(robot: Host, gateway: Host, attack
         assert reaches(attacker, robot.address, INSIDE)
 
 
-def test_nobody_behind_the_machine_is_taken_for_it(
+def test_a_container_behind_the_machine_is_not_taken_for_it(
     lab: Lab, robot: Host, gateway: Host, attacker: Host
 ) -> None:
-    """A container on the robot arrives at the appliance as the robot; with the protection it does not arrive at all."""
+    """A container's packets appear to come from the robot; with the protection they do not arrive at all."""
     need_program("iptables-legacy-restore", "iptables")
     behind = lab.host("container", "10.76.0.2/24")
     interfaces.delete_link(behind.namespace, "eth0")
@@ -135,14 +110,14 @@ def test_nobody_behind_the_machine_is_taken_for_it(
         assert source_seen(master, robot, gateway.address, 11311) == robot.address
         assert source_seen(master, robot, gateway.address6, 11311) == robot.address6
         assert source_seen(elsewhere, guest, attacker.address, 80) == robot.address, (
-            "not the appliance's affair"
+            "not concerned by the appliance"
         )
         load(robot.namespace, "iptables-legacy-restore", "*nat\n-F POSTROUTING\nCOMMIT\n")
         assert source_seen(master, guest, gateway.address, 11311) == guest.address, "a router stays a router"
 
 
-def test_a_machine_that_forged_first_packets_can_fill_is_told(robot: Host, gateway: Host) -> None:
-    """Without SYN cookies half-open connections keep the appliance out; who applies the file is told so."""
+def test_missing_syn_cookies_are_reported(robot: Host, gateway: Host) -> None:
+    """Without SYN cookies half-open connections block the appliance; --apply warns about it."""
     robot.namespace.sysctl("net.ipv4.tcp_syncookies", "0")
     command = [sys.executable, "-c", COMMAND, "--appliance", gateway.address, "--ports", FEW, "--apply"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
@@ -152,7 +127,7 @@ def test_a_machine_that_forged_first_packets_can_fill_is_told(robot: Host, gatew
     assert "sysctl -w net.ipv4.tcp_syncookies=1" in process.communicate(timeout=240)[1]
 
 
-def test_the_check_from_outside_sees_what_is_open(robot: Host, gateway: Host, attacker: Host) -> None:
+def test_the_check_from_outside_finds_open_ports(robot: Host, gateway: Host, attacker: Host) -> None:
     """The scan finds the listeners before, none after, and its exit status and JSON say so."""
     arguments = ("--check", robot.address, "--ports", FEW, "--json")
     with listening(robot, INSIDE, KEPT):
@@ -177,8 +152,8 @@ def test_the_whole_local_port_range_is_closed_and_checked(robot: Host, gateway: 
         assert after["addresses"][0]["refused"] == last - first + 1
 
 
-def test_what_the_machine_does_itself_goes_on(robot: Host, gateway: Host, attacker: Host) -> None:
-    """Old connections, connections out and answers to its own UDP questions pass; new UDP does not."""
+def test_own_connections_of_the_machine_work(robot: Host, gateway: Host, attacker: Host) -> None:
+    """Open and outgoing connections and answers to its own UDP requests pass; new UDP does not."""
     with robot.entered():
         server = socket.create_server((robot.address, INSIDE))
         node = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -205,8 +180,8 @@ def test_what_the_machine_does_itself_goes_on(robot: Host, gateway: Host, attack
         assert node.recv(100) == b"answer", "the stray packet came first but was dropped"
 
 
-def test_applying_twice_leaves_one_set_and_removing_nothing(robot: Host, gateway: Host) -> None:
-    """A second --apply replaces the first; --remove leaves exactly the rules of others; twice is fine."""
+def test_applying_and_removing_can_be_repeated(robot: Host, gateway: Host) -> None:
+    """A second --apply replaces the first; --remove leaves exactly the foreign rules, also when repeated."""
     robot.popen(["nft", "add", "table", "inet", "filter"]).wait(timeout=20)
     before = rules(robot)
     close(robot, gateway)
@@ -220,10 +195,8 @@ def test_applying_twice_leaves_one_set_and_removing_nothing(robot: Host, gateway
     assert "nothing to remove" in protect(robot, "--remove")
 
 
-def test_printing_changes_nothing_and_the_file_can_be_loaded(
-    robot: Host, gateway: Host, tmp_path: Path
-) -> None:
-    """Without a verb the file is printed only; `nft -f` on it does what --apply does, time and again."""
+def test_the_printed_file_can_be_loaded(robot: Host, gateway: Host, tmp_path: Path) -> None:
+    """Without a verb the file is only printed; `nft -f` on it has the effect of --apply, also repeatedly."""
     text = protect(robot, "--appliance", gateway.address, "--ports", FEW)
     assert rules(robot) == ""
     file = tmp_path / "rosrv-protect.nft"
@@ -235,17 +208,17 @@ def test_printing_changes_nothing_and_the_file_can_be_loaded(
     assert rules(robot) == loaded
 
 
-def test_a_machine_that_does_not_answer_is_not_called_closed(lab: Lab, robot: Host, attacker: Host) -> None:
-    """When nothing answers, the check says that it does not know, with another exit status."""
+def test_a_silent_machine_is_not_reported_as_closed(lab: Lab, robot: Host, attacker: Host) -> None:
+    """Without any answer, the check reports that it does not know, with another exit status."""
     lab.unplug(robot)
     arguments = ("--check", robot.address, "--ports", "40000-40010", "--seconds", "0.2")
-    assert "is not known" in protect(attacker, *arguments, status=2)
+    assert "may be open" in protect(attacker, *arguments, status=2)
     assert json.loads(protect(attacker, *arguments, "--json", status=2))["state"] == "unknown"
 
 
 @pytest.mark.parametrize("address", ["192.0.2.7", "2001:db8::7"])
-def test_a_network_without_a_way_is_not_called_open(attacker: Host, address: str) -> None:
-    """From a machine that has no route there nothing is tried: neither open nor closed, and the reason is told."""
+def test_an_unroutable_network_is_not_reported_as_open(attacker: Host, address: str) -> None:
+    """Without a route nothing is tried: the result is neither open nor closed, with the reason."""
     arguments = ("--check", address, "--ports", "40000-40010", "--json")
     report = json.loads(protect(attacker, *arguments, status=2))
     (seen,) = report["addresses"]
@@ -256,7 +229,7 @@ def test_a_network_without_a_way_is_not_called_open(attacker: Host, address: str
     assert "could not be tried: Network is unreachable" in words
 
 
-def test_a_check_of_itself_is_refused(robot: Host) -> None:
+def test_a_machine_cannot_check_itself(robot: Host) -> None:
     """From the machine itself everything is open by design, so a check there is an error, not a finding."""
     for address in (robot.address, robot.address6, "localhost"):
         assert "run the check on another machine" in protect(robot, "--check", address, status=2)
@@ -266,11 +239,11 @@ def test_a_check_of_itself_is_refused(robot: Host) -> None:
     ("arguments", "words"),
     [
         ((), "--appliance 192.168.1.20"),
-        (("--appliance", "robot.local"), "'robot.local' is no IP address"),
+        (("--appliance", "robot.local"), "'robot.local' is not the IP address of an appliance"),
         (("--appliance", "127.0.0.1"), "127.0.0.1 cannot be the address of an appliance"),
-        (("--appliance", "10.0.0.1", "--open", "tcp/22,ssh"), "--open 'ssh' is no service"),
-        (("--appliance", "10.0.0.1", "--open", "tcp/99999"), "--open 'tcp/99999' is no service"),
-        (("--appliance", "10.0.0.1", "--ports", "9-3"), "9-3 is no range of ports"),
+        (("--appliance", "10.0.0.1", "--open", "tcp/22,ssh"), "--open 'ssh' is not a service"),
+        (("--appliance", "10.0.0.1", "--open", "tcp/99999"), "--open 'tcp/99999' is not a service"),
+        (("--appliance", "10.0.0.1", "--ports", "9-3"), "9-3 is not a range of ports"),
         (("--apply", "--remove"), "exclude one another"),
         (("--check", "no-such-host.invalid"), "the host 'no-such-host.invalid' is not known"),
     ],
@@ -282,13 +255,13 @@ def test_wrong_arguments_are_named(robot: Host, arguments: tuple[str, ...], word
 
 
 def test_without_nft_the_error_names_the_package(robot: Host) -> None:
-    """On a machine without nftables, --apply says what to install."""
+    """On a machine without nftables, --apply names the package to install."""
     words = protect(robot, "--appliance", "10.77.0.2", "--apply", status=2, PATH="/nonexistent")
     assert "sudo apt install nftables" in words
 
 
 def test_without_root_the_error_says_so(robot: Host) -> None:
-    """Started by an ordinary user, --apply changes nothing and says that root is needed."""
+    """As an ordinary user, --apply changes nothing and says that root is needed."""
     program = (
         "import os; os.setgroups([]); os.setgid(61099); os.setuid(61099)\n"
         "from appliance.network.namespaces import NetworkError\n"

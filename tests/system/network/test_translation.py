@@ -1,4 +1,4 @@
-"""Who is who behind others' address translation: guests of Docker, libvirt, podman, a hotspot, on the same machine."""
+"""Identity behind other programs' NAT: guests of Docker, libvirt, podman, a hotspot, on the same machine."""
 
 import os
 import socket
@@ -26,7 +26,7 @@ DOCKER = TRANSLATORS[0]
 
 @pytest.fixture
 def lab() -> Iterator[Lab]:
-    """A lab with the machine that the appliance is started on, and room for a guest behind it."""
+    """Make a lab with the machine that the appliance is started on, and a possible guest behind it."""
     need_root()
     for program, package in (("nft", "nftables"), ("iptables-legacy", "iptables")):
         need_program(program, package)
@@ -37,21 +37,23 @@ def lab() -> Iterator[Lab]:
 
 @pytest.fixture
 def machine(lab: Lab) -> Host:
-    """The machine."""
+    """Return the machine."""
     return lab.hosts["machine"]
 
 
 @pytest.fixture
 def behind(lab: Lab) -> Namespace:
-    """A namespace for the guest, which the lab clears away with its host."""
+    """Return a namespace for the guest, which the lab removes with its host."""
     host = lab.host("guest", "10.76.0.2/24")
     interfaces.delete_link(host.namespace, "eth0")
     return host.namespace
 
 
 @pytest.mark.parametrize("translator", TRANSLATORS, ids=lambda one: one.name)
-def test_a_guest_is_itself(machine: Host, behind: Namespace, tmp_path: Path, translator: Translator) -> None:
-    """Behind the rules that each program writes, a guest has its own address, and the machine's nodes have theirs."""
+def test_a_guest_keeps_its_address(
+    machine: Host, behind: Namespace, tmp_path: Path, translator: Translator
+) -> None:
+    """Behind the rules of each program, a guest has its own address, and the machine's nodes have theirs."""
     guest = guest_behind(machine.namespace, behind, translator)
     with isolated(machine, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
         for address in (f"{translator.network}.1", machine.address):
@@ -67,10 +69,10 @@ def test_a_guest_is_itself(machine: Host, behind: Namespace, tmp_path: Path, tra
 
 
 @pytest.mark.parametrize("legacy", [False, True], ids=["iptables-nft", "iptables-legacy"])
-def test_a_guest_of_the_real_docker_is_itself(
+def test_a_guest_of_the_real_docker_keeps_its_address(
     machine: Host, behind: Namespace, tmp_path: Path, legacy: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The rules and the bridge are a running engine's; what lets the appliance's link pass is the line of the page."""
+    """With the rules and bridge of a running engine, the documented line lets the appliance's link pass."""
     if legacy:
         for program in ("iptables", "ip6tables"):
             (tmp_path / program).symlink_to(need_program(f"{program}-legacy", "iptables"))
@@ -90,7 +92,7 @@ def test_a_guest_of_the_real_docker_is_itself(
         assert f"{kind} POSTROUTING" in isolation.translations()
 
 
-def test_a_chain_that_comes_before_all_others_gives_nobody_the_machines_address(
+def test_an_earlier_chain_cannot_give_a_guest_the_machines_address(
     machine: Host, behind: Namespace, tmp_path: Path
 ) -> None:
     """A connection that was given an address of the machine before the appliance's chain is dropped, and counted."""
@@ -106,15 +108,15 @@ def test_a_chain_that_comes_before_all_others_gives_nobody_the_machines_address(
 
 
 @pytest.mark.parametrize("backend", ["nft", "iptables"])
-def test_while_the_rules_are_flushed_the_appliance_knows_the_machines_own_packets(
+def test_without_rules_the_machines_own_packets_are_recognized(
     machine: Host, behind: Namespace, tmp_path: Path, backend: BackendChoice
 ) -> None:
-    """Without any rule on the host a guest is translated into the machine; its packets have passed a router."""
+    """Without any rule on the host a guest is translated into the machine, but its packets have passed a router."""
     guest = guest_behind(machine.namespace, behind, DOCKER)
     with isolated(machine, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
         own = isolation.ends[4]
         NftBackend(machine.namespace).remove()
-        assert source_seen(server, guest, own.appliance, MASTER) == own.host, "the danger is there"
+        assert source_seen(server, guest, own.appliance, MASTER) == own.host, "the attack is possible"
         firewall = Firewall(isolation.namespace, backend)
         neighbours = tuple(ends.host for ends in isolation.ends.values())
         firewall.install(
@@ -134,8 +136,8 @@ def test_while_the_rules_are_flushed_the_appliance_knows_the_machines_own_packet
         assert next(rule for rule in firewall.report().rules if "own packets" in rule.purpose).packets > 1
 
 
-def test_written_addresses_do_not_arrive(machine: Host, behind: Namespace, tmp_path: Path) -> None:
-    """A guest that writes its packets itself brings none to the appliance under an address of the machine's link."""
+def test_forged_source_addresses_do_not_arrive(machine: Host, behind: Namespace, tmp_path: Path) -> None:
+    """A guest cannot send forged packets to the appliance under an address of the machine's link."""
     guest = guest_behind(machine.namespace, behind, DOCKER)
     with isolated(machine, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
         with isolation.namespace.entered():

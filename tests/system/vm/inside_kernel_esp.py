@@ -1,4 +1,4 @@
-"""Runs in the virtual machine: tunnels whose ESP is the kernel's own, and attacks on them."""
+"""Run in the virtual machine: tunnels with the kernel's own ESP, and attacks on them."""
 
 import re
 import subprocess
@@ -20,12 +20,12 @@ from tests.system.ipsec import test_attacks as attacks
 kit, other, others_kit, datagrams = attacks.kit, attacks.other, attacks.others_kit, attacks.datagrams
 test_replayed_packets_are_refused = attacks.test_replayed_packets_are_refused
 test_a_host_cannot_send_as_another = attacks.test_a_host_in_a_tunnel_cannot_send_as_another
-test_a_local_program_is_no_host = attacks.test_a_program_on_the_appliances_machine_is_no_tunnelled_host
+test_a_local_program_is_no_host = attacks.test_a_local_program_is_not_a_tunnelled_host
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """An appliance, with the back end that is proven first."""
+    """Run an appliance that tests its back end first."""
     home = tmp_path_factory.mktemp("site")
     with Lab("rosrv-kernel") as lab, TunnelSite(lab, home, options=("--api", "off")) as one:
         yield one
@@ -34,25 +34,25 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
 
 @pytest.fixture
 def joined(site: TunnelSite, kit: Path) -> Iterator[JoinedHost]:
-    """The trusted host, with its tunnel up."""
+    """Return the trusted host, with its tunnel up."""
     with site.joined(kit) as host:
         yield host
 
 
 def middle(site: TunnelSite) -> Host:
-    """The appliance's host."""
+    """Return the appliance's host."""
     assert isinstance(site.appliance.host, Host)
     return site.appliance.host
 
 
 def told(host: Host, *command: str) -> str:
-    """What a program says on a host."""
+    """Return the output of a program on a host."""
     process = host.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     return str(process.communicate(timeout=LIMIT)[0])
 
 
 def test_esp_is_the_kernels(site: TunnelSite, joined: JoinedHost) -> None:
-    """The appliance has chosen the kernel's ESP: states with the cipher are there, an interface of charon is not."""
+    """The appliance has chosen the kernel's ESP: there are states with the cipher, and no interface of charon."""
     status = site.appliance.status()
     assert status["ipsec"]["esp"] == "kernel"
     assert status["ipsec"]["up"] == 1
@@ -66,8 +66,9 @@ def test_esp_is_the_kernels(site: TunnelSite, joined: JoinedHost) -> None:
 
 
 def test_a_node_publishes_through_the_kernel(site: TunnelSite, joined: JoinedHost) -> None:
-    """A node of the host that the policy knows as `host:ocu-1` is heard on the robot; it comes from its virtual
-    address, through the kernel's states."""
+    """The robot hears a node of the host that the policy knows as `host:ocu-1`, from its virtual address, through the
+    kernel's states.
+    """
     with site.talking(joined, rate=20) as (_talker, listener):
         listener.wait_for_count(20, event="received", timeout=LONG)
     registered = site.trail.seen(event="registered", caller_id="/boss")[0]
@@ -77,20 +78,21 @@ def test_a_node_publishes_through_the_kernel(site: TunnelSite, joined: JoinedHos
 
 
 def test_a_forged_address_gets_nowhere(site: TunnelSite, joined: JoinedHost) -> None:
-    """Packets in clear text from a virtual address are dropped, while those in the tunnel are answered: of a host
-    whose tunnel stands, of one whose does not, and of nobody's."""
+    """Packets in clear text from a virtual address are dropped, and those in the tunnel answered: for a host with a
+    tunnel, for one without, and for an unassigned address.
+    """
     interfaces.add_route(site.attacker.namespace, f"{OWN}/32", MIDDLE)
     for forged in (joined.address, "10.113.11.77"):
         interfaces.add_address(site.attacker.namespace, INTERFACE, f"{forged}/32")
         assert connect(site.attacker, forged, MIDDLE) == "nothing"
         assert connect(site.attacker, forged, OWN) == "nothing"
-    assert connect(site.attacker, ATTACKER, MIDDLE) == "connected", "the way there is open"
+    assert connect(site.attacker, ATTACKER, MIDDLE) == "connected", "the destination is reachable"
     assert connect(site.ocu, joined.address, OWN) == "connected", "through the tunnel"
     assert connect(site.ocu, OCU, MIDDLE) == "connected"
 
 
 def test_charon_that_dies_leaves_nothing_behind(site: TunnelSite, joined: JoinedHost) -> None:
-    """charon is killed: the kernel's states of its life, with their keys, are gone, and the tunnel is back."""
+    """After a kill of charon, its kernel states and keys are removed, and the tunnel returns."""
     assert joined.charon is not None
     mark, before = joined.charon.mark(), set(_spis(middle(site)))
     site.appliance.kill("charon")
@@ -107,6 +109,6 @@ def _spis(host: Host) -> list[str]:
 
 
 def stop_and_look(site: TunnelSite) -> None:
-    """A clean stop leaves no rule, no state, no policy, no interface and no address."""
+    """Assert that a clean stop leaves no rule, no state, no policy, no interface and no address."""
     assert site.appliance.stop() == 0
     assert left_behind(middle(site)) == {}

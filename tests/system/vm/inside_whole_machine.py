@@ -1,6 +1,6 @@
-"""Runs in the virtual machine: the appliance, and the machine of a trusted host, as they are on real machines.
+"""Run in the virtual machine: the appliance, and the machine of a trusted host, as on real machines.
 
-What happens here changes the network of the machine itself, so it is never run anywhere else.
+The tests change the network of the machine itself, so they never run anywhere else.
 """
 
 import subprocess
@@ -24,13 +24,13 @@ from tests.support.wire import connect
 
 @pytest.fixture
 def lab() -> Iterator[Lab]:
-    """An Ethernet."""
+    """Make an Ethernet."""
     with Lab("rosrv-machine") as lab:
         yield lab
 
 
 def told(*command: str) -> str:
-    """What a program says on the machine itself."""
+    """Return the output of a program on the machine itself."""
     done = subprocess.run(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=LIMIT, check=False
     )
@@ -38,7 +38,7 @@ def told(*command: str) -> str:
 
 
 def state_of_the_machine() -> dict[str, object]:
-    """What an appliance changes on a machine, and must put back."""
+    """Return the settings of a machine that an appliance changes, and must restore."""
     return {
         "rules": told("nft", "list", "ruleset"),
         "iptables": "ROSRV" in told("iptables-legacy-save") + told("ip6tables-legacy-save"),
@@ -59,8 +59,9 @@ def state_of_the_machine() -> dict[str, object]:
     ids=["container", "netns"],
 )
 def test_the_appliance_on_a_machine(lab: Lab, tmp_path: Path, isolation: str, backend: str) -> None:
-    """On the machine itself the ROSMaster is hidden, nodes in clear text and behind a kernel tunnel hear each other, a
-    forged address gets nowhere, and an orderly end leaves the machine as it was."""
+    """rosmaster is hidden, nodes in clear text and behind a kernel tunnel hear each other, forged packets are dropped,
+    and a clean stop leaves the machine as it was.
+    """
     robot, ocu = lab.host("robot", f"{ROBOT}/24"), lab.host("ocu", f"{OCU}/24")
     attacker = lab.host("attacker", f"{ATTACKER}/24")
     config, kit = tmp_path / "appliance.yaml", tmp_path / "kit.tar.gz"
@@ -91,8 +92,9 @@ def test_the_appliance_on_a_machine(lab: Lab, tmp_path: Path, isolation: str, ba
 
 
 def test_a_host_joins_and_leaves_by_its_kit(lab: Lab, tmp_path: Path) -> None:
-    """join.sh on a Debian with systemd: the tunnel is up, ROS works through it, its own ports are closed to others;
-    leave.sh takes all of it away."""
+    """After join.sh on a Debian with systemd the tunnel is up, ROS works through it, and the ports are closed;
+    leave.sh undoes everything.
+    """
     with (
         TunnelSite(lab, tmp_path, options=("--api", "off")) as site,
         root_host(lab, "10.88.0.50/24") as machine,
@@ -135,7 +137,7 @@ def test_a_host_joins_and_leaves_by_its_kit(lab: Lab, tmp_path: Path) -> None:
 
 
 class _Joined:
-    """The machine as nodes on it are told of it: by its virtual address."""
+    """The machine as nodes on it see it: by its virtual address."""
 
     def __init__(self, address: str, machine: Host) -> None:
         self.address = address

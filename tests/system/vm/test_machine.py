@@ -1,7 +1,7 @@
-"""The appliance in a virtual machine with Debian's own kernel: what no namespace of the test machine can show.
+"""The appliance in a virtual machine with Debian's own kernel: promises that no namespace can show.
 
-Each test here runs some tests *in* the machine: those of `inside_*.py`, which are written for it, and those of other
-folders whose promise depends on the kernel. What they said is in the report when one fails.
+Each test here runs tests *in* the machine: those of `inside_*.py`, which are written for it, and those of other
+folders that depend on the kernel. The report of a failure contains their output.
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from tests.support.machine_disk import ROOT
 
 HERE = "tests/system/vm"
 PLUGINS = ("env", "PYTEST_DISABLE_PLUGIN_AUTOLOAD=1")
-# Alone none takes two minutes; emulated beside other work ten were not enough.
+# Alone none takes two minutes; with emulation and other load, ten were not enough.
 SECONDS = 1500.0
 
 pytestmark = pytest.mark.timeout(2400)  # the first one makes the machine's disk
@@ -21,14 +21,14 @@ pytestmark = pytest.mark.timeout(2400)  # the first one makes the machine's disk
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
-    """The machine, booted once for all tests here."""
+    """Boot the machine once for all tests here."""
     with Machine(tmp_path_factory.mktemp("machine")) as one:
         yield one
-        assert one.stop(), f"it was not switched off in order\n{one.story()}"
+        assert one.stop(), f"it was not shut down cleanly\n{one.story()}"
 
 
 def passes(machine: Machine, *what: str) -> None:
-    """These tests pass in the machine, all of them: none is skipped."""
+    """Assert that all these tests pass in the machine, without skips."""
     done = machine.run(
         *(*PLUGINS, f"{ROOT}/.venv/bin/pytest", "-p", "pytest_timeout", "-p", "no:cacheprovider", "--quiet"),
         *("--durations=5", "-o", f"timeout={SECONDS:.0f}", *what),
@@ -42,26 +42,26 @@ def passes(machine: Machine, *what: str) -> None:
 
 
 def test_the_kernels_esp(machine: Machine) -> None:
-    """Tunnels in the kernel: nodes talk, forged addresses do not, by both back ends, and nothing is left behind."""
+    """With tunnels in the kernel and both back ends, nodes communicate, forged addresses fail, and nothing remains."""
     passes(machine, f"{HERE}/inside_kernel_esp.py")
 
 
 def test_the_appliance_on_a_machine(machine: Machine) -> None:
-    """isolation netns and container on the machine itself, from its start to a machine that is as it was before."""
+    """Run isolation netns and container on the machine itself, from the start until the machine is restored."""
     passes(machine, f"{HERE}/inside_whole_machine.py", "-k", "appliance")
 
 
 def test_the_kit_on_a_machine(machine: Machine) -> None:
-    """join.sh and leave.sh of a kit, on a Debian with systemd."""
+    """Run join.sh and leave.sh of a kit on a Debian with systemd."""
     passes(machine, f"{HERE}/inside_whole_machine.py", "-k", "joins")
 
 
 def test_the_firewall_in_debians_kernel(machine: Machine) -> None:
-    """Both back ends hide the ROSMaster and keep tunnelled addresses from being forged, in this kernel too."""
+    """In this kernel too, both back ends hide rosmaster and drop forged tunnel addresses."""
     passes(machine, "tests/system/network/test_firewall.py", "-k", "tunnelled_host or only_control")
 
 
 def test_the_machine_is_alone(machine: Machine) -> None:
-    """It runs Debian's cloud kernel and has no network card: what happens in it stays in it."""
+    """It runs Debian's cloud kernel and has no network card, so its effects stay inside."""
     assert machine.run("uname", "-r").output.strip().endswith("cloud-amd64")
     assert machine.run("ls", "/sys/class/net").output.split() == ["lo"]

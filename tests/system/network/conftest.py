@@ -1,0 +1,35 @@
+"""A lab of network namespaces, and the hosts that tests of several files have."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from examples.landshark.lab import Host, Lab
+from tests.support.requirements import need_program, need_root
+
+
+@pytest.fixture
+def lab(request: pytest.FixtureRequest) -> Iterator[Lab]:
+    """Make a lab with the name of the test's file."""
+    need_root()
+    need_program("nft", "nftables")
+    with Lab(request.path.stem.replace("test_", "rosrv-").replace("_", "-")) as one:
+        yield one
+
+
+@pytest.fixture
+def protected(lab: Lab) -> Host:
+    """Return the host that a firewall protects."""
+    return lab.host("protected", "10.77.0.2/24", "fd77::2/64")
+
+
+@pytest.fixture
+def robot(lab: Lab) -> Host:
+    """Return the machine that the nodes run on."""
+    return lab.host("robot", "10.77.0.10/24", "fd77::10/64")
+
+
+@pytest.fixture
+def attacker(lab: Lab) -> Host:
+    """Return any other machine; it may forge the robot's address."""
+    return lab.host("attacker", "10.77.0.66/24", "fd77::66/64")
