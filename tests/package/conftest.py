@@ -1,4 +1,4 @@
-"""The Debian package, built once for all its tests, and clean machines to install it on."""
+"""Build the Debian package once for all its tests, and provide clean machines to install it on."""
 
 import os
 import subprocess
@@ -21,12 +21,12 @@ _NODE_PACKAGES = (
     "systemd-resolved",
 )
 LATER = "+40h"
-SLOW_SECONDS = 1200.0  # of what is over in seconds on a machine of its own
+SLOW_SECONDS = 1200.0  # for work that takes seconds on a machine of its own
 
 
 @pytest.fixture(scope="session")
 def package() -> Path:
-    """dist/rosrv_VERSION_amd64.deb, built now by the one command."""
+    """Build dist/rosrv_VERSION_amd64.deb now, with the documented command."""
     for program, debian in (("dh", "debhelper"), ("dpkg-buildpackage", "dpkg-dev"), ("lintian", "lintian")):
         need_program(program, debian)
     done = subprocess.run(
@@ -41,7 +41,7 @@ def package() -> Path:
 
 
 def elsewhere(folder: Path) -> Path:
-    """The checkout as it is, as somebody else has it: in this folder, which is new, and for nobody but its owner."""
+    """Copy the checkout to this new folder, as another user has it, readable for its owner only."""
     git = ["git", "-c", f"safe.directory={ROOT}", "-c", f"safe.directory={ROOT}/.git"]
     subprocess.run(
         [*git, "clone", "--quiet", "--no-hardlinks", str(ROOT), str(folder)], umask=0o077, check=True
@@ -55,7 +55,7 @@ def elsewhere(folder: Path) -> Path:
 
 
 def build_later(module: str, *options: str, folder: Path, **environment: str) -> Path:
-    """Run a module of `distribution` in this folder `LATER`, by the clock it sees: what it names first."""
+    """Run a module of `distribution` in this folder `LATER`, by a later clock; return the files that it names first."""
     command = [need_program("faketime", "faketime"), "-f", LATER, sys.executable, "-m", module, *options]
     done = subprocess.run(
         command,
@@ -78,9 +78,9 @@ def clean_machine(
     more: tuple[str, ...] = (),
     name: str = "clean",
 ) -> Machine:
-    """A machine that has what the package depends on, not started; `files`, by their names there, lie in its folder.
+    """Return a machine with the package's dependencies, not started; its folder contains `files` under these names.
 
-    `more` are further Debian packages that it has; such a machine has a `name` of its own.
+    `more` are additional Debian packages; such a machine has its own `name`.
     """
     depends = subprocess.run(
         ["dpkg-deb", "--field", str(package), "Depends"], capture_output=True, text=True, check=True

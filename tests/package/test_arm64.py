@@ -1,4 +1,4 @@
-"""A Jetson, a Raspberry Pi: all that the program stands on is there for arm64, though nothing of it runs here."""
+"""All dependencies of the program exist for arm64 (Jetson, Raspberry Pi), though none of it runs here."""
 
 import re
 from pathlib import Path
@@ -12,8 +12,8 @@ from tests.support.requirements import need_program
 pytestmark = pytest.mark.timeout(900)
 
 
-def test_every_locked_package_is_there_for_arm64(tmp_path: Path) -> None:
-    """Wheels for both Pythons, and python-iptables compiled: every library in the tree is one for arm64."""
+def test_every_locked_package_exists_for_arm64(tmp_path: Path) -> None:
+    """Wheels for both Pythons exist, python-iptables compiles, and every library in the tree is one for arm64."""
     need_program("aarch64-linux-gnu-gcc", "gcc-aarch64-linux-gnu")
     work = tmp_path / "work"
     work.mkdir()

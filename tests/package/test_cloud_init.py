@@ -1,6 +1,6 @@
-"""The cloud-init example, in a virtual machine that is the appliance from its first boot: docs/virtual-machine.md.
+"""The cloud-init example in a virtual machine that is the appliance from its first boot: docs/install.md.
 
-Web server and vehicle of the example are in the machine, too: it has no network card.
+The example's web server and vehicle are in the same machine: it has no network card.
 """
 
 import hashlib
@@ -13,7 +13,7 @@ from tests.package.conftest import SLOW_SECONDS, clean_machine
 from tests.support.machine import Machine
 from tests.support.machine_disk import ROOT
 
-pytestmark = pytest.mark.timeout(5400)  # a machine boots three times, each instruction computed
+pytestmark = pytest.mark.timeout(5400)  # a machine boots three times, with every instruction emulated
 EXAMPLE = ROOT / "examples/cloud-init/user-data.yaml"
 SEED = "/var/lib/cloud/seed/nocloud"
 VEHICLE = ("ip", "netns", "exec", "vehicle", "env", "ROS_MASTER_URI=http://192.168.1.5:11311",
@@ -32,7 +32,7 @@ ExecStartPost=curl --silent --retry 1000 --retry-delay 1 --retry-connrefused --o
 [Install]
 WantedBy=multi-user.target
 """
-# The machine's packages are there already, and there is nothing to fetch others from; no locale but C was generated.
+# The machine already has its packages, as it has no network; no locale except C was generated.
 OFFLINE = "apt: {preserve_sources_list: true}\nnetwork: {config: disabled}\nlocale: C.UTF-8\n"
 
 
@@ -42,7 +42,7 @@ def write(machine: Machine, path: str, text: str) -> None:
 
 
 def boot(machine: Machine, user_data: str, instance: str) -> str:
-    """Boot as a machine that was never booted with this user data; how cloud-init says it went, and its log."""
+    """Boot with this user data as on the first boot; return cloud-init's status and its log."""
     write(machine, f"{SEED}/meta-data", f"instance-id: {instance}\n")
     write(machine, f"{SEED}/user-data", user_data)
     assert machine.stop(), machine.story()
@@ -52,7 +52,9 @@ def boot(machine: Machine, user_data: str, instance: str) -> str:
 
 
 def test_the_first_boot_makes_an_appliance(package: Path, tmp_path: Path) -> None:
-    """With the package's checksum filled in, the vehicle has its master; as shipped, nothing is installed."""
+    """With the package's checksum filled in, the vehicle has its master; with the shipped example, nothing is
+    installed.
+    """
     machine = clean_machine(
         tmp_path, package, {package.name: package}, more=("cloud-init", "chrony"), name="cloud"
     )

@@ -1,4 +1,4 @@
-"""`make site`: the image as it is released, its list of parts, and the archive for a site without a network."""
+"""`make site`: the released image, its list of components, and the archive for a site without a network."""
 
 import hashlib
 import io
@@ -33,7 +33,7 @@ import re
 for found in distributions():
     print(re.sub(r"[-_.]+", "-", found.name).lower(), found.version)
 """
-# Files that neither dpkg nor Python's installer knows of; links of Debian's alternatives are left out.
+# Files unknown to dpkg and Python's installer, except links of Debian's alternatives.
 NOBODYS = r"""
 import os, re, sys
 from importlib.metadata import distributions
@@ -55,7 +55,7 @@ for folder, folders, files in os.walk("/"):
         if real(path) not in owned and real(source) not in owned and os.lstat(path).st_dev == device:
             print(path)
 """
-# Of those, what is there all the same: our own part, what the build wrote, what packages write when they are set up.
+# Those that the image contains: our own files, files of the build, files that packages write during setup.
 EXPECTED = re.compile(
     r"/opt/rosrv/lib/python3\.11/site-packages/appliance/.+|/opt/rosrv/share/rosrv/(build|sbom\.cdx)\.json"
     r"|/opt/rosrv/(bin/(python\S*|rosrv)|pyvenv\.cfg|lib64)|/etc/.+|/usr/local/share/ca-certificates/.+\.crt"
@@ -66,14 +66,14 @@ EXPECTED = re.compile(
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Engine]:
-    """One that has the base, and a clock that can be changed."""
+    """Provide an engine that has the base, and a clock that can be changed."""
     with builder(clock=True) as engine:
         yield engine
 
 
 @pytest.fixture(scope="module")
 def unpacked(engine: Engine, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The archive, built by the one command, and unpacked; its image is in the engine, loaded from there."""
+    """Build the archive with the documented command, unpack it, and load its image into the engine."""
     command = [sys.executable, "-m", "distribution.site", *OPTIONS]
     environment = os.environ | {"DOCKER_HOST": engine.address}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
@@ -89,24 +89,24 @@ def unpacked(engine: Engine, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def parts(unpacked: Path) -> list[dict[str, Any]]:
-    """The components of the list."""
+    """Return the components of the list."""
     components: list[dict[str, Any]] = json.loads(next(unpacked.glob("*.cdx.json")).read_text())["components"]
     return components
 
 
 def run(engine: Engine, *command: str, text: str = "") -> str:
-    """What a program of the image says; without a network."""
+    """Return the output of a program of the image, run without a network."""
     options = ("run", "--rm", "--interactive", "--network", "none", "--entrypoint", command[0], NAME)
     return engine.docker(*options, *command[1:], text=text).stdout
 
 
 def of(parts: list[dict[str, Any]], kind: str) -> set[tuple[str, str]]:
-    """Names and versions of the components of a kind."""
+    """Return names and versions of the components of a kind."""
     return {(one["name"], one["version"]) for one in parts if one["purl"].startswith(f"pkg:{kind}/")}
 
 
 def test_every_part_is_in_the_list(engine: Engine, unpacked: Path, parts: list[dict[str, Any]]) -> None:
-    """What dpkg and Python say in the running image is what the list has, no more and no less."""
+    """The list has exactly the components that dpkg and Python report in the running image."""
     listed = run(engine, "dpkg-query", "--show", "--showformat", "${Package} ${Version}\\n")
     assert {tuple(line.split()) for line in listed.splitlines()} == of(parts, "deb")
     installed = run(engine, "/opt/rosrv/bin/python", "-P", "-", text=INSIDE)
@@ -118,8 +118,8 @@ def test_every_part_is_in_the_list(engine: Engine, unpacked: Path, parts: list[d
     assert of(parts, "npm") == bundled
 
 
-def test_no_file_is_of_no_part(engine: Engine, unpacked: Path) -> None:
-    """Each file of the image belongs to a part of the list; one that was put beside them is found."""
+def test_every_file_belongs_to_a_part(engine: Engine, unpacked: Path) -> None:
+    """Each file of the image belongs to a component of the list; an additional file is found."""
     python = ("/opt/rosrv/bin/python", "-P", "-")
     assert [
         one for one in run(engine, *python, text=NOBODYS).splitlines() if not EXPECTED.fullmatch(one)
@@ -131,14 +131,14 @@ def test_no_file_is_of_no_part(engine: Engine, unpacked: Path) -> None:
 
 
 def test_every_part_has_a_licence(parts: list[dict[str, Any]]) -> None:
-    """As an identifier, an expression, a name, or the file in the image that says it."""
+    """The licence is an identifier, an expression, a name, or the file in the image with its text."""
     assert [one["name"] for one in parts if not one.get("licenses")] == []
     unread = [one["name"] for one in parts if "see /usr/share/doc" in json.dumps(one["licenses"])]
     assert len(unread) < 10, unread
 
 
-def test_the_list_is_what_its_format_says(unpacked: Path) -> None:
-    """By the schema of CycloneDX 1.6."""
+def test_the_list_is_valid(unpacked: Path) -> None:
+    """The list is valid by the schema of CycloneDX 1.6."""
     folder = files("cyclonedx.schema._res")
     names = [f"{name}.SNAPSHOT.schema.json" for name in ("bom-1.6", "spdx", "jsf-0.82")]
     schemas = {name: json.loads((folder / name).read_text()) for name in names}
@@ -150,8 +150,8 @@ def test_the_list_is_what_its_format_says(unpacked: Path) -> None:
     assert [str(error.message) for error in validator.iter_errors(found)] == []
 
 
-def test_it_says_what_it_is(engine: Engine, unpacked: Path) -> None:
-    """Its annotations and `rosrv version --json` name version and commit; the list is in the image, too."""
+def test_it_reports_its_version_and_commit(engine: Engine, unpacked: Path) -> None:
+    """Its annotations and `rosrv version --json` contain version and commit; the list is also in the image."""
     labels = engine.inspect(NAME)["Config"]["Labels"]
     build = json.loads(run(engine, "rosrv", "version", "--json"))["build"]
     assert build["kind"] == "image"
@@ -161,8 +161,8 @@ def test_it_says_what_it_is(engine: Engine, unpacked: Path) -> None:
     assert inside == next(unpacked.glob("*.cdx.json")).read_text()
 
 
-def test_the_packages_are_those_of_the_lock(parts: list[dict[str, Any]]) -> None:
-    """Each package that was pinned is in the image with its version."""
+def test_the_packages_match_the_lock(parts: list[dict[str, Any]]) -> None:
+    """Each pinned package is in the image with its version."""
     lock = (ROOT / "distribution/image-packages.lock").read_text().splitlines()
     pinned = {tuple(line.split("=", 1)) for line in lock if not line.startswith("#")}
     assert len(pinned) > 50
@@ -170,7 +170,7 @@ def test_the_packages_are_those_of_the_lock(parts: list[dict[str, Any]]) -> None
 
 
 def test_the_archive_has_all_that_a_site_needs(unpacked: Path) -> None:
-    """Its checksums hold; compose files, policies, monitors and pages are in it."""
+    """Its checksums are correct; it contains compose files, policies, monitors and pages."""
     done = subprocess.run(
         ["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=unpacked, capture_output=True, check=False
     )
@@ -183,13 +183,13 @@ def test_the_archive_has_all_that_a_site_needs(unpacked: Path) -> None:
         "compose.yaml",
         "compose.host.yaml",
         "policies/containers.ini",
-        "docs/air-gapped.md",
+        "docs/install.md",
         "LICENSE",
     }
 
 
 def test_the_archive_protects_a_robot(unpacked: Path, tmp_path: Path) -> None:
-    """On a machine whose engine has nothing, by the page's commands; nodes of the machine talk through it."""
+    """On a machine with an empty engine, the page's commands work, and nodes of the machine communicate through it."""
     needs(has_ros(), "ROS 1 (run `make setup`)")
     with Lab("rosrv-site") as lab:
         machine = lab.host("machine", "10.79.0.1/24")
@@ -208,9 +208,9 @@ def test_the_archive_protects_a_robot(unpacked: Path, tmp_path: Path) -> None:
 
 
 def test_two_builds_are_the_same(engine: Engine, unpacked: Path, tmp_path: Path) -> None:
-    """Who builds the same commit gets the same image, byte by byte: two days later, with nothing of the first build.
+    """A build of the same commit two days later, from nothing, gives the same image, byte by byte.
 
-    In another folder, too, where files are for nobody but their owner.
+    It is built in another folder, with files readable for their owner only.
     """
     engine.go_ahead(LATER)
     folder = elsewhere(tmp_path / "elsewhere")
@@ -219,7 +219,7 @@ def test_two_builds_are_the_same(engine: Engine, unpacked: Path, tmp_path: Path)
 
 
 def differences(first: Path, second: Path) -> list[str]:
-    """The files of two images that are not the same, with what of them is not."""
+    """Return the files that differ between two images, with their differences."""
     if first.read_bytes() == second.read_bytes():
         return []
     with tarfile.open(first) as one, tarfile.open(second) as other:
@@ -236,14 +236,14 @@ def differences(first: Path, second: Path) -> list[str]:
 
 
 def content(archive: tarfile.TarFile, name: str) -> bytes:
-    """A member of an archive."""
+    """Return the content of a member of an archive."""
     file = archive.extractfile(name)
     assert file is not None, name
     return file.read()
 
 
 def entries(layer: bytes) -> dict[str, dict[str, object]]:
-    """What a layer says of each of its files."""
+    """Return the metadata of each file in a layer."""
     found: dict[str, dict[str, object]] = {}
     with tarfile.open(fileobj=io.BytesIO(layer)) as members:
         for member in members:

@@ -1,7 +1,7 @@
-"""Robot and laptop of Noetic's generation beside the appliance in its container: docs/noetic-robot.md.
+"""Robot and laptop of Noetic's generation beside the appliance in its container: docs/install.md.
 
-Ubuntu is not to be had from Debian's archive. Debian 11 is of its age: ROS 1.15, Python 3.9, OpenSSL 1.1.1, nftables
-0.9, strongSwan 5.9. Each machine here is such a system, in a mount namespace and a host of the lab.
+Debian's archive does not have Ubuntu. Debian 11 is as old: ROS 1.15, Python 3.9, OpenSSL 1.1.1, nftables 0.9,
+strongSwan 5.9. Each machine here is such a system, in a mount namespace and a host of the lab.
 """
 
 import json
@@ -22,9 +22,9 @@ from tests.support.tunnels import need_strongswan
 pytestmark = pytest.mark.timeout(2400)  # the system is fetched, and the image is built
 SUITE = "bullseye"
 PACKAGES = (
-    # A robot's: unmodified nodes, rospy's and roscpp's, and what `rosrv protect` writes for.
+    # for a robot: unmodified rospy and roscpp nodes, and nftables for `rosrv protect`
     *("python3-rospy", "python3-rostopic", "python3-std-msgs", "topic-tools"),
-    # What a kit takes.
+    # for a kit
     *("charon-systemd", "strongswan-swanctl", "libcharon-extra-plugins", "libstrongswan-standard-plugins"),
     *("nftables", "iproute2", "openssl", "curl", "procps"),
 )
@@ -35,12 +35,12 @@ TALKER = ("rostopic", "pub", "--rate=10", "/chatter", "std_msgs/String", "data: 
 
 @pytest.fixture
 def system(tmp_path: Path) -> Path:
-    """The root of a Debian 11, to be changed."""
+    """Return the root of a Debian 11, which the test may change."""
     return make_base(tmp_path / "system", PACKAGES, suite=SUITE)
 
 
 def test_a_robot_beside_the_container(system: Path, tmp_path: Path) -> None:
-    """Its nodes, rospy's and roscpp's, talk through the appliance; its ports are closed by its own nftables."""
+    """Its rospy and roscpp nodes communicate through the appliance; its own nftables close its ports."""
     with builder() as engine:
         engine.build("appliance", APPLIANCE)
     (tmp_path / "project").mkdir()
@@ -68,7 +68,7 @@ def test_a_robot_beside_the_container(system: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[TunnelSite]:
-    """An appliance whose REST the lab's network may reach."""
+    """Run an appliance whose REST the lab's network may reach."""
     need_strongswan()
     (tmp_path / "appliance.yaml").write_text(CONFIG)
     with Lab("rosrv-noetic") as lab:
@@ -81,7 +81,9 @@ def site(tmp_path: Path) -> Iterator[TunnelSite]:
 def test_a_laptop_joins_renews_and_leaves_without_python(
     site: TunnelSite, system: Path, tmp_path: Path
 ) -> None:
-    """By the kit's scripts as they are, with OpenSSL 1.1.1; its nodes, which need Python, come when it has joined."""
+    """The kit's unchanged scripts work with OpenSSL 1.1.1; the laptop's nodes, which need Python, start after it
+    joined.
+    """
     hidden = tmp_path / "hidden"
     hidden.mkdir()
     pythons = [path for path in (system / "usr/bin").iterdir() if path.name.startswith("python3")]

@@ -1,6 +1,6 @@
 """The Debian package on a clean Debian with systemd, in a virtual machine: install, serve, reboot, upgrade, remove.
 
-The machine has the packages that ours depends on (it has no network to fetch them) and nothing else of the project.
+The machine has the packages that ours depends on (it has no network to fetch them) and no other part of the project.
 """
 
 import filecmp
@@ -15,20 +15,20 @@ from tests.package.conftest import SLOW_SECONDS, build_later, clean_machine, els
 from tests.support.machine import Done, Machine
 from tests.support.machine_disk import ROOT
 
-# Packages are built, and a machine boots twice, each instruction computed, perhaps by a processor that others use.
+# Packages are built, and a machine boots twice, emulated, perhaps on a busy processor.
 pytestmark = pytest.mark.timeout(5400)
 EVERYWHERE = {"ROS_MASTER_URI": "http://localhost:11311"}
 
 
 @pytest.fixture
 def newer(package: Path, tmp_path: Path) -> Path:
-    """The same package as 0.1.1."""
+    """Return the same package as 0.2.1."""
     tree = tmp_path / "newer"
     subprocess.run(["dpkg-deb", "--raw-extract", str(package), str(tree)], check=True)
     control = tree / "DEBIAN/control"
-    control.write_text(control.read_text().replace("Version: 0.1.0", "Version: 0.1.1"))
-    made = tmp_path / "rosrv_0.1.1_amd64.deb"
-    # As the package itself is compressed: xz takes minutes, which are missing to the machine.
+    control.write_text(control.read_text().replace("Version: 0.2.0", "Version: 0.2.1"))
+    made = tmp_path / "rosrv_0.2.1_amd64.deb"
+    # compressed as the package itself: xz takes minutes, in which the machine cannot use the processor
     build = ["dpkg-deb", "--root-owner-group", "-Zgzip", "-z1", "--build", str(tree), str(made)]
     subprocess.run(build, check=True, capture_output=True)
     return made
@@ -36,7 +36,7 @@ def newer(package: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def machine(package: Path, newer: Path, tmp_path: Path) -> Iterator[Machine]:
-    """A clean machine with both packages in its folder, not started."""
+    """Return a clean machine with both packages in its folder, not started."""
     machine = clean_machine(tmp_path, package, {"old.deb": package, "new.deb": newer})
     try:
         yield machine
@@ -45,7 +45,7 @@ def machine(package: Path, newer: Path, tmp_path: Path) -> Iterator[Machine]:
 
 
 def state_of(machine: Machine) -> dict[str, str]:
-    """What the appliance changes on a machine while it runs."""
+    """Return the settings of a machine that the appliance changes while it runs."""
     looks = {
         "rules": ("nft", "list", "ruleset"),
         "legacy rules": ("iptables-legacy-save",),
@@ -59,15 +59,15 @@ def state_of(machine: Machine) -> dict[str, str]:
 
 
 def ros(machine: Machine, *command: str) -> Done:
-    """A stock tool on the robot's machine; nothing is set but ROS_MASTER_URI."""
+    """Run a stock tool on the robot's machine, with ROS_MASTER_URI as the only setting."""
     return machine.run(
         "env", *(f"{key}={value}" for key, value in EVERYWHERE.items()), *command, seconds=SLOW_SECONDS
     )
 
 
 def serves(machine: Machine) -> dict[str, object]:
-    """The status of the appliance, once systemd says that it is ready."""
-    machine.run("systemctl", "start", "rosrv", seconds=SLOW_SECONDS)  # waits for a start that is under way
+    """Return the status of the appliance, once systemd reports that it is ready."""
+    machine.run("systemctl", "start", "rosrv", seconds=SLOW_SECONDS)  # waits for a start in progress
     status: dict[str, object] = json.loads(machine.run("rosrv", "status", "--json", check=False).output)
     return status
 
@@ -77,7 +77,7 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     machine.start()
     before = state_of(machine)
     machine.run("dpkg", "--install", "old.deb", seconds=SLOW_SECONDS)
-    assert serves(machine)["version"] == "0.1.0"
+    assert serves(machine)["version"] == "0.2.0"
     assert machine.run("rosrv", "policy", "check", "/etc/rosrv/policies/default.ini").status == 0
     assert "/etc/rosrv/policies/default.ini" in machine.run("rosrv", "config", "show").output
     assert (
@@ -95,7 +95,7 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     machine.run("systemctl", "kill", "--kill-whom=main", "--signal=KILL", "rosrv")
     machine.run(
         "tail", f"--pid={main}", "--follow", "/dev/null"
-    )  # it is there until systemd has taken note of its end
+    )  # it exists until systemd has noticed its end
     serves(machine)
     assert "hello" in ros(machine, "rostopic", "echo", "-n", "1", "/chatter").output, (
         "the talker was not restarted"
@@ -105,10 +105,10 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     machine.run("systemctl", "reload", "rosrv")
     machine.run("dpkg", "--install", "new.deb", seconds=SLOW_SECONDS)
     serves(machine)
-    assert machine.run("dpkg-query", "--show", "--showformat=${Version}", "rosrv").output == "0.1.1"
+    assert machine.run("dpkg-query", "--show", "--showformat=${Version}", "rosrv").output == "0.2.1"
     assert "a line of mine" in machine.run("tail", "-1", "/etc/rosrv/policies/default.ini").output
     assert "hello" in ros(machine, "rostopic", "echo", "-n", "1", "/chatter").output, (
-        "the upgrade took the talker along"
+        "the upgrade ended the talker"
     )
     assert machine.run("rosrv", "audit", "verify").status == 0
 
@@ -127,8 +127,8 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     assert left == "", left
 
 
-def test_what_lintian_says_of_it(package: Path) -> None:
-    """Debian's checker finds no error but what a package that brings its own Python packages cannot avoid."""
+def test_lintian_finds_no_avoidable_error(package: Path) -> None:
+    """Debian's checker finds only those errors that a package with its own Python packages cannot avoid."""
     done = subprocess.run(
         ["lintian", "--fail-on", "none", str(package)], capture_output=True, text=True, check=False
     )
@@ -142,7 +142,7 @@ def test_what_lintian_says_of_it(package: Path) -> None:
 
 
 def test_two_builds_are_the_same(package: Path, tmp_path: Path) -> None:
-    """Who builds the same commit gets the same package, byte by byte: in another folder, two days later."""
+    """A build of the same commit in another folder, two days later, gives the same package, byte by byte."""
     folder = elsewhere(tmp_path / "elsewhere")
     (folder / ".venv").symlink_to(ROOT / ".venv")
     second = build_later("distribution.deb", "amd64", folder=folder)

@@ -1,4 +1,4 @@
-"""The wheel, installed by pipx as docs/install.md says, far from a checkout: all of `rosrv` is there."""
+"""The wheel, installed by pipx as in docs/install.md, without a checkout, contains the whole `rosrv`."""
 
 import json
 import os
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.timeout(600)
 
 @pytest.fixture(scope="module")
 def rosrv() -> Iterator[Path]:
-    """The command, installed by the page's own: `make wheel`, `pipx install`; no compiler is asked for anything."""
+    """Install the command with the page's `make wheel` and `pipx install`, without a compiler."""
     pipx = need_program("pipx", "pipx")
     subprocess.run(["make", "--silent", "wheel"], cwd=ROOT, check=True, capture_output=True)
     built = ROOT / "dist" / f"rosrv_appliance-{__version__}"
@@ -38,7 +38,7 @@ def rosrv() -> Iterator[Path]:
 
 
 def run(rosrv: Path, *arguments: str, folder: Path, seconds: float = 60) -> subprocess.CompletedProcess[str]:
-    """One command in an empty folder, with an environment that knows nothing of the checkout."""
+    """Run one command in an empty folder, with an environment that has no reference to the checkout."""
     environment = {
         "PATH": f"{rosrv.parent}:/usr/sbin:/usr/bin:/sbin:/bin",
         "HOME": str(folder),
@@ -50,7 +50,7 @@ def run(rosrv: Path, *arguments: str, folder: Path, seconds: float = 60) -> subp
     )
 
 
-def test_it_says_what_it_is(rosrv: Path, tmp_path: Path) -> None:
+def test_it_reports_its_version_and_packages(rosrv: Path, tmp_path: Path) -> None:
     """Version and packages are those of the project and its lock; the verbs have their help."""
     assert re.fullmatch(r"rosrv \d+\.\d+\.\d+\n", run(rosrv, "--version", folder=tmp_path).stdout)
     facts = json.loads(run(rosrv, "version", "--json", folder=tmp_path).stdout)
@@ -61,7 +61,7 @@ def test_it_says_what_it_is(rosrv: Path, tmp_path: Path) -> None:
         for part in facts["parts"]
         if part["kind"] == "python"
     }
-    # pipx's own, which each of its environments sees.
+    # pipx's own, visible in each of its environments
     for own in {"pip", "setuptools", "wheel", "packaging"} - locked.keys():
         installed.pop(own, None)
     assert installed == locked | {"rosrv-appliance": facts["version"]}
@@ -69,7 +69,7 @@ def test_it_says_what_it_is(rosrv: Path, tmp_path: Path) -> None:
 
 
 def test_its_selftest_names_a_policy_to_begin_with(rosrv: Path, tmp_path: Path) -> None:
-    """Where nobody has configured anything, the advice is a file that is there and right."""
+    """Without any configuration, the advice names an existing, valid file."""
     done = run(rosrv, "selftest", "--json", "--state", str(tmp_path / "none"), folder=tmp_path)
     rows = {row["check"]: row for row in map(json.loads, done.stdout.splitlines())}
     assert rows["policy"]["outcome"] == "warn", done.stdout + done.stderr
@@ -79,7 +79,7 @@ def test_its_selftest_names_a_policy_to_begin_with(rosrv: Path, tmp_path: Path) 
 
 
 def test_its_demonstration_works(rosrv: Path, tmp_path: Path) -> None:
-    """Robot, operator and attacker come with it, and what it promises happens."""
+    """Robot, operator and attacker are included, and the demonstration succeeds."""
     need_root()
     needs(has_ros(), "ROS 1 (run `make setup`)")
     done = run(rosrv, "demo", "--json", "--picture", str(tmp_path / "way.svg"), folder=tmp_path, seconds=280)
