@@ -8,7 +8,8 @@ Invariants:
 2. The waiting class of hosts with the least use runs next, and in it the host with the least use. All unknown hosts
    are one class. This is deficit round robin without the round: a class that comes back waits for one piece, not for a
    piece of each other class.
-3. No class saves time: after a break it starts with the use of the waiting classes. It keeps its debt.
+3. No class saves time: after a break it starts with the use of the waiting classes. It keeps its debt while others
+   wait. When a turn ends and nothing waits, all use is forgotten: who works alone takes time from nobody.
 4. While no work waits and the turn has time left, work runs at once.
 """
 
@@ -60,6 +61,10 @@ class Line(Generic[Key, Item]):
         self._used[key] = self.used(key) + seconds
         if len(self._used) > _MOST_KEPT:
             self._used = {one: used for one, used in self._used.items() if used > self.start}
+
+    def forget(self) -> None:
+        """Forget what all keys have used."""
+        self._used.clear()
 
     def put(self, key: Key, item: Item) -> None:
         """Append an item to those of its key."""
@@ -211,6 +216,8 @@ class ProcessorTime:
         self._go_on()
         if self._classes:
             self._end_turn_later()
+        elif not self._granted:
+            self._classes.forget()
 
     def _go_on(self) -> None:
         """Run waiting work while this turn has time left; grant one step at a time."""

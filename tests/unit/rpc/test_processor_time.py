@@ -66,6 +66,27 @@ async def test_the_robot_waits_for_one_piece_of_a_flood(loop: Loop) -> None:
     assert loop.order.index(ROBOT) <= 5
 
 
+async def test_a_robot_that_worked_alone_owes_nothing(loop: Loop) -> None:
+    """The robot made calls for an hour while nobody else did; under a flood by a new guest, it is served next."""
+    for _ in range(1000):
+        assert loop.time.run(ROBOT, loop.work(ROBOT))
+        await asyncio.sleep(0)
+    loop.order.clear()
+    for _ in range(500):
+        loop.time.run(GUEST, loop.work(GUEST))
+    loop.time.run(ROBOT, loop.work(ROBOT))
+    await loop.all()
+    assert loop.order.index(ROBOT) <= 5
+
+
+async def test_a_debt_stays_while_others_wait(loop: Loop) -> None:
+    """A host that took a long piece while others waited is next when they have had as much."""
+    for host in (GUEST, ROBOT) * 50:
+        loop.time.run(host, loop.work(host, 20 * PIECE if not loop.order else PIECE))
+    await loop.all()
+    assert loop.order[1:20].count(ROBOT) >= 18
+
+
 async def test_two_hundred_unknown_hosts_are_one(loop: Loop) -> None:
     """Unknown hosts have together what one named host has, and take turns among themselves."""
     for host in UNKNOWN * 2:
