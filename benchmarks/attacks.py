@@ -706,9 +706,11 @@ def main() -> None:
     parser.add_argument("--by", default="guest,unknown", help="who attacks: guest, unknown")
     parser.add_argument("--busy", type=int, default=0, help="processes that only compute")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of each round")
-    parser.add_argument("--relays", type=int, default=1)
+    parser.add_argument("--relays", type=int, default=1, help="relay processes of the appliance")
     given = parser.parse_args()
-    chosen = given.only.split(",") if given.only else [*ATTACKS]
+    chosen, attackers = given.only.split(",") if given.only else [*ATTACKS], given.by.split(",")
+    for name in sorted({*chosen} - {*ATTACKS} | {*attackers} - {"guest", "unknown"}):
+        parser.error(f"{name!r} is not an attack of --only or an attacker of --by; see --help")
     rows: list[tuple[str, str, dict[str, Any]]] = []
     with tempfile.TemporaryDirectory() as name, Lab("rosrv-bench") as lab:
         Path(name).chmod(0o755)  # the appliance's users read the specifications in it
@@ -719,7 +721,7 @@ def main() -> None:
         with rig.running():
             rows.append(("quiet", "", rig.round((), ())))
             for what in chosen:
-                for who in given.by.split(","):
+                for who in attackers:
                     if who == "unknown" and "scans" in what:
                         continue  # no rule lets an unknown host publish scans
                     rows.append((what, who, rig.round(ATTACKS[what], GUEST if who == "guest" else UNKNOWN)))
