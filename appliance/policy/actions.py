@@ -25,7 +25,7 @@ def parse_action(text: str) -> tuple[Category, str]:
     category = VERBS.get(verb)
     if category is None:
         guess = meant(verb, VERBS) or f"; one of {', '.join(VERBS)}"
-        raise BadWordError(f"{quoted(text)} begins with no known verb{guess}")
+        raise BadWordError(f"{quoted(text)} does not begin with a known verb{guess}")
     return category, check_resource(category, name.strip())
 
 
@@ -37,7 +37,7 @@ def check_resource(category: Category, name: str) -> str:
             guess = f": it is decided by {elsewhere}" if elsewhere else meant(name, COMMANDS)
             raise BadWordError(f"{quoted(name)} is not a command{guess}")
     elif not (is_parameter_key(name) if category in PARAMETERS else is_global_name(name)):
-        raise BadWordError(f"{quoted(name)} is not a resolved ROS name, as /landshark/gps")
+        raise BadWordError(f"{quoted(name)} is not a resolved ROS name, such as /landshark/gps")
     return name
 
 
@@ -45,7 +45,7 @@ def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
     """Return the addresses of an address, `robot` or `host:NAME` under this policy; raises `BadWordError`."""
     if text == "robot":
         if not policy.robot:
-            raise BadWordError("it is not said which address robot is")
+            raise BadWordError("the address of robot is not known")
         return tuple(_first(network) for network in policy.robot)
     if text.startswith("host:"):
         name = text.removeprefix("host:")

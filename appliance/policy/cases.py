@@ -139,9 +139,9 @@ class _CaseReader:
         if "node" in case:
             caller_id = self._text(case["node"][1], "node")
             if not is_global_name(caller_id):
-                self._error(case["node"][1], f"{quoted(caller_id)} is not a node name, as /joystick")
+                self._error(case["node"][1], f"{quoted(caller_id)} is not a node name, such as /joystick")
         if not ("allow" in case or "deny" in case):
-            self._error(node, "a case needs allow: or deny: with what the host does")
+            self._error(node, "a case needs allow: or deny: with the actions of the host")
         for word, expected in (("allow", True), ("deny", False)):
             for action in self._sequence(case[word][1], word) if word in case else ():
                 yield from self._check(action, hosts, caller_id, expected)

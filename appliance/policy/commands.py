@@ -75,8 +75,8 @@ CALLS: dict[str, PolicyCall] = {
     "getPublications": _COMMAND,
     "getName": _COMMAND,
     "shutdown": _COMMAND,
-    "publisherUpdate": PolicyCall(elsewhere="nobody: only the master sends it"),
-    "paramUpdate": PolicyCall(elsewhere="nobody: only the master sends it"),
+    "publisherUpdate": PolicyCall(elsewhere="no rule: only the master sends it"),
+    "paramUpdate": PolicyCall(elsewhere="no rule: only the master sends it"),
     # the XML-RPC server
     "system.multicall": PolicyCall(elsewhere="the rules of each of its parts"),
     "listMethods": PolicyCall(wire="system.listMethods"),

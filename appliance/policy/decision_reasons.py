@@ -93,7 +93,7 @@ def render(explanation: DecisionExplanation) -> Iterator[str]:
         if other.request.category is Category.NODE:
             yield "and the node rule, because this call makes a node part of the graph:"
         else:
-            yield f"and the rule for {other.request.resource}, the call with which it is done:"
+            yield f"and the rule for {other.request.resource}, the call that does it:"
         yield from ("  " + line for line in _render_one(other))
     if explanation.also:
         yield f"together: {'allowed' if explanation.allowed else 'denied'}"
@@ -105,15 +105,15 @@ def _render_one(explanation: DecisionExplanation) -> Iterator[str]:
     yield f"{'would be denied (audit-only: passes)' if decision.would_deny else verdict}: {decision.reason}"
     yield f"  rule: {decision.rule or 'no rule'}"
     if explanation.told is not None:
-        yield f"  the host is told: {explanation.told}"
+        yield f"  answer to the host: {explanation.told}"
     if explanation.through:
         yield f"  the host is in: {', '.join(explanation.through)}"
     if explanation.limit:
         yield f"  limit: {explanation.limit}"
     if explanation.namespace is not None:
-        yield f"  but denied while it is a namespace: {explanation.namespace.reason}"
+        yield f"  but denied if it has parameters below it: {explanation.namespace.reason}"
     for lost in explanation.lost:
-        yield f"  lost: {lost.rule}, which would {'allow' if lost.grants else 'deny'}: {lost.why}"
+        yield f"  overruled: {lost.rule}, which would {'allow' if lost.grants else 'deny'}: {lost.why}"
 
 
 def _limit(policy: Policy, request: Request) -> str:

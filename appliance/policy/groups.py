@@ -62,12 +62,10 @@ class HostGroups:
         word = entry.key
         first = self.groups.get(word.text)
         if word.text == ROBOT:
-            text = (
-                'the group "robot" is predefined (the machine the appliance stands next to): use another name'
-            )
+            text = 'the group "robot" is predefined (the machine next to the appliance): use another name'
             self._findings.error(word.line, word.column, text)
         elif first is not None and first.word is not None:
-            text = f"the group {quoted(word.text)} is defined already at line {first.word.line}"
+            text = f"the group {quoted(word.text)} is already defined at line {first.word.line}"
             self._findings.error(word.line, word.column, text)
         elif not _GROUP_NAME.fullmatch(word.text):
             text = f"{quoted(word.text)} is not a group name: letters, digits and _ . - after a letter"
@@ -83,7 +81,7 @@ class HostGroups:
                 break
             atom = self._atom(word)
             if atom in atoms:
-                self._findings.warn(word.line, word.column, f"{quoted(word.text)} is said twice")
+                self._findings.warn(word.line, word.column, f"{quoted(word.text)} is listed twice")
             elif atom is not None:
                 atoms[atom] = word.text
         return tuple((text, atom) for atom, text in atoms.items())
@@ -147,7 +145,7 @@ class HostGroups:
         elif name not in self._warned_hosts:
             self._warned_hosts.add(name)
             guess = meant(name, self._hosts.keys())
-            text = f"no host {quoted(name)} is enrolled: host:{name} matches nobody until it is{guess}"
+            text = f"no host {quoted(name)} is enrolled: host:{name} matches no host until it is{guess}"
             self._findings.warn(word.line, word.column, text)
         return None
 

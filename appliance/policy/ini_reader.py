@@ -94,7 +94,9 @@ def _add_entry(line: str, number: int, sections: list[SectionText], findings: Fi
     elif not key:
         findings.error(number, column, 'expected a key before "="')
     elif not sections:
-        findings.error(number, column, f"{quoted(key)} stands before the first section: add one, as [Groups]")
+        findings.error(
+            number, column, f"{quoted(key)} is before the first section: add one, such as [Groups]"
+        )
     else:
         words = _WORD.finditer(right)
         values = tuple(Word(m.group(), number, len(left) + 1 + m.start() + 1) for m in words)

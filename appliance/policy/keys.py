@@ -97,7 +97,7 @@ def parse_key(text: str, *, parameter: bool = False) -> Key:
     subtree = parts[-1] == "**"
     steps = tuple((part.removesuffix("*"), part.endswith("*")) for part in parts[: -1 if subtree else None])
     if any("*" in step for step, _ in steps):
-        raise BadKeyError("a star may stand at the end of a level only, and ** alone as the last level")
+        raise BadKeyError("a star may only be at the end of a level, and ** only as the whole last level")
     # A level that is only a star matches any name, also x.
     name = "".join(f"/{step or 'x'}" for step, _ in steps) or "/x"
     if not (is_parameter_key(name) if parameter else is_global_name(name)):

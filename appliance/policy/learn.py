@@ -121,7 +121,7 @@ def _needful(rights: dict[tuple[Category, str], _Right]) -> dict[tuple[Category,
 
 
 def _text(rights: dict[tuple[Category, str], _Right], robot: Collection[Address | Network]) -> Iterator[str]:
-    yield "# Learned from what was seen to be done: read it, give the groups their names, add its tests.\n"
+    yield "# Learned from recorded actions: review it, name its groups, add its tests.\n"
     hosts = {named: _hosts(right.hosts, robot) for named, right in rights.items()}
     lines = Counter(others for _known, others in hosts.values())
     shared = sorted(others for others, used in lines.items() if used > 1 and " " in others)

@@ -246,7 +246,7 @@ class Policy:
         if decider.extension:
             deed = f"{decider.phrases[request.category]} {_shortened(request.resource)}"
             return Decision(True, None, f"no [{decider.name}] section: every host may {deed}")
-        reason = f"{_what(request, 'may not')}: the policy has no [{decider.name}] section, so nobody may"
+        reason = f"{_what(request, 'may not')}: the policy has no [{decider.name}] section, so no host may"
         return _decided(False, None, reason, table.audit_only)
 
 

@@ -90,7 +90,7 @@ def _by_name(found: list[SectionText], findings: Findings) -> dict[str, SectionT
                 by_name.setdefault(name, section)  # read as intended, so that one slip is one error
         elif name in by_name:
             first = by_name[name]
-            text = f"the section [{name}] stands already at line {first.name.line}: put its lines there"
+            text = f"the section [{name}] is already defined at line {first.name.line}: move its lines there"
             findings.error(place.line, place.column, text)
             first.entries.extend(section.entries)
         else:

@@ -57,7 +57,7 @@ def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
     for host, (rule, count) in seen.items():
         shown = str(host).removesuffix("/32").removesuffix("/128")
         more = f" ({count} rules)" if count > 1 else ""
-        text = f"{shown} may use no node name ([Nodes]), so what {rule.rule.key} grants it is dead{more}"
+        text = f"{shown} may not use any node name ([Nodes]), so {rule.rule.key} grants it nothing{more}"
         findings.warn(rule.rule.line, rule.column, text)
 
 
@@ -110,18 +110,20 @@ def _nodes_that_cannot_start(
         rule = table.tree.find(command) or table.default
         if call.at_start and (rule is None or not rule.atoms):
             line, column = (rule.rule.line, rule.column) if rule else (place.line, place.column)
-            text = f"{command} is granted to nobody, and a node needs it: {call.at_start}"
+            text = f"{command} is granted to no host, and a node needs it: {call.at_start}"
             findings.warn(line, column, text)
 
 
 def _unused_groups(groups: HostGroups, findings: Findings) -> None:
     for name, group in groups.groups.items():
         if not group.used and group.word is not None:
-            findings.warn(group.word.line, group.word.column, f"the group {quoted(name)} is used nowhere")
+            findings.warn(group.word.line, group.word.column, f"the group {quoted(name)} is not used")
 
 
 def _missing_sections(present: set[Category], findings: Findings) -> None:
     """Warn of missing sections without which the policy grants nothing that a node can use."""
     for decider in sections.DECIDERS:
         if not decider.extension and decider.categories[0] not in present:
-            findings.warn(1, 1, f"there is no [{decider.name}] section: what it would grant is denied to all")
+            findings.warn(
+                1, 1, f"there is no [{decider.name}] section, so its requests are denied for all hosts"
+            )

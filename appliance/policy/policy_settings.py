@@ -49,9 +49,9 @@ def _range(entry: Entry, findings: Findings) -> range | None:
     found = _RANGE.fullmatch("".join(value.text for value in entry.values))
     first, last = (int(found[1]), int(found[2])) if found else (0, 0)
     if not found:
-        findings.error(word.line, word.column, "expected range = FIRST-LAST, as 19001-20000")
+        findings.error(word.line, word.column, "expected range = FIRST-LAST, such as 19001-20000")
     elif not 1024 <= first < last <= 65535:
-        text = f"{first}-{last}: the range goes upwards, within 1024 to 65535, two ports for each node"
+        text = f"{first}-{last}: the range must be ascending, within 1024 to 65535, two ports for each node"
         findings.error(word.line, word.column, text)
     elif first <= _MASTER_PORT <= last:
         findings.error(
@@ -68,10 +68,12 @@ def read_monitor(section: SectionText | None, findings: Findings) -> MonitorSect
     for entry in _entries(section, tuple(names), findings):
         for word in entry.values:
             if not is_global_name(word.text):
-                text = f"{quoted(word.text)} is not a resolved name, as /landshark/gps (no patterns here)"
+                text = (
+                    f"{quoted(word.text)} is not a resolved name, such as /landshark/gps (no patterns here)"
+                )
                 findings.error(word.line, word.column, text)
             elif word.text in names[entry.key.text]:
-                findings.warn(word.line, word.column, f"{word.text} is said twice")
+                findings.warn(word.line, word.column, f"{word.text} is listed twice")
             names[entry.key.text].add(word.text)
     return MonitorSection(frozenset(names["topic"]), frozenset(names["service"]))
 
@@ -115,7 +117,9 @@ def _audit_only(entry: Entry, findings: Findings) -> frozenset[str]:
     if chosen:
         what = "nothing" if len(chosen) == len(by_fold) else f"nothing by [{'], ['.join(sorted(chosen))}]"
         findings.warn(
-            entry.key.line, entry.key.column, f"audit-only: this policy denies {what}, it only records"
+            entry.key.line,
+            entry.key.column,
+            f"audit-only: this policy denies {what}; denials are only recorded",
         )
     return frozenset(chosen)
 
@@ -131,7 +135,7 @@ def _entries(section: SectionText | None, keys: Collection[str], findings: Findi
             )
             findings.error(word.line, word.column, f"unknown key {quoted(word.text)}{guess}")
         elif word.text in first_lines:
-            text = f"the key {quoted(word.text)} stands already at line {first_lines[word.text]}"
+            text = f"the key {quoted(word.text)} is already defined at line {first_lines[word.text]}"
             findings.error(word.line, word.column, text)
         else:
             first_lines[word.text] = word.line

@@ -123,11 +123,13 @@ def read_limits(section: SectionText | None, file: str, groups: HostGroups, find
             break
         word = entry.key
         if len(first_lines) >= _LINES:
-            findings.error(word.line, word.column, f"more than {_LINES} limits: use patterns, as /camera/**")
+            findings.error(
+                word.line, word.column, f"more than {_LINES} limits: use patterns, such as /camera/**"
+            )
             break
         first = first_lines.setdefault(word.text, word.line)
         if first != word.line:
-            text = f"the key {quoted(word.text)} stands already at line {first}: put its limits there"
+            text = f"the key {quoted(word.text)} is already defined at line {first}: put its limits there"
             findings.error(word.line, word.column, text)
             continue
         key = _key(word, patterns, findings)
@@ -166,12 +168,14 @@ def _clauses(entry: Entry, groups: HostGroups, findings: Findings) -> Iterator[C
         elif parts:
             parts[-1][1].append(word)
         else:
-            guess = meant(word.text, _PARTS) or ", as publisher 30 Hz 10 MB/s"
+            guess = meant(word.text, _PARTS) or ", such as publisher 30 Hz 10 MB/s"
             text = f"a limit begins with publisher, subscriber or topic, not {quoted(word.text)}{guess}"
             findings.error(word.line, word.column, text)
             return
     if not parts:
-        findings.error(entry.key.line, entry.key.column, "say whose limit it is, as publisher 30 Hz 10 MB/s")
+        findings.error(
+            entry.key.line, entry.key.column, "add whose limit it is, such as publisher 30 Hz 10 MB/s"
+        )
     for word, words in parts:
         clause = _clause(word, words, groups, findings)
         if clause is not None:
@@ -201,7 +205,7 @@ def _rate(part: Word, words: list[Word], findings: Findings) -> Rate | None:
         word = words.pop(0)
         number = _NUMBER.fullmatch(word.text)
         if number is None:
-            findings.error(word.line, word.column, f"{quoted(word.text)}: hosts stand before the numbers")
+            findings.error(word.line, word.column, f"{quoted(word.text)}: put hosts before the numbers")
             return None
         unit = number[2] or (words.pop(0).text if words else "")
         fault = _fault(float(number[1]), _FOLDED.get(unit.casefold()), unit, found)
@@ -225,9 +229,12 @@ def _fault(number: float, known: str | None, unit: str, found: dict[str, float])
             + f" has no unit of a limit{guess or ': Hz, B/s, kB/s, MB/s or GB/s'}"
         )
     if not _LEAST <= number * _UNITS[known] <= _MOST:
-        return f"{number:g} {known} is no limit that can be kept; who may send nothing is left out of [Publishers]"
+        return (
+            f"{number:g} {known} cannot be enforced as a limit;"
+            " to forbid sending, leave the host out of [Publishers]"
+        )
     if ("Hz" if known == "Hz" else "B/s") in found:
-        return f"{number:g} {known}: this is limited already; give one number of messages and one of bytes"
+        return f"{number:g} {known}: this is already limited; give one number of messages and one of bytes"
     return ""
 
 

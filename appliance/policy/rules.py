@@ -40,7 +40,7 @@ class RuleCompiler:
                 name = Word(commands.ALIASES.get(name.text, name.text), name.line, name.column)
             first = first_lines.setdefault((category, name.text), name.line)
             if first != name.line:
-                text = f"the key {quoted(entry.key.text)} stands already at line {first}: put its hosts there"
+                text = f"the key {quoted(entry.key.text)} is already defined at line {first}: put its hosts there"
                 self._error(entry.key, text)
                 continue
             key = self._key(category, name)
@@ -49,7 +49,7 @@ class RuleCompiler:
             if key is not None and not key.exact and not self._fits(category, key, name):
                 continue
             rule = Rule(decider.name, entry.key.text, self._file, entry.key.line)
-            shown = f"only {self._groups.shown(entry.values)} may" if entry.values else "nobody may"
+            shown = f"only {self._groups.shown(entry.values)} may" if entry.values else "no host may"
             atoms = frozenset(atom for _, atom in words)
             self._add(
                 category, CompiledRule(rule, key, atoms, words, shown, place_of(rule), entry.key.column)
@@ -59,7 +59,7 @@ class RuleCompiler:
         """Whether a pattern ties with none before it, within the number of patterns."""
         self._inner_stars += key.inner_star
         if self._inner_stars > MAXIMUM_INNER_STARS:
-            text = f"more than {MAXIMUM_INNER_STARS} keys have a star before the end, as /*/state: use fewer"
+            text = f"more than {MAXIMUM_INNER_STARS} keys have a star before the end, such as /*/state: use fewer"
             self._error(name, text)
             return False
         alike = self._patterns.setdefault((category, key.literal, key.subtree), [])
@@ -87,7 +87,7 @@ class RuleCompiler:
         verb, _, name = entry.key.text.partition(" ")
         category = next((category for category in decider.categories if category.value == verb), None)
         if category is None or not name:
-            text = "a key here is read or write and a name, as read /ns/** or write default"
+            text = "a key here is read or write and a name, such as read /ns/** or write default"
             self._error(entry.key, f"{quoted(entry.key.text)}: {text}")
             return None
         return category, Word(name, entry.key.line, entry.key.column + len(verb) + 1)
@@ -114,7 +114,9 @@ class RuleCompiler:
         if elsewhere is not None:
             self._error(name, f"can never match: {name.text} is decided by {elsewhere}, not here")
         elif "*" in name.text:
-            self._error(name, f"{quoted(name.text)}: commands have no patterns; default is what is left")
+            self._error(
+                name, f"{quoted(name.text)}: commands have no patterns; default matches all other commands"
+            )
         else:
             guess = meant(name.text, [*commands.COMMANDS, *commands.DECIDED_ELSEWHERE, DEFAULT])
             self._error(name, f"unknown command {quoted(name.text)}{guess}")

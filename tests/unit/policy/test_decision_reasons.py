@@ -83,7 +83,7 @@ def test_dependence_on_a_namespace_is_explained() -> None:
     lines = list(render(explain(policy, Request(host, "/ocu", Category.READ, "/arm"))))
     assert lines[0].startswith("allowed")
     assert any(
-        line.startswith("  but denied while it is a namespace: 10.0.0.5 may not read") for line in lines
+        line.startswith("  but denied if it has parameters below it: 10.0.0.5 may not read") for line in lines
     )
     lines = list(render(explain(policy, Request(host, "/ocu", Category.READ, "/leg"))))
     assert not any("namespace" in line for line in lines)

@@ -121,7 +121,7 @@ def test_an_empty_value_denies_all_hosts() -> None:
     """A key without a value denies every host, and says so."""
     decision = ask(compiled("[Publishers]\ndefault = *\n/cmd =\n"), "10.0.0.1", "publish", "/cmd")
     assert not decision.allowed
-    assert "nobody may" in decision.reason
+    assert "no host may" in decision.reason
 
 
 def test_robot_and_enrolled_hosts_come_from_outside() -> None:
