@@ -57,7 +57,7 @@ class Bounds:
             raise ValueError(f"{self} has a part below 0")
         if self.host > self.whole or self.unknown > self.whole - self.kept:
             raise ValueError(
-                f"{self}: a host's share, or that of unknown hosts with the kept part, exceeds the whole"
+                f"{self}: the quota of a host, or of unknown hosts and the kept part together, exceeds the whole"
             )
 
     def sized(self, whole: int, host: int | None = None) -> "Bounds":
