@@ -93,7 +93,7 @@ class TokenAuthenticator:
             if time.time() < kept.expires:
                 self._remember(peer_key(host))
                 return Bearer(kept.id, kept.name, cast(TokenRole, kept.role), kept.expires, text)
-            raise self._refusal("the token has expired: ask for another one (rosrv token add)")
+            raise self._refusal("the token has expired: ask for a new one (rosrv token add)")
         failures = self._unknown if kept is None else self._wrong
         _require_patience(failures, host)
         failures.take(host, time.monotonic())
@@ -127,5 +127,5 @@ class TokenAuthenticator:
 def _require_patience(failures: Buckets, host: str) -> None:
     seconds = failures.wait(host, time.monotonic())
     if seconds:
-        text = "too many requests of this host came without a good token"
+        text = "too many requests from this host came without a valid token"
         raise too_many("too-many-failures", text, seconds)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.channel.status_summary import no_relay, probe_failed
 
@@ -22,7 +22,7 @@ class Alarm(msgspec.Struct, frozen=True, kw_only=True):
 
     kind: str
     severity: Severity
-    text: Annotated[str, told("what is the matter and what to do, for a person")]
+    text: Annotated[str, doc("the problem and what to do, for a person")]
     about: About
 
 
@@ -78,10 +78,10 @@ def _policy(status: Status) -> Iterator[_Condition]:
         )
     if policy.audit_only:
         sections = "], [".join(policy.audit_only)
-        text = f"the policy refuses nothing by [{sections}], it only records (audit-only)"
+        text = f"the policy denies nothing by [{sections}]; denials are only recorded (audit-only)"
         yield "warning", "policy-audit-only", "policy", text
     if policy.differs_from_file:
-        text = f"revision {policy.revision} is not what {policy.file} says"
+        text = f"revision {policy.revision} differs from {policy.file}"
         yield "notice", "policy-differs", "policy", text
 
 
@@ -100,7 +100,7 @@ def _monitors(status: Status) -> Iterator[_Condition]:
         text = _rolls_back("the specifications roll", monitors.confirm_by, "monitor")
         yield "warning", "monitors-unconfirmed", "monitors", text
     if monitors.differs_from_folder:
-        text = f"revision {monitors.revision} of the specifications is not what their folder has"
+        text = f"revision {monitors.revision} of the specifications differs from their folder"
         yield "notice", "monitors-differ", "monitors", text
 
 

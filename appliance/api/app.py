@@ -121,10 +121,12 @@ async def _of_http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)  # noqa: S101  registered for it
     match error.status_code:
         case 404:
-            problem = ProblemError(404, "unknown-path", "there is nothing here")
+            problem = ProblemError(404, "unknown-path", "there is no such path")
         case 405:
             allowed = {"Allow": ", ".join(sorted(_methods(request)))}
-            problem = ProblemError(405, "wrong-method", "this cannot be done here", headers=allowed)
+            problem = ProblemError(
+                405, "wrong-method", "this path does not have that method", headers=allowed
+            )
         case status:
             problem = ProblemError(status, "bad-request", str(error.detail), headers=error.headers)
     return _answer(request, problem)

@@ -57,11 +57,14 @@ _PAGE = {
     "type": "object",
     "properties": {
         "records": {"type": "array", "items": _RECORD_REF},
-        "cursor": {"type": ["string", "null"], "description": "of the next page; null: there is none"},
+        "cursor": {
+            "type": ["string", "null"],
+            "description": "cursor of the next page; null: this is the last page",
+        },
         "notes": {
             "type": "array",
             "items": {"type": "string"},
-            "description": "only where there are any: an event or category that this version does not record",
+            "description": "only if there are any: an event or category that this version does not record",
         },
     },
     "required": ["records", "cursor"],
@@ -89,27 +92,29 @@ def _wanted(
     *,
     decision: Annotated[list[Literal["allow", "deny", "would deny"]] | None, Query()] = None,
     since: Annotated[str | None, Query(max_length=64, description="1h (ago), a date, or RFC 3339")] = None,
-    until: Annotated[str | None, Query(max_length=64, description="before this moment")] = None,
-    host: Annotated[str | None, Query(max_length=256, description="of the peer; a glob")] = None,
-    caller_id: Annotated[str | None, Query(max_length=256, description="the name it gave; a glob")] = None,
+    until: Annotated[str | None, Query(max_length=64, description="before this time")] = None,
+    host: Annotated[str | None, Query(max_length=256, description="address of the peer; a glob")] = None,
+    caller_id: Annotated[
+        str | None, Query(max_length=256, description="the name that the peer gave; a glob")
+    ] = None,
     resource: Annotated[
         str | None, Query(max_length=256, description="topic, service, call…; a glob")
     ] = None,
     category: Annotated[str | None, Query(max_length=256)] = None,
     event: Annotated[str | None, Query(max_length=256)] = None,
-    severity: Annotated[Severity | None, Query(description="this one or a graver one")] = None,
-    rule: Annotated[str | None, Query(max_length=256, description="section or key; a glob")] = None,
+    severity: Annotated[Severity | None, Query(description="this severity or a higher one")] = None,
+    rule: Annotated[
+        str | None, Query(max_length=256, description="section or key of the rule; a glob")
+    ] = None,
     text: Annotated[
         str | None, Query(max_length=256, description="anywhere in names, reason, details")
     ] = None,
     who: Annotated[
         str | None, Query(max_length=256, description="the token's name, or `operator`; a glob")
     ] = None,
-    deny: Annotated[bool, Query(description="only what was denied: the same as decision=deny")] = False,
+    deny: Annotated[bool, Query(description="only denials: the same as decision=deny")] = False,
     topic: Annotated[str | None, Query(max_length=256, description="another word for resource")] = None,
-    looks: Annotated[
-        bool, Query(description="0: leave out REST calls that were allowed and only looked")
-    ] = True,
+    looks: Annotated[bool, Query(description="0: leave out allowed REST calls that only read")] = True,
 ) -> Filter:
     if resource is not None and topic is not None:
         raise ProblemError(422, "bad-input", "resource and topic mean the same: give one")
@@ -198,9 +203,9 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
     async def search_audit(
         bearer: Viewer,
         wanted: Wanted,
-        cursor: Annotated[str | None, Query(max_length=18, description="of the page before")] = None,
+        cursor: Annotated[str | None, Query(max_length=18, description="cursor of the previous page")] = None,
         limit: Limit = 100,
-        order: Annotated[Literal["newest", "oldest"], Query(description="which comes first")] = "newest",
+        order: Annotated[Literal["newest", "oldest"], Query(description="order of the records")] = "newest",
     ) -> JSONResponse:
         """Records that match, a page at a time; for viewers without what messages said (`detail.withheld`)."""
         return JSONResponse(
@@ -212,7 +217,9 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
         request: Request,
         bearer: Viewer,
         wanted: Wanted,
-        after: Annotated[int | None, Query(ge=0, le=10**18, description="begin after this sequence")] = None,
+        after: Annotated[
+            int | None, Query(ge=0, le=10**18, description="start after the record with this sequence")
+        ] = None,
         last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", pattern="^[0-9]{1,18}$")] = None,
     ) -> Response:
         """Records as they are made (server-sent events): each is an event `record`, its id the sequence.
@@ -238,14 +245,14 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
 
     @router.get("/checkpoints", dependencies=[VIEWER])
     async def audit_checkpoints(
-        after: Annotated[int, Query(ge=0, le=10**18, description="only those with a greater number")] = 0,
+        after: Annotated[int, Query(ge=0, le=10**18, description="only records with a greater number")] = 0,
         limit: Limit = 1000,
     ) -> LogCheckpoints:
         """Signed checkpoints, to be kept on another machine: `rosrv audit verify --checkpoints` takes them."""
         return LogCheckpoints(await desk.read(signed_checkpoints, desk.path, after, limit))
 
     @router.get(
-        "/export", responses=file("application/x-ndjson", "A record a line."), response_class=Response
+        "/export", responses=file("application/x-ndjson", "One record per line."), response_class=Response
     )
     async def export_audit(request: Request, bearer: Viewer, wanted: Wanted) -> Response:
         """Return all records that match, oldest first, one JSON object a line.
@@ -303,7 +310,7 @@ async def _follow(
 ) -> AsyncIterator[ServerSentEvent]:
     while not services.stopping.is_set():
         if not services.doorkeeper.still_good(bearer):
-            yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has ended"}))
+            yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has expired"}))
             return
         entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
         for entry in entries:

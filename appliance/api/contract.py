@@ -14,20 +14,18 @@ from appliance.api.routing import CONTRACT
 
 # Answers of the gate to any call.
 _ALWAYS = {
-    "403": "From a page of another site, or not for this role.",
-    "408": "The body did not come in time.",
+    "403": "The request is from a page of another site, or not for this role.",
+    "408": "The body did not arrive in time.",
     "413": "The body is too large.",
-    "421": "The appliance is not called by this name.",
-    "429": "Too many requests of this host.",
+    "421": "The appliance does not answer to this host name.",
+    "429": "Too many requests from this host.",
 }
 _WITH_TOKEN = {
     "401": "No token, or a wrong, expired or revoked one.",
     "503": "The appliance cannot answer now.",
 }
-_NOT_HTTP = (
-    "What came is not HTTP, or its first line or headers are too long (64 KiB); the server's own words."
-)
-_HASH = {"description": "of this body; If-None-Match takes it", "schema": {"type": "string"}}
+_NOT_HTTP = "The request is not HTTP, or its first line or headers are too long (64 KiB); the text is the server's own."
+_HASH = {"description": "ETag of this body; If-None-Match takes it", "schema": {"type": "string"}}
 _REFERENCE = CONTRACT.reference(Problem)
 # Requests and answers of an appliance, with long texts and lists cut, by the kind of the body, or by the operation for
 # a body without a kind. tests/integration/api/test_examples.py compares them with real answers.
@@ -99,7 +97,7 @@ def _tagged(responses: dict[str, Any]) -> None:
     if "application/json" in good.get("content", {}) and "ETag" not in good.get("headers", {}):
         good.setdefault("headers", {})["ETag"] = _HASH
         responses["304"] = {
-            "description": "The body is the one whose ETag is in If-None-Match.",
+            "description": "The body has the ETag in If-None-Match.",
             "headers": {"ETag": _HASH},
         }
 
@@ -124,7 +122,7 @@ def _complete(operation: dict[str, Any]) -> None:
     for status, response in responses.items():
         if int(status) >= 400:
             if response["description"] == "Validation Error":
-                response["description"] = "A parameter or the body makes no sense."
+                response["description"] = "A parameter or the body is invalid."
             response["content"] = {MEDIA_TYPE: {"schema": _REFERENCE}}
     words = responses.setdefault("400", {"description": _NOT_HTTP}).setdefault("content", {})
     words["text/plain"] = {"schema": {"type": "string"}}

@@ -38,8 +38,8 @@ _MOST_OPEN = 48
 _MOST_KEPT = 1000
 _GRACE_SECONDS = 10.0  # for control's report on an order whose time is over
 _UNKNOWN = (
-    ": the order may have taken effect; if it has not by now, it never will. What took effect is in the audit log:"
-    " rosrv audit search --since 5m (GET /v1/audit)"
+    ": the order may have taken effect; if it has not by now, it never will. Orders that took effect are in the audit"
+    " log: rosrv audit search --since 5m (GET /v1/audit)"
 )
 
 
@@ -115,7 +115,7 @@ class ControlLink:
                 f"the appliance did not answer within {longest:g} s{_UNKNOWN if changes else ''}"
             ) from None
         except ChannelFullError:
-            raise ControlAwayError("the appliance does not take requests now: try again") from None
+            raise ControlAwayError("the appliance does not accept requests now: try again") from None
         except ChannelClosedError:
             raise ControlAwayError(
                 f"the appliance was restarted before it answered{_UNKNOWN if changes else ': try again'}"
@@ -167,7 +167,8 @@ class ControlLink:
             self._kept.popleft()
         if self._dropped and self._link.channel is not None:
             _log.warning(
-                "REST calls were not recorded: control was away, or did not take them", calls=self._dropped
+                "REST calls were not recorded: control was not connected, or did not accept them",
+                calls=self._dropped,
             )
             self._dropped = 0
 

@@ -55,7 +55,7 @@ def _of_revoked(record: AuditRecord) -> DecidedRequest:
     call = str(record.detail.get("call", ""))
     if not call:
         raise UngrantableError(
-            "no change of the policy would have kept it: it was taken back for what its reason says"
+            "no change of the policy would have kept it: it was revoked for its recorded reason"
             " (or by an earlier version, whose records do not have the call that gave it)"
         )
     return _of_call(record, call)
@@ -65,7 +65,7 @@ def _of_connection(record: AuditRecord) -> DecidedRequest:
     call = _ASKS.get(record.category or "")
     if call is None or not record.reason.startswith(NO_GRANT) or record.decision is None:
         raise UngrantableError(
-            "no change of the policy would allow it: it was refused for what its reason says"
+            "no change of the policy would allow it: it was denied for its recorded reason"
         )
     return _of_call(record, call)
 
@@ -91,7 +91,7 @@ def _of_folded(record: AuditRecord) -> DecidedRequest:
 
 
 def _of_limited(record: AuditRecord) -> DecidedRequest:
-    line = "a line of [Limits] that is gone" if record.rule is None else rule_text(record.rule)
+    line = "a line of [Limits] that no longer exists" if record.rule is None else rule_text(record.rule)
     raise UngrantableError(f"no right is missing; more would pass with a higher limit at {line}")
 
 
@@ -102,17 +102,17 @@ DENIALS: dict[str, str | Callable[[AuditRecord], DecidedRequest]] = {
     "denials folded": _of_folded,
     "rate limited": _of_limited,
     "limit exceeded": "the bounds on what one peer may send, hold and open are settings (docs/reference/quotas.md)",
-    "malformed": "what was sent is not what the protocol says, as its reason has it",
-    "message dropped": "the monitor dropped it; change its specification, or switch it off (rosrv monitor disable)",
-    "publication refused": "the specifications in force are for another definition of it; load specifications for this"
+    "malformed": "the data did not follow the protocol; the reason of the record says how",
+    "message dropped": "the monitor dropped it; change its specification, or disable it (rosrv monitor disable)",
+    "publication refused": "the specifications in force are for another type definition; load specifications for this"
     " one, or give the node theirs",
-    "policy refused": "the policy itself was refused, for what its findings say",
-    "specifications refused": "the specifications were refused, for what their findings say",
-    "order refused": "REST goes by tokens and their roles (rosrv token list), and by signatures, not by the policy",
-    "rest call": "REST goes by tokens and their roles (rosrv token list), not by the policy",
-    "enrolment refused": "enrolment needs a one-time token that is in force (rosrv host add)",
+    "policy refused": "the policy itself was rejected; its findings say why",
+    "specifications refused": "the specifications were rejected; their findings say why",
+    "order refused": "tokens, their roles (rosrv token list) and signatures decide on REST, not the policy",
+    "rest call": "tokens and their roles (rosrv token list) decide on REST, not the policy",
+    "enrolment refused": "enrolment needs a valid one-time token (rosrv host add)",
     "renewal refused": "a host renews its certificate in its own tunnel",
-    "tunnel refused": "a tunnel takes a certificate of this appliance that is in force (rosrv host list)",
-    "packets refused": "packets that were sent again, or under another's address, are never taken",
+    "tunnel refused": "a tunnel needs a valid certificate of this appliance (rosrv host list)",
+    "packets refused": "replayed packets, and packets with the address of another host, are never accepted",
 }
 """For each event, the function that derives the request from its record, or why no policy would allow it."""

@@ -30,7 +30,7 @@ from appliance.policy.policy_findings import PolicyError
 from appliance.policy.rights import needs_node
 
 _GRANTED = (
-    "the policy in force has every right that it needs: it was refused for what its reason says, or before this"
+    "the policy in force has every right that it needs: it was denied for its recorded reason, or before this"
     " revision"
 )
 
@@ -112,7 +112,7 @@ def explanation(
     except BadWordError as error:
         raise ProblemError(422, "bad-input", str(error)) from error
     if needs_node(request) and not node:
-        raise ProblemError(422, "bad-input", "this needs the name of the node: give it (node)")
+        raise ProblemError(422, "bad-input", "the name of the node is missing: add `node`")
     return explain(policy, request)
 
 
@@ -128,6 +128,6 @@ def _refused(error: PolicyError) -> ProblemError:
     return ProblemError(
         422,
         "policy-refused",
-        f"the policy is refused, nothing was changed: {first.file}:{first.line}:{first.column}: {first.text}{more}",
+        f"the policy is rejected, nothing was changed: {first.file}:{first.line}:{first.column}: {first.text}{more}",
         findings=_findings_of(findings),
     )

@@ -30,7 +30,7 @@ from appliance.api.services import Services
 from appliance.api.streams import peer_of
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
-from appliance.channel.answers.field_docs import Moment, told
+from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.host_answers import NewCertificate
 from appliance.channel.rest_bodies import WHOLE, SigningRequest
 from appliance.ipsec.enrolment_kit import archive, members
@@ -51,8 +51,8 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     address: str
-    appliance: Annotated[str, told("the appliance's address in the tunnel")]
-    master: Annotated[str, told("ROS_MASTER_URI through the tunnel")]
+    appliance: Annotated[str, doc("the appliance's address in the tunnel")]
+    master: Annotated[str, doc("ROS_MASTER_URI through the tunnel")]
     serial: str
     expires: Moment
     certificate: str
@@ -76,7 +76,7 @@ _KIT: Responses = {
         "description": "Enrolled; with `Accept: application/gzip` the kit as an archive",
         "content": content(Enrolled) | _ARCHIVE,
     },
-    403: {"description": "The token is wrong, was used, or has ended."},
+    403: {"description": "The token is wrong, was used, or has expired."},
     503: {"description": "The appliance cannot answer now."},
 }
 _TUNNEL: Responses = {

@@ -38,7 +38,9 @@ def routes(services: Services) -> Routes:
         if seen.status is None or unserved(seen.status) is not None:
             seen = await services.history.again(_PATIENCE_SECONDS)
         if seen.status is None or unserved(seen.status) is not None:
-            raise ProblemError(503, "not-served", "nodes are not served: /v1/status says why", retry_after=1)
+            raise ProblemError(
+                503, "not-served", "nodes are not served: GET /v1/status says why", retry_after=1
+            )
         return Health("ready")
 
     unready: Responses = {503: {"description": "Not in service."}}

@@ -15,7 +15,7 @@ import msgspec
 
 from appliance.api.control import ControlAwayError, ControlLink
 from appliance.channel.admin import MetricsWanted
-from appliance.channel.answers.field_docs import Moment, told
+from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import Status
 
@@ -32,13 +32,13 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
     """Counters at one time, since RVMaster started; after its restart they begin at zero."""
 
     time: Moment
-    allowed: Annotated[int, told("decisions of the policy")]
-    denied: Annotated[int, told("decisions of the policy, `would deny` included")]
-    messages: Annotated[int, told("relayed")]
-    bytes: Annotated[int, told("relayed")]
-    dropped: Annotated[int, told("messages that slow subscribers did not get")]
+    allowed: Annotated[int, doc("decisions of the policy")]
+    denied: Annotated[int, doc("decisions of the policy, `would deny` included")]
+    messages: Annotated[int, doc("relayed")]
+    bytes: Annotated[int, doc("relayed")]
+    dropped: Annotated[int, doc("messages dropped for slow subscribers")]
     nodes: int
-    monitors: Annotated[dict[str, list[int]], told("of each monitor: verdicts, drops, changes, faults")]
+    monitors: Annotated[dict[str, list[int]], doc("for each monitor: verdicts, drops, changes, faults")]
 
 
 class LastSample(NamedTuple):

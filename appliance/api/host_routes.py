@@ -30,7 +30,8 @@ _KIT: Responses = {
     200: {"description": "The kit: an archive (.tar.gz)", "content": _ARCHIVE, "headers": ETAG}
 }
 OneName = Annotated[
-    str, Path(min_length=1, max_length=63, pattern=HOST_NAME, description="of a host", examples=["ocu-1"])
+    str,
+    Path(min_length=1, max_length=63, pattern=HOST_NAME, description="name of the host", examples=["ocu-1"]),
 ]
 
 
@@ -74,7 +75,9 @@ async def _enrol(call: OperationCall[Any]) -> Response:
     if call.body.how == "kit":
         return await _kit(call)
     if call.body.request is not None:
-        raise ProblemError(422, "bad-input", "a request goes with how=kit; a token is brought with one")
+        raise ProblemError(
+            422, "bad-input", "`request` needs how=kit; with a token, the host sends its own request"
+        )
     made = (await _token(call)).body
     return answer(made, 201, made.revision)
 

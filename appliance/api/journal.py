@@ -51,7 +51,7 @@ class Journal:
             self._repeated[kind] = 0
             self._tell(RestCalled(*kind, duration_us))
         else:
-            rest = ("", "", "", "", status, "further calls, not reported one by one")
+            rest = ("", "", "", "", status, "further calls, not reported separately")
             self._repeated[rest] = self._repeated.get(rest, 0) + 1
 
     def flush(self) -> None:

@@ -24,7 +24,7 @@ from appliance.api.routing import Routes, file
 from appliance.api.services import Services
 from appliance.api.streams import StreamResponse, Streams, peer_of
 from appliance.channel.admin import GraphWanted
-from appliance.channel.answers.field_docs import Moment, told
+from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.status import Status
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
@@ -44,7 +44,7 @@ class Holder(msgspec.Struct, frozen=True):
     """The token's name and role; `expires` is seconds since the epoch."""
 
     name: str
-    role: Annotated[TokenRole, told("each may do all that those before it may")]
+    role: Annotated[TokenRole, doc("role of the token")]
     expires: Moment
 
 
@@ -66,7 +66,7 @@ def routes(services: Services) -> Routes:
 
     @router.get("/history", operation_id="history", dependencies=[VIEWER])
     async def last_hour(
-        points: Annotated[int, Query(ge=2, le=1800, description="at most so many samples")] = 360,
+        points: Annotated[int, Query(ge=2, le=1800, description="maximum number of samples")] = 360,
     ) -> Hour:
         """Decisions, relayed messages and what monitors did over the last hour, as counters."""
         return Hour(services.history.samples(points))
@@ -75,7 +75,7 @@ def routes(services: Services) -> Routes:
     async def live(
         request: Request,
         bearer: Viewer,
-        graph: Annotated[bool, Query(description="the graph too, as `/v1/graph` has it")] = False,
+        graph: Annotated[bool, Query(description="also the graph, as in `/v1/graph`")] = False,
     ) -> Response:
         """Status, open alarms and a sample every two seconds (server-sent events).
 
@@ -96,7 +96,7 @@ async def _follow(services: Services, bearer: Bearer, graph: bool) -> AsyncItera
     with history.following():
         while not services.stopping.is_set():
             if not services.doorkeeper.still_good(bearer):
-                yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has ended"}))
+                yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has expired"}))
                 return
             try:
                 async with asyncio.timeout(BUSY_SECONDS * 2):

@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 
 from appliance.api.problems import Finding
-from appliance.channel.answers.field_docs import Moment, told
+from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.monitor_answers import MonitorState, Tag
 
 
@@ -16,8 +16,8 @@ class EventShown(msgspec.Struct, frozen=True, kw_only=True):
     line: int
     topic: str | None
     type: str | None
-    part: Annotated[str | None, told("of a service: request or response")]
-    every: Annotated[float | None, told("so many seconds; null: not this way")]
+    part: Annotated[str | None, doc("for a service: request or response")]
+    every: Annotated[float | None, doc("interval in seconds; null: not periodic")]
 
 
 class PropertyShown(msgspec.Struct, frozen=True, kw_only=True):
@@ -34,11 +34,11 @@ class Happened(msgspec.Struct, frozen=True, kw_only=True):
     """Something a monitor did, as it is in the audit log under this sequence; `count`: more of the same."""
 
     sequence: int
-    time: Annotated[str, told("RFC 3339, UTC, nanoseconds")]
+    time: Annotated[str, doc("RFC 3339, UTC, nanoseconds")]
     event: str
     resource: str | None
     reason: str
-    category: Annotated[str | None, told("of a verdict")]
+    category: Annotated[str | None, doc("the events of the verdict")]
     count: int | None
 
 
@@ -47,12 +47,12 @@ class Monitor(MonitorState, frozen=True, kw_only=True):
 
     revision: int
     tag: Tag
-    text: Annotated[str, told("of its whole file")]
-    alphabet: Annotated[list[EventShown], told("its events")]
+    text: Annotated[str, doc("text of its whole file")]
+    alphabet: Annotated[list[EventShown], doc("its events")]
     properties: list[PropertyShown]
-    warnings: Annotated[list[Finding], told("of its file")]
-    uses: Annotated[list[str], told("monitors whose variables it uses")]
-    hold: Annotated[bool, told("declared `hold`: blocks its topics after a restart of the relay")]
+    warnings: Annotated[list[Finding], doc("name of its file")]
+    uses: Annotated[list[str], doc("monitors whose variables it uses")]
+    hold: Annotated[bool, doc("declared `hold`: blocks its topics after a restart of the relay")]
 
 
 class History(msgspec.Struct, frozen=True):
@@ -60,28 +60,29 @@ class History(msgspec.Struct, frozen=True):
 
     name: str
     happened: list[Happened]
-    cursor: Annotated[str | None, told("of the next page; null: there is none")]
+    cursor: Annotated[str | None, doc("cursor of the next page; null: this is the last page")]
 
 
 class Replaced(msgspec.Struct, frozen=True, kw_only=True):
     """The effect of a change, or of the dry run of one (`loaded` false); `replaced` is the revision before."""
 
     loaded: bool
-    revision: Annotated[int, told("in force now")]
+    revision: Annotated[int, doc("in force now")]
     tag: Tag
     replaced: int | None = None
     added: list[str]
     changed: list[str]
     removed: list[str]
     warnings: list[Finding]
-    monitors: Annotated[list[str], told("those that there are (would be), in order")]
+    monitors: Annotated[list[str], doc("the resulting monitors, in order")]
     moved: Annotated[
-        list[str], told("monitors that began anew because another relay process has them now")
+        list[str], doc("monitors in their initial state because they moved to another relay process")
     ] = []
     began: Annotated[
-        list[str], told("all monitors that are in their initial state by this change, new ones among them")
+        list[str],
+        doc("all monitors that are in their initial state because of this change, including new ones"),
     ] = []
     kept: Annotated[
-        list[str], told("files that a reload left in force although the folder does not have them")
+        list[str], doc("files that a reload left in force although the folder does not have them")
     ] = []
-    confirm_by: Annotated[Moment | None, told("when it goes back automatically unless confirmed")] = None
+    confirm_by: Annotated[Moment | None, doc("when it is rolled back automatically unless confirmed")] = None

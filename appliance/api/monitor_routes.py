@@ -27,7 +27,9 @@ from appliance.channel.answers.monitor_answers import (
 
 UNKNOWN: Responses = {404: {"description": "There is no such monitor, or revision."}}
 _PICTURE = file("image/svg+xml", "OK")
-OneName = Annotated[str, Path(min_length=1, max_length=256, description="of a monitor", examples=["censor"])]
+OneName = Annotated[
+    str, Path(min_length=1, max_length=256, description="name of the monitor", examples=["censor"])
+]
 
 
 class _Looking:
@@ -94,7 +96,7 @@ def routes(services: Services) -> Routes:
     async def monitor_history(
         name: OneName,
         bearer: Viewer,
-        cursor: Annotated[str | None, Query(max_length=18, description="of the page before")] = None,
+        cursor: Annotated[str | None, Query(max_length=18, description="cursor of the previous page")] = None,
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
     ) -> History:
         """Return the monitor's latest actions: verdicts, drops, changes, faults, output, switches; from the audit log.

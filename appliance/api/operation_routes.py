@@ -27,13 +27,13 @@ from appliance.channel.rest_meaning import BadTagError, NoOrderError, meant
 from appliance.channel.rest_operation import Operation, parameter_of, plain
 
 Q = TypeVar("Q", bound=AdminRequest[Any])
-DryRun = Annotated[bool, Query(description="only say what it would do; for operators, without If-Match")]
+DryRun = Annotated[bool, Query(description="only report the effect; for operators, without If-Match")]
 IfMatch = Annotated[
     str | None,
     Header(
         alias="If-Match",
         max_length=100,
-        description="The ETag of what the change is meant for, or `*` for whatever is in force.",
+        description="The ETag of the state that the change is for, or `*` for any state.",
     ),
 ]
 _CONVERTORS = {"{recording_id}": "{recording_id:recording}"}  # of Starlette
@@ -123,9 +123,8 @@ def _call(services: Services, operation: Operation, received: Mapping[str, Any])
     if not may(bearer.role, role):
         raise problem_of("forbidden", reason)
     if operation.is_change and operation.of is not None and if_match is None and not dry_run:
-        text = (
-            f"say which {operation.of.what} you have seen: If-Match with the ETag of GET {operation.of.where}"
-        )
+        seen = f"the ETag of the {operation.of.what} that you have seen"
+        text = f"If-Match is missing: send {seen}, from GET {operation.of.where}"
         raise ProblemError(428, "precondition-required", text)
     try:
         order = meant(bearer.asked or asked_of(request.scope, request.headers, b""), dry_run=dry_run)

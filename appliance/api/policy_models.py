@@ -6,11 +6,13 @@ import msgspec
 from fastapi import Path
 
 from appliance.api.problems import Finding
-from appliance.channel.answers.field_docs import Moment, told
+from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.rest_bodies import LONGEST_REVISION
 from appliance.policy.model import Category
 
-OneRevision = Annotated[int, Path(ge=1, le=LONGEST_REVISION, description="its number", examples=[1])]
+OneRevision = Annotated[
+    int, Path(ge=1, le=LONGEST_REVISION, description="number of the revision", examples=[1])
+]
 Decided = Literal["allow", "deny", "would deny"]
 
 
@@ -23,14 +25,14 @@ class Change(msgspec.Struct, frozen=True):
     resource: str
     now: Decided
     then: Decided
-    reason: Annotated[str, told("of the new policy")]
+    reason: Annotated[str, doc("of the new policy")]
 
 
 class Ended(msgspec.Struct, frozen=True):
     """Something live that the policy ends."""
 
     host: str
-    caller_id: Annotated[str, told("empty: a client that gave no name")]
+    caller_id: Annotated[str, doc("empty: the client gave no name")]
     what: Literal["publication", "subscription", "service", "call", "parameter"]
     resource: str
     reason: str
@@ -42,13 +44,13 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     loaded: bool
-    revision: Annotated[int, told("in force now")]
+    revision: Annotated[int, doc("in force now")]
     replaced: int | None = None
-    revoked: Annotated[int | None, told("registrations and connections that were taken back")] = None
+    revoked: Annotated[int | None, doc("number of registrations and connections that were revoked")] = None
     confirm_by: Moment | None = None
     warnings: list[Finding]
     changes: list[Change]
-    ends: Annotated[list[Ended], told("what is live and ends by it")]
+    ends: Annotated[list[Ended], doc("live registrations and connections that end with the change")]
 
 
 class RuleText(msgspec.Struct, frozen=True):
@@ -78,23 +80,22 @@ class Explained(msgspec.Struct, frozen=True, kw_only=True):
     decision: Decided
     rule: RuleText | None
     reason: str
-    told: Annotated[str | None, told("what the host is told of a denial ([Options] tell); null: allowed")]
-    through: Annotated[list[str], told("the words of the rule that mean the host")]
-    limit: Annotated[
-        str, told("how much of what is allowed may pass, and by which line of [Limits]; or empty")
-    ]
+    told: Annotated[str | None, doc("text of the answer to a denied host ([Options] tell); null: allowed")]
+    through: Annotated[list[str], doc("words of the rule that match the host")]
+    limit: Annotated[str, doc("the limit on allowed messages, and its line of [Limits]; empty: none")]
     lost: list[LostRule]
-    node: Annotated["Explained | None", told("the name that it gives, where a node is needed")]
+    node: Annotated["Explained | None", doc("the node name that the host gives, if the action needs a node")]
     command: Annotated[
-        "Explained | None", told("the command with which it is done: `lookupService`, `getParam`, `setParam`")
+        "Explained | None",
+        doc("the rule for the command that does it: `lookupService`, `getParam`, `setParam`"),
     ]
-    allowed: Annotated[bool, told("the answer to the whole call")]
+    allowed: Annotated[bool, doc("the decision on the whole call")]
 
 
 class Question(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A request to explain; `text`: under this policy instead of the one in force."""
 
-    host: Annotated[str, told("an address, or `robot`", min_length=1, max_length=100)]
+    host: Annotated[str, doc("an address, or `robot`", min_length=1, max_length=100)]
     node: Annotated[str, msgspec.Meta(max_length=256)] = ""
     category: Category
     resource: Annotated[str, msgspec.Meta(min_length=1, max_length=256)]

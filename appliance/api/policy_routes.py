@@ -17,7 +17,7 @@ from appliance.api.route_roles import Viewer, ask
 from appliance.api.routing import Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services
 from appliance.channel import admin
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.channel.rest_bodies import Text
 from appliance.policy.cases import CaseResult
@@ -57,7 +57,7 @@ class Tested(msgspec.Struct, frozen=True, kw_only=True):
     exists: bool
     passed: int
     failed: int
-    cases: Annotated[list[Case], told("those that failed first")]
+    cases: Annotated[list[Case], doc("failed cases first")]
 
 
 def routes(services: Services) -> Routes:
@@ -84,7 +84,10 @@ def routes(services: Services) -> Routes:
         category: Category,
         resource: Annotated[str, Query(min_length=1, max_length=256)],
         node: Annotated[
-            str, Query(max_length=256, description="the name it gives, where a node is needed")
+            str,
+            Query(
+                max_length=256, description="the node name that the host gives, if the action needs a node"
+            ),
         ] = "",
     ) -> Explained:
         """Why the policy in force decides a request as it does."""

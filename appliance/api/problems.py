@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from starlette.responses import Response
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import doc
 
 MEDIA_TYPE = "application/problem+json"
 REASON = "rosrv.reason"  # the key of a request's scope for the reason of its answer
@@ -27,17 +27,17 @@ class Finding(msgspec.Struct, frozen=True):
 class BadInput(msgspec.Struct, frozen=True):
     """One part of a request that makes no sense."""
 
-    where: Annotated[str, told("for example `query.limit` or `body.revision`")]
+    where: Annotated[str, doc("for example `query.limit` or `body.revision`")]
     text: str
 
 
 class Problem(msgspec.Struct, frozen=True, omit_defaults=True):
     """Problem details; `line` and `column` are those of the first finding."""
 
-    type: Annotated[str, told("stable name of the kind of problem: urn:rosrv:problem:…")]
+    type: Annotated[str, doc("stable name of the kind of problem: urn:rosrv:problem:…")]
     title: str
     status: int
-    detail: Annotated[str, told("what happened and what to do, for a person")]
+    detail: Annotated[str, doc("the cause and what to do, for a person")]
     line: int | None = None
     column: int | None = None
     findings: list[Finding] | None = None

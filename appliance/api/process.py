@@ -165,7 +165,7 @@ class _Api:
     def _give_up(self) -> None:
         self._without_control = None
         if not self._control.connected:
-            _log.error("no control for a long time: the api is started afresh")
+            _log.error("control was not connected for a long time: the api is restarted")
             self._stopping.set()
 
     def _say(self, message: messages.Message) -> None:

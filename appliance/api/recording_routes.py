@@ -41,7 +41,7 @@ _PIECE = 1 << 20
 _UNKNOWN: Responses = {404: {"description": "There is no such recording, or the flight recorder is off."}}
 _BAG = file("application/octet-stream", "The bag (rosbag, format 2.0), or MCAP (profile ros1)", binary=True)
 OneId = Annotated[
-    str, Path(pattern="^[0-9a-f]{20}$", description="of a recording", examples=["18ea0bb9b11c1024196c"])
+    str, Path(pattern="^[0-9a-f]{20}$", description="id of the recording", examples=["18ea0bb9b11c1024196c"])
 ]
 
 _Moment = Annotated[
@@ -49,7 +49,7 @@ _Moment = Annotated[
 ]
 _Topics = Annotated[
     list[Annotated[str, Query(max_length=500)]],
-    Query(max_length=20, description="of these alone; none: of all", examples=[["/scan"]]),
+    Query(max_length=20, description="only these topics; none: all topics", examples=[["/scan"]]),
 ]
 _Reading = Callable[[Recording, FilePath], _T]
 
@@ -84,7 +84,7 @@ def _add_bag(router: Routes, services: Services) -> None:
         recording_id: OneId,
         request: Request,
         bearer: Investigator,
-        format: Annotated[Literal["bag", "mcap"], Query(description="mcap: made of the bag")] = "bag",  # noqa: A002  its name in the contract
+        format: Annotated[Literal["bag", "mcap"], Query(description="mcap: converted from the bag")] = "bag",  # noqa: A002  its name in the contract
     ) -> Response:
         """Return the messages of a recording, for investigators; it is recorded who fetched them."""
         give_back = services.exports.take(bearer, peer_of(request), "exports")
@@ -121,7 +121,7 @@ def _add_reading(router: Routes, services: Services) -> None:
         since: _Moment = None,
         until: _Moment = None,
         columns: Annotated[
-            int, Query(ge=1, le=MOST_COLUMNS, description="parts that the time is divided into")
+            int, Query(ge=1, le=MOST_COLUMNS, description="number of columns that the time is divided into")
         ] = COLUMNS,
     ) -> Timeline:
         """Return the traffic of each topic of a recording, and the events, on one time line; without messages."""
@@ -140,13 +140,13 @@ def _add_reading(router: Routes, services: Services) -> None:
             str,
             Query(
                 max_length=64,
-                description="RFC 3339, or the place of a message",
+                description="RFC 3339, or the `place` of a message",
                 examples=["2026-03-01T12:00:00.5Z"],
             ),
         ],
         topic: _Topics = [],  # noqa: B006  FastAPI copies it
         neighbours: Annotated[
-            int, Query(ge=1, le=MOST_NEIGHBOURS, description="messages before, and after")
+            int, Query(ge=1, le=MOST_NEIGHBOURS, description="number of messages before, and after")
         ] = NEIGHBOURS,
     ) -> RecordedMessages:
         """Messages of a recording around a moment, read as fields, for investigators; it is recorded who read."""
@@ -180,7 +180,7 @@ def _bag_of(services: Services, recording_id: str) -> FilePath:
 
 
 def _gone(recording_id: str) -> ProblemError:
-    return ProblemError(503, "not-available", f"the bag of {recording_id} is not there any more")
+    return ProblemError(503, "not-available", f"the bag of {recording_id} no longer exists")
 
 
 def _moment(moment: str | int | None) -> int | None:

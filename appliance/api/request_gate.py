@@ -103,7 +103,9 @@ class RequestGate:
         except ProblemError as problem:
             await answer.fail(problem, receive)
         except (TimeoutError, ConnectionError) as error:
-            _log.info("a client was cut off", path=scope["path"], reason=str(error) or "it does not read")
+            _log.info(
+                "a client was cut off", path=scope["path"], reason=str(error) or "it does not read the answer"
+            )
             raise
         except Exception as error:  # noqa: BLE001  a defect in a route is one client's failure
             _log.exception("a REST call failed", path=scope["path"])
@@ -117,7 +119,7 @@ class RequestGate:
         rate = self._page_rate if is_console(scope["path"]) else self._rate
         wait = rate.take(host, time.monotonic())
         if wait:
-            raise too_many("too-many-requests", "too many requests of this host", wait)
+            raise too_many("too-many-requests", "too many requests from this host", wait)
         headers = Headers(scope=scope)
         self._check_host(headers)
         _check_origin(scope, headers)
@@ -154,7 +156,7 @@ class RequestGate:
             raise ProblemError(
                 421,
                 "wrong-host",
-                "the appliance is not called by this name: use its address, or add the name to api_names",
+                "the appliance does not answer to this host name: use its address, or add the name to api_names",
             )
 
 
@@ -256,7 +258,7 @@ def _is_address(name: str) -> bool:
 def _check_origin(scope: Scope, headers: Headers) -> None:
     origin = headers.get("origin")
     if origin is not None and origin.lower() != f"{scope['scheme']}://{headers['host']}".lower():
-        raise ProblemError(403, "foreign-origin", "requests that pages of other sites make are not served")
+        raise ProblemError(403, "foreign-origin", "requests from pages of other sites are not served")
 
 
 async def _read(headers: Headers, receive: Receive, limit: int) -> bytes:
@@ -282,6 +284,6 @@ async def _read(headers: Headers, receive: Receive, limit: int) -> bytes:
         raise ProblemError(
             408,
             "too-slow",
-            f"the body was not there within {_BODY_SECONDS:g} s",
+            f"the body did not arrive within {_BODY_SECONDS:g} s",
             headers={"Connection": "close"},
         ) from None

@@ -22,7 +22,7 @@ from appliance.base.validation_messages import body_refusal, meant
 
 A = TypeVar("A")
 Responses = dict[int | str, dict[str, Any]]
-ETAG = {"ETag": {"description": "what If-Match takes of the next change", "schema": {"type": "string"}}}
+ETAG = {"ETag": {"description": "the ETag for If-Match of the next change", "schema": {"type": "string"}}}
 _JSON = "application/json"
 _MOST_ERRORS = 50
 _PLACE = re.compile(r"(?s)(.*) - at `(?:key` in `)?\$(.*)`")
@@ -122,7 +122,7 @@ class _Body:
 
     def responses(self) -> Responses:
         """Return the contract's responses for bodies that are rejected."""
-        wrong: Responses = {422: {"description": "A parameter or the body makes no sense."}}
+        wrong: Responses = {422: {"description": "A parameter or the body is invalid."}}
         if self.text is not None:
             wrong[415] = {"description": "The body is neither text/plain nor JSON."}
         return wrong

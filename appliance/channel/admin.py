@@ -47,14 +47,14 @@ from appliance.channel.rest_operation import Operation, Versioned, parameter, re
 A = TypeVar("A")
 P = ParamSpec("P")
 
-POLICY = Versioned("policy", "/v1/policy", "Another policy is in force than If-Match names.")
+POLICY = Versioned("policy", "/v1/policy", "The policy in force is not the one that If-Match names.")
 MONITORS = Versioned(
     "monitors",
     "/v1/monitors",
-    "The monitors were changed, switched or resumed since they had the ETag of If-Match.",
+    "The monitors were changed, switched or resumed since the ETag in If-Match was read.",
     seconds=40.0,  # RVMaster compiles, and then the relay
 )
-HOSTS = Versioned("table of hosts", "/v1/hosts", "The table of hosts is another than If-Match names.")
+HOSTS = Versioned("table of hosts", "/v1/hosts", "The table of hosts is not the one that If-Match names.")
 
 _WITHIN = ("confirm_within",)
 _LOADED = (*_WITHIN, "force", "shadow")
@@ -64,29 +64,34 @@ _NO_RECORDING = {404: "There is no such recording, or the flight recorder is off
 _NO_HOST = {404: "There is no such host."}
 _CHARON_SECONDS = 45.0  # charon may have to be started first
 
-Revision = Annotated[int, parameter("its number", ge=1, le=bodies.LONGEST_REVISION, examples=[1])]
+Revision = Annotated[int, parameter("number of the revision", ge=1, le=bodies.LONGEST_REVISION, examples=[1])]
 Confirm = Annotated[
     float | None,
     parameter(
-        "seconds after which it goes back automatically unless confirmed",
+        "seconds after which the change is rolled back automatically unless confirmed",
         gt=0,
         le=86_400,
         allow_inf_nan=False,
     ),
 ]
-Force = Annotated[bool, parameter("also where that cuts a topic whose publisher has another type")]
-Shadow = Annotated[bool, parameter("the specifications come into force in shadow mode")]
-OneMonitor = Annotated[str, parameter("of a monitor", min_length=1, max_length=256, examples=["censor"])]
+Force = Annotated[bool, parameter("load even if this cuts a topic whose publisher has another type")]
+Shadow = Annotated[bool, parameter("load the specifications in shadow mode")]
+OneMonitor = Annotated[
+    str, parameter("name of the monitor", min_length=1, max_length=256, examples=["censor"])
+]
 SomeMonitors = Annotated[list[OneMonitor], parameter(name="name", min_length=1, max_length=1000)]
 RecordingId = Annotated[
     str,
     parameter(
-        "of a recording", name="recording_id", pattern="^[0-9a-f]{20}$", examples=["18ea0bb9b11c1024196c"]
+        "id of the recording",
+        name="recording_id",
+        pattern="^[0-9a-f]{20}$",
+        examples=["18ea0bb9b11c1024196c"],
     ),
 ]
 OneHost = Annotated[
     str,
-    parameter("of a host", min_length=1, max_length=63, pattern=bodies.HOST_NAME, examples=["ocu-1"]),
+    parameter("name of the host", min_length=1, max_length=63, pattern=bodies.HOST_NAME, examples=["ocu-1"]),
 ]
 
 
@@ -218,12 +223,12 @@ class GraphWanted(AdminRequest[graph_answers.Graph], frozen=True, tag="graph"):
 class TopicLook(WaitingRequest[graph_answers.TopicMessages], frozen=True, tag="topic look"):
     """The next messages of a topic as subscribers get them, read as fields. It is recorded who looked."""
 
-    topic: Annotated[str, parameter("its name", max_length=500, examples=["/scan"])]
-    messages: Annotated[int, parameter("how many at most", ge=1, le=20)] = 1
-    seconds: Annotated[float, parameter("how long they are waited for", gt=0, le=10)] = 2.0
-    latched: Annotated[bool, parameter("a latched message first; false for whoever looks on and has it")] = (
-        True
-    )
+    topic: Annotated[str, parameter("name of the topic", max_length=500, examples=["/scan"])]
+    messages: Annotated[int, parameter("maximum number of messages", ge=1, le=20)] = 1
+    seconds: Annotated[float, parameter("how long to wait for messages, in seconds", gt=0, le=10)] = 2.0
+    latched: Annotated[
+        bool, parameter("send a latched message first; false if the client already has it")
+    ] = True
 
 
 @rest(None)
@@ -235,7 +240,7 @@ class MetricsWanted(AdminRequest[measures.Measures], frozen=True, tag="metrics")
 class MonitorsWanted(AdminRequest[monitor_answers.Monitors], frozen=True, tag="monitors"):
     """All monitors with state and counters, and whether they are equal to the files of the folder."""
 
-    texts: Annotated[bool, parameter("with the texts of the specifications")] = False
+    texts: Annotated[bool, parameter("include the texts of the specifications")] = False
 
 
 @rest(
@@ -294,13 +299,13 @@ class MonitorReplace(AdminRequest[monitor_answers.Replacement], frozen=True, tag
 
 @rest(
     "operator", "POST", "/v1/monitors/reload", ("prune", *_LOADED), name="reload_monitors", of=MONITORS,
-    admin_with={"prune": "removing what the folder does not have"},
+    admin_with={"prune": "removing files that the folder does not have"},
 )  # fmt: skip
 class MonitorReload(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor reload"):
     """Take what the folder has now; what it does not have stays, unless an admin says `prune`."""
 
     expected: str | None = None
-    prune: Annotated[bool, parameter("also remove what the folder does not have")] = False
+    prune: Annotated[bool, parameter("also remove files that the folder does not have")] = False
     confirm_within: Confirm = None
     force: Force = False
     shadow: Shadow = False
@@ -425,7 +430,7 @@ class RecordingWanted(WaitingRequest[recording_answers.Recording], frozen=True, 
 
 @rest(
     "operator", "POST", "/v1/recordings", name="record_now", body=bodies.NewRecording, status=201,
-    good="It is being made.", problems=_NO_RECORDING,
+    good="The recording is being made.", problems=_NO_RECORDING,
 )  # fmt: skip
 class RecordNow(WaitingRequest[recording_answers.RecordingBegun], frozen=True, tag="record now"):
     """Record the last seconds, and the next ones, of what the robot says."""
@@ -483,7 +488,7 @@ class TokenList(AdminRequest[token_answers.Tokens], frozen=True, tag="token list
 
 @rest(
     "admin", "DELETE", "/v1/tokens/{name}", name="revoke_token",
-    problems={422: "There is no token of this name that can be used."},
+    problems={422: "There is no valid token of this name."},
 )  # fmt: skip
 class TokenRevoke(AdminRequest[token_answers.Token], frozen=True, tag="token revoke"):
     """End a token now: from then on it is answered with 401, and open streams of its holder end. For admins."""
@@ -609,7 +614,10 @@ class HostPorts(AdminRequest[host_answers.PortsReport], frozen=True, tag="host p
     """Tell whether the ROS ports of a host are closed, as `rosrv protect --check` saw it from outside."""
 
     name: Annotated[
-        str, parameter("of a host, or a machine's address", min_length=1, max_length=63, examples=["ocu-1"])
+        str,
+        parameter(
+            "name of the host, or a machine's address", min_length=1, max_length=63, examples=["ocu-1"]
+        ),
     ]
     state: Literal["closed", "open", "unknown"]
     open: list[int] = []

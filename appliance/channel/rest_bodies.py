@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.host_answers import PortsState
 
 HOST_NAME = r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?$"
@@ -19,7 +19,7 @@ LONGEST_REVISION = 10**15
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
 Signature = Annotated[
     str,
-    told("of the site, where it asks for one: what `rosrv sign FILE` writes to FILE.sig", max_length=8192),
+    doc("the site's signature, where required: what `rosrv sign FILE` writes to FILE.sig", max_length=8192),
 ]
 MonitorName = Annotated[str, msgspec.Meta(min_length=1, max_length=256)]
 FileName = Annotated[
@@ -32,15 +32,16 @@ Definition = Annotated[
 FileText = Annotated[str, msgspec.Meta(max_length=1 << 20)]
 Definitions = Annotated[
     dict[Definition, FileText],
-    told(
-        "definitions of messages and services that ROS does not ship, by `package/Type.msg`", max_length=1000
+    doc(
+        "definitions of message and service types that ROS does not ship, by `package/Type.msg`",
+        max_length=1000,
     ),
 ]
-Note = Annotated[str, told("kept with the revision: why", max_length=200)]
+Note = Annotated[str, doc("reason for the change, stored with the revision", max_length=200)]
 Signatures = Annotated[
-    dict[MonitorName, Signature], told("by the names of files and definitions", max_length=2000)
+    dict[MonitorName, Signature], doc("signatures by the names of files and definitions", max_length=2000)
 ]
-HostName = Annotated[str, told("`host:NAME` in the policy", pattern=HOST_NAME + WHOLE)]
+HostName = Annotated[str, doc("name of the host, `host:NAME` in the policy", pattern=HOST_NAME + WHOLE)]
 Endpoint = Annotated[str, msgspec.Meta(pattern=ENDPOINT + WHOLE)]
 Service = Annotated[str, msgspec.Meta(pattern=SERVICE + WHOLE)]
 Address = Annotated[str, msgspec.Meta(max_length=64)]
@@ -48,12 +49,12 @@ Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
 GivenMoment = (
     Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)] | Annotated[str, msgspec.Meta(max_length=64)]
 )
-Days = Annotated[float, told("until the certificate ends", gt=0, le=LONGEST_DAYS)]
+Days = Annotated[float, doc("until the certificate ends", gt=0, le=LONGEST_DAYS)]
 TokenSeconds = Annotated[float, msgspec.Meta(ge=60, le=LONGEST_TOKEN_SECONDS)]
-SigningRequest = Annotated[str, told("PKCS #10, in PEM", min_length=1, max_length=LONGEST_REQUEST)]
+SigningRequest = Annotated[str, doc("PKCS #10, in PEM", min_length=1, max_length=LONGEST_REQUEST)]
 GivenNanoMoment = Annotated[
     Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)] | Annotated[str, msgspec.Meta(max_length=64)] | None,
-    told("RFC 3339, or nanoseconds since the epoch"),
+    doc("RFC 3339, or nanoseconds since the epoch"),
 ]
 
 
@@ -61,7 +62,7 @@ class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A new policy."""
 
     text: Text
-    note: Annotated[str, told("kept with the revision: why", max_length=200)] = ""
+    note: Annotated[str, doc("reason for the change, stored with the revision", max_length=200)] = ""
     signature: Signature = ""
 
 
@@ -75,7 +76,7 @@ class NewSpecifications(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     """Specifications to add, or to put in the place of those in files of the same name."""
 
     files: Annotated[
-        dict[FileName, FileText], told("texts by the name of the file", min_length=1, max_length=1000)
+        dict[FileName, FileText], doc("texts by the name of the file", min_length=1, max_length=1000)
     ]
     definitions: Definitions = {}
     note: Note = ""
@@ -89,7 +90,7 @@ class NewText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     definitions: Definitions = {}
     note: Note = ""
     signature: Signature = ""
-    signatures: Annotated[Signatures, told("of the definitions")] = {}
+    signatures: Annotated[Signatures, doc("signatures of the definitions")] = {}
 
 
 class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -98,14 +99,16 @@ class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     enabled: bool | None = None
     for_seconds: Annotated[
         Annotated[float, msgspec.Meta(gt=0, le=2_592_000)] | None,
-        told("with `enabled` false: enable it again by itself after this time"),
+        doc("with `enabled` false: enable it again automatically after this time"),
     ] = None
-    held: Annotated[bool | None, told("false: let its topics go on")] = None
+    held: Annotated[bool | None, doc("false: resume its topics")] = None
     shadow: Annotated[
         bool | None,
-        told("true: shadow mode, it only records what it would have done; false: from there into force"),
+        doc(
+            "true: put it into shadow mode, where its would-be actions are only recorded; false: end shadow mode"
+        ),
     ] = None
-    trial: Annotated[bool | None, told("the same as `shadow`; deprecated")] = None
+    trial: Annotated[bool | None, doc("the same as `shadow`; deprecated")] = None
 
     def __post_init__(self) -> None:
         """Raises `ValueError`."""
@@ -124,8 +127,8 @@ class SwitchMany(Switch, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The wanted recording: seconds before and after now (null: as configured), and why."""
 
-    before: Annotated[Annotated[float, msgspec.Meta(ge=0)] | None, told("seconds")] = None
-    after: Annotated[Annotated[float, msgspec.Meta(gt=0)] | None, told("seconds")] = None
+    before: Annotated[Annotated[float, msgspec.Meta(ge=0)] | None, doc("seconds")] = None
+    after: Annotated[Annotated[float, msgspec.Meta(gt=0)] | None, doc("seconds")] = None
     note: Annotated[str, msgspec.Meta(max_length=300)] = ""
 
 
@@ -141,23 +144,23 @@ class KitWishes(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     endpoint: Annotated[
         Endpoint | None,
-        told(
+        doc(
             "address or name at which the host reaches the appliance; null: `ipsec.endpoint` of the configuration, else"
-            " the machine's address towards its default route (422 when that cannot be told)"
+            " the machine's address towards its default route (422 if it has none)"
         ),
     ] = None
     ports: Annotated[
-        str, told("the host's local port range, which its firewall closes", pattern=PORTS + WHOLE)
+        str, doc("the host's local port range, which its firewall closes", pattern=PORTS + WHOLE)
     ] = "32768-60999"
     open: Annotated[
-        list[Service], told("services of the host that stay open, such as tcp/22", max_length=100)
+        list[Service], doc("the host's services that stay open, such as tcp/22", max_length=100)
     ] = []
 
 
 class TokenWishes(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A one-time token for a host, new or enrolled before."""
 
-    address: Annotated[Address | None, told("its virtual address; null: the next free one")] = None
+    address: Annotated[Address | None, doc("its virtual address; null: the next free one")] = None
     days: Days = 90
     token_seconds: TokenSeconds = 3600
 
@@ -168,14 +171,14 @@ class NewHost(TokenWishes, frozen=True, kw_only=True, forbid_unknown_fields=True
     name: HostName
     how: Annotated[
         Literal["token", "kit"],
-        told(
-            "token: the host makes its own key and brings a one-time token (POST /v1/enrol); kit: an archive with a"
-            " private key in it, to be carried there"
+        doc(
+            "token: the host makes its own key and presents a one-time token (POST /v1/enrol); kit: an archive with a"
+            " private key in it, to be copied to the host"
         ),
     ] = "token"
     request: Annotated[
         SigningRequest | None,
-        told("with how=kit: of a key that the host has; the kit has no private key then"),
+        doc("with how=kit: signing request for the host's own key; the kit then has no private key"),
     ] = None
 
 
@@ -191,4 +194,4 @@ class PortsTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     state: PortsState
     open: Annotated[list[Port], msgspec.Meta(max_length=100)] = []
-    checked: Annotated[GivenMoment | None, told("RFC 3339, or seconds since the epoch; null: now")] = None
+    checked: Annotated[GivenMoment | None, doc("RFC 3339, or seconds since the epoch; null: now")] = None

@@ -52,7 +52,7 @@ def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
     """Return the order that a request means, or, for a `dry_run`, would mean. Raises `NoOrderError`."""
     path, _mark, text = asked.target.partition("?")
     if is_dry_run(text) is not dry_run:
-        raise NoOrderError("a dry run orders nothing")
+        raise NoOrderError("a dry run changes nothing")
     parts = [unquote(part) for part in path.split("/")]
     try:
         query = parse_qs(text, keep_blank_values=True)
@@ -65,8 +65,8 @@ def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
     except NoOrderError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise NoOrderError(f"the request makes no sense: {type(error).__name__}") from None
-    raise NoOrderError("no order is given there")
+        raise NoOrderError(f"the request is invalid: {type(error).__name__}") from None
+    raise NoOrderError("this path takes no orders")
 
 
 def filled_in(order: AdminRequest[Any], given: AdminRequest[Any]) -> AdminRequest[Any]:
@@ -169,7 +169,7 @@ def _body(asked: ClientRequest) -> dict[str, Any]:
         return {"text": asked.body.decode("utf-8")}
     body = json.loads(asked.body) if asked.body else {}
     if not isinstance(body, dict):
-        raise NoOrderError("the body is no object")
+        raise NoOrderError("the body is not an object")
     return body
 
 
@@ -183,6 +183,6 @@ def _tag(operation: Operation, if_match: str) -> str | None:
     numbered = plain(operation.fields()["expected"].type) is int
     if found is None or (numbered and not _REVISION.fullmatch(found[1])):
         raise BadTagError(
-            f'{if_match[:80]!r} is not an ETag of {operation.of.where}: give the one that GET answers, as in "7"'
+            f'{if_match[:80]!r} is not an ETag of {operation.of.where}: send the one that GET returns, as in "7"'
         )
     return found[1]

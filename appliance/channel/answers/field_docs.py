@@ -8,13 +8,13 @@ UNIT = "x-epoch"
 """The key of a moment's unit in its schema."""
 
 
-def told(description: str, **bounds: Any) -> msgspec.Meta:
+def doc(description: str, **bounds: Any) -> msgspec.Meta:
     """Return the contract's description of a field, and its bounds."""
     return msgspec.Meta(description=description, **bounds)
 
 
-Moment = Annotated[float, told("seconds since the epoch", extra_json_schema={UNIT: "seconds"})]
+Moment = Annotated[float, doc("seconds since the epoch", extra_json_schema={UNIT: "seconds"})]
 """A moment, as answers have it."""
 
-NanoMoment = Annotated[int, told("nanoseconds since the epoch", extra_json_schema={UNIT: "nanoseconds"})]
+NanoMoment = Annotated[int, doc("nanoseconds since the epoch", extra_json_schema={UNIT: "nanoseconds"})]
 """A moment of a message, for whom the digits of a float are too few."""

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import NanoMoment, told
+from appliance.channel.answers.field_docs import NanoMoment, doc
 
 
 class Node(msgspec.Struct, frozen=True):
@@ -23,11 +23,11 @@ class Flow(msgspec.Struct, frozen=True, kw_only=True):
 
     messages: int
     bytes: int
-    dropped: Annotated[int, told("messages that slow subscribers did not get")]
+    dropped: Annotated[int, doc("messages dropped for slow subscribers")]
     messages_per_second: float
     bytes_per_second: float
     delay_seconds: Annotated[
-        float, told("that the relay added to a message of the last second, on average; of services 0")
+        float, doc("average delay that the relay added to the messages of the last second; 0 for services")
     ]
 
 
@@ -76,17 +76,17 @@ class Graph(msgspec.Struct, frozen=True):
 class TopicMessage(msgspec.Struct, frozen=True):
     """A message of a topic as subscribers get it, after the monitors."""
 
-    time: Annotated[NanoMoment, told("when the relay passed it on, nanoseconds since the epoch")]
-    node: Annotated[str, told("that published it")]
-    size: Annotated[int, told("bytes, without those of its length")]
+    time: Annotated[NanoMoment, doc("when the relay sent it, nanoseconds since the epoch")]
+    node: Annotated[str, doc("the node that published it")]
+    size: Annotated[int, doc("bytes, without the length prefix")]
     fields: Annotated[
         dict[str, Any],
-        told(
-            "by name; what is left out of long values is counted (`… 344 more`), bytes are hexadecimal, NaN and"
+        doc(
+            "by name; long values are cut and the rest is counted (`… 344 more`), bytes are hexadecimal, NaN and"
             " infinity are strings"
         ),
     ]
-    why: Annotated[str, told("why there are no fields but the first bytes; else empty")]
+    why: Annotated[str, doc("why only the first bytes are shown instead of the fields; else empty")]
 
 
 class TopicMessages(msgspec.Struct, frozen=True):

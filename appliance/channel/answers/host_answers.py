@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, told
+from appliance.channel.answers.field_docs import Moment, doc
 
 PortsState = Literal["closed", "open", "unknown"]
 State = Literal["up", "down", "expired", "revoked", "not wanted", "awaited", "not enrolled"]
@@ -14,9 +14,9 @@ class PortsSeen(msgspec.Struct, frozen=True):
     """Whether a machine's ROS ports are closed to all but the appliance, as probed from another host."""
 
     state: PortsState
-    checked: Annotated[Moment | None, told("null: never")]
-    open: Annotated[list[int], told("TCP ports that accepted a connection, the first hundred")]
-    who: Annotated[str, told("the token by which it was told, or `operator`; empty: never tried")]
+    checked: Annotated[Moment | None, doc("null: never")]
+    open: Annotated[list[int], doc("TCP ports that accepted a connection, the first hundred")]
+    who: Annotated[str, doc("name of the token that reported it, or `operator`; empty: never checked")]
 
 
 class Host(msgspec.Struct, frozen=True):
@@ -26,24 +26,24 @@ class Host(msgspec.Struct, frozen=True):
     """
 
     name: str
-    address: Annotated[str | None, told("its virtual address, which it keeps for good")]
+    address: Annotated[str | None, doc("its permanent virtual address")]
     state: State
-    groups: Annotated[list[str], told("of hosts.yaml")]
-    declared: Annotated[bool, told("it is in hosts.yaml")]
-    wanted: Annotated[bool, told("hosts.yaml wants its tunnel, or does not know it")]
-    divergence: Annotated[str | None, told("what is different from hosts.yaml, in a sentence")]
-    serial: Annotated[str | None, told("of its certificate, in hexadecimal")]
+    groups: Annotated[list[str], doc("its groups in hosts.yaml")]
+    declared: Annotated[bool, doc("it is in hosts.yaml")]
+    wanted: Annotated[bool, doc("hosts.yaml allows its tunnel, or does not list the host")]
+    divergence: Annotated[str | None, doc("the difference from hosts.yaml, in a sentence")]
+    serial: Annotated[str | None, doc("serial number of its certificate, in hexadecimal")]
     enrolled: Moment | None
-    expires: Annotated[Moment | None, told("the end of its certificate")]
-    expires_soon: Annotated[bool, told("within 14 days, or a third of its life if that is shorter")]
-    renewing: Annotated[bool, told("it has a newer certificate that it has not put in place yet")]
+    expires: Annotated[Moment | None, doc("the end of its certificate")]
+    expires_soon: Annotated[bool, doc("within 14 days, or a third of its life if that is shorter")]
+    renewing: Annotated[bool, doc("it has a newer certificate that it has not installed yet")]
     revoked: Moment | None
-    remote: Annotated[str | None, told("where it really is; null: no tunnel")]
-    seconds: Annotated[int | None, told("age of the SA")]
+    remote: Annotated[str | None, doc("its real address; null: no tunnel")]
+    seconds: Annotated[int | None, doc("age of the SA")]
     bytes_in: int | None
     bytes_out: int | None
-    last_seen: Annotated[Moment | None, told("when something last came through its tunnel")]
-    token_expires: Annotated[Moment | None, told("until when its one-time token can be used; null: none")]
+    last_seen: Annotated[Moment | None, doc("when a packet last arrived through its tunnel")]
+    token_expires: Annotated[Moment | None, doc("when its one-time token expires; null: none")]
     ports: PortsSeen
 
 
@@ -58,16 +58,18 @@ class Machine(msgspec.Struct, frozen=True):
 class Hosts(msgspec.Struct, frozen=True):
     """All hosts, and how the tunnels stand."""
 
-    revision: Annotated[int, told("the number in the ETag")]
+    revision: Annotated[int, doc("the number in the ETag")]
     hosts: list[Host]
-    machines: Annotated[list[Machine], told("machines of nodes without a tunnel")]
-    esp: Annotated[Literal["kernel", "user space"] | None, told("where ESP runs; null: no tunnels are open")]
-    key_exchange: Annotated[list[str], told("offered and accepted, the best first; empty: not known yet")]
-    post_quantum: Annotated[bool | None, told("whether ML-KEM is among them; null: not known yet")]
+    machines: Annotated[list[Machine], doc("machines of nodes without a tunnel")]
+    esp: Annotated[Literal["kernel", "user space"] | None, doc("where ESP runs; null: no tunnels are open")]
+    key_exchange: Annotated[
+        list[str], doc("key exchanges offered and accepted, the best first; empty: not known yet")
+    ]
+    post_quantum: Annotated[bool | None, doc("whether ML-KEM is among them; null: not known yet")]
     pool: str
-    address: Annotated[str, told("the appliance's own in the tunnels")]
+    address: Annotated[str, doc("the appliance's own address in the tunnels")]
     hosts_file: str
-    troubles: Annotated[list[str], told("what a person should look at")]
+    troubles: Annotated[list[str], doc("problems that need a person's attention")]
 
 
 class KitParts(msgspec.Struct, frozen=True, kw_only=True):
@@ -96,19 +98,17 @@ class KitParts(msgspec.Struct, frozen=True, kw_only=True):
 class EnrolmentToken(msgspec.Struct, frozen=True, kw_only=True):
     """A one-time token: shown this once."""
 
-    revision: Annotated[int, told("of the table of hosts, the number in the ETag")]
+    revision: Annotated[int, doc("revision of the table of hosts, the number in the ETag")]
     name: str
-    address: Annotated[str, told("the virtual address that is kept for it")]
+    address: Annotated[str, doc("the virtual address that is reserved for the host")]
     token: str
     expires: Moment
-    endpoint: Annotated[str, told("address or name at which the host reaches the appliance")]
-    endpoint_reason: Annotated[str, told("why this one, where none was given; else empty")]
-    url: Annotated[str, told("where the host brings it: POST /v1/enrol there")]
-    pin: Annotated[str, told("of the key of that server, as curl's --pinnedpubkey takes it")]
-    authority: Annotated[str, told("SHA-256 of the authority's certificate, in hexadecimal")]
-    script: Annotated[
-        str, told("join.sh: makes the key on the host, enrols it, starts and checks the tunnel")
-    ]
+    endpoint: Annotated[str, doc("address or name at which the host reaches the appliance")]
+    endpoint_reason: Annotated[str, doc("why this endpoint was chosen if none was given; else empty")]
+    url: Annotated[str, doc("URL where the host presents the token (POST /v1/enrol)")]
+    pin: Annotated[str, doc("pin of that server's key, as curl's --pinnedpubkey takes it")]
+    authority: Annotated[str, doc("SHA-256 of the authority's certificate, in hexadecimal")]
+    script: Annotated[str, doc("join.sh: makes the key on the host, enrols it, starts and checks the tunnel")]
 
 
 class Renewed(msgspec.Struct, frozen=True):
@@ -134,7 +134,7 @@ class Revoked(msgspec.Struct, frozen=True):
     name: str
     address: str
     serial: str
-    taken_back: Annotated[int, told("registrations and grants")]
+    taken_back: Annotated[int, doc("revoked registrations and grants")]
 
 
 class PortsReport(msgspec.Struct, frozen=True):
@@ -150,8 +150,8 @@ class Reloaded(msgspec.Struct, frozen=True):
 
     revision: int
     declared: list[str]
-    opened: Annotated[list[str], told("hosts whose tunnel is wanted again")]
-    closed: Annotated[list[str], told("hosts whose tunnel is no longer wanted")]
+    opened: Annotated[list[str], doc("hosts whose tunnel is allowed again")]
+    closed: Annotated[list[str], doc("hosts whose tunnel is no longer allowed")]
     divergence: list[str]
 
 

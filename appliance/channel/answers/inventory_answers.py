@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import doc
 
 
 class Part(msgspec.Struct, frozen=True):
@@ -13,17 +13,17 @@ class Part(msgspec.Struct, frozen=True):
     kind: Literal["python", "debian"]
     name: str
     version: str
-    licences: Annotated[list[str], told("as its maker names them; empty: it does not say")]
+    licences: Annotated[list[str], doc("as the package names them; empty: not stated")]
 
 
 class InUse(msgspec.Struct, frozen=True):
     """The kernel features that the running appliance uses."""
 
-    firewall: Annotated[str | None, told("the back end; null: this isolation has none")]
-    esp: Annotated[Literal["kernel", "user space"] | None, told("where ESP runs; null: no tunnels are open")]
-    sandbox: Annotated[dict[str, str], told("by process: limits of its system calls, files and ports")]
-    lacks: Annotated[list[str], told("the parts of the sandbox that this kernel lacks")]
-    walls: Annotated[dict[str, str], told("the same as `sandbox`; deprecated")] = {}
+    firewall: Annotated[str | None, doc("the back end; null: this isolation has none")]
+    esp: Annotated[Literal["kernel", "user space"] | None, doc("where ESP runs; null: no tunnels are open")]
+    sandbox: Annotated[dict[str, str], doc("by process: limits of its system calls, files and ports")]
+    lacks: Annotated[list[str], doc("parts of the sandbox that this kernel does not support")]
+    walls: Annotated[dict[str, str], doc("the same as `sandbox`; deprecated")] = {}
 
 
 class Inventory(msgspec.Struct, frozen=True):
@@ -32,15 +32,17 @@ class Inventory(msgspec.Struct, frozen=True):
     version: str
     build: Annotated[
         dict[str, str] | None,
-        told("of a package or an image: kind, commit, moment; null: a checkout or a wheel, which have none"),
+        doc(
+            "kind, commit and time of a package's or image's build; null: a checkout or a wheel, which have none"
+        ),
     ]
     python: str
     system: str
-    kernel: Annotated[str, told("its release")]
+    kernel: Annotated[str, doc("its release")]
     machine: str
     parts: list[Part]
     parts_list: Annotated[
         str | None,
-        told("SHA-256 of the list of all parts (CycloneDX) that an image has; null: there is none"),
+        doc("SHA-256 of the list of all parts (CycloneDX) that an image has; null: there is none"),
     ]
-    in_use: Annotated[InUse | None, told("null: nothing that runs was asked")] = None
+    in_use: Annotated[InUse | None, doc("null: no running appliance was queried")] = None

@@ -4,13 +4,11 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, told
+from appliance.channel.answers.field_docs import Moment, doc
 
 Tag = Annotated[
     str,
-    told(
-        "another after every change, switch and resumption; in quotes it is the ETag, and what If-Match takes"
-    ),
+    doc("changes with every load, switch and resumption; in quotes it is the ETag, which If-Match takes"),
 ]
 RvState = tuple[int, int, list[tuple[str, str, int, int]]]
 
@@ -19,9 +17,9 @@ class MonitorState(msgspec.Struct, frozen=True):
     """A running monitor; counters since it was loaded or its relay began."""
 
     name: str
-    file: Annotated[str, told("the specification file it stands in; a file may have several monitors")]
-    enabled: Annotated[bool, told("what it does is done; false while it is in shadow mode")]
-    held: Annotated[bool, told("blocks its topics until it is resumed")]
+    file: Annotated[str, doc("the specification file that defines it; a file may have several monitors")]
+    enabled: Annotated[bool, doc("its actions take effect; false while it is in shadow mode")]
+    held: Annotated[bool, doc("blocks its topics until it is resumed")]
     failing: bool
     topics: list[str]
     services: list[str]
@@ -32,26 +30,22 @@ class MonitorState(msgspec.Struct, frozen=True):
     faults: int
     certificates: Annotated[
         list[str],
-        told("of each property: whether its automaton was proved to be what is written, or why not"),
+        doc("for each property: whether its automaton is proved equal to the formula, or why not"),
     ]
-    trial: Annotated[bool, told("the same as `shadow`; deprecated")] = False
-    would_drop: Annotated[int, told("messages that it would have dropped since it is in shadow mode")] = 0
-    would_change: Annotated[int, told("the same of changes")] = 0
+    trial: Annotated[bool, doc("the same as `shadow`; deprecated")] = False
+    would_drop: Annotated[int, doc("messages that it would have dropped since shadow mode began")] = 0
+    would_change: Annotated[int, doc("messages that it would have changed since shadow mode began")] = 0
     missed: Annotated[
         int,
-        told("messages that it was not given in shadow mode, or not to the end: its counts are not complete"),
+        doc("messages that it did not get, or did not finish, in shadow mode: its counts are incomplete"),
     ] = 0
-    slices: Annotated[
-        int, told("bindings of its parameters that are monitored now; 0 of one without parameters")
-    ] = 0
-    slice_limit: Annotated[int, told("at most so many at a time; 0 of one without parameters")] = 0
-    why_held: Annotated[str, told("why its state was lost, if it holds its topics for that")] = ""
+    slices: Annotated[int, doc("bindings of its parameters that are monitored now; 0 without parameters")] = 0
+    slice_limit: Annotated[int, doc("maximum number of slices at a time; 0 without parameters")] = 0
+    why_held: Annotated[str, doc("why its state was lost, if it holds its topics because of that")] = ""
     shadow: Annotated[
-        bool, told("in shadow mode: given copies of messages, to record what it would have done")
+        bool, doc("in shadow mode: it gets copies of messages, and its would-be actions are recorded")
     ] = False
-    off_until: Annotated[Moment | None, told("disabled, and enabled again by itself then; null: no end")] = (
-        None
-    )
+    off_until: Annotated[Moment | None, doc("when it is enabled again automatically; null: no end")] = None
 
 
 class Monitors(msgspec.Struct, frozen=True):
@@ -62,19 +56,26 @@ class Monitors(msgspec.Struct, frozen=True):
     who: str
     note: str
     loaded: Moment
-    confirm_by: Annotated[Moment | None, told("when it goes back automatically unless confirmed")]
-    folder: Annotated[str | None, told("what `reload` reads; null: no folder was given at start")]
+    confirm_by: Annotated[Moment | None, doc("when it is rolled back automatically unless confirmed")]
+    folder: Annotated[str | None, doc("the folder that `reload` reads; null: no folder was given at start")]
     differs_from_folder: bool
     warnings: list[str]
-    refused: Annotated[list[str], told("why the relay does not take them: everything is blocked then")]
-    rv_state: Annotated[
-        RvState, told("ROSRV's `getRVState`: ROSMaster's port, RVMaster's, and where topics are carried")
+    refused: Annotated[
+        list[str], doc("why the relay rejects the specifications: all topics are blocked then")
     ]
-    site_keys: Annotated[list[str], told("with any, one of them must have signed what is loaded")]
-    monitors: Annotated[list[MonitorState], told("in the order in which they see messages")]
-    files: Annotated[dict[str, str] | None, told("with `texts=1`: specifications by file name")] = None
-    definitions: Annotated[dict[str, str] | None, told("with `texts=1`: those that came with them")] = None
-    signatures: Annotated[dict[str, str] | None, told("with `texts=1`: the site's, by the same names")] = None
+    rv_state: Annotated[
+        RvState,
+        doc("ROSRV's `getRVState`: ports of the ROS master and of RVMaster, and the addresses of topics"),
+    ]
+    site_keys: Annotated[list[str], doc("if there are any, one of them must have signed what is loaded")]
+    monitors: Annotated[list[MonitorState], doc("in the order in which they see messages")]
+    files: Annotated[dict[str, str] | None, doc("with `texts=1`: specifications by file name")] = None
+    definitions: Annotated[
+        dict[str, str] | None, doc("with `texts=1`: type definitions that were loaded with them")
+    ] = None
+    signatures: Annotated[
+        dict[str, str] | None, doc("with `texts=1`: the site's signatures, by the same names")
+    ] = None
 
 
 class Tried(msgspec.Struct, frozen=True):
@@ -128,7 +129,7 @@ class MonitorRevision(msgspec.Struct, frozen=True):
     who: str
     note: str
     in_force: bool
-    names: Annotated[list[str], told("of its files")]
+    names: Annotated[list[str], doc("names of its files")]
 
 
 class MonitorRevisionList(msgspec.Struct, frozen=True):
@@ -140,9 +141,9 @@ class MonitorRevisionList(msgspec.Struct, frozen=True):
 class RevisionTexts(MonitorRevision, frozen=True):
     """A kept revision with its texts."""
 
-    files: Annotated[dict[str, str], told("specifications by file name")]
-    definitions: Annotated[dict[str, str], told("those that came with them")]
-    signatures: Annotated[dict[str, str], told("the site's, by the names of files and definitions")]
+    files: Annotated[dict[str, str], doc("specifications by file name")]
+    definitions: Annotated[dict[str, str], doc("type definitions that were loaded with them")]
+    signatures: Annotated[dict[str, str], doc("the site's signatures, by the names of files and definitions")]
 
 
 class Switched(msgspec.Struct, frozen=True):
@@ -152,5 +153,5 @@ class Switched(msgspec.Struct, frozen=True):
     revision: int
     tag: Tag
     began: Annotated[
-        list[str], told("of those that are in shadow mode now or were: which are in their initial state")
+        list[str], doc("monitors that entered or left shadow mode and are in their initial state")
     ] = []

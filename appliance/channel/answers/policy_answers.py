@@ -4,7 +4,7 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, told
+from appliance.channel.answers.field_docs import Moment, doc
 
 
 class PolicyRevision(msgspec.Struct, frozen=True):
@@ -34,11 +34,11 @@ class RevisionText(PolicyRevision, frozen=True):
 class PolicyInForce(RevisionText, frozen=True):
     """The policy in force. It rolls back at `confirm_by` (seconds since the epoch) unless confirmed."""
 
-    policy_file: Annotated[str, told("what `reload` reads")]
+    policy_file: Annotated[str, doc("the file that `reload` reads")]
     differs_from_file: bool
     warnings: list[str]
     confirm_by: Moment | None
-    site_keys: Annotated[list[str], told("with any, one of them must have signed what is loaded")]
+    site_keys: Annotated[list[str], doc("if there are any, one of them must have signed what is loaded")]
 
 
 class PolicyKnown(PolicyInForce, frozen=True):
@@ -61,8 +61,8 @@ class Loaded(msgspec.Struct, frozen=True):
     revision: int
     replaced: int
     warnings: list[str]
-    revoked: Annotated[int, told("registrations and connections that were taken back")]
-    confirm_by: Annotated[Moment | None, told("when it goes back automatically unless confirmed")]
+    revoked: Annotated[int, doc("number of registrations and connections that were revoked")]
+    confirm_by: Annotated[Moment | None, doc("when it is rolled back automatically unless confirmed")]
 
 
 class PolicyConfirmed(msgspec.Struct, frozen=True):
@@ -76,21 +76,26 @@ class Why(msgspec.Struct, frozen=True, kw_only=True):
     """The explanation of a record; for a denial also the change of the policy that would allow it."""
 
     lines: Annotated[
-        list[str], told("for people: who, which events and values made it so, at which lines of which files")
+        list[str],
+        doc("explanation for people: who acted, the events and values that caused it, with files and lines"),
     ]
-    grant: Annotated["Granted | None", told("of a refusal: the smallest change that would allow it")]
-    refusal: Annotated[str, told("of a refusal: why no change of the policy would; else empty")]
+    grant: Annotated["Granted | None", doc("for a denial: the smallest change that would allow the request")]
+    refusal: Annotated[
+        str, doc("for a denial: why no change of the policy would allow the request; else empty")
+    ]
 
 
 class Granted(msgspec.Struct, frozen=True, kw_only=True):
     """The smallest change of the policy in force that grants a denied request of a record. Nothing is changed."""
 
-    revision: Annotated[int, told("of the policy that it was worked out for")]
-    reason: Annotated[str, told("of the record")]
+    revision: Annotated[int, doc("revision of the policy that the change is for")]
+    reason: Annotated[str, doc("reason in the record")]
     added: Annotated[
         list[str],
-        told("a line for each right that is missing; none: the policy grants it, and it was refused else"),
+        doc(
+            "a line for each missing right; none: the policy allows the request, and something else denied it"
+        ),
     ]
-    diff: Annotated[list[str], told("unified, a line each")]
-    text: Annotated[str, told("the whole policy with it, to be loaded")]
-    findings: Annotated[list[str], told("why it would be refused: test cases that it fails")]
+    diff: Annotated[list[str], doc("lines of the unified diff")]
+    text: Annotated[str, doc("the whole changed policy, ready to be loaded")]
+    findings: Annotated[list[str], doc("why it would be rejected: the test cases that it fails")]

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import NanoMoment, told
+from appliance.channel.answers.field_docs import NanoMoment, doc
 
 ROBOT, OPERATORS, APPLIANCE, UNKNOWN = "robot", "operators", "appliance", "unknown hosts"
 """Recordings are charged to these, or to a host or network as the policy names it."""
@@ -18,10 +18,10 @@ class Trigger(msgspec.Struct, frozen=True):
 
     time: NanoMoment
     what: TriggerKind
-    record: Annotated[str, told("id of the audit record that says it")]
+    record: Annotated[str, doc("id of the trigger's audit record")]
     text: str
     charged_to: Annotated[
-        str, told("whose act it was: robot, operators, appliance, unknown hosts, a host or network")
+        str, doc("who caused it: robot, operators, appliance, unknown hosts, a host or network")
     ] = APPLIANCE
 
 
@@ -33,16 +33,16 @@ class RecordedTopic(msgspec.Struct, frozen=True):
     md5sum: str
     messages: int
     bytes: int
-    missed: Annotated[int, told("messages of that time for which the recorder's memory had no room")]
+    missed: Annotated[int, doc("messages of that time that did not fit in the recorder's memory")]
 
 
 class LeftOutTopic(msgspec.Struct, frozen=True):
     """A topic of one publisher that carried messages in that time and is not in the recording (`recorder.never`)."""
 
     topic: str
-    type: Annotated[str, told("as the publisher says")]
+    type: Annotated[str, doc("type that the publisher declared")]
     host: str
-    why: Annotated[str, told("by whose word it was left out")]
+    why: Annotated[str, doc("the setting that excluded it")]
 
 
 class Recording(msgspec.Struct, frozen=True):
@@ -53,32 +53,36 @@ class Recording(msgspec.Struct, frozen=True):
     ended: NanoMoment
     triggers: list[Trigger]
     topics: list[RecordedTopic]
-    policy: Annotated[int, told("revision of the policy in force at the end")]
-    monitors: Annotated[int, told("revision of the specifications in force at the end")]
-    size: Annotated[int, told("bytes of the bag")]
-    sha256: Annotated[str, told("of the bag, hexadecimal")]
+    policy: Annotated[int, doc("revision of the policy in force at the end")]
+    monitors: Annotated[int, doc("revision of the specifications in force at the end")]
+    size: Annotated[int, doc("bytes of the bag")]
+    sha256: Annotated[str, doc("SHA-256 of the bag, in hexadecimal")]
     complete: bool
-    why_not: Annotated[str, told("what is missing, in words; empty when it is complete")]
+    why_not: Annotated[str, doc("what is missing, in words; empty if it is complete")]
     left_out: Annotated[
-        list[LeftOutTopic], told("the first topics that recorder.never left out, and why")
+        list[LeftOutTopic], doc("the first topics that recorder.never excluded, and why")
     ] = []
-    charged_to: Annotated[str, told("whose share of the hour and of the disk it takes")] = OPERATORS
+    charged_to: Annotated[str, doc("whose quotas of recordings per hour and of disk space it uses")] = (
+        OPERATORS
+    )
 
 
 class RecordingBegun(msgspec.Struct, frozen=True):
     """A recording that is being made."""
 
     id: str
-    ends: Annotated[NanoMoment, told("when it ends, or later if more happens: nanoseconds since the epoch")]
+    ends: Annotated[
+        NanoMoment, doc("when it ends, or later after further triggers: nanoseconds since the epoch")
+    ]
 
 
 class Recordings(msgspec.Struct, frozen=True):
     """All recordings that are kept, the oldest first, and what is recorded."""
 
     recordings: list[Recording]
-    topics: Annotated[list[str], told("names of topics that are recorded; `*` is anything")] = []
-    never: Annotated[list[str], told("names and types that are never recorded")] = []
-    before: Annotated[float, told("seconds that the memory keeps")] = 0.0
+    topics: Annotated[list[str], doc("names of topics that are recorded; `*` matches anything")] = []
+    never: Annotated[list[str], doc("names and types that are never recorded")] = []
+    before: Annotated[float, doc("seconds of messages that the memory keeps")] = 0.0
 
 
 class Sender(msgspec.Struct, frozen=True):
@@ -93,15 +97,15 @@ class RecordedFlow(msgspec.Struct, frozen=True):
 
     topic: str
     type: str
-    senders: Annotated[list[Sender], told("who published it")]
-    counts: Annotated[list[int], told("messages in each column, in their order")]
+    senders: Annotated[list[Sender], doc("the publisher")]
+    counts: Annotated[list[int], doc("messages in each column, in their order")]
 
 
 class EventMarks(msgspec.Struct, frozen=True):
     """The events of a kind: their number in each column of the time line, including those that are not listed."""
 
     kind: EventKind
-    counts: Annotated[list[int], told("events in each column, in their order")]
+    counts: Annotated[list[int], doc("events in each column, in their order")]
 
 
 class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
@@ -111,44 +115,43 @@ class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
 
     time: NanoMoment
     kind: EventKind
-    record: Annotated[str, told("id of the audit record")]
+    record: Annotated[str, doc("id of the audit record")]
     event: str
     severity: str
-    decision: Annotated[str | None, told("allow, deny or would deny; null: nothing was decided")]
-    host: Annotated[str | None, told("of whom it is about")]
+    decision: Annotated[str | None, doc("allow, deny or would deny; null: nothing was decided")]
+    host: Annotated[str | None, doc("the host that the record is about")]
     caller_id: str | None
-    resource: Annotated[str | None, told("topic, service, call or monitor")]
-    reason: Annotated[str, told("why, in words")]
+    resource: Annotated[str | None, doc("topic, service, call or monitor")]
+    reason: Annotated[str, doc("the reason, in words")]
 
 
 class Timeline(msgspec.Struct, frozen=True):
     """A recording, or a part of it, in columns of equal time: what flowed, and what happened."""
 
     id: str
-    since: Annotated[NanoMoment, told("where the first column begins: nanoseconds since the epoch")]
-    until: Annotated[NanoMoment, told("the last moment of the last column: nanoseconds since the epoch")]
+    since: Annotated[NanoMoment, doc("where the first column begins: nanoseconds since the epoch")]
+    until: Annotated[NanoMoment, doc("the last moment of the last column: nanoseconds since the epoch")]
     topics: Annotated[
-        list[RecordedFlow], told("by their names, those of the recording without a message here too")
+        list[RecordedFlow],
+        doc("sorted by name, including topics of the recording without a message in this part"),
     ]
-    more_topics: Annotated[int, told("topics with fewer messages that are left out, in number")]
-    marks: Annotated[list[EventMarks], told("of each kind that happened")]
-    events: Annotated[list[RecordedEvent], told("the first of them, in their order")]
-    more_events: Annotated[
-        int, told("further events of this time, which a shorter part would list, in number")
-    ]
+    more_topics: Annotated[int, doc("number of topics with fewer messages that are omitted")]
+    marks: Annotated[list[EventMarks], doc("marks of each kind of event that occurred")]
+    events: Annotated[list[RecordedEvent], doc("the first events, in order")]
+    more_events: Annotated[int, doc("number of further events of this time, which a shorter part would list")]
 
 
 class RecordedMessage(msgspec.Struct, frozen=True):
     """A message of a recording as its publisher sent it, before the monitors."""
 
-    time: Annotated[NanoMoment, told("when the relay received it: nanoseconds since the epoch")]
-    place: Annotated[str, told("where it is in the recording; `at` takes it")]
+    time: Annotated[NanoMoment, doc("when the relay received it: nanoseconds since the epoch")]
+    place: Annotated[str, doc("position in the recording, which `at` takes")]
     topic: str
     type: str
-    sender: Annotated[Sender, told("who published it")]
-    size: Annotated[int, told("bytes, without those of its length")]
-    fields: Annotated[dict[str, Any], told("as those of a message of /v1/messages")]
-    why: Annotated[str, told("why there are no fields but the first bytes; else empty")]
+    sender: Annotated[Sender, doc("the publisher")]
+    size: Annotated[int, doc("bytes, without the length prefix")]
+    fields: Annotated[dict[str, Any], doc("fields as in a message of /v1/messages")]
+    why: Annotated[str, doc("why only the first bytes are shown instead of the fields; else empty")]
 
 
 class RecordedMessages(msgspec.Struct, frozen=True):
@@ -157,5 +160,5 @@ class RecordedMessages(msgspec.Struct, frozen=True):
     id: str
     messages: list[RecordedMessage]
     chosen: Annotated[
-        int, told("position of the first one at that moment or after it; their number: there is none")
+        int, doc("index of the first message at that time or later; the number of messages if there is none")
     ]

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, told
+from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.host_answers import PortsSeen
 
 
@@ -13,17 +13,17 @@ class ProcessInfo(msgspec.Struct, frozen=True):
 
     role: str
     pid: int
-    since: Annotated[str, told("RFC 3339, UTC, milliseconds")]
+    since: Annotated[str, doc("RFC 3339, UTC, milliseconds")]
     restarts: int
     sandbox: Annotated[
         str,
-        told("limits of its system calls, files and ports; empty: the supervisor, or not reported yet"),
+        doc("limits of its system calls, files and ports; empty: the supervisor, or not reported yet"),
     ] = ""
-    lacks: Annotated[list[str], told("the parts of the sandbox that this kernel lacks")] = []
-    congestion: Annotated[str, told("the TCP congestion control of a relay's connections")] = ""
-    failing: Annotated[str, told("why it ends soon after every start; empty: it does not")] = ""
-    output: Annotated[list[str], told("the last lines that the program of a failing process printed")] = []
-    walls: Annotated[str, told("the same as `sandbox`; deprecated")] = ""
+    lacks: Annotated[list[str], doc("parts of the sandbox that this kernel does not support")] = []
+    congestion: Annotated[str, doc("the TCP congestion control of a relay's connections")] = ""
+    failing: Annotated[str, doc("why it ends soon after every start; empty: it is not failing")] = ""
+    output: Annotated[list[str], doc("the last lines that the program of a failing process printed")] = []
+    walls: Annotated[str, doc("the same as `sandbox`; deprecated")] = ""
 
 
 class FirewallRule(msgspec.Struct, frozen=True):
@@ -44,10 +44,10 @@ class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
     """
 
     backend: str | None = None
-    not_used: Annotated[list[str] | None, told("other back ends, and why they are not used")] = None
+    not_used: Annotated[list[str] | None, doc("other back ends, and why they are not used")] = None
     rules: list[FirewallRule] | None = None
     forwarding: Annotated[
-        list[FirewallRule] | None, told("on the host, towards the appliance's namespace")
+        list[FirewallRule] | None, doc("on the host, towards the appliance's namespace")
     ] = None
     translations: list[str] | None = None
     obstacles: list[str] | None = None
@@ -57,30 +57,34 @@ class PolicyState(msgspec.Struct, frozen=True):
     """The policy in force; `confirm_by` (seconds since the epoch) is when it goes back unless confirmed."""
 
     revision: int
-    file: Annotated[str, told("what `reload` reads")]
-    source: Annotated[str, told("where the text in force came from")]
+    file: Annotated[str, doc("the file that `reload` reads")]
+    source: Annotated[str, doc("source of the text in force")]
     who: str
     differs_from_file: bool
     warnings: int
-    audit_only: Annotated[list[str], told("sections whose denials are recorded and pass")]
+    audit_only: Annotated[list[str], doc("sections whose denials are recorded and pass")]
     confirm_by: Moment | None
 
 
 class IpsecState(msgspec.Struct, frozen=True):
     """The state of the tunnels, and problems that need attention."""
 
-    esp: Annotated[Literal["kernel", "user space"] | None, told("where ESP runs; null: no tunnels are open")]
-    key_exchange: Annotated[list[str], told("offered and accepted, the best first; empty: not known yet")]
-    post_quantum: Annotated[bool | None, told("whether ML-KEM is among them; null: not known yet")]
-    charon: Annotated[str | None, told("its version")]
+    esp: Annotated[Literal["kernel", "user space"] | None, doc("where ESP runs; null: no tunnels are open")]
+    key_exchange: Annotated[
+        list[str], doc("key exchanges offered and accepted, the best first; empty: not known yet")
+    ]
+    post_quantum: Annotated[bool | None, doc("whether ML-KEM is among them; null: not known yet")]
+    charon: Annotated[str | None, doc("its version")]
     pool: str
-    address: Annotated[str, told("the appliance's own in the tunnels")]
+    address: Annotated[str, doc("the appliance's own address in the tunnels")]
     hosts_file: str
     enrolled: int
     awaited: int
     up: int
-    troubles: Annotated[list[str], told("what a person should look at")]
-    ports: Annotated[dict[str, PortsSeen], told("of every host that may have nodes, by name or address")]
+    troubles: Annotated[list[str], doc("problems that need a person's attention")]
+    ports: Annotated[
+        dict[str, PortsSeen], doc("port checks of every host that may have nodes, by name or address")
+    ]
 
 
 class MonitorsState(msgspec.Struct, frozen=True):
@@ -92,13 +96,15 @@ class MonitorsState(msgspec.Struct, frozen=True):
     enabled: int
     held: list[str]
     failing: list[str]
-    refused: Annotated[list[str], told("why the relay does not take them: everything is blocked then")]
+    refused: Annotated[
+        list[str], doc("why the relay rejects the specifications: all topics are blocked then")
+    ]
     who: str
     differs_from_folder: bool
     confirm_by: Moment | None
-    shadow: Annotated[list[str], told("monitors in shadow mode")] = []
+    shadow: Annotated[list[str], doc("monitors in shadow mode")] = []
     why_held: Annotated[
-        dict[str, str], told("why the state of those was lost that hold their topics for that")
+        dict[str, str], doc("monitors that hold their topics because their state was lost, with the reason")
     ] = {}
 
 
@@ -114,7 +120,7 @@ class ForwardingState(msgspec.Struct, frozen=True):
     behind: int
     seconds: float
     missed: int
-    trouble: Annotated[str, told("why nothing goes on, or empty")]
+    trouble: Annotated[str, doc("why forwarding is stopped; empty: it is not")]
     to: str
     send: str
 
@@ -124,13 +130,14 @@ class ClockState(msgspec.Struct, frozen=True):
 
     synchronised: Annotated[
         bool | None,
-        told("whether a time service keeps the machine's clock; null: its kernel does not tell us"),
+        doc("whether a time service synchronises the machine's clock; null: the kernel does not report it"),
     ]
     behind_seconds: Annotated[
-        float, told("how long the clock stands before the last record: it was set back; 0: it does not")
+        float, doc("how far the clock is behind the last record, because it was set back; 0: it is not")
     ]
     before_program_seconds: Annotated[
-        float, told("how long it stands before this program was made: it was never set; 0: it does not")
+        float,
+        doc("how far the clock is before this program's build date, because it was never set; 0: it is not"),
     ] = 0.0
 
 
@@ -142,7 +149,7 @@ class AuditState(msgspec.Struct, frozen=True):
     failed: str | None
     on_failure: Literal["deny", "allow"]
     degraded: str | None
-    forwarding: Annotated[ForwardingState | None, told("null: it is not to be forwarded")]
+    forwarding: Annotated[ForwardingState | None, doc("null: forwarding is not configured")]
 
 
 class RecorderState(msgspec.Struct, frozen=True):
@@ -156,13 +163,13 @@ class RecorderState(msgspec.Struct, frozen=True):
 class SwitchedOff(msgspec.Struct, frozen=True):
     """A monitor that an order disabled or put into shadow mode, or a section of the policy that is audit-only."""
 
-    about: Annotated[Literal["monitors", "policy"], told("what it belongs to")]
-    name: Annotated[str, told("of the monitor, or of the section")]
-    what: Annotated[str, told("a sentence: what is off, and how")]
-    again: Annotated[str, told("what brings it back")]
+    about: Annotated[Literal["monitors", "policy"], doc("what the switch belongs to")]
+    name: Annotated[str, doc("name of the monitor or section")]
+    what: Annotated[str, doc("a sentence: what is off, and how")]
+    again: Annotated[str, doc("how to enable it again")]
     since: Moment
-    until: Annotated[Moment | None, told("when it comes back by itself; null: never")]
-    forgotten: Annotated[bool, told("off for longer than `forgotten_after`: an alarm")]
+    until: Annotated[Moment | None, doc("when it is enabled again automatically; null: never")]
+    forgotten: Annotated[bool, doc("off for longer than `forgotten_after`: an alarm")]
 
 
 class Status(msgspec.Struct, frozen=True):
@@ -170,15 +177,13 @@ class Status(msgspec.Struct, frozen=True):
 
     version: str
     since: Moment
-    master: Annotated[str, told("where nodes find their master")]
+    master: Annotated[str, doc("URI for the nodes' ROS_MASTER_URI")]
     processes: list[ProcessInfo]
     isolation: str
-    relaying: Annotated[
-        str, told("`all`, or `monitored`: then what no monitor is on passes the appliance by")
-    ]
-    mediation: Annotated[str, told("`full`, or `monitored`: then nodes are told each other's own addresses")]
+    relaying: Annotated[str, doc("`all`, or `monitored`: only topics and services with monitors are relayed")]
+    mediation: Annotated[str, doc("`full`, or `monitored`: nodes then get each other's own addresses")]
     firewall: FirewallState
-    probe: Annotated[str, told("of the hidden ROS Master: `passed`, or what was seen; empty: not run yet")]
+    probe: Annotated[str, doc("probe of the hidden ROS master: `passed`, or the finding; empty: not run yet")]
     policy: PolicyState
     ipsec: IpsecState
     monitors: MonitorsState
@@ -193,5 +198,5 @@ class Status(msgspec.Struct, frozen=True):
     dropped: int
     audit: AuditState
     clock: ClockState
-    recorder: Annotated[RecorderState | None, told("null: nothing is recorded")] = None
-    switched_off: Annotated[list[SwitchedOff], told("what an operator switched off")] = []
+    recorder: Annotated[RecorderState | None, doc("null: nothing is recorded")] = None
+    switched_off: Annotated[list[SwitchedOff], doc("what an operator switched off")] = []

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, told
+from appliance.channel.answers.field_docs import Moment, doc
 
 TokenRole = Literal["viewer", "investigator", "operator", "admin"]
 """Viewers read. Only investigators can also fetch the messages of recordings. Operators load the file's policy, or one
@@ -46,4 +46,4 @@ class Challenge(msgspec.Struct, frozen=True):
     """The challenge under which the next order is signed."""
 
     challenge: str
-    seconds: Annotated[float, told("so long it is good, for one order")]
+    seconds: Annotated[float, doc("seconds for which it is valid, for one order")]

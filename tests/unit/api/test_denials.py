@@ -102,7 +102,7 @@ def test_denials_without_a_policy_are_not_blamed_on_it() -> None:
     decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
     assert not revocation(decision, HOST, "/it", "publication", "/x", call="").more
     found = why(denied("revoked", category="publication"))
-    assert (allowing(found), "what its reason says" in found.refusal) == ([], True)
+    assert (allowing(found), "its recorded reason" in found.refusal) == ([], True)
 
 
 def test_a_connection_without_a_grant() -> None:

@@ -9,13 +9,13 @@ import pytest
 from appliance.api.moments import describe, given, in_full
 from appliance.api.problems import ProblemError
 from appliance.api.routing import CONTRACT
-from appliance.channel.answers.field_docs import UNIT, Moment, NanoMoment, told
+from appliance.channel.answers.field_docs import UNIT, Moment, NanoMoment, doc
 from appliance.channel.answers.graph_answers import Graph
 from tests.support.answers import example
 
 
 class _Inner(msgspec.Struct):
-    at: Annotated[Moment | None, told("null: never")]
+    at: Annotated[Moment | None, doc("null: never")]
     exact: NanoMoment
 
 

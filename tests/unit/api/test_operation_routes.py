@@ -288,7 +288,7 @@ def test_pruning_is_for_admins() -> None:
     """Operators take what the folder has; only admins remove what it does not have."""
     for role, status in (("operator", 403), ("admin", 503)):
         assert asked("POST", "/v1/monitors/reload?prune=1", None, role, "*").status_code == status
-    assert "removing what the folder does not have is for admins" in asked(
+    assert "removing files that the folder does not have is for admins" in asked(
         "POST", "/v1/monitors/reload?prune=1", None, "operator", "*"
     ).text  # fmt: skip
 

@@ -49,7 +49,7 @@ def test_a_started_download_is_completed(tmp_path: Path, *, mcap: bool) -> None:
         return b"".join([piece async for piece in response.body_iterator if isinstance(piece, bytes)])
 
     assert asyncio.run(fetched()) == whole
-    with pytest.raises(ProblemError, match="not there any more") as gone:
+    with pytest.raises(ProblemError, match="no longer exists") as gone:
         asyncio.run(_asked(services, mcap=mcap))
     assert gone.value.status == 503
     kept.mkdir()

@@ -15,7 +15,7 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.cli.connection.rest_session import RestClient, RestProblemError
 
-END = 'data: {"reason": "the token has ended"}'
+END = 'data: {"reason": "the token has expired"}'
 
 
 class Answer:
@@ -106,7 +106,7 @@ def test_following_survives_broken_connections(monkeypatch: pytest.MonkeyPatch) 
     last = Answer(["event: record", f"data: {line(9)}", "event: end", END], breaks=False)
     followed = log_of(*broken, last).follow(Filter(), 0, on=True)
     assert [one.sequence for one in next(followed)] == [9]
-    with pytest.raises(NotRunningError, match="the token has ended"):
+    with pytest.raises(NotRunningError, match="the token has expired"):
         next(followed)
 
 
