@@ -145,7 +145,7 @@ class ListenerLimits:
         """Handle the supervisor's probe of whether the ROS master is hidden; `reason` is empty if it is."""
         if bool(reason) != bool(self._unhidden):
             event = "probe failed" if reason else "probe passed"
-            self._trail.happened(event, reason or "the ROS Master is hidden")
+            self._trail.happened(event, reason or "the ROS master is hidden")
         self._unhidden = reason
 
 
