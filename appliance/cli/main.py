@@ -81,7 +81,7 @@ VERBS: dict[str, Verb | Group] = {
             "diff": Verb("monitor.revision_verbs:diff"),
             "rollback": Verb(
                 "monitor.revision_verbs:rollback",
-                "Return to an earlier revision of the specifications, with its monitors enabled or disabled as then.",
+                "Return to an earlier revision of the specifications and enable or disable monitors as they were then.",
             ),
             "confirm": Verb("monitor.revision_verbs:confirm", _CONFIRM),
             "resume": Verb("monitor.in_force:resume"),

@@ -48,9 +48,9 @@ FailUnder = Annotated[
     float, typer.Option(min=0.0, max=100.0, metavar="PERCENT", help="Exit with 1 below this percentage")
 ]
 SUMMARIES: Mapping[str, str] = {
-    "check": "Report every error and warning with its place. Exit status 1 if there is an error.",
+    "check": "List all errors and warnings with line and column. Exit status 1 if there is an error.",
     "run": "Run the monitors on a recording, by the recording's clock, and report the result for each message.",
     "learn": "Propose specifications from recordings of a robot that behaves correctly, for you to edit.",
-    "coverage": "Show which events, branches, handlers, states and transitions the recordings covered, and which not.",
+    "coverage": "List the events, branches, handlers, states and transitions that the recordings covered or missed.",
 }
 """The first sentence of each command's help."""

@@ -72,7 +72,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     opened: _Open = None,
     ports: _Ports = "32768-60999",
 ) -> None:
-    """Enrol a host. Write its kit, one archive with everything it needs, or let it enrol itself with --token.
+    """Enrol a host: write its kit (one archive). With --token, print a token with which the host enrols itself.
 
     Example: rosrv host add ocu-1 --token
     """

@@ -97,7 +97,7 @@ def enable(
 
 @speaks
 def promote(appliance: Appliance, names: _Names, *, force: _Force = False) -> None:
-    """Move monitors from shadow mode into force, keeping their state.
+    """Enable monitors that are in shadow mode. They keep their state.
 
     A monitor that missed messages in shadow mode starts in its initial state; the output names it.
 
@@ -193,7 +193,7 @@ def reload(
     shadow: _Shadow = False,
     force: _Force = False,
 ) -> None:
-    """Load the folder of specifications again. Specifications that it lacks stay in force and are listed.
+    """Load the folder of specifications again. Specifications that are not in it stay loaded and are listed.
 
     Example: rosrv monitor reload
     """
@@ -208,7 +208,7 @@ def reload(
 
 @speaks
 def resume(appliance: Appliance, names: _Names) -> None:
-    """Release the topics that these monitors hold because their state was lost or they are declared `hold`.
+    """Release the topics that these monitors hold, for example because their state was lost.
 
     Example: rosrv monitor resume safeTrigger
     """

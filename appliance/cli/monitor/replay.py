@@ -92,7 +92,7 @@ def replay_monitor(
     ] = False,
     msg: Folders = None,
 ) -> None:
-    """Show which messages of recordings a monitor would have dropped or changed, and count them.
+    """List and count the recorded messages that a monitor would have dropped or changed.
 
     Read bags (--bag), or the running appliance's flight recorder (--since), with its recordings and its memory; gaps
     are reported. Each recording starts in the monitor's initial state. With --json, print every place.

@@ -24,7 +24,7 @@ def why(
     appliance: Appliance,
     record: Annotated[str, typer.Argument(metavar="RECORD", help="Id or sequence number of the record")],
 ) -> None:
-    """Explain a record: who, which events and values, which line, and which rule would allow a denied request.
+    """Explain a record: its sender, events, values and line, and the rule that would allow a denied request.
 
     The listed events alone lead to a monitor's verdict. The appliance may be stopped; only the rule that would allow a
     denied request needs the running appliance.
@@ -73,7 +73,7 @@ def grant(
     load: Annotated[bool, typer.Option("--load", help="Bring the changed policy into force")] = False,
     confirm_within: ConfirmWithin = None,
 ) -> None:
-    """Show the smallest change of the policy in force that grants a denied request.
+    """Show the smallest policy change that would allow a denied request.
 
     The change is checked with the policy's tests. Only --write and --load change anything. Exit status 1 if no rule
     can grant the request or a test fails.

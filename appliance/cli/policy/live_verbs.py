@@ -43,7 +43,7 @@ def show(
 
 @speaks
 def reload(appliance: Appliance, confirm_within: ConfirmWithin = None) -> None:
-    """Read the policy file again, check it, test it, and bring it into force; revoke what it no longer allows.
+    """Reload the policy file: check it, run its tests, enforce it, and revoke rights that it no longer grants.
 
     An invalid file changes nothing: all errors are shown and the exit status is 1.
 

@@ -42,7 +42,7 @@ _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_d
 
 @speaks
 def check(appliance: Appliance, file: _File, *, robot: Robot = None, enrolled: Enrolled = None) -> None:
-    """Report every error and warning with its place. Exit status 1 if there is an error.
+    """List all errors and warnings with line and column. Exit status 1 if there is an error.
 
     With --state or --api, use the running appliance's enrolled hosts, and list the live connections that would end.
 
