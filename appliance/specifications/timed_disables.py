@@ -3,8 +3,8 @@
 Invariants:
 
 1. The time is stored before its monitor is disabled, and survives restarts of control and of the appliance.
-2. A monitor is never off longer than ordered plus the time for which the appliance did not run, even if the clock was
-   set back.
+2. A monitor is off for at most the ordered time plus the time for which the appliance did not run, even if the clock
+   was set back.
 3. If enabling is refused (the monitor shares variables with others that are in shadow mode now), it is tried again
    until it succeeds, or an operator switches the monitor.
 """
@@ -59,7 +59,7 @@ class TimedDisables:
         return found.until if found is not None else None
 
     def start(self, disabled: Collection[str]) -> None:
-        """Go on after a start, for the monitors that are still disabled."""
+        """Resume the time limits of monitors that are still disabled after a start."""
         text = self._store.settings().get(_SETTING, "{}")
         kept = msgspec.json.decode(text, type=dict[str, _Return])
         now = time.time()
@@ -71,7 +71,7 @@ class TimedDisables:
         self._save()
 
     def begin(self, back: Mapping[str, Switch], seconds: float) -> None:
-        """Have these monitors come back after `seconds`, switched as `back` says."""
+        """Limit the time of these monitors: after `seconds`, apply the switches in `back`."""
         until = time.time() + seconds
         self._kept |= {
             name: _Return(until, seconds, self._kept[name].back if name in self._kept else to)

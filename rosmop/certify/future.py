@@ -1,9 +1,9 @@
-"""Formulas about the future, over endless traces: what remains to be true after an event, and whether it can be.
+"""Formulas about the future, over endless traces: the remaining obligation after an event, and whether it can be met.
 
-A state is what remains, as a set of *clauses*, one of which must come true: a clause is a set of parts of the formula
-that begin with a temporal operator, all of which must. (Clauses that require more than another one are left out, so
-there are finitely many states.) The remainder of a part after an event follows from its definition: `x U y` is `y`, or
-`x` and `x U y` at the next event.
+A state is the remaining obligation: a set of *clauses*, of which one must come true. A clause is a set of parts of the
+formula that begin with a temporal operator; all of them must come true. (Clauses that require more than another one are
+left out, so there are finitely many states.) The remainder of a part after an event follows from its definition: `x U
+y` is `y`, or `x` and `x U y` at the next event.
 
 A clause can come true if its paths from event to event reach a cycle on which no `until` is postponed at every step.
 """
@@ -42,14 +42,14 @@ class FutureFollower:
         return self._any([self._after(clause, letter) for clause in state])
 
     def steps(self, state: State, letters: Sequence[int]) -> State:
-        """Return the remaining obligation after any one of them."""
+        """Return the remaining obligation after any one of these letters."""
         self._work -= len(letters)
         return self._any(
             [self._after(clause, letter) for clause in state for letter in self._among(clause, letters)]
         )
 
     def possible(self, state: State) -> bool:
-        """Whether some endless trace makes it true."""
+        """Whether some endless trace meets the obligation."""
         return any(self._possible(clause) for clause in state)
 
     def _among(self, clause: Clause, letters: Sequence[int]) -> list[int]:
@@ -178,13 +178,13 @@ class FutureFollower:
 
 
 def _fulfils(group: set[Clause], ways: dict[Clause, set[Way]]) -> bool:
-    """Whether staying in these clauses for ever never postpones an `until` for ever."""
+    """Whether a trace can stay in these clauses for ever and fulfil every `until`."""
     inside = [off for clause in group for after, off in ways[clause] if after in group]
     return bool(inside) and not frozenset.intersection(*inside)
 
 
 def _circles(ways: dict[Clause, set[Way]]) -> list[set[Clause]]:
-    """Return the strongly connected sets: what is reached forwards and backwards (Kosaraju)."""
+    """Return the strongly connected components (Kosaraju)."""
     order: list[Clause] = []
     seen: set[Clause] = set()
     for root in ways:

@@ -1,12 +1,12 @@
-"""Strings: constants, those of the message, and those that variables of the set keep.
+"""Generate code for strings: constants, strings of the message, and strings in variables of the set.
 
 A variable is 8 bytes: the address of the string and its length (4 bytes each). While a batch is processed, the string
 may be in a message, in a constant, or in the former place of another variable, so that assignments copy nothing. At the
-end of a batch all strings are copied together (`settling`), to the places used by the batch before the last one,
-because lines of output may still show the last ones.
+end of a batch all strings are copied together (`settling`). Each variable has two places, used by batches in turn,
+because lines of output may still read the strings of the last batch.
 
 Strings longer than `MOST_KEPT` are not kept: the message that brings one is left to the interpreter, the variable is
-marked `BEYOND`, and messages that read it are left.
+marked `BEYOND`, and messages that read this variable are also left to the interpreter.
 """
 
 from rosmop.fast.abi import MOST_KEPT, Cells

@@ -42,7 +42,7 @@ class EventOccurrence(NamedTuple):
 class Explanation(NamedTuple):
     """Events that alone give a verdict. If they are the `fewest`, none of them can be left out.
 
-    With `since`, they lead to it from the property's state at this time (ns), after events that are no longer kept.
+    With `since` (ns), they lead from the property's state at that time to the verdict; earlier events are not kept.
     """
 
     events: tuple[EventOccurrence, ...]
@@ -96,12 +96,12 @@ class Outcome:
     `buffer` is the message to relay: the buffer that came in (changed in place where that was possible), or another.
     `events` are named `specification.event`. `timer` names the source of a tick or deadline (`specification.tick`,
     `specification.timeout`, `specification.deadline`); `time` is in nanoseconds. `before` are ticks and deadlines that
-    were due before this message. `shadowed` are, at the start of a set, the outcomes of its sets in shadow mode.
+    were due before this message. `shadowed` are the outcomes of the sets in shadow mode when a set starts.
 
     `changed_by` are the events whose actions changed bytes of the message, in order; empty unless the result is
     `changed`. `changed_at` are the positions of the statements that assigned to the changed fields. An event that
     assigned nothing, or the same value, is not included. `dropped_by` is the specification that dropped the message:
-    by its last event, by `fatal` (a fault that dropped it), or for `reason` (it is held, or could not begin).
+    at its last event, after a fault (`fatal`), or for `reason` (the topic is held, or the start failed).
     `dropped_at` is the position of the statement, the action or the specification. `handling` has the verdicts whose
     handlers dropped the message (under `DROPPED`) or published messages (under their places in `published`).
 

@@ -48,7 +48,7 @@ class Introspection:
         return (call.method.perform.__doc__ or "").replace("`", "") if call is not None else ""
 
     async def method_signature(self, _caller: Caller, _name: str) -> str:
-        """`system.methodSignature(method_name)`: Python's servers answer with these words."""
+        """`system.methodSignature(method_name)`: the same answer as Python's XML-RPC servers."""
         return "signatures not supported"
 
 

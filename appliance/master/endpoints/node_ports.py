@@ -166,7 +166,7 @@ class NodePorts:
                 self.unused.append(port)
 
     def close_unclaimed(self, claimed: set[int]) -> None:
-        """Close kept sockets without a known incarnation; the next ports to open are above the claimed ones."""
+        """Close kept sockets without a known incarnation. Ports above the claimed ones are opened next."""
         for name, sock in list(self._sockets.items()):
             port = sock.getsockname()[1]
             if port not in claimed:
@@ -203,8 +203,8 @@ _ANSWER_SECONDS = 3.0
 class AdvertisedAddresses:
     """The choice of the appliance's address for each host.
 
-    It is the address at which the host reached the appliance. Exceptions are an address for its network in
-    `advertise:`, and, in a network namespace behind address translation, the machine's address that the host used.
+    It is the address at which the host reached the appliance. But an address in `advertise:` for the host's network
+    comes first. In a namespace behind address translation, it is the machine's address that the host used.
 
     `advertised` are (network, address) pairs; `route_to(host)` finds the translated address (None: no translation).
     `listen` is the address that RVMaster, the proxy endpoints and the relay listen on.

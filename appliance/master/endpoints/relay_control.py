@@ -54,7 +54,7 @@ class RelayOutbox(Link):
             self.carried_out()
 
     def orders(self) -> list[asyncio.Future[None]]:
-        """Return a future that is done when the relay has carried out its orders, or ends; [] without a relay."""
+        """Return one future, done when the relay has carried out its orders or ends; [] if no relay is connected."""
         if not self.send(messages.OrdersAsked()):
             return []
         self._orders.append(asyncio.get_running_loop().create_future())

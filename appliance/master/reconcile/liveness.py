@@ -1,8 +1,8 @@
 """Check nodes every few seconds, and at once after a failure.
 
 A node is *lost* if its API refuses connections (twice in a row), if another process answers there, or if it does not
-answer for `silent` seconds. It is then unregistered at the ROS master, like by `rosnode cleanup`, and its registrations
-are kept as a shadow. A shadow whose API answers again gets them back, because a ROS 1 node never registers twice.
+answer for `silent` seconds. It is then unregistered at the ROS master, as `rosnode cleanup` does, and its registrations
+are kept as a shadow. If its API answers again, they are restored, because a ROS 1 node never registers twice.
 """
 
 import asyncio
@@ -59,7 +59,7 @@ _LOOK_AGAIN_SECONDS = 0.3
 
 @dataclass(slots=True)
 class MissedUpdates:
-    """The updates that did not reach a node; `made_up` is when missed ones were last sent again (monotonic)."""
+    """The updates that did not reach a node; `made_up` is the time of the last repetition (monotonic)."""
 
     topics: set[str] = field(default_factory=set)
     parameters: bool = False
@@ -80,7 +80,7 @@ class Watchlist:
         self._filled.set()
 
     def could_not_tell(self, node: Incarnation, call: NodeCall, why: str) -> None:
-        """Store a call that did not reach a node, and check the node; it gets the present state once it answers."""
+        """Store a call that did not reach a node, and check the node. Once it answers, it gets the present state."""
         _log.info("a node could not be told", node=node.name, call=call.method, why=why)
         missed = self._missed.setdefault(node.key, MissedUpdates())
         if call.method == "publisherUpdate":
@@ -257,8 +257,8 @@ class Liveness:
     async def _call(self, incarnation: Incarnation) -> None:
         """Call a node. Raises `CallFailedError`; `RefusedError` also if another process has its port.
 
-        A node that registers again at the same address may be another process, so the process that answers after that
-        is expected from then on.
+        A node that registers again at the same address may be a new process. So the first process that answers after
+        a registration is the expected one.
         """
         answer = await self.nodes.call(incarnation, "getPid", RELAY_NAME)
         match answer:

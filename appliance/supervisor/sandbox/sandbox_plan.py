@@ -12,7 +12,7 @@ ROUTES = (*NETWORK, int(socket.AF_NETLINK))  # name lookups read the kernel's ro
 class SandboxPlan:
     """The permissions of a process.
 
-    `allowlist`: only system calls on a list; otherwise all except those that no process of the appliance makes.
+    `allowlist`: permit only listed system calls; otherwise deny only those that no process of the appliance makes.
     `families`: families of the sockets that it may make. `programs`: files that it may execute, and the libraries they
     load. `reads`, `writes`: folders and files; what is in `writes` may also be read. A missing path grants nothing.
     `binds`, `connects`: TCP ports to listen on and to connect to; None: any. With an allowlist and without ports the
