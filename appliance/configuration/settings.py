@@ -289,7 +289,7 @@ class Relay:
 
 @_section
 class RecorderRules:
-    """The flight recorder, which keeps messages from before and after an incident. Off by default: it stores contents."""
+    """The flight recorder: messages from before and after an incident. Off by default, because it stores contents."""
 
     enabled: bool = key(default=False, description="whether anything is recorded")
     memory: Annotated[int, _BYTES, Field(ge=16 << 20)] = key(

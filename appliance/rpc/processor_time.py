@@ -9,7 +9,7 @@ Invariants:
    are one class. This is deficit round robin without the round: a class that comes back waits for one piece, not for a
    piece of each other class.
 3. No class saves time: after a break it starts with the use of the waiting classes. It keeps its debt while others
-   wait. When a turn ends and nothing waits, all use is forgotten: who works alone takes time from nobody.
+   wait. When a turn ends and nothing waits, all use is forgotten: a class that works alone takes no time from others.
 4. While no work waits and the turn has time left, work runs at once.
 """
 

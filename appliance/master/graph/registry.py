@@ -427,7 +427,7 @@ class Registry:
         self._note_type(registration)
 
     def _note_type(self, registration: NodeRegistration) -> None:
-        """Store a topic's type as the ROS master does: that of a publisher, or of a subscriber if no publisher gave one."""
+        """Store a topic's type as the ROS master does: the publisher's, or else the subscriber's."""
         kind, topic, told = registration.kind, registration.resource, registration.detail
         if kind not in _OF_TOPICS:
             return
