@@ -65,7 +65,7 @@ class BothWays:
         self.counting = False
         """Whether verdicts are only counted."""
         self._inside = False
-        """Whether messages stand in the module's memory, every other time."""
+        """Whether messages are in the module's memory; this changes with each check."""
 
     def lane(self, topic: str = "/plain") -> FastLane:
         """The walk of a topic; there is one."""

@@ -274,9 +274,9 @@ def test_fuel_lasts_for_many_calls_and_is_renewed(
 
 
 def test_only_the_beginning_of_a_long_message_is_copied() -> None:
-    """Changed and dropped there; a field that is further behind is left, and so is the bytes' number.
+    """The module changes and drops long messages; an event that reads past the copied beginning is not handled there.
 
-    Not where all of it stands in the module's memory.
+    This does not apply to a message that is in the module's memory as a whole.
     """
     picture = bytes(range(256)) * (BEGINNING // 128)
     both = BothWays(event("if (count == 3) { return; } count = count + 1; n++;"))

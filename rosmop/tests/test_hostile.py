@@ -279,7 +279,7 @@ def test_an_array_of_too_many_strings_is_a_fault() -> None:
 
 
 def test_unreadable_texts_are_rejected_with_a_position() -> None:
-    """Whatever stands in a file, the answer is an error with a place."""
+    """Whatever a file contains, the answer is an error with a position."""
     for text in (
         "\0",
         "\x1b[31m",

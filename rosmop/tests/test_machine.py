@@ -168,14 +168,14 @@ def test_the_limit_is_whole_pages_of_what_is_given(limit: int) -> None:
         ('(module (import "" "clock" (func)) (memory (export "memory") 1))', "expected 1 imports"),
     ],
 )
-def test_what_is_no_machine(code: str | bytes, reason: str) -> None:
-    """It is refused with the reason."""
+def test_an_invalid_module_is_refused(code: str | bytes, reason: str) -> None:
+    """The error has the reason."""
     with pytest.raises(WasmError, match=reason):
         run(code if isinstance(code, bytes) else bytes(wasmtime.wat2wasm(code)))
 
 
-def test_what_a_module_does_at_its_start_is_bounded_too() -> None:
-    """It has fuel, and its traps are traps."""
+def test_the_start_function_of_a_module_is_bounded() -> None:
+    """It has fuel, and its traps are reported as such."""
     with pytest.raises(WasmTrap) as caught:
         made("(func $begin (loop (br 0))) (start $begin)")
     assert caught.value.reason == "out of fuel"

@@ -79,8 +79,8 @@ def test_a_part_is_the_same_whatever_else_is_in_the_set() -> None:
     assert encoded_part(part_of(compiled("a"), ["a"], ["a"])) != alone
 
 
-def test_it_is_the_same_whoever_makes_it() -> None:
-    """In another process, with other hashes of strings."""
+def test_another_process_makes_the_same_module() -> None:
+    """String hashes differ in the other process."""
     hashes = {
         subprocess.run(
             [sys.executable, "-c", PROGRAM],
@@ -127,8 +127,8 @@ def test_only_what_is_not_in_shadow_mode_has_a_module() -> None:
 
 
 @pytest.mark.parametrize("wrong", [b"", b"\x7fELF", b"\0asm\1\0\0\0"])
-def test_what_is_no_machine_code_of_this_library(wrong: bytes) -> None:
-    """It is refused, and nothing of it is run."""
+def test_foreign_machine_code_is_refused(wrong: bytes) -> None:
+    """None of it is run."""
     part = part_of(compiled("a"), ["a"], [])
     with pytest.raises(WasmError):
         MonitorSet.of(part.compiled, fast=WasmFastPath(replace(part.module, code=wrong)))

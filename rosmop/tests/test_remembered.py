@@ -68,8 +68,8 @@ def again(formula: Any, run: Any) -> Any:
 
 @pytest.mark.parametrize("name", FORMULAS)
 @pytest.mark.parametrize("data", [[], [[], []], [["x"], []], [[["o", 3]], []], 7, [[10**6, 0, 0], []], None])
-def test_what_is_no_state_of_a_property_is_refused(name: str, data: object) -> None:
-    """Whatever is written in the place of a run, another is not made of it, and nothing else is raised."""
+def test_an_invalid_state_of_a_property_is_refused(name: str, data: object) -> None:
+    """Whatever is stored in place of a run, no run is made of it, and only ValueError is raised."""
     formula = compiled(FORMULAS[name]).compiled.specifications[0].properties[0].property
     with pytest.raises(ValueError):
         run_of(formula, data, 0)

@@ -208,7 +208,7 @@ def test_every_parametric_logic(logic: str) -> None:
 
 
 @pytest.mark.parametrize("handler", ["@enforced { late++; }", "@violation { late++; __RESET; }"])
-def test_what_is_enforced_at_a_deadline(handler: str) -> None:
+def test_publications_enforced_at_a_deadline(handler: str) -> None:
     """Withheld publications equal real ones, at the same times, with the same variables."""
     remedy = "help() { std_msgs::UInt8 one; one.data = late; PUBLISH(/n1, std_msgs/UInt8, one); }"
     events = "".join(f"event e{at}() /n{at} std_msgs/UInt8 '{{}}' {{ }} " for at in range(2))

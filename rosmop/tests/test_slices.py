@@ -46,7 +46,7 @@ TWO = {"ere": ("match", "fail"), "fsm": ("match", "fail"), "cfg": ("match", "fai
 
 @dataclass(frozen=True)
 class Made:
-    """A random specification: which event binds what, which ones begin a slice, and what stands in it."""
+    """A random specification: the parameters that each event binds, the events that create a slice, and its body."""
 
     parameters: str
     binds: dict[str, str]

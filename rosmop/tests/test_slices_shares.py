@@ -185,7 +185,7 @@ def test_slices_of_a_guest_take_no_tick_from_those_of_the_robot() -> None:
     assert [one.topic for one in outcome.published] == ["/stop"]
 
 
-def test_what_a_message_may_take_grows_with_the_slices_that_it_concerns() -> None:
+def test_the_time_limit_of_a_message_grows_with_its_slices() -> None:
     """The robot's stop for all its goals is not cut off, though each handler takes some microseconds."""
     text = STOPPED.replace("@again { DROP; }", '@stopped { ROS_INFO("stopped"); }') % "{ }"
     monitors = begun(text, 1000)

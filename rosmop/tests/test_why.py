@@ -192,8 +192,8 @@ def explained(
 
 
 @pytest.mark.parametrize("logic", ["tfsm", "pattern"])
-def test_what_is_kept_of_a_clock_is_what_steps_keep(logic: str) -> None:
-    """In a room of fixed size, whatever the length of the trace."""
+def test_clocked_steps_explain_the_same_as_steps(logic: str) -> None:
+    """They use a fixed amount of memory, whatever the length of the trace."""
     random, compared = seeded(43), 0
     for _ in range(12):
         made = compiled(logic, MAKERS[logic](random), EVENTS)
@@ -245,8 +245,8 @@ def test_the_named_events_alone_give_the_verdict(logic: str) -> None:
 
 
 @pytest.mark.parametrize("logic", MAKERS)
-def test_what_is_cut_says_so(logic: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With next to nothing kept the named events give the verdict to the property as it was at `since`."""
+def test_a_shortened_explanation_says_so(logic: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With almost no history kept, the named events lead from the property's state at `since` to the verdict."""
     monkeypatch.setattr(explain, "KEPT", 2)
     random = seeded(42)
     whole = cut = 0
@@ -270,7 +270,7 @@ def test_what_is_cut_says_so(logic: str, monkeypatch: pytest.MonkeyPatch) -> Non
         assert cut > 5
 
 
-def test_a_long_way_is_told_whole() -> None:
+def test_a_long_path_is_explained_in_full() -> None:
     """Loops back to an earlier state are left out; a path too long to be shortened is marked."""
     states = 400
     text = " ".join(f"s{number} [ a -> s{number + 1}, b -> s{number} ]" for number in range(states))
@@ -327,8 +327,8 @@ def test_sub_formulas_have_the_meaning_of_the_monitors(logic: str) -> None:
             assert meaning.holds(formula, len(trace) - 1) is holds
 
 
-def test_what_decides_a_formula() -> None:
-    """Named are sub-formulas as they are written, with their values."""
+def test_sub_formulas_that_decide_a_formula() -> None:
+    """Sub-formulas are named as they are written, with their values."""
     made = compiled("mtl", "a -> once[0,500ms] b and !c")
     run, history = made.start(0), history_of(made, 0)
     for event, time in ((1, 1), (0, 700 * MILLISECOND)):
@@ -339,8 +339,8 @@ def test_what_decides_a_formula() -> None:
     assert deciding(made.source, explanation) == ["a is true", "once[0ns,500ms] b is false"]
 
 
-def test_what_was_long_ago_is_known_by_what_it_led_to() -> None:
-    """Where there are no tables the last events are kept; the deciding one is older, and the explanation says so."""
+def test_an_old_event_is_explained_by_its_effect() -> None:
+    """Without tables only the last events are kept; the deciding one is older, and the explanation says so."""
     made = compiled("mtl", "a -> !(once[0,10s] b)")
     run, history = made.start(0), history_of(made, 0)
     for number, event in enumerate((1, *[0] * 4 * explain.KEPT)):
@@ -395,7 +395,7 @@ def test_a_verdict_of_a_slice_is_explained_by_its_own_events() -> None:
     assert [one.sender.source for one in verdict.why.events] == [1, 4]
 
 
-def test_what_was_compared_and_which_statement_dropped() -> None:
+def test_compared_values_and_the_statement_that_dropped() -> None:
     """The values are those of the comparison, though the action changes them after it."""
     text = """gun() {
         int count = 0;

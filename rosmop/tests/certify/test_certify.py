@@ -123,8 +123,8 @@ def properties(logic: str, seed: int, count: int) -> list[CompiledProperty]:
 
 
 @pytest.mark.parametrize("logic", LOGICS)
-def test_what_the_compilers_make_is_proved(logic: str) -> None:
-    """Two readings of the definitions, on random formulas."""
+def test_compiled_properties_are_proved(logic: str) -> None:
+    """Two readings of the definitions agree on random formulas."""
     for compiled in properties(logic, 1, 150):
         certificate = certificate_of(compiled)
         assert certificate.proved, (compiled.formula, compiled.events, certificate.text)
@@ -178,8 +178,8 @@ def broken(random: Random, tables: AutomatonTables) -> AutomatonTables:
 
 
 @pytest.mark.parametrize("logic", LOGICS)
-def test_what_is_no_automaton_is_refused(logic: str) -> None:
-    """Python takes a negative state for one from the end; the module of the relay would look beside its table."""
+def test_an_invalid_automaton_is_refused(logic: str) -> None:
+    """Python counts a negative state from the end; the relay's module would read outside its table."""
     compiled = next(iter(properties(logic, 5, 5)))
     made = tables_of(compiled)
     states = len(made.table)
@@ -242,8 +242,8 @@ def test_unproved_properties_have_a_reason(logic: str, formula: str, why: str) -
     assert certificate.text.endswith("tested, not proved")
 
 
-def test_what_is_too_large_is_not_proved() -> None:
-    """A machine with more ways on than are followed."""
+def test_a_machine_that_is_too_large_is_not_proved() -> None:
+    """The machine has more transitions than the proof follows."""
     events = [f"e{number}" for number in range(200)]
     states = MOST_STEPS // len(events) + 10
     formula = " ".join(f"s{number} [ default s{(number + 1) % states} ]" for number in range(states))

@@ -35,7 +35,7 @@ def test_an_action_prints_what_cpp_prints(case: Case) -> None:
     assert (fault or lines,) == case.expected
     assert not fault or (outcome.result, lines) == ("dropped", "")
     for text in (case.text, unfolded(case)):
-        with suppress(SpecificationError):  # a size, or a case, that is no constant any more
+        with suppress(SpecificationError):  # a size or case label stops being a constant
             BothWays(action(text, before=case.beside)).check([message("std_msgs/Int32")], "/t", 1_500_000_000)
 
 

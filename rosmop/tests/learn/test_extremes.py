@@ -28,7 +28,7 @@ def test_a_bound_is_not_far_beyond_what_is_possible() -> None:
     assert below is not None and -0.5 < -below <= min(map(min, windows))
 
 
-def test_what_several_windows_reach_exactly_is_the_bound() -> None:
+def test_a_value_reached_exactly_by_several_windows_is_the_bound() -> None:
     """A joint that is stopped at 0.6 has no margin."""
     highs = [0.1, 0.3, 0.6, 0.2, 0.6, 0.5, 0.6, 0.4]
     assert upper(highs, 1e6, stops=True) == 0.6

@@ -88,8 +88,8 @@ def test_every_property_can_be_rebuilt_from_data(
 
 
 @pytest.mark.parametrize("logic", LOGICS)
-def test_what_may_block(logic: str) -> None:
-    """Every category whose verdict comes with the message may block; only a timeout may not (of these)."""
+def test_categories_that_may_block(logic: str) -> None:
+    """Every category whose verdict comes with the message may block; of these, only a timeout may not."""
     monitor = compiled(logic, ROWS[logic][0])
     refused = {category for category in monitor.categories if monitor.blocking_refused(category)}
     assert refused == ({"timeout"} if logic == "tfsm" else set())

@@ -91,8 +91,8 @@ PROVED = {
 
 
 @pytest.mark.parametrize("name", PROVED)
-def test_what_the_language_has_without_loops(name: str) -> None:
-    """For every message and every state, of which there are more than any test can try."""
+def test_the_language_without_loops_is_proved(name: str) -> None:
+    """The proof covers all messages and states, which are more than any test can try."""
     assert answers(PROVED[name]) == {"s.e": EQUAL}
 
 
@@ -108,8 +108,8 @@ UNPROVED = {
 
 
 @pytest.mark.parametrize("answer", UNPROVED)
-def test_what_is_not_proved_says_why(answer: str) -> None:
-    """Nothing is called equal that was not shown to be."""
+def test_an_unproved_answer_says_why(answer: str) -> None:
+    """The answer is never `equal` without a proof."""
     assert answers(UNPROVED[answer]) == {"s.e": answer}
 
 

@@ -7,7 +7,7 @@ import pytest
 from rosmop.runtime.wire import WireMessage
 
 
-def test_what_is_written_twice_can_be_as_it_was() -> None:
+def test_a_message_written_back_is_unchanged() -> None:
     """A message is changed if its bytes differ at the end, whatever was written on the way."""
     message = WireMessage(bytearray(b"abcdef"), 0)
     found = [message.changed]
@@ -20,8 +20,8 @@ def test_what_is_written_twice_can_be_as_it_was() -> None:
     assert bytes(message.buffer) == b"abcdef"
 
 
-def test_what_is_written_as_it_was_touches_nothing() -> None:
-    """`touched` is set by other bytes only, in place or of another length, until it is cleared."""
+def test_writing_equal_bytes_touches_nothing() -> None:
+    """Only different bytes, in place or of another length, set `touched`, until it is cleared."""
     message = WireMessage(bytearray(b"abcdef"), 0)
     found = []
     for start, end, new in ((1, 3, b"bc"), (1, 3, b"bx"), (0, 2, b"abc"), (0, 3, b"abc"), (0, 1, b"z")):

@@ -49,7 +49,7 @@ CONVERTIBLE = [
 
 
 @pytest.mark.parametrize(("source", "target", "possible"), CONVERTIBLE)
-def test_what_can_be_assigned(source: Type, target: Type, possible: bool) -> None:
+def test_types_that_can_be_assigned(source: Type, target: Type, possible: bool) -> None:
     """Numbers to numbers, strings to strings, vectors of the same elements, the same message type."""
     assert value_types.convertible(source, target) is possible
 
