@@ -111,13 +111,13 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 def pytest_configure(config: pytest.Config) -> None:
     """Have programs listen to SIGINT; give each worker of pytest-xdist a loopback of its own, as root.
 
-    What a script starts in the background ignores SIGINT, and so does every program that it starts: tests that
-    interrupt one would wait for its end until their limit.
+    A script's background process ignores SIGINT, and so does every program that it starts: a test that interrupts
+    such a program would wait for its end until the time limit.
 
     A node that a test killed is remembered by its master with a port; on a common loopback the next node that takes
-    this port may be another worker's. It would answer for the dead one, or be told to shut down in its place.
+    this port may belong to another worker. It would answer for the dead node, or get its order to shut down.
     """
-    # What was collected stays: the collector would look through millions of objects again and again.
+    # The collected tests stay in memory: the garbage collector would scan their millions of objects again and again.
     gc.set_threshold(700, 10, 100)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -111,10 +111,8 @@ def test_over_rest_it_is_not_for_viewers(appliance: Appliance, tmp_path: Path) -
     assert by[:2] == ["operator", "first"]
 
 
-def test_of_a_recording(appliance: Appliance, tmp_path: Path) -> None:
-    """The bundle has its messages, proven by the log; the export is recorded; an unknown id is refused with a
-    reason.
-    """
+def test_a_recording_exports_as_evidence(appliance: Appliance, tmp_path: Path) -> None:
+    """The log proves the bundle's messages; the export is recorded; an unknown id is refused with a reason."""
     order = appliance.rosrv(
         "record", "now", "--before", "2s", "--after", "1s", "--note", "the arm hit the door", "--json"
     )

@@ -57,7 +57,7 @@ def ros(appliance: Appliance, hosts: tuple[Host, Host], tmp_path: Path) -> Itera
 
 
 def seconds_for(listener: Process, count: int) -> float:
-    """Return the time until so many more messages have arrived."""
+    """Return the seconds until `count` more messages have arrived."""
     there = len(listener.seen(event="received"))
     began = time.monotonic()
     listener.wait_for_count(there + count, event="received")
@@ -75,8 +75,9 @@ def judged(appliance: Appliance) -> int:
 def test_only_the_publisher_beyond_its_limit_loses_messages(
     appliance: Appliance, ros: RosSession, client: Client, topic: str
 ) -> None:
-    """Of a hundred messages a second five pass, with or without a monitor, with a record; the other topic loses
-    none.
+    """With a monitor or without, five of a hundred messages a second pass, and a record says so.
+
+    The other topic loses none.
     """
     before = judged(appliance)
     listener, other = ros.listener(client, topic), ros.listener(client, "/quiet")

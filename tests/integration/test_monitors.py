@@ -59,7 +59,7 @@ def monitor(appliance: Appliance, name: str) -> dict[str, object]:
 
 
 def dropped_by(appliance: Appliance, name: str, count: int) -> bool:
-    """Whether a monitor has dropped so many messages."""
+    """Whether a monitor has dropped exactly `count` messages."""
     return monitor(appliance, name)["drops"] == count
 
 

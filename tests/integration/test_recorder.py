@@ -61,7 +61,7 @@ def appliance(recording: Appliance) -> Iterator[Appliance]:
 
 
 def recordings(appliance: Appliance, count: int = 1) -> list[dict[str, Any]]:
-    """Return the recordings, once there are so many."""
+    """Return the recordings, once there are `count` of them."""
 
     def found() -> list[dict[str, Any]] | None:
         listed = appliance.rosrv("record", "list", "--json", check=False)

@@ -22,7 +22,7 @@ MUTANTS = {
     "NOT_REDECIDED": ("barred", ONE_OF_EACH),
     "NOBODY_REMINDED": ("connected", Bounds(crashes=1, sending=False)),
 }
-"""Of each: the property that it breaks, and within which bounds."""
+"""For each mutant, the property that it breaks, and the bounds within which it does."""
 
 
 @pytest.mark.parametrize("mutant", MUTANTS)

@@ -10,10 +10,11 @@ Actions (`Conversation.say`):
     /talker misses the list of /chatter                             its delivery failed
     policy NAME | policy NAME, NAME                                 put that policy in force, or several at once
     host 10.0.0.1 is expelled                                       take back everything of its nodes
-    ROSMaster starts anew | a relay starts anew | a round           of the reconcile loop
-    ROSMaster has /talker publication /chatter of /other            a registration that control has not made
-    ROSMaster sets /speed 3                                         a value that control has not set
-    state                                                           what control and ROSMaster have
+    `ROSMaster starts anew` | `a relay starts anew`                 the ROS master or a relay restarts
+    a round                                                         of the reconcile loop
+    `ROSMaster has /talker publication /chatter of /other`          a registration that control has not made
+    `ROSMaster sets /speed 3`                                       a value that control has not set
+    state                                                           what control and the ROS master have
     given LINE                                                      another action, whose effects are not listed
 
 Effects follow, one per line, in the order in which they are carried out; a denial is `deny: reason`, the answer to a

@@ -117,7 +117,7 @@ class Subscription:
     """A node's state for a topic: its list of publishers, and its connections to them with the entry used for each."""
 
     known: list[str] = field(default_factory=list)
-    ways: dict[str, str] = field(default_factory=dict)  # URI to the key behind the port it was told
+    ways: dict[str, str] = field(default_factory=dict)  # URI to the key behind the port that the node got
 
 
 @dataclass(eq=False)

@@ -42,7 +42,7 @@ api_names: [{MIDDLE}, {OWN}]
 recorder: {{enabled: true, memory: 16MiB, disk: 512MiB, triggers: []}}
 """
 NAME = EXAMPLES["NewHost"]["name"]
-# One call of the generated client per line: the parsed answer and the raw answer. Of a stream, the first event.
+# One call of the generated client per line: the parsed answer and the raw answer; for a stream, its first event.
 DRIVER = """
 import base64, enum, importlib, json, pkgutil, sys, typing
 folder, url, certificate = sys.argv[1:]

@@ -28,7 +28,7 @@ def test_the_image_has_every_user() -> None:
 
 
 def test_the_archive_of_a_site_has_what_its_compose_files_mount() -> None:
-    """What compose.yaml and compose.host.yaml take from beside them is carried along, they themselves too."""
+    """The archive has compose.yaml and compose.host.yaml, and the files beside them that they mount."""
     for name in ("compose.yaml", "compose.host.yaml"):
         assert name in BESIDE
         services = yaml.safe_load((ROOT / name).read_text())["services"].values()
@@ -53,7 +53,7 @@ def test_the_container_is_given_what_the_supervisor_knows() -> None:
 
 
 def test_each_right_has_its_reason_beside_it() -> None:
-    """In compose.yaml every capability stands on a line with a comment."""
+    """In compose.yaml every capability has a comment on its line."""
     lines = [
         line for line in (ROOT / "compose.yaml").read_text().splitlines() if re.match(r" +- [A-Z_]+\b", line)
     ]
@@ -62,7 +62,7 @@ def test_each_right_has_its_reason_beside_it() -> None:
 
 
 def environment(**outside: str) -> dict[str, str]:
-    """What the appliance in compose.yaml is told, with these variables in `.env`."""
+    """Return the appliance's environment from compose.yaml, with these variables in `.env`."""
     told = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["environment"]
     return {
         key: re.sub(r"\$\{(\w+):-(.*?)\}", lambda found: outside.get(found[1], found[2]), value)
@@ -71,13 +71,13 @@ def environment(**outside: str) -> dict[str, str]:
 
 
 def test_the_endpoint_is_one_line_in_env() -> None:
-    """`ROSRV_ENDPOINT=192.168.1.20` in `.env` is what kits say; without it the configuration is right, too."""
+    """Kits get `ROSRV_ENDPOINT=192.168.1.20` from `.env`; without it the configuration is also valid."""
     assert resolve(None, environment(), {}).ipsec.endpoint is None
     assert resolve(None, environment(ROSRV_ENDPOINT="192.168.1.20"), {}).ipsec.endpoint == "192.168.1.20"
 
 
 def test_no_script_is_written_that_cannot_reach_rest() -> None:
-    """While REST is published on loopback a host cannot enrol itself by a token: that is said, and what to do."""
+    """While REST is published on loopback no host can enrol itself by a token; the error says so, and what to do."""
     published = [
         port
         for port in yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["ports"]
@@ -93,7 +93,7 @@ def test_no_script_is_written_that_cannot_reach_rest() -> None:
 
 
 def test_a_flood_ends_in_the_container() -> None:
-    """Memory and processes are bounded, and what the relay may hold by itself is within that."""
+    """Memory and processes are bounded, and the relay's own limit is within these bounds."""
     appliance = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]
     assert appliance["mem_limit"] == appliance["memswap_limit"] == "2g"
     assert 100 <= appliance["pids_limit"] <= 1000

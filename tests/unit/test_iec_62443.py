@@ -30,8 +30,8 @@ def test_every_requirement_has_one_row() -> None:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: str(row[0]))
-def test_what_is_claimed_is_shown(row: tuple[str, str, str, str]) -> None:
-    """What is met in whole or in part names a test (test_threat_model.py sees that it is there); all else a reason."""
+def test_every_claim_names_a_test(row: tuple[str, str, str, str]) -> None:
+    """A requirement met in whole or in part names a test (test_threat_model.py finds it); others give a reason."""
     requirement, state, how, shown = row
     assert state in ("met", "site", "partly", "no", "none"), requirement
     assert len(how) > 10, requirement

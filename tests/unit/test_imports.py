@@ -1,4 +1,4 @@
-"""What imports what."""
+"""Check which modules import which."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -55,7 +55,7 @@ PUBLIC = {
 
 
 def test_the_appliance_imports_only_public_modules_of_the_language(imports: dict[str, set[str]]) -> None:
-    """Those of the table, and the command's, which only the appliance's own command imports."""
+    """They are the modules of the table, and the command's modules, which only the appliance's command imports."""
     found = {
         (module, imported.removeprefix("rosmop."))
         for module, all_imported in imports.items()

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_it_depends_on_what_the_image_has() -> None:
-    """What runs in the container is what the package asks for; only the container needs an init of its own."""
+    """The package depends on the programs of the container; only the container needs its own init."""
     stage = (ROOT / "Dockerfile").read_text().partition("FROM ${BASE} AS appliance")[2]
     installed = re.search(r"--no-install-recommends \\\n((?: +\S+ \\\n)+)", stage)
     assert installed is not None
@@ -21,7 +21,7 @@ def test_it_depends_on_what_the_image_has() -> None:
 
 
 def test_each_dependency_has_its_reason() -> None:
-    """Every package that it asks for stands in packages.txt, where the reasons are."""
+    """Every dependency of the package is listed in packages.txt, with its reason."""
     listed = {line.partition("#")[0].strip() for line in (ROOT / "packages.txt").read_text().splitlines()}
     assert set(RUNS) <= listed
 
@@ -38,7 +38,7 @@ def test_the_service_has_the_rights_of_the_supervisor() -> None:
 
 
 def test_the_installed_configuration_is_right() -> None:
-    """What the package puts to /etc/rosrv is read without a mistake, and every commented key is one."""
+    """The configuration that the package installs in /etc/rosrv is valid, and every commented key exists."""
     file = ROOT / "distribution/appliance.yaml"
     settings = resolve(file, {}, {})
     assert settings.enable == "none"

@@ -27,7 +27,7 @@ def test_every_page_is_in_the_list_for_readers(page: Path) -> None:
 
 @pytest.mark.parametrize("page", WITH_LINKS, ids=lambda page: page.name)
 def test_links_lead_somewhere(page: Path) -> None:
-    """What a page links to, or names as a page, is there."""
+    """Every file that a page links to, or names as a page, exists."""
     text = page.read_text()
     prose = re.sub(r"```.*?```|`[^`\n]*`", "", text, flags=re.DOTALL)
     linked = [page.parent / link for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", prose)]

@@ -16,8 +16,8 @@ NAMED = sorted(
 
 
 @pytest.mark.parametrize(("path", "name"), NAMED)
-def test_what_the_model_names_is_there(path: str, name: str) -> None:
-    """A reader finds what a step models, under the name that the step gives."""
+def test_the_model_names_existing_code(path: str, name: str) -> None:
+    """A reader finds the code that a step models, under the name that the step gives."""
     inside: list[ast.stmt] = ast.parse((ROOT / path).read_text()).body
     for part in name.split("."):
         found = [
@@ -41,5 +41,5 @@ def test_every_process_names_what_it_models() -> None:
 
 
 def test_every_mutant_is_tried() -> None:
-    """Those of the model are those of the table."""
+    """The mutants of the model are those of the table."""
     assert set(re.findall(r"MUTANT_(\w+)", TEXT)) == set(MUTANTS)

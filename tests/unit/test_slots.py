@@ -1,4 +1,4 @@
-"""What calls what is said when a part is made: there is no place for a function that can stay empty."""
+"""An object gets the functions that it calls when it is made: no attribute for a function may stay empty."""
 
 import ast
 from collections.abc import Iterator

@@ -33,7 +33,7 @@ def test_a_test_that_was_removed_is_missed(tmp_path: Path) -> None:
 
 
 def named(text: str) -> list[str]:
-    """What a page names as a test."""
+    """Return the tests that a page names."""
     return re.findall(r"`([^`\s]*test_[^`\s]*)`", text)
 
 

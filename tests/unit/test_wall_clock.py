@@ -33,7 +33,7 @@ READERS = {
         "cli/status_verb.py",
     ],
 }  # fmt: skip
-"""The files that read the wall clock, by what for. A new one is added here by whoever can say the same of it."""
+"""The files that read the wall clock, by purpose. Add a file only if it has one of these purposes."""
 
 _WALL = {("time", "time"), ("time", "time_ns"), ("time", "CLOCK_REALTIME")} | {
     (of, call) for of in ("datetime", "date") for call in ("now", "utcnow", "today")
@@ -43,7 +43,7 @@ _WALL = {("time", "time"), ("time", "time_ns"), ("time", "CLOCK_REALTIME")} | {
 def _reads_wall_clock(path: Path) -> bool:
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module == "time":
-            return True  # nobody sees which clock `time()` would be
+            return True  # a bare `time()` does not show its clock
         if isinstance(node, ast.Attribute):
             of = node.value.attr if isinstance(node.value, ast.Attribute) else getattr(node.value, "id", "")
             if (of, node.attr) in _WALL:
@@ -52,6 +52,6 @@ def _reads_wall_clock(path: Path) -> bool:
 
 
 def test_only_these_files_read_the_wall_clock() -> None:
-    """What waits, expires or counts seconds elsewhere would believe a clock that was set."""
+    """Any other timeout, expiry or duration would be wrong after someone sets the clock."""
     found = {str(path.relative_to(ROOT)) for path in product_files() if _reads_wall_clock(path)}
     assert found == {f"appliance/{file}" for files in READERS.values() for file in files}

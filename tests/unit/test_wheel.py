@@ -77,8 +77,8 @@ def test_it_brings_what_is_not_code(wheel: Path) -> None:
     assert not [name for name in names if name.startswith("rosmop/tests")]
 
 
-def test_no_compiler_is_told_from_a_wrong_source(tmp_path: Path) -> None:
-    """`rosrv demo` goes on without its compiled node only where there is nothing to compile it with."""
+def test_a_missing_compiler_differs_from_a_wrong_source(tmp_path: Path) -> None:
+    """`rosrv demo` continues without its compiled node only if the compiler or the library is missing."""
     source = tmp_path / "wrong.cpp"
     source.write_text("int main() { return ")
     build = ["/bin/bash", str(ROOT / "scripts/build-roscpp"), str(source), str(tmp_path / "made")]

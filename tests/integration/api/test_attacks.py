@@ -135,7 +135,7 @@ def test_each_pipelined_request_needs_its_token(rest: Rest) -> None:
 
 
 def test_two_tokens_do_not_add_up(rest: Rest) -> None:
-    """Of two Authorization headers, one valid, at most one is used, and roles never add up."""
+    """With two Authorization headers, one valid, at most one is used, and roles never add up."""
     wrong = "Authorization: Bearer rosrv_000000000000_" + "A" * 43 + "\r\n"
     right = f"Authorization: Bearer {rest.token}\r\n"
     for headers in (wrong + right, right + wrong):

@@ -179,7 +179,7 @@ def test_one_monitor_is_shown_in_detail(appliance: Appliance) -> None:
 
 
 def test_an_invalid_specification_is_rejected_with_its_place(appliance: Appliance) -> None:
-    """An error on trial or load is 422 with file, line and column; the revision in force stays."""
+    """An error in a dry run or load is 422 with file, line and column; the revision in force stays."""
     rest = appliance.rest()
     before = load(rest, {"speed.rv": LIMIT}).json["revision"]
     for query, match in (("?dry_run=1", None), ("", "*")):

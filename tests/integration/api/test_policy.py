@@ -246,7 +246,7 @@ def test_the_tests_beside_the_file_guard_it(appliance: Appliance) -> None:
 
 
 def test_an_unconfirmed_change_is_rolled_back(appliance: Appliance) -> None:
-    """A change with confirm_within is rolled back unless somebody confirms it."""
+    """A change with confirm_within is rolled back unless it is confirmed in time."""
     rest = appliance.rest()
     first = in_force(rest)
     events = rest.events("/v1/audit/stream?event=policy%20*")
@@ -341,7 +341,7 @@ def test_explain_returns_the_same_as_the_command(running: Appliance, rest: Rest)
     ],
 )
 def test_an_invalid_body_is_reported(rest: Rest, body: bytes, kind: str, status: int) -> None:
-    """Another type, no JSON (with line and column), an unknown field, too deep, no text, empty: each has its error."""
+    """Every invalid body (such as a wrong type, broken JSON, an unknown field, an empty text) has its own error."""
     headers = {"If-Match": "*"} | ({"Content-Type": kind} if kind else {})
     answer = rest.request("POST", "/v1/policy", body, headers)
     assert answer.status == status

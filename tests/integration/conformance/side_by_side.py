@@ -3,9 +3,8 @@
     answers = both.call("registerPublisher", "/talker", "/chatter", "std_msgs/String", Api("talker"))
     assert answers.plain == answers.appliance
 
-What must differ by design is written here once: URIs (each is turned into the name of the node behind it) and
-ids. Everything else is left as it came. `Api` and `ServiceApi` stand for URIs of fake nodes, of which each master
-has its own.
+Only URIs and ids may differ by design, and only they are replaced here: each URI becomes the name of the node behind
+it. `Api` and `ServiceApi` stand for URIs of fake nodes; each master has its own fake nodes.
 """
 
 import itertools

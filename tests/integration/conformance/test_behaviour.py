@@ -278,6 +278,6 @@ def test_hundred_nodes_of_ten_topics(local: Site) -> None:
 
 
 def _told(nodes: FakeNodes) -> set[tuple[str, str]]:
-    """Return the subscribers that were told a publisher of a topic (or learnt it when they registered)."""
+    """Return the subscribers that know a publisher, by an update or from their registration, each with its topic."""
     told = {(call.node, call.params[1]) for call in nodes.all_calls() if call.method == "publisherUpdate"}
     return told | {("n99", f"/n0/t{topic}") for topic in range(10)}

@@ -228,7 +228,7 @@ def test_watchers_get_the_same_updates_of_any_sequence(both: BothMasters, steps:
 
 
 def _is_told(side: MasterSide, node: str, number: int) -> bool:
-    """Whether the node was told that `number` is settled, which follows everything before it."""
+    """Whether the node got the update that sets `/settled` to `number`; all earlier updates have come before it."""
     return any(
         call.node.startswith(f"{node}-") and call.params[1:] == ("/settled/", number)
         for call in side.nodes.all_calls()

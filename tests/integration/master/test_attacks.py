@@ -1,7 +1,7 @@
 """Attacks on the graph from another host, by calls: identity, names, parameters, services, addresses, endpoints.
 
-After each of them the robot's talker and its operator's listener have gone on (the fixture looks), the caller was
-told why in the shape its library expects, and the audit log has the refusal with the rule it stands on.
+After each attack the robot's talker and its operator's listener still run (the fixture checks this), the caller has
+the reason in the form that its library expects, and the audit log has the denial with its rule.
 """
 
 import contextlib
@@ -104,7 +104,7 @@ def no_hidden_port_is_revealed(field: Field) -> Iterator[None]:
 
 
 def outer(field: Field, node: str) -> str:
-    """Return the address of a node as the rogue is told it."""
+    """Return the address that the rogue gets for a node."""
     code, _text, uri = field.rogue("lookupNode", "/looker", node)
     assert code == 1
     return str(uri)

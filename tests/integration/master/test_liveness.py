@@ -71,7 +71,9 @@ def test_a_dead_node_is_noticed_despite_unresponsive_nodes(lab: Lab, robot: Host
                 tail.wait_for(event="node lost", caller_id="/brief", timeout=allowed(8))
 
 
-def test_a_paused_subscriber_is_told_of_a_new_publisher(lab: Lab, robot: Host, tmp_path: Path) -> None:
+def test_a_paused_subscriber_gets_a_new_publisher_when_it_goes_on(
+    lab: Lab, robot: Host, tmp_path: Path
+) -> None:
     """After failed updates about a new publisher, a subscriber that was never lost gets the update when it goes on."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     middle = lab.host("appliance", "10.77.0.2/24")

@@ -1,6 +1,6 @@
 """When a node's machine is gone, a node on another host that the policy allows takes over its name at once.
 
-A ROS 1 node registers only once: after a refusal, somebody has to start it again.
+A ROS 1 node registers only once: after a denial it has to be started again.
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""A latched emergency stop survives the death of every process, until somebody releases it."""
+"""A latched emergency stop survives the death of every process, until an operator releases it."""
 
 import itertools
 import json

@@ -99,7 +99,7 @@ def test_the_death_of_a_relay_does_not_affect_the_other(appliance: Appliance, ro
 def test_loading_a_specification_across_relays_moves_only_one_monitor(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Only the monitor that moves is reset, which raises an alarm; nodes are told to reconnect and do."""
+    """Only the monitor that moves is reset, which raises an alarm; nodes get the new address and reconnect."""
     listeners = {
         (one, client): ros.listener(client, f"/{one}")
         for one in ("left", "right")

@@ -154,7 +154,7 @@ def test_a_message_of_ten_megabytes_arrives_whole(driver: RelayDriver, ros: RosS
 
 
 def test_a_subscriber_without_a_permission_is_not_served(driver: RelayDriver, ros: RosSession) -> None:
-    """Another caller_id or topic of the same publisher gets an error header, and control is told."""
+    """A request with another caller_id or topic gets an error header, and control gets a report."""
     ros.talker("rospy", "/chatter", name="talker")
     face = driver.faces["/talker"]
     driver.link.send(GrantInstalled(face.key, "/chatter", LOOPBACK, "/listener"))
@@ -199,7 +199,7 @@ def test_a_connection_is_for_one_topic(driver: RelayDriver, ros: RosSession) -> 
 
 
 def test_traffic_continues_while_control_restarts(driver: RelayDriver, ros: RosSession) -> None:
-    """The death of control interrupts no connection; the next control is told of all of them."""
+    """The death of control interrupts no connection; the next control gets a report of each."""
     ros.talker("roscpp", "/chatter", "--rate", "50")
     listener = ros.listener("roscpp", "/chatter", name="listener")
     listener.wait_for(event="received")

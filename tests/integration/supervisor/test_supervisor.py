@@ -155,7 +155,7 @@ def common() -> Iterator[Running]:
 
 @pytest.mark.parametrize("role", ALL)
 def test_a_killed_process_is_back_within_a_second(common: Running, role: str) -> None:
-    """A dead process is restarted within a second of its first death, and control is told the new process."""
+    """A process is restarted within a second of its first death, and control gets the id of the new one."""
     old, restarts = common.living(role), common.restarts(role)
     killed = time.monotonic()
     os.kill(old, signal.SIGKILL)

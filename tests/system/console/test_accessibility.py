@@ -113,8 +113,8 @@ def test_it_goes_by_keys(opened: Callable[..., Reader]) -> None:
     expect(page.get_by_role("region", name=re.compile(r"^Record \d"))).to_be_visible()
 
 
-def test_the_theme_is_the_readers_until_he_chooses(opened: Callable[..., Reader]) -> None:
-    """It follows the system's theme; the switch overrides it, also after a reload."""
+def test_the_theme_is_the_systems_until_the_reader_chooses(opened: Callable[..., Reader]) -> None:
+    """The page follows the system's theme; the switch overrides it, also after a reload."""
     reader = opened(theme="dark")
     page = reader.go("now")
     assert page.evaluate("document.documentElement.dataset.theme") == "dark"

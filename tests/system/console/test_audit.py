@@ -70,7 +70,7 @@ def test_pages_go_back_to_the_beginning(opened: Callable[..., Reader], attempt: 
     assert numbers[0] - numbers[-1] == len(numbers) - 1
 
 
-def test_what_falls_off_the_list_can_be_fetched(opened: Callable[..., Reader]) -> None:
+def test_records_dropped_from_the_list_can_be_fetched(opened: Callable[..., Reader]) -> None:
     """A list that is followed for long drops its oldest records; `Older records` continues after the last one shown."""
     page = opened().go("audit")
     added = """async (state) => {
@@ -86,8 +86,8 @@ def test_what_falls_off_the_list_can_be_fetched(opened: Callable[..., Reader]) -
     assert whole["cursor"] is None
 
 
-def test_numbers_of_records_are_told_whole(opened: Callable[..., Reader]) -> None:
-    """Numbers of records are shown in full, never rounded."""
+def test_numbers_of_records_are_shown_in_full(opened: Callable[..., Reader]) -> None:
+    """Numbers of records are never rounded."""
     page = opened().go("audit")
     answer = {
         "ok": True, "log": "ab" * 16, "records": 1_234_567, "first": 400_001, "last": 1_634_567, "removed": 400_000,
@@ -134,7 +134,7 @@ def test_evidence_of_a_time_is_exported(opened: Callable[..., Reader], attempt: 
         assert b"/evident" in bundle.read("records.ndjson")
 
 
-def test_a_record_that_is_not_there_is_said(opened: Callable[..., Reader]) -> None:
+def test_an_unknown_record_shows_an_error(opened: Callable[..., Reader]) -> None:
     """A URL with an unknown record shows the appliance's error, and the list beside it."""
     page = opened().go("audit/ffffffffffffffffffff")
     expect(page.get_by_role("alert")).to_contain_text("there is no record")
@@ -183,7 +183,7 @@ def test_the_readers_own_looks_are_not_what_is_shown_first(
     expect(page.locator("tbody tr").filter(has_text=looked).first).to_be_visible()
 
 
-def test_short_names_stand_in_one_line(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
+def test_short_names_are_not_broken(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
     """On a wide screen no column breaks a name of a dozen letters, whatever the others contain."""
     refuse(attempt, "/a_dozen_let")
     page = opened().go("audit")

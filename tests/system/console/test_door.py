@@ -74,7 +74,7 @@ def test_an_expired_token_ends_the_session(token: Callable[..., str], opened: Ca
     expect(reader.page.get_by_role("status").filter(has_text="Signed out")).to_contain_text("rosrv token add")
 
 
-def test_a_page_that_nobody_uses_is_locked_and_loses_nothing(
+def test_an_unused_page_is_locked_and_loses_nothing(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
     """A locked page forgets the token, shows and requests nothing, and ignores keys; the same token restores it."""
@@ -108,7 +108,7 @@ def test_a_page_that_nobody_uses_is_locked_and_loses_nothing(
     expect(page.locator("[data-standing=live]")).to_be_visible()
 
 
-def test_a_tab_that_is_loaded_anew_after_hours_asks_for_the_token(opened: Callable[..., Reader]) -> None:
+def test_a_tab_reloaded_after_hours_asks_for_the_token(opened: Callable[..., Reader]) -> None:
     """The time in which the browser had unloaded a tab counts as time without input."""
     reader = opened()
     page = reader.go("now")
@@ -120,10 +120,10 @@ def test_a_tab_that_is_loaded_anew_after_hours_asks_for_the_token(opened: Callab
     assert page.evaluate("sessionStorage.getItem('rosrv.token')") is None
 
 
-def test_a_locked_page_is_nobody_elses(
+def test_a_locked_page_shows_another_user_none_of_its_drafts(
     appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
 ) -> None:
-    """A sign-in with another token shows none of the drafts that were written under the first."""
+    """After a sign-in with another token, no draft written under the first token is shown."""
     reader = opened()
     reader.page.clock.install()
     page = reader.go("policy")
@@ -137,7 +137,7 @@ def test_a_locked_page_is_nobody_elses(
     assert appliance.rest().get("/v1/policy").json["revision"] == 1
 
 
-def test_what_a_viewer_may_not_do_is_said_and_not_done(
+def test_a_viewer_sees_disabled_buttons_with_the_required_role(
     appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
 ) -> None:
     """For a viewer, buttons that change something are disabled and name the required role; REST also denies them."""

@@ -38,7 +38,7 @@ def test_names_are_text(view: str, opened: Callable[..., Reader]) -> None:
     reader.fits()
 
 
-def test_what_cannot_be_seen_is_shown(opened: Callable[..., Reader]) -> None:
+def test_invisible_characters_are_shown(opened: Callable[..., Reader]) -> None:
     """Direction, invisible and control characters are shown by their codes, and a long name with its length."""
     reader = opened()
     page = reader.go("audit?text=safe")

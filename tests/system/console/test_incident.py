@@ -150,10 +150,10 @@ def test_an_incident_by_keys(
     assert appliance.rest().get("/v1/policy").json["text"].count("/rude = 10.9.9.9") == 1
 
 
-def test_who_may_not_read_is_told_why(
+def test_a_viewer_sees_which_role_may_read_messages(
     recording: dict[str, Any], opened: Callable[..., Reader], token: Callable[..., str]
 ) -> None:
-    """A viewer sees the list, the time line, and which role may read the messages; nothing is wider than the window."""
+    """A viewer sees the list, the time line, and the role that may read messages; nothing is wider than the window."""
     reader = opened(token("viewer"), width=390, height=844)
     page = reader.go("recordings")
     press(page.locator(f'tbody a[href$="{recording["id"]}"]'))

@@ -81,7 +81,7 @@ def test_two_clicks_at_once_are_both_made(appliance: Appliance, opened: Callable
     expect(page.get_by_text("Changed by someone else")).to_have_count(0)
 
 
-def test_a_switch_that_somebody_else_was_quicker_with_says_so(
+def test_a_switch_changed_by_another_user_is_not_overwritten(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
     """A change that the page has not shown yet is not overwritten; then the page shows it."""

@@ -39,7 +39,7 @@ def test_health_says_what_the_appliance_says(appliance: Appliance, opened: Calla
         expect(row).to_contain_text(str(process["pid"]))
 
 
-def test_processes_of_one_role_are_told_apart(opened: Callable[..., Reader]) -> None:
+def test_several_relays_are_numbered(opened: Callable[..., Reader]) -> None:
     """Several relay processes are numbered as in `rosrv status`; a single process is not."""
     page = opened().go("now")
     named = """async (processes) => {

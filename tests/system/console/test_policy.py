@@ -55,7 +55,7 @@ def test_an_error_is_shown_at_its_line_and_changes_nothing(
     assert revision(appliance) == before
 
 
-def test_what_is_typed_stands_there(opened: Callable[..., Reader]) -> None:
+def test_the_editor_has_exactly_the_typed_text(opened: Callable[..., Reader]) -> None:
     """After quick typing over several lines, undo and redo, the text is exactly what was typed."""
     reader = opened()
     page = reader.go("policy")

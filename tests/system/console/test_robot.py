@@ -99,7 +99,7 @@ def test_groups_by_host(opened: Callable[..., Reader]) -> None:
 
 
 @pytest.mark.usefixtures("robot")
-def test_who_talks_to_the_arm(opened: Callable[..., Reader]) -> None:
+def test_publishers_and_subscribers_of_the_arm(opened: Callable[..., Reader]) -> None:
     """A topic's name and Enter show its publishers and subscribers, and a denied attempt on it."""
     page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
     search = page.get_by_label("Search the graph")

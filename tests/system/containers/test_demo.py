@@ -76,7 +76,7 @@ def test_nodes_have_no_setting_but_the_master(demo: Compose) -> None:
 
 
 def test_denials_of_the_visitor_name_the_rule(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
-    """Of the visitor's attempts only those succeed that the policy grants; each denial is recorded with its rule."""
+    """Only the visitor's attempts that the policy grants succeed; each denial is recorded with its rule."""
     succeeded = {name for name, one in attacks.items() if one["succeeded"]}
     assert succeeded <= {"watch the battery"}
     assert len(attacks) >= 12

@@ -84,7 +84,7 @@ def test_new_keys_under_traffic(site: TunnelSite) -> None:
 
 
 def _told(charon: Process, text: str, count: int) -> None:
-    """Wait until charon has logged this so many times."""
+    """Wait until charon has logged the text `count` times."""
     position = 0
     for _ in range(count):
         found = charon.wait_for(lambda event: text in str(event.get("text")), since=position, timeout=LONG)

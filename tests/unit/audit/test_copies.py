@@ -130,10 +130,10 @@ def test_a_replaced_key_is_found(log: Path, tmp_path: Path) -> None:
     assert kinds(verify(log, public, tmp_path / "signer", copies)) == {FindingKind.WRONG_KEY}
 
 
-def test_checkpoints_of_removed_records_are_no_contradiction(
+def test_checkpoints_of_removed_records_contradict_nothing(
     make_log: MakeLog, path: Path, notary: Notary
 ) -> None:
-    """Checkpoints of removed records contradict nothing; alone they prove nothing, as the result says."""
+    """Without their records, checkpoints prove nothing, and the result says so."""
     notary.ago = 2 * 86_400_000_000_000
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     for number in range(60):

@@ -140,7 +140,7 @@ def test_an_invalid_syslog_receiver_is_rejected(syslog: dict[str, object], why: 
     ],
 )
 def test_an_invalid_pool_of_virtual_addresses_is_rejected(pool: str, said: str) -> None:
-    """IPv6, too small and too large: the error says what is valid."""
+    """The error for an IPv6 pool, or one of a wrong size, says what is valid."""
     with pytest.raises(ValidationError, match=said):
         read({"ipsec": {"pool": pool}})
 

@@ -124,7 +124,7 @@ def world() -> Iterator[Everything]:
 @pytest.fixture
 def link(world: Everything, pins: list[str]) -> RestLink:
     """Return control's end."""
-    return RestLink(world, world, world, served=pins.append, require_proof=False)  # type: ignore[arg-type]  # stands in for all three
+    return RestLink(world, world, world, served=pins.append, require_proof=False)  # type: ignore[arg-type]  # `Everything` is all three
 
 
 @pytest.fixture

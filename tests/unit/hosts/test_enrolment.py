@@ -293,7 +293,7 @@ async def test_a_name_or_an_address_that_cannot_be_had_is_refused(
 
 
 def test_without_a_firewall_no_name_stands_for_an_address(tmp_path: Path) -> None:
-    """The supervisor cannot keep clear text out: nobody is enrolled, and hosts of an earlier life are nobody."""
+    """If the supervisor cannot keep clear text out, no host can be enrolled, and enrolled hosts lose their names."""
 
     async def enrol(bench: Bench) -> None:
         await bench.add("a")
@@ -312,8 +312,8 @@ def test_without_a_firewall_no_name_stands_for_an_address(tmp_path: Path) -> Non
     run(tmp_path, again)
 
 
-def test_a_master_that_cannot_be_reached_in_the_tunnel_is_said(tmp_path: Path) -> None:
-    """An appliance that listens on one address of the network is not there for hosts in tunnels."""
+def test_a_master_that_tunnels_cannot_reach_is_reported(tmp_path: Path) -> None:
+    """An appliance that listens on one address of the network is unreachable for hosts in tunnels."""
 
     async def work(bench: Bench) -> None:
         with pytest.raises(HostRefusedError, match=r"listen: 0\.0\.0\.0:11311"):
@@ -344,8 +344,8 @@ async def test_a_new_certificate_revokes_the_one_before(bench: Bench) -> None:
     assert [row.serial for row in bench.store.hosts.revoked()] == [first.serial]
 
 
-async def test_a_bad_request_enrols_nobody(bench: Bench) -> None:
-    """What the authority refuses is refused whole."""
+async def test_a_bad_request_enrols_no_host(bench: Bench) -> None:
+    """A request that the authority refuses leaves no trace."""
     with pytest.raises(HostRefusedError, match="not a signing request"):
         await bench.hosts.add(HostAdd("a", "rubbish", 90), "tester")
     assert bench.hosts.rows() == []
@@ -396,7 +396,7 @@ async def test_two_who_bring_a_token_at_once_get_one_certificate(bench: Bench) -
 
 
 async def test_a_bad_request_does_not_use_the_token_up(bench: Bench) -> None:
-    """The host may come again with a right one; an ended or revoked token is good for nothing."""
+    """The host may try again with a valid request; an expired or revoked token is invalid."""
     text = (await bench.token("a")).token
     with pytest.raises(HostRefusedError, match="not a signing request"):
         await bench.hosts.itself.enrol(HostEnrol(text, "rubbish", "10.9.9.9"))
@@ -412,7 +412,7 @@ async def test_a_bad_request_does_not_use_the_token_up(bench: Bench) -> None:
 
 
 def test_tokens_outlive_a_restart(tmp_path: Path) -> None:
-    """Whoever is awaited is awaited after a crash too."""
+    """A token that was not used yet is valid after a crash."""
     texts: list[str] = []
 
     async def before(bench: Bench) -> None:
@@ -427,7 +427,7 @@ def test_tokens_outlive_a_restart(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", ["kit", "token", "itself"])
 async def test_revoked_while_a_certificate_is_made(bench: Bench, how: str) -> None:
-    """What is under way for a revoked host comes to nothing, however it comes; it stays revoked."""
+    """A kit, token or renewal under way for a revoked host comes to nothing; the host stays revoked."""
     key = make_key()
     await bench.add("a", key=key)
     text = (await bench.token("a", new=False)).token
@@ -472,7 +472,7 @@ async def test_a_host_renews_itself(bench: Bench) -> None:
 
 
 def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:
-    """A twentieth of the certificate's life, whether control was started anew meanwhile or not; a kit needs no wait."""
+    """A host waits a twentieth of its certificate's life, also across restarts of control; a kit needs no wait."""
     keys = [make_key(), make_key(), make_key()]
 
     async def first(bench: Bench) -> None:
@@ -493,7 +493,7 @@ def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:
 
 
 async def test_a_short_life_needs_a_short_wait(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is renewed often ends soon, and is on the list of revoked certificates for as short a time."""
+    """A certificate with a short life stays on the list of revoked certificates for as short a time."""
     keys = [make_key(), make_key(), make_key()]
     await bench.hosts.add(HostAdd("a", signing_request(keys[0], "a").decode(), 100 / 86_400), "tester")
     for former, key in itertools.pairwise(keys):
@@ -529,8 +529,8 @@ async def test_nobody_renews_for_another(bench: Bench) -> None:
         await bench.hosts.itself.renew(HostRenewItself("a", request, good, "10.113.11.2"))
 
 
-async def test_revoking_amid_a_renewal_revokes_both_certificates(bench: Bench) -> None:
-    """The one that was to follow is as dead as the present one, over a restart too."""
+async def test_revoking_during_a_renewal_revokes_both_certificates(bench: Bench) -> None:
+    """The new certificate is revoked with the present one, also after a restart."""
     key = make_key()
     first = await bench.add("a", key=key)
     request = request_of("a")
@@ -548,7 +548,7 @@ async def test_revoking_amid_a_renewal_revokes_both_certificates(bench: Bench) -
 
 
 async def test_the_list_is_signed_once_however_often_it_is_asked_for(bench: Bench) -> None:
-    """Whoever asks without a token costs no signature, and for the certificate never; who is revoked is on at once."""
+    """Requests without a token cause no signature; a revoked certificate is on the list at once."""
     first = await bench.add("a")
     assert "BEGIN CERTIFICATE" in (await bench.certification.authority(AuthorityWanted())).authority
     assert bench.authority.lists == 0
@@ -642,7 +642,7 @@ async def test_a_tunnel_that_is_not_wanted_stays_closed(bench: Bench) -> None:
 
 
 def test_the_first_tunnel_that_is_wanted_counts_in_the_policy(tmp_path: Path) -> None:
-    """What `host:NAME` means is told when clear text is kept out, which a reload may be the first to ask for."""
+    """The policy gets the addresses of `host:NAME` once the firewall is set, here after a reload."""
 
     async def enrol(bench: Bench) -> None:
         await bench.add("a")
@@ -664,8 +664,8 @@ def test_the_first_tunnel_that_is_wanted_counts_in_the_policy(tmp_path: Path) ->
     run(tmp_path, again)
 
 
-async def test_a_certificate_that_ends_soon_is_said_once(bench: Bench) -> None:
-    """In the log once, in the status as long as it is so; a short life warns in its last third."""
+async def test_a_certificate_that_ends_soon_is_logged_once(bench: Bench) -> None:
+    """The status shows it until it is renewed; a short-lived certificate warns in its last third."""
     await bench.hosts.add(HostAdd("short", request_of("a"), 10), "tester")
     assert bench.hosts.status().troubles == []
     await bench.hosts.renew(HostRenew("short", request_of("a"), 1e-5), "tester")
@@ -677,8 +677,8 @@ async def test_a_certificate_that_ends_soon_is_said_once(bench: Bench) -> None:
     assert "short" in bench.hosts.status().troubles[0]
 
 
-async def test_what_was_seen_of_ports_is_kept(bench: Bench) -> None:
-    """By a host's name, its address, or a machine's in clear text; a name nobody has is refused."""
+async def test_scanned_ports_of_a_host_are_kept(bench: Bench) -> None:
+    """A report names a host by name, its address, or a machine's in clear text; an unknown name is refused."""
     await bench.add("a")
     bench.machines = {"10.0.0.7": 3, "127.0.0.1": 1, "10.113.11.2": 2}
     assert (await bench.hosts.ports.tell(HostPorts("10.113.11.2", "open", [40001], 5.0), "eve")).name == "a"
@@ -695,10 +695,10 @@ async def test_what_was_seen_of_ports_is_kept(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("order", [HostRevoke("a"), HostsReload()], ids=["revoke", "reload"])
-async def test_who_is_told_that_a_host_is_out_finds_its_connections_closed(
+async def test_removing_a_host_answers_once_its_connections_are_closed(
     bench: Bench, order: HostRevoke | HostsReload
 ) -> None:
-    """The answer waits for the relays."""
+    """The answer to `revoke` or `reload` waits for the relays."""
     await bench.add("a")
     bench.relays.clear()
     hosts = bench.hosts
@@ -742,10 +742,10 @@ async def test_only_what_charon_took_of_this_life_counts_as_taken(
         one.close()
 
 
-def test_a_host_whose_disk_fills_meanwhile_is_told_how_it_stands(
+def test_a_full_disk_during_enrolment_names_the_way_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is enrolled and nobody has its kit: whoever ordered it hears so, and by what it is made or taken back."""
+    """The host is enrolled without a kit: the error names the commands that make the kit or revoke the host."""
 
     async def full() -> None:
         raise StoreError("state.db: full; make room")

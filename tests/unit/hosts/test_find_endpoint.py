@@ -24,15 +24,15 @@ async def _several() -> EndpointFound:
     return EndpointFound(None, "there are several addresses here (10.0.0.5, 10.0.1.5)")
 
 
-def test_what_is_configured_comes_first() -> None:
-    """Nobody looks then, so that it also helps where nothing can be found."""
+def test_the_configured_endpoint_comes_first() -> None:
+    """Nothing is searched then, so the setting also helps where no endpoint can be found."""
     assert asyncio.run(find_endpoint(_settings("robot.example.org"), _several)) == Endpoint(
         "robot.example.org", "ipsec.endpoint of the configuration"
     )
 
 
-def test_what_the_supervisor_sees_is_taken_with_its_reason() -> None:
-    """So that a person can judge it."""
+def test_the_address_found_by_the_supervisor_comes_with_its_reason() -> None:
+    """The reason lets a person judge the choice."""
     assert asyncio.run(find_endpoint(_settings(), _found)) == Endpoint("10.0.0.5", "the only address here")
 
 

@@ -17,7 +17,7 @@ def test_hosts_with_and_without_an_address(tmp_path: Path) -> None:
     }
 
 
-def test_no_file_and_an_empty_one_declare_nobody(tmp_path: Path) -> None:
+def test_a_missing_or_empty_file_declares_no_host(tmp_path: Path) -> None:
     """The baseline may be missing."""
     assert read_declared(tmp_path / "none.yaml") == {}
     (tmp_path / "empty.yaml").write_text("# nobody yet\n")
@@ -94,7 +94,7 @@ def test_the_shipped_file_is_read() -> None:
 
 
 def test_the_example_in_the_file_is_right(tmp_path: Path) -> None:
-    """What it shows in comments can be taken as it is."""
+    """The example in the comments is valid as it is."""
     shipped = (Path(__file__).parents[3] / "ipsec" / "hosts.yaml").read_text()
     example = [line[2:] for line in shipped.splitlines() if line.startswith(("# hosts:", "#   "))]
     path = tmp_path / "hosts.yaml"

@@ -26,8 +26,8 @@ NET = ["192.168.1.0/24"]
         ),
     ],
 )
-def test_who_cannot_be_reached_says_what_to_set(settings: dict[str, Any], trouble: str) -> None:
-    """No host can enrol itself, and the reason is a thing to do."""
+def test_an_unreachable_rest_says_which_setting_helps(settings: dict[str, Any], trouble: str) -> None:
+    """Hosts cannot enrol themselves, and the reason names a setting."""
     place = rest_address(read(settings))
     assert place.port is None
     assert trouble in place.trouble
@@ -41,8 +41,8 @@ def test_who_cannot_be_reached_says_what_to_set(settings: dict[str, Any], troubl
         ({"api": "127.0.0.1:9000", "isolation": "netns", "api_networks": NET}, 9000, 9000),
     ],
 )
-def test_who_can_be_reached(settings: dict[str, Any], port: int, inner: int | None) -> None:
-    """In a namespace of its own always where the networks are named; bound to one address, not through tunnels."""
+def test_the_address_where_hosts_reach_rest(settings: dict[str, Any], port: int, inner: int | None) -> None:
+    """In its own namespace REST is reachable wherever networks are named; bound to one address, not through tunnels."""
     place = rest_address(read(settings))
     assert (place.port, place.trouble, place.inner_port) == (port, "", inner)
 

@@ -72,8 +72,8 @@ def test_a_clock_that_stood_too_late_lets_no_certificate_in_again(
     again.close()
 
 
-def test_what_is_revoked_is_kept_over_restarts(tmp_path: Path) -> None:
-    """And what ended long since is not; one whose end was not noted counts as long as there may be one."""
+def test_revoked_certificates_are_kept_over_restarts(tmp_path: Path) -> None:
+    """Long expired ones are dropped; one without a stored expiry is kept as long as it could be valid."""
     now = time.time()
     first = StateStore(tmp_path, failed=pytest.fail)
     revoked = RevokedCertificates(first.hosts)

@@ -69,7 +69,7 @@ def test_a_weak_key_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_request_without_its_key_is_refused(tmp_path: Path) -> None:
-    """Who does not hold the private key gets no certificate for it: a changed request is not signed."""
+    """A certificate needs proof of the private key: a changed request is not signed."""
     key = ec.generate_private_key(ec.SECP384R1())
     der = x509.load_pem_x509_csr(request_of(key, "aaaaaaa")).public_bytes(Encoding.DER)
     changed = x509.load_der_x509_csr(der.replace(b"aaaaaaa", b"bbbbbbb")).public_bytes(Encoding.PEM)
@@ -81,7 +81,7 @@ def test_a_request_without_its_key_is_refused(tmp_path: Path) -> None:
     "request_text",
     [b"", b"\0" * 100, b"-----BEGIN CERTIFICATE REQUEST-----\nMA==\n-----END CERTIFICATE REQUEST-----\n"],
 )
-def test_what_is_no_request_is_refused(tmp_path: Path, request_text: bytes) -> None:
+def test_an_invalid_request_is_refused(tmp_path: Path, request_text: bytes) -> None:
     """Rubbish is refused with a reason."""
     with pytest.raises(RequestRefusedError, match="not a signing request"):
         CertificateAuthority(tmp_path).issue(request_text, "ocu-1", 90)

@@ -61,7 +61,7 @@ class StandIn:
                     connection.sendall(struct.pack("!I", len(answer)) + answer)
 
     def ended(self, by: str) -> list[str]:
-        """What it was asked to end since this was asked last: the `ike` (connection) or `ike-id` of each."""
+        """Return the connections that charon had to end since the last call, by their `ike` (name) or `ike-id`."""
         asked, self.asked = self.asked, []
         return [body[by].decode() for name, body in asked if name == "terminate" and by in body]
 
@@ -92,16 +92,16 @@ def charon(tmp_path: Path) -> Iterator[tuple[StandIn, ViciClient]]:
     stand_in.close()
 
 
-def test_an_answer_of_another_kind_is_said(charon: tuple[StandIn, ViciClient]) -> None:
-    """What the library calls an error of the session is one of ours, with what was asked for."""
+def test_an_unexpected_answer_names_the_request(charon: tuple[StandIn, ViciClient]) -> None:
+    """A session error of the library becomes a CharonError that names the request."""
     stand_in, vici = charon
     stand_in.events = bytes([Packet.CMD_RESPONSE])
     with pytest.raises(CharonError, match="the list of tunnels"):
         vici.seen()
 
 
-def test_a_list_that_is_too_long_is_said(charon: tuple[StandIn, ViciClient]) -> None:
-    """A value has 65,535 bytes at most: more is an error that names the list, and what was loaded before stays."""
+def test_a_list_that_is_too_long_is_an_error(charon: tuple[StandIn, ViciClient]) -> None:
+    """A value over 65,535 bytes is an error that names the list; the lists loaded before stay."""
     _stand_in, vici = charon
     vici.provision(stated(65_535))
     with pytest.raises(CharonError, match="the list of revoked certificates"):
@@ -118,10 +118,10 @@ def test_unwanted_tunnels_are_closed_at_each_check(charon: tuple[StandIn, ViciCl
         assert stand_in.ended("ike") == [connection_name("gone")]
 
 
-def test_what_stands_of_a_certificate_that_was_replaced_is_closed_at_each_look(
+def test_tunnels_of_a_replaced_certificate_are_closed_at_each_check(
     charon: tuple[StandIn, ViciClient],
 ) -> None:
-    """By the numbers of what stood then, and of what new keys made of it; not the tunnel of the new certificate."""
+    """Tunnels open at the replacement are found by their numbers, also after rekeying; the new one's tunnel stays."""
     stand_in, vici = charon
     tunnel, certificates = connection_name("laptop"), ("1a", "1b")
     before, other = Standing(tunnel, 3, 7), Standing(connection_name("other"), 4, 8)

@@ -44,7 +44,7 @@ class Machine:
         (root / "x509/rosrv.pem").write_bytes(made)
 
     def keeps_what_is_in_place(self) -> bool:
-        """What join.sh decides."""
+        """Whether join.sh keeps the files that are in place."""
         text = filled("join.sh", defaultdict(str, name="laptop"))
         begin, end = text.index("end() {"), text.index("\n}\n", text.index("renewed() {")) + 3
         script = text[begin:end].replace("/etc/swanctl", str(self._etc)) + "renewed\n"
@@ -81,8 +81,8 @@ def test_any_other_certificate_is_replaced(tmp_path: Path, openssl: str, name: s
 
 
 @pytest.mark.parametrize(("sas", "status"), [("ros{1}: INSTALLED", 0), ("", 1)])
-def test_what_charon_says_is_shown_where_it_fails(tmp_path: Path, sas: str, status: int) -> None:
-    """Nothing of the two dozen lines of a tunnel that comes up; of one that does not, all, and where to look."""
+def test_output_of_charon_is_shown_only_after_a_failure(tmp_path: Path, sas: str, status: int) -> None:
+    """A tunnel that comes up prints none of its two dozen lines; a failed one prints all, and where to look."""
     text = filled("join.sh", defaultdict(str, name="laptop", endpoint="10.0.0.2"))
     begin, end = text.index('say "waiting for'), text.index("\nfi\n", text.index("INSTALLED")) + 4
     functions = "".join(line for line in text.splitlines(True) if line.startswith(("die()", "say()")))

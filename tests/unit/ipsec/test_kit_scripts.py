@@ -29,7 +29,7 @@ def test_it_needs_no_python(script: Path) -> None:
     assert re.findall(r"python|perl|ruby", script.read_text(), re.IGNORECASE) == []
 
 
-# What curl 7.68 and OpenSSL 1.1.1 have, of Ubuntu 20.04; who adds an option looks there first.
+# Options of curl 7.68 and OpenSSL 1.1.1, from Ubuntu 20.04. Check there before you add one.
 _CURL = "silent show-error max-time insecure pinnedpubkey fail data-binary"
 _OPENSSL = (
     "x509 pkey ecparam req crl verify dgst base64 pkeyutl"  # pkeyutl -rawin is OpenSSL 3's: for Ed25519 only
@@ -48,8 +48,8 @@ def test_it_asks_of_its_tools_what_ubuntu_20_04_has(script: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["join.sh", "leave.sh"])
-def test_what_has_ended_and_nobody_collects_runs_no_more(name: str) -> None:
-    """Process 1 of a container may collect nothing: who waits for the end of such a program waits for ever."""
+def test_a_zombie_does_not_count_as_running(name: str) -> None:
+    """Process 1 of a container may not collect its children: waiting for such a program would never end."""
     runs = next(line for line in (FOLDER / name).read_text().splitlines() if line.startswith("runs() "))
     with subprocess.Popen(["/bin/true"]) as ended:
         os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)

@@ -89,7 +89,7 @@ async def test_charon_gets_one_request_at_a_time(tmp_path: Path, monkeypatch: py
 
 
 def failure_of(directory: Path, esp: Esp) -> Failed:
-    """What the supervisor hears when charon is to be started."""
+    """Return the failure that the supervisor gets at the start of charon."""
 
     async def work() -> Failed:
         (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
@@ -119,8 +119,8 @@ def failure_of(directory: Path, esp: Esp) -> Failed:
     return asyncio.run(work())
 
 
-def test_what_charon_printed_last_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The supervisor hears how charon ended and its last 40 lines, each up to a length."""
+def test_the_last_output_of_charon_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The supervisor gets charon's exit and its last 40 lines, each up to a length."""
     program = tmp_path / "charon"
     program.write_text("#!/bin/sh\nseq 1 100 >&2\nhead -c 9000 /dev/zero | tr '\\0' x >&2\nkill -SEGV $$\n")
     program.chmod(0o700)

@@ -14,7 +14,7 @@ REVOKED = """\
 
 
 def refusals(text: str) -> list[Refusal]:
-    """What a log says."""
+    """Return the refusals in a log."""
     reader = RefusalParser()
     return [found for line in text.splitlines() if (found := reader.read(line)) is not None]
 
@@ -27,8 +27,8 @@ def test_the_reason_belongs_to_the_packet_of_its_thread() -> None:
     assert "revoked on Nov 20" in found.reason
 
 
-def test_a_handshake_that_goes_well_is_no_refusal() -> None:
-    """An answer without an error says nothing."""
+def test_a_successful_handshake_is_not_a_refusal() -> None:
+    """An answer without an error yields nothing."""
     lines = REVOKED.replace("N(AUTH_FAILED)", "IDr CERT AUTH CPRP(ADDR) SA TSi TSr N(MOBIKE_SUP)")
     assert refusals(lines) == []
 
@@ -42,13 +42,13 @@ def test_the_answer_may_have_more_than_the_error() -> None:
 
 
 def test_a_name_chosen_by_an_unknown_host_makes_no_long_reason() -> None:
-    """What is passed on is bounded, whatever the certificate says."""
+    """The reason has a limited length, whatever the certificate contains."""
     (found,) = refusals(REVOKED.replace("unspecified", "x" * 5000))
     assert len(found.reason) <= 400
 
 
-def test_what_is_no_line_of_the_log_is_passed_over() -> None:
-    """Rubbish and lines of threads that have no packet are nothing."""
+def test_unknown_lines_of_the_log_are_skipped() -> None:
+    """Rubbish, and lines of threads that have no packet, yield nothing."""
     assert refusals("\n\nrubbish\n09[ENC] generating IKE_AUTH response 1 [ N(AUTH_FAILED) ]\n") == []
 
 

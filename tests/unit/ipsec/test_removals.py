@@ -46,8 +46,8 @@ class Desk:
         return self.removals.approve(self.texts[number - 1], self.texts[-1]).decode()
 
 
-def test_what_is_old_by_the_signers_clock_goes(tmp_path: Path) -> None:
-    """Records go by the time at which the signer signed them, whatever time control wrote into the checkpoint."""
+def test_records_expire_by_the_signers_clock(tmp_path: Path) -> None:
+    """The age of a record counts from its signature, whatever time control wrote into the checkpoint."""
     desk = Desk(tmp_path, RetentionLimits(days=5))
     text = desk.approve(5)
     assert text.startswith("rosrv audit removal 1\n")

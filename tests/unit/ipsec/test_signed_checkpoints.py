@@ -20,7 +20,7 @@ def checkpoint(number: int, previous: str = _NONE, log: str = "a" * 32, digest: 
 
 
 def digest(text: bytes) -> str:
-    """What the next checkpoint carries as `previous`."""
+    """Return the digest that the next checkpoint carries as `previous`."""
     return hashlib.sha256(text).hexdigest()
 
 

@@ -236,7 +236,7 @@ async def test_an_unexpected_parser_error_is_a_refusal(
     """The refusal has words, and other requests in the same read are answered."""
 
     class OddError(Exception):
-        """Of no kind that is expected."""
+        """An error of an unexpected kind."""
 
     def fail(*_arguments: object, **_named: object) -> None:
         raise OddError("something is odd")

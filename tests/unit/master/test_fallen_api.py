@@ -37,7 +37,7 @@ class World:
         self.recorded: list[dict[str, Any]] = []
         self.obstacle: str | None = None
         self.apis: list[Api] = []
-        self.tokens = TokenOrders(self.store, self, self.token_changed)  # type: ignore[arg-type]  # stands in for the trail
+        self.tokens = TokenOrders(self.store, self, self.token_changed)  # type: ignore[arg-type]  # this class is the trail
         self.begin(require_proof=False)
 
     def begin(self, *, require_proof: bool) -> None:

@@ -13,8 +13,8 @@ from appliance.network.namespaces import NetworkError
 from appliance.network.scan import addresses_of, scan
 
 
-def test_open_and_refused_ports_are_told_apart() -> None:
-    """A port with a listener is open, one that is bound without listening is refused."""
+def test_open_and_refused_ports_differ() -> None:
+    """A port with a listener is open; one that is bound without listening is refused."""
     with socket.create_server(("127.0.0.1", 0)) as server, socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         listening, bound = server.getsockname()[1], closed.getsockname()[1]

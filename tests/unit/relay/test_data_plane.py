@@ -359,8 +359,8 @@ def test_whatever_peers_send_the_relay_serves_on(world: World, seed: int) -> Non
     ],
     ids=lambda message: type(message).__name__,
 )
-def test_what_a_connection_stands_on_takes_it_along(world: World, message: Message) -> None:
-    """Grant, publication and node: withdrawn means cut."""
+def test_a_connection_ends_with_its_grant_publication_or_node(world: World, message: Message) -> None:
+    """Withdrawing any of the three closes the connection."""
     _publisher, subscriber = world.subscribed()
     world.hears(ConnectionOpened)
     world.state(message)

@@ -225,8 +225,8 @@ def test_a_host_alone_is_served_without_waiting_and_owes_nothing(costs: Costs) -
     assert costs.order.count("robot") <= 30
 
 
-def test_what_is_left_for_later_takes_turns_with_events_and_with_others(costs: Costs) -> None:
-    """Work that a handler has left is charged to its payer, and starves neither its events nor another host."""
+def test_postponed_work_takes_turns_with_events_and_other_hosts(costs: Costs) -> None:
+    """Work that a handler postpones is charged to its payer, and starves neither its events nor another host."""
 
     def work() -> None:
         costs.used += QUANTUM

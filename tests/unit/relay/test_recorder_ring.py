@@ -44,8 +44,8 @@ def kept(descriptor: int) -> list[tuple[str, bytes]]:
     ]
 
 
-def test_what_monitors_drop_is_recorded(memory: int) -> None:
-    """As it came, with the publisher's true name and host; from the connection's beginning to its end."""
+def test_messages_dropped_by_monitors_are_recorded(memory: int) -> None:
+    """Each is recorded as it came, with the publisher's true name and host, for the life of the connection."""
     story = Story(recorded=given(memory))
     story.topic.monitor(lambda _batch: None, wanted=True)
     member = story.join()

@@ -189,8 +189,8 @@ def test_headers_of_publishers_and_servers_count_while_they_are_connected(world:
 
 
 @pytest.mark.parametrize("asked", [ASK, CALL])
-def test_of_a_peers_header_little_is_remembered(world: World, asked: dict[str, str]) -> None:
-    """Fields that ROS has, none longer than a name: eight thousand connections of a host take little memory."""
+def test_little_of_a_peers_header_is_kept(world: World, asked: dict[str, str]) -> None:
+    """Only ROS fields are kept, none longer than a name: eight thousand connections of a host take little memory."""
     long = world.connect(encode_header(asked | {"type": "x" * 2000}))
     assert world.gets_header(long)["error"] == "its header has a type of 2000 characters"
     world.connect(encode_header(asked | {"message_definition": "x" * 30_000, "own": "x" * 30_000}))

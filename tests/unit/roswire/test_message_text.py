@@ -55,7 +55,7 @@ def test_fields_and_constants_of_every_form() -> None:
     ],
 )
 def test_bad_lines_are_refused_with_their_place(line: str, complaint: str) -> None:
-    """An error names the file and the line it stands on."""
+    """An error names its file and line."""
     with pytest.raises(DefinitionError, match=complaint) as refused:
         parse_message("a/B", f"int32 first\n\n{line}", "B.msg")
     assert refused.value.source == "B.msg"

@@ -70,8 +70,8 @@ def test_long_values_are_shortened() -> None:
     assert fields["name"] == "x" * MOST_CHARACTERS + f"{CUT} {1000 - MOST_CHARACTERS} more"
 
 
-def test_what_is_left_out_of_an_array_does_not_hide_what_follows() -> None:
-    """A laser scan, an image, a list of names: each later field is there, and how much is left out."""
+def test_a_shortened_array_does_not_hide_later_fields() -> None:
+    """A laser scan, an image, a list of names: each later field is shown, with the number of omitted elements."""
     scan = struct.pack("<720f", *range(720))
     names = b"".join(struct.pack("<I", 3) + b"abc" for _ in range(100))
     data = b"".join(struct.pack("<I", 720) + scan for _ in range(2)) + struct.pack("<I", 100) + names

@@ -59,7 +59,7 @@ def test_service_uris() -> None:
     ),
     port=st.integers(1, 65535),
 )
-def test_what_is_written_is_read_back(host: str, port: int) -> None:
+def test_a_written_uri_is_read_back(host: str, port: int) -> None:
     """Any host and port come back from the URI that is written for them."""
     assert parse_node_uri(node_uri(host, port)) == NodeUri("http", host, port, "/")
     assert parse_node_uri(node_uri(host, port, "/key/")) == NodeUri("http", host, port, "/key/")

@@ -276,8 +276,8 @@ ENTITY_BOMB = (
         (call("<value>@</value>").replace(b"@", b"\xc0\xaf"), "well-formed"),
     ],
 )
-def test_what_is_not_xml_rpc_is_refused(body: bytes, text: str) -> None:
-    """Anything outside the grammar, ambiguous or out of range is refused with the place and the reason."""
+def test_invalid_xml_rpc_is_refused(body: bytes, text: str) -> None:
+    """Input outside the grammar, ambiguous or out of range is refused with the place and the reason."""
     with pytest.raises(ProtocolError, match=text) as refused:
         parse_call(body)
     assert "byte" in str(refused.value)
@@ -464,8 +464,8 @@ def test_texts_of_faults_are_always_sent() -> None:
         parse_response(build_fault(1, "a\x00<b>"))
 
 
-def test_what_is_read_can_be_written() -> None:
-    """The deepest value that is read can be written."""
+def test_the_deepest_readable_value_can_be_written() -> None:
+    """Reading and writing have the same limit of depth."""
     depth = XmlRpcLimits().depth
     body = call("<value><array><data>" * depth + "</data></array></value>" * depth)
     assert parse_call(build_call("m", parse_call(body).params)) == parse_call(body)

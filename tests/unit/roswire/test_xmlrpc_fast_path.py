@@ -52,7 +52,7 @@ LISTS: st.SearchStrategy[Value] = st.lists(SCALARS, max_size=3)
 
 @given(values=st.lists(st.one_of(SCALARS, LISTS, st.lists(LISTS, max_size=2)), max_size=4), data=st.data())
 @settings(max_examples=examples(1000))
-def test_what_the_pattern_reads_the_walk_reads_alike(values: list[Value], data: st.DataObject) -> None:
+def test_the_pattern_and_the_walk_read_the_same_values(values: list[Value], data: st.DataObject) -> None:
     """Whole or damaged, a call or an answer has the same values both ways, or the pattern leaves it to the walk."""
     whole = [dumped(values, "registerService"), dumped(values, None), ROSCPP]
     whole.append(dumped(parts(values, ["/a", "/b", 1]), "system.multicall"))

@@ -67,7 +67,7 @@ async def test_the_robot_waits_for_one_piece_of_a_flood(loop: Loop) -> None:
 
 
 async def test_a_robot_that_worked_alone_owes_nothing(loop: Loop) -> None:
-    """The robot made calls for an hour while nobody else did; under a flood by a new guest, it is served next."""
+    """The robot was the only caller for an hour; under a flood by a new guest, it is served next."""
     for _ in range(1000):
         assert loop.time.run(ROBOT, loop.work(ROBOT))
         await asyncio.sleep(0)

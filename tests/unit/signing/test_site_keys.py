@@ -33,8 +33,8 @@ ACEApIhnpdGjdF9HHm+vAXk/KSt3Z7TQEDyKJzsKxJvmkYU=
 
 
 @pytest.mark.parametrize("signature", [OPENSSH, OF_SHA256, OPENSSH.replace("\n", "\r\n"), f"\n{OPENSSH}\n"])
-def test_what_openssh_signed_is_taken(signature: str) -> None:
-    """With either hash of the format; the key is named as `ssh-keygen -l` names it, with its comment."""
+def test_a_signature_by_openssh_is_accepted(signature: str) -> None:
+    """Both hashes of the format are valid; the key is named as `ssh-keygen -l` names it, with its comment."""
     assert signer([OTHER_LINE, LINE], TEXT, signature) == NAME == name_of(LINE)
 
 

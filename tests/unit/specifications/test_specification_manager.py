@@ -143,7 +143,7 @@ async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
 
 
 async def test_records_of_loads_have_the_hash_of_the_files_and_of_what_was_compiled(desk: Desk) -> None:
-    """The first is what `sha256sum` makes of the files; equal texts have the same hash, whoever compiled them."""
+    """The first is the `sha256sum` of the files; equal texts have the same hash, by whichever process compiled."""
     monitors = await desk.monitors()
     await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
     await monitors.reload(admin.MonitorReload(prune=True), "operator")

@@ -19,8 +19,8 @@ def test_a_token_proves_itself_and_nothing_else_does() -> None:
     assert not is_secret(row.hash.hex()[:43], row.salt, row.hash)
 
 
-def test_what_is_kept_does_not_have_the_secret() -> None:
-    """The row has only a hash, salted: the same name twice gives another."""
+def test_the_stored_row_does_not_have_the_secret() -> None:
+    """The row has only a salted hash: the same name twice gives different ones."""
     row, text = make_token("alice", "viewer", now=1000.0, seconds=60)
     assert text.split("_", 2)[2] not in repr(row)
     again, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
@@ -38,7 +38,7 @@ def test_it_ends_in_time() -> None:
     "text", ["", "rosrv_", "rosrv_0123456789ab_", "rosrv_0123456789AB_" + "a" * 43, "rosrv_0123456789ab_" + "a" * 44,
              "rosrv_0123456789ab_" + "a" * 42 + "é", " rosrv_0123456789ab_" + "a" * 43],
 )  # fmt: skip
-def test_what_is_no_token_is_none(text: str) -> None:
+def test_an_invalid_token_is_none(text: str) -> None:
     """Only the exact form is parsed."""
     assert parse_token(text) is None
 

@@ -58,10 +58,10 @@ def test_the_registry_comes_back_as_it_was(tmp_path: Path) -> None:
     again.close()
 
 
-def test_what_a_killed_process_left_is_carried_out_again_from_any_statement_on(
+def test_statements_of_a_killed_process_are_repeated_from_any_of_them_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wherever control was killed, the next one starts and finds the registry, though the database had it already."""
+    """Wherever control was killed, the next one starts and finds the registry, even if the database already had it."""
     statements: list[Statement] = []
     append = WriteAhead.append
 
@@ -157,8 +157,8 @@ def test_a_parameter_that_was_just_set_outlasts_the_process(tmp_path: Path) -> N
     last.close()
 
 
-def test_who_set_parameters_outlasts_the_process(tmp_path: Path) -> None:
-    """Owners of keys are there for the next control; with a key go those below it, and no other that looks like it."""
+def test_owners_of_parameters_outlast_the_process(tmp_path: Path) -> None:
+    """The next control has the owners of keys; removing a key removes the keys below it, and no similar name."""
 
     def first(store: StateStore) -> None:
         for key in ("/", "/a", "/a/b", "/a/b/c", "/a/bc", "/ab", "/a-", "/b"):

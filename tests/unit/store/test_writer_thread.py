@@ -54,7 +54,7 @@ def database(tmp_path: Path, failures: list[str]) -> Iterator[Database]:
     database.close()
 
 
-async def test_what_was_queued_is_in_the_file_once_settled(database: Database, tmp_path: Path) -> None:
+async def test_queued_statements_are_in_the_file_once_settled(database: Database, tmp_path: Path) -> None:
     """After `settled` another connection sees every statement, in order."""
     for size in range(500):
         database.submit("INSERT OR REPLACE INTO thing VALUES ('a', ?)", (size,))
@@ -112,7 +112,7 @@ def test_a_failing_write_does_not_delay_the_end(tmp_path: Path, failures: list[s
 def test_a_waiting_caller_learns_that_the_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An operator is not kept waiting without a word; with room again all that was queued is written."""
+    """An operator who waits gets an error; once the disk has space again, all queued statements are written."""
     need_root()
     monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 0.05)
     place = tmp_path / "disk"
@@ -141,10 +141,10 @@ def test_a_waiting_caller_learns_that_the_disk_is_full(
         subprocess.run(["umount", "--lazy", place], check=True)
 
 
-async def test_what_was_awaited_outlasts_the_machines_power(
+async def test_settled_statements_survive_a_power_failure(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before `settled` returns the disk has the database's log, and the file of what is on its way as it is then."""
+    """When `settled` returns, the disk has the database's log, and the current file of statements under way."""
     synced: list[tuple[str, int]] = []
     fsync = os.fsync
 
@@ -169,7 +169,7 @@ def test_a_file_that_is_not_a_database_is_an_error_with_a_remedy(tmp_path: Path)
 
 
 def test_a_file_that_lost_all_it_had_is_not_taken_for_a_new_one(tmp_path: Path) -> None:
-    """Tokens, hosts and what was revoked would be gone without a word; an empty file before the first start is none."""
+    """Tokens, hosts and revocations would be lost silently. A file that is empty before the first start is new."""
     path = tmp_path / "state.db"
     path.touch()
     Database(path, SCHEMA, failed=print).close()
@@ -189,8 +189,8 @@ def test_an_unwritable_folder_is_not_taken_for_a_bad_file(tmp_path: Path) -> Non
     assert "move" not in str(caught.value)
 
 
-def test_what_a_killed_process_had_queued_is_there_after_the_next_start(tmp_path: Path) -> None:
-    """Nothing that `submit` took is lost to SIGKILL, whatever the writer thread had done by then; in order."""
+def test_statements_queued_by_a_killed_process_are_there_after_the_next_start(tmp_path: Path) -> None:
+    """Nothing that `submit` took is lost to SIGKILL or reordered, whatever the writer thread had done by then."""
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), SCHEMA], check=False, timeout=60)
     assert killed.returncode == -signal.SIGKILL
     again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
@@ -225,10 +225,10 @@ def test_rows_of_one_table_are_one_statement(
     assert rows == expected
 
 
-def test_what_is_submitted_together_is_kept_by_one_write_and_holds_up_no_other_thread(
+def test_a_block_of_statements_is_one_write_and_delays_no_other_thread(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In its order, at the end of the block, also where that fails; what another thread submits is kept at once."""
+    """The block is written in order at its end, also if it fails; another thread's statements are written at once."""
     kept: list[list[str]] = []
     append = WriteAhead.append
 

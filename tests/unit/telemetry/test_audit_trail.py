@@ -57,8 +57,8 @@ def test_errors_do_not_reveal_the_path_of_the_log() -> None:
 
 
 @pytest.mark.parametrize("failed", [None, "full"])
-def test_when_it_is_to_go_on_without(failed: str | None) -> None:
-    """With `on_audit_failure: allow`, or while the log is well, nothing stands in the way."""
+def test_changes_go_on_without_the_log_where_allowed(failed: str | None) -> None:
+    """With `on_audit_failure: allow`, or while the log works, changes are not blocked."""
     log = Log()
     log.failed = failed
     assert trail(log, deny=failed is None).obstacle is None

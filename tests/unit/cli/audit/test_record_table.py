@@ -1,4 +1,4 @@
-"""What `rosrv audit` prints on a terminal."""
+"""The output of `rosrv audit` on a terminal."""
 
 import sys
 
@@ -20,7 +20,7 @@ from appliance.cli.audit.record_table import print_entries, print_verification
 def test_a_log_is_complete_only_once_something_is_signed(
     capsys: pytest.CaptureFixture[str], signed_through: int, verdict: str
 ) -> None:
-    """Without a signature, whoever can write the files could have written another log."""
+    """Without a signature, anyone who can write the files could have written another log."""
     print_verification(
         Verification(
             ok=True, log="one", first=1, last=9, records=9, removed=0, checkpoints=1, signed_checkpoints=1,

@@ -83,7 +83,7 @@ def test_only_a_value_blocks_a_write_below_it() -> None:
     ("method", "arguments"),
     [("getParam", ("/arm",)), ("hasParam", ("/arm",)), ("setParam", ("/arm", 0)), ("deleteParam", ("/arm",))],
 )
-def test_an_exact_key_is_no_right_to_a_namespace(method: str, arguments: tuple[Any, ...]) -> None:
+def test_an_exact_key_does_not_grant_its_namespace(method: str, arguments: tuple[Any, ...]) -> None:
     """While /arm is a value, `/arm = ocu` applies; members of a namespace /arm are decided by `default`."""
     assert ask(EXACT, OPERATOR, method, *arguments, tree={"arm": 7}).allowed
     assert ask(EXACT, OPERATOR, method, *arguments, tree={}).allowed

@@ -461,8 +461,8 @@ class LeavingMember(RecordedMember):
 
 
 @pytest.mark.parametrize("served", [True, False], ids=["served", "waiting"])
-def test_what_a_subscriber_costs_is_the_same_among_thousands(served: bool) -> None:
-    """To come and to go: subscribers that end all at once hold the loop up for no longer than their number."""
+def test_a_subscriber_costs_the_same_among_thousands(served: bool) -> None:
+    """Joining and leaving cost the same; subscribers that all end at once delay the loop only by their number."""
 
     def work(many: int) -> int:
         story = Story()

@@ -257,7 +257,7 @@ def test_shipped_monitors_do_the_same_together() -> None:
         agree(texts, known, _shipped_traffic(seed))
 
 
-def test_requests_and_replies_need_the_engine_only_for_what_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_engine_sees_only_reported_requests_and_replies(monkeypatch: pytest.MonkeyPatch) -> None:
     """In each second these are the first verdict and change, and all refusals."""
     text = """s() { int n = 0; bool b = false;
         event ask(bool wish) service /mode std_srvs/SetBool request '{data:wish}' {
@@ -368,8 +368,8 @@ def test_a_batch_is_prepared_once_until_an_event_happens(does: str, monkeypatch:
     monitored.close()
 
 
-def test_what_several_change_is_counted_for_each_of_them() -> None:
-    """Taken together, by bits and runs, as one by one: a message counts for each monitor that changed it."""
+def test_a_change_by_several_monitors_counts_for_each() -> None:
+    """A message counts for each monitor that changed it, in a batch (by bits and runs) as one by one."""
     body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
     quiet = struct.pack("<BidfBII3qI", 1, 17, 2.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
     far = struct.pack("<BidfBII3qI", 2, 5, 9.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
@@ -380,8 +380,10 @@ def test_what_several_change_is_counted_for_each_of_them() -> None:
     assert {row.name: row.changes for row in monitored.rows()} == {"one": 100, "two": 200, "three": 0}
 
 
-def test_a_defect_of_the_walk_is_told_once_and_the_engine_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Messages go on, one by one; the walk of this topic is not tried again."""
+def test_a_defect_of_the_walk_is_reported_once_and_the_engine_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Messages continue one by one; the walk of this topic is not tried again."""
     monitored = Monitored(
         {"x.rv": "s() { event e(int count) /plain own/Plain '{count:count}' { count = 3; } }"},
         definitions(),

@@ -133,10 +133,10 @@ def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_ord
 
 
 @pytest.mark.parametrize("text", [GUARD.replace("/chatter", "/late"), "nonsense"])
-def test_what_a_new_control_begins_with_is_in_force_before_it_places_anything(
+def test_specifications_of_a_new_control_are_in_force_before_its_placements(
     world: Monitored, compiled: threading.Event, text: str
 ) -> None:
-    """It may have another revision than the relay, after a crash in the middle of a change; or one that is refused."""
+    """After a crash during a change, control may begin with another revision than the relay's, or a refused one."""
     compiled.set()
     world.load(GUARD)
     compiled.clear()
@@ -194,8 +194,8 @@ def test_hosts_that_the_policy_does_not_name_have_one_pace(world: Monitored) -> 
     ]
 
 
-def test_what_is_left_of_a_read_outlives_other_specifications_and_comes_in_order(world: Monitored) -> None:
-    """Messages that wait for their turn are judged by what is in force then; none is lost or overtaken."""
+def test_waiting_messages_survive_new_specifications_in_order(world: Monitored) -> None:
+    """The specifications in force at their turn judge messages that wait; none is lost or overtaken."""
     world.load(COSTLY)
     publisher, subscriber = world.typed()
     many = [string(f"{number:05}" + "x" * 100) for number in range(3000)]
@@ -206,8 +206,8 @@ def test_what_is_left_of_a_read_outlives_other_specifications_and_comes_in_order
     world.gets(subscriber, b"".join(many))
 
 
-def test_what_is_left_of_a_read_ends_with_the_publication(world: Monitored) -> None:
-    """It is withdrawn while messages wait for their turn: they are forgotten, and the memory they took."""
+def test_waiting_messages_end_with_the_publication(world: Monitored) -> None:
+    """Withdrawing a publication drops its waiting messages and frees their memory."""
     world.load(COSTLY)
     publisher, subscriber = world.typed()
     world.engine.interceptor.over = lambda: True
@@ -258,8 +258,8 @@ alarm() {
 """
 
 
-def test_what_monitors_publish_is_served_by_the_appliance_and_given_to_no_monitor(world: Monitored) -> None:
-    """With the header of the specification's definition, to who has a grant; timers go on without messages."""
+def test_publications_of_monitors_are_served_and_not_monitored(world: Monitored) -> None:
+    """Subscribers with a grant get the header of the specification's definition; timers go on without messages."""
     hearer = GUARD.replace("/chatter", "/alarm")
     world.load(ALARM, hearer)
     port = world.listen()
@@ -450,8 +450,8 @@ def test_nothing_is_lost_while_specifications_come_and_go(world: Monitored) -> N
     assert sorted(set(marks)) == sorted(["", "0", "1", "2", "3", "6"])
 
 
-def test_a_monitor_that_is_replaced_counts_anew_and_not_what_its_predecessor_saw(world: Monitored) -> None:
-    """Also what had not been summed up when it came; one that stays goes on counting."""
+def test_a_replaced_monitor_counts_from_zero(world: Monitored) -> None:
+    """Its predecessor's counts that were not yet summed up are dropped also; a monitor that stays goes on counting."""
     other = "other() { event e() /chatter std_msgs/String '{}' { } }"
     world.load(other, GUARD)
     publisher, subscriber = world.typed()

@@ -93,8 +93,8 @@ def test_a_drop_is_recorded_under_the_monitor_that_dropped(told: Told) -> None:
     assert told.counts() == {"stop": (0, 0), "turn": (0, 0), "look": (1, 0)}
 
 
-def test_what_is_published_is_recorded_under_its_monitor(told: Told) -> None:
-    """Though others' events happen after it."""
+def test_a_publication_is_recorded_under_its_monitor(told: Told) -> None:
+    """This holds although events of other monitors follow it."""
     told.send((5, 0, 0))
     [published] = told.events("publish")
     assert (published.monitor, published.resource) == ("stop", "/alarm")

@@ -132,8 +132,8 @@ def test_shadow_mode_has_a_bounded_part_of_the_processor(
     assert "take more than 20%" in world.event("shadow missed", count=0).text
 
 
-def test_what_waits_is_bounded(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
-    """More messages than can be kept are missed by the trial, not by the subscriber."""
+def test_waiting_messages_are_bounded(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The shadow monitor misses messages beyond the limit; the subscriber gets them all."""
     monkeypatch.setattr(shadow, "_MOST_WAITING", 5)
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()

@@ -156,8 +156,8 @@ def test_another_text_loses_the_state_and_says_so() -> None:
     assert drives(new) == "passed"
 
 
-def test_what_was_held_is_held_by_the_next_process() -> None:
-    """No death of a process lets go of topics that are held; only an operator does."""
+def test_held_topics_are_held_by_the_next_process() -> None:
+    """The death of a process never releases held topics; only an operator does."""
     memory = bytearray(SIZE)
     first = stop()
     press(first, begun(first, memory))
@@ -172,8 +172,8 @@ def test_what_was_held_is_held_by_the_next_process() -> None:
     assert not third.monitor("stop").held
 
 
-def test_a_memory_that_cannot_be_read_is_no_reason_to_begin() -> None:
-    """A damaged memory does not show its monitors: all that act by a state hold their topics."""
+def test_an_unreadable_memory_does_not_start_monitors_over() -> None:
+    """A damaged memory does not show its monitors: all monitors that act by a state hold their topics."""
     memory = bytearray(SIZE)
     first = stop()
     press(first, begun(first, memory))

@@ -77,8 +77,8 @@ def test_catch_up_carries_out_everything_that_was_sent(ends: Ends) -> None:
     assert len(ends.received) == 1000
 
 
-def test_what_was_sent_before_the_end_counts(ends: Ends) -> None:
-    """The end is reported after it, once."""
+def test_messages_sent_before_the_end_are_read(ends: Ends) -> None:
+    """The end is reported after them, once."""
     send(ends.raw, 600)
     ends.other.close()
     for _ in range(4):
@@ -87,7 +87,7 @@ def test_what_was_sent_before_the_end_counts(ends: Ends) -> None:
     assert len(ends.ended) == 1
 
 
-def test_closing_closes_descriptors_that_nobody_took(ends: Ends) -> None:
+def test_closing_closes_descriptors_that_were_not_taken(ends: Ends) -> None:
     """A replaced control leaves nothing open."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         for number in range(40):
@@ -98,7 +98,7 @@ def test_closing_closes_descriptors_that_nobody_took(ends: Ends) -> None:
 
 
 def test_while_messages_wait_no_more_is_read(ends: Ends) -> None:
-    """What waits is bounded, and reports go out meanwhile. Then all is carried out in order, and the end after it."""
+    """Waiting messages are bounded, and reports go out meanwhile. All are then handled in order, the end last."""
     ends.waits = True
     body = msgspec.msgpack.encode(NodeWithdrawn("k"))
     frame, sent = struct.pack(">I", len(body)) + body, 0

@@ -151,8 +151,8 @@ def test_a_host_within_its_part_loses_nothing_because_of_others(guests: int) -> 
     assert sum(counts.values()) <= 20 * 40 + max(20, 2 * (guests + 1)) + guests + 1
 
 
-def test_what_a_host_does_not_use_is_there_for_the_others() -> None:
-    """Publishers that are silent take nothing: one that sends alone has the whole limit, two have equal parts of it."""
+def test_the_unused_part_of_a_host_goes_to_the_others() -> None:
+    """Silent publishers take nothing: one that sends alone has the whole limit, two have equal parts of it."""
     flow = SharedRateLimit(FlowLimit(messages=100), 0.0)
     idle = [flow.of(str(number)) for number in range(8)]
     one, other = flow.of("one"), flow.of("other")
@@ -210,8 +210,8 @@ def test_names_of_a_host_share_its_limit() -> None:
     assert min(counts.values()) >= 18
 
 
-def test_a_publication_is_limited_by_itself_and_with_its_topic() -> None:
-    """Each publication has its own limit, and its part of the topic's limit plus the unused rest."""
+def test_a_publication_has_its_own_limit_and_a_part_of_its_topics() -> None:
+    """Besides its own limit, each gets its part of the topic's limit plus the unused rest."""
     told: list[tuple[str, int, int]] = []
     together = SharedRateLimit(FlowLimit(messages=8), 0.0)
     flow, other = (PublicationRateLimit(share(), lambda *row: told.append(row)) for _ in range(2))
