@@ -1,7 +1,7 @@
 """Pages, docstrings and comments are written in plain English: one word for one thing, and none of the habits below.
 
-`ROOTS` lists the files that are checked: pages as a whole, Python files by their docstrings and comments. Code,
-quoted output and generated pages are left out.
+`ROOTS` lists the files that are checked: pages as a whole, Python files by their docstrings, comments and names of
+tests. Code, quoted output and generated pages are left out.
 """
 
 import ast
@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 ROOTS = (
     "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs", "appliance", "rosmop", "roswire", "examples",
-    "benchmarks", "distribution",
+    "benchmarks", "distribution", "tests",
 )  # fmt: skip
 GENERATED = ("metrics.md", "audit-events.md")
 
@@ -82,7 +82,7 @@ def files() -> Iterator[Path]:
     for name in ROOTS:
         path = ROOT / name
         found = sorted([*path.rglob("*.md"), *path.rglob("*.py")]) if path.is_dir() else [path]
-        yield from (file for file in found if file.name not in GENERATED and "tests" not in file.parts[-3:-1])
+        yield from (file for file in found if file.name not in GENERATED)
 
 
 def prose(path: Path) -> str:
@@ -99,9 +99,11 @@ def _without_code(text: str) -> str:
 
 
 def _said_in(source: str) -> str:
-    """Return the docstrings and comments of a Python file, each on its line."""
+    """Return the docstrings, comments and names of tests of a Python file, each on its line."""
     lines = [""] * (source.count("\n") + 2)
     for node in ast.walk(ast.parse(source)):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and node.name.startswith("test_"):
+            lines[node.lineno] += f"{node.name.removeprefix('test_').replace('_', ' ').capitalize()}."
         if (
             isinstance(node, ast.Expr)
             and isinstance(node.value, ast.Constant)
