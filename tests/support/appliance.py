@@ -52,7 +52,7 @@ class Appliance:
         json: bool = True,
         relays: int = 1,
     ) -> None:
-        """Prepare the start. With `json=False` it starts as for a person: there is no `ready`, only lines in `process`.
+        """Prepare the start. With `json=False` the output is for a person: no `ready`, only lines in `process`.
 
         `settings` is the text of appliance.yaml. `monitors` are the specifications in its folder, by name.
         `relays` is the number of relay processes, the same on every machine.
@@ -110,7 +110,7 @@ class Appliance:
         command += ["--listen", "127.0.0.1:0" if loopback else f"{inside}:11311"]
         if loopback:
             command += ["--rosmaster-port", "0"]
-        command += self.options  # last: of a repeated flag the second value counts
+        command += self.options  # last, because the last value of a repeated flag counts
         environment = _environment() | {"ROSRV_RELAYS": str(self.relays)}
         self.process = Process(self.host, command, env=environment, label="rosrv up")
         if self.json:
@@ -148,7 +148,7 @@ class Appliance:
         return status
 
     def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
-        """Return the records of `rosrv audit search --json` with these flags that have these fields."""
+        """Run `rosrv audit search --json` with these flags, and return the records that have these fields."""
         lines = self.rosrv("audit", "search", *flags, "--json").stdout.splitlines()
         records: list[dict[str, Any]] = [json.loads(line) for line in lines if line.strip()]
         return [

@@ -1,4 +1,4 @@
-"""Send requests to an application in the process of the test."""
+"""Send requests to an ASGI application that runs in the test's own process."""
 
 import asyncio
 from typing import Any

@@ -383,7 +383,7 @@ class ControlParts:
         target: Incarnation | None = None,
         own: bool = False,
     ) -> Value:
-        """Return the answer to a call that a node (or our `own`) at `host` makes of RVMaster or of `target`."""
+        """Return the answer to a call of RVMaster or `target`, by a node at `host` (or by our `own` node)."""
         peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
         serve = self._serving(own=own, target=target) if own or target is not None else self._serve
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))

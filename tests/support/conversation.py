@@ -9,7 +9,7 @@ Actions (`Conversation.say`):
     /talker dies | /talker is silent | /talker answers              and is checked
     /talker misses the list of /chatter                             its delivery failed
     policy NAME | policy NAME, NAME                                 put that policy in force, or several at once
-    host 10.0.0.1 is expelled                                       take back everything of its nodes
+    host 10.0.0.1 is expelled                                       revoke everything that its nodes have
     `ROSMaster starts anew` | `a relay starts anew`                 the ROS master or a relay restarts
     a round                                                         of the reconcile loop
     `ROSMaster has /talker publication /chatter of /other`          a registration that control has not made
@@ -20,9 +20,8 @@ Actions (`Conversation.say`):
 Effects follow, one per line, in the order in which they are carried out; a denial is `deny: reason`, the answer to a
 question `answer: value`, a withheld update `withhold`. Nodes are written by name (a second incarnation as
 `/talker:2`), also for the URIs of their proxy endpoints; `/talker itself` is the node's own URI.
-Effects that only store state for a restart of control are left out.
-No socket is opened and no name is random, so a formal model of RVMaster can be
-compared with the text.
+Effects that only store state for a restart of control are left out. No socket is opened and no name is random, so a
+formal model of RVMaster can be compared with the text.
 """
 
 import ipaddress
@@ -140,7 +139,7 @@ class Conversation:
         return _denial(answer)
 
     async def _event(self, said: list[str]) -> list[str]:
-        """Let something else happen; return what there is to show beside its effects."""
+        """Apply an event that is not a call; return the lines to show beside its effects."""
         parts = self.parts
         match said:
             case ["state"]:
@@ -168,7 +167,7 @@ class Conversation:
         return []
 
     async def _node_event(self, node: Incarnation, happening: list[str]) -> None:
-        """Let something happen to a node, and check it."""
+        """Apply an event to a node, and have control check the node."""
         match happening:
             case ["misses", "the", "list", "of", topic]:
                 missed = NodeCall("publisherUpdate", (topic, []))
@@ -307,7 +306,7 @@ class _Ports:
 
 
 class _Monitors:
-    """Without specifications in force."""
+    """Monitors without a specification in force."""
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
         return messages.SpecificationsStated(0, b"", {}, restarted=False)

@@ -51,7 +51,7 @@ class Field:
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
             stack.enter_context(self.appliance)
-            # It also has the records from before it could be queried.
+            # The last 1,000 lines include records from before the audit log could be queried.
             tail = ("audit", "tail", "--lines", "1000", "--json")
             command = [ROSRV, *tail, "--state", str(self.appliance.state)]
             self.trail = stack.enter_context(

@@ -1,4 +1,4 @@
-"""Forge an audit log as root can on the appliance: with the signer's key, its memory and the program."""
+"""Forge an audit log as root on the appliance can, with the signer's key, its memory and the program."""
 
 import hashlib
 import sqlite3

@@ -76,7 +76,7 @@ POLICIES: dict[str, tuple[str, dict[str, set[str]], dict[str, set[str]]]] = {
     ),
     "/b is nobody's": (POLICY.format("/b =\n", "/b =\n"), {"/b": set()}, {"/b": set()}),
 }  # fmt: skip
-"""Each with who may publish and who may subscribe to the topics that it names: an oracle of a few lines."""
+"""Policies by name: the text, and as an oracle the hosts that may publish and subscribe to each topic it names."""
 
 _SETTLES = 150.0  # seconds
 _RELAY_PORTS = 30_000
@@ -446,13 +446,13 @@ class World:
             await self.update(process, topic, answer[2])
 
     def _takes_the_name(self, process: Process) -> None:
-        """Tell the node that had this name to end. If it hangs it goes on, and its state depends on the next caller."""
+        """Mark the node that had this name as superseded. If it hangs it goes on; the next caller decides its state."""
         for other in self.processes:
             if other.name == process.name and other is not process:
                 other.superseded = True
 
     async def update(self, process: Process, topic: str, uris: list[str]) -> None:
-        """Tell a node the publishers of a topic."""
+        """Send a node the publishers of a topic."""
         while process.alive and ("registerSubscriber", topic) in process.calling:
             await asyncio.sleep(0.01)
         self.see(process, uris)
@@ -693,7 +693,7 @@ class _Ports:
 
 
 class _Monitors:
-    """Without specifications in force."""
+    """Monitors without a specification in force."""
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
         return messages.SpecificationsStated(0, b"", {}, restarted=False)

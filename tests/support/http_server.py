@@ -105,7 +105,7 @@ class Client:
 
 
 class Server:
-    """A server of a test, its requests, and its complaints."""
+    """A server of a test, its requests, and its reported errors."""
 
     def __init__(
         self, handler: Handler | None, limits: HttpLimits, refusal: bytes | None, shares: "Shares"

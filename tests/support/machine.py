@@ -27,7 +27,7 @@ from appliance.network.hang_detection import ProcessActivity
 from tests.support.machine_disk import ROOT, Kernel, checkout_archive, machine_disk, newest_kernel
 from tests.support.requirements import need_program, need_root
 
-BOOT_SECONDS = 900.0  # for a machine that makes progress; a stalled one is not waited for
+BOOT_SECONDS = 900.0  # for a machine that makes progress; waiting for a stalled one ends earlier
 _STILL_SECONDS = 60.0  # a halted kernel stops its processors
 KVM = Path("/dev/kvm")
 MEGABYTES = 2048

@@ -165,7 +165,7 @@ class Siege:
             stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
             stack.enter_context(self.appliance)
             stack.callback(self.crowd.leave)
-            # It also has the records from before it could be queried.
+            # The last 1,000 lines include records from before the audit log could be queried.
             tail = ("audit", "tail", "--lines", "1000", "--json")
             command = [ROSRV, *tail, "--state", str(self.appliance.state)]
             self.trail = stack.enter_context(

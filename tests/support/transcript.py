@@ -10,12 +10,12 @@
         p.ini:2:1: error: ...
         [1]
 
-A line at the margin is an action; the indented lines below it are what it is given, or what comes of it:
+A line at the margin is an action; the indented lines below it are its input or its result:
 
     file NAME               these lines are a file
-    control VERB            the answer of the appliance to this request, as YAML; what is left out is empty or zero
+    control VERB            the answer of the appliance to this request, as YAML; omitted fields are empty or zero
     control VERB TROUBLE    its rejection: an error, and findings
-    now TIME                what `time.time` returns
+    now TIME                the time that `time.time` returns
     rest STATUS [PROBLEM]   every answer over REST: a body, or the detail of a problem; `Retry-After=7` is a header
     $ COMMAND               `-> ` a request that reached the appliance, standard output, `2> ` standard error,
                             `[2]` the exit status unless it is 0
@@ -80,11 +80,11 @@ class Section(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Return all actions with what is written below them."""
+        """Return all actions with the lines below them."""
         return f"{self.head}\n{self.steps}".strip()
 
     def played(self, transcript: "Transcript") -> str:
-        """Return the text as it took place; with `TRANSCRIPTS=write` also write it into the file."""
+        """Return the transcript with its actual output; with `TRANSCRIPTS=write` also write it into the file."""
         played = transcript.play(self.text)
         if os.environ.get("TRANSCRIPTS") == "write":
             steps = played.removeprefix(self.head).strip()
@@ -121,7 +121,7 @@ class Transcript:
         Path("state").mkdir()
 
     def play(self, text: str) -> str:
-        """Return the text as it took place: with the output that came."""
+        """Return the text with the actual output of its actions."""
         played: list[str] = []
         for action, below in _actions(text):
             came = self._act(action, below)
@@ -230,7 +230,7 @@ def _actions(text: str) -> Iterator[tuple[str, list[str]]]:
 
 
 def _matches(written: list[str], came: list[str]) -> bool:
-    """Whether the output is what is written."""
+    """Whether the output matches the written lines."""
     pattern = "".join(_ANY_LINES if line == "..." else f"{_pattern(line)}\n" for line in written)
     return re.fullmatch(pattern, "".join(f"{line}\n" for line in came)) is not None
 

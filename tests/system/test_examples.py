@@ -135,7 +135,7 @@ class Robot:
 
 
 def test_ansible_makes_a_robot_an_appliance(debian: Path) -> None:
-    """Package and service; a second run changes nothing; a new policy is reloaded, an invalid one refused."""
+    """The role installs the appliance; a second run changes nothing; a new policy is loaded, an invalid one is not."""
     robot = Robot(debian)
     policy = debian / "etc/rosrv/policies/default.ini"
 

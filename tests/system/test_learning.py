@@ -1,6 +1,6 @@
 """Monitors learnt from drives of the simulated LandShark judge other drives and injected faults.
 
-It computes for a quarter of a minute, and so is not in `make test`; tests/unit/learning tests the learning.
+The test computes for 15 seconds, and so is not in `make test`; the learning itself is tested in rosmop/tests/learn.
 """
 
 from benchmarks.learning import KINDS, judge

@@ -95,7 +95,7 @@ def test_the_contract_is_true(appliance: Appliance, tmp_path: Path) -> None:
 
 
 def test_the_fuzzer_finds_a_difference(appliance: Appliance, tmp_path: Path) -> None:
-    """The same run against another contract fails, so the test above can fail."""
+    """The same run against another contract fails: the test above can find a difference."""
     rest = appliance.rest()
     contract = rest.get("/v1/openapi.json").json
     contract["paths"] = {"/v1/status": contract["paths"]["/v1/status"]}

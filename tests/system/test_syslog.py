@@ -63,7 +63,7 @@ class Keeper:
                 "rsyslog accepts connections",
             )
             yield
-            process.stop(with_signal=signal.SIGTERM)  # it ignores SIGINT
+            process.stop(with_signal=signal.SIGTERM)  # rsyslog ignores SIGINT
 
     def lines(self) -> list[str]:
         """Return the lines of its file."""
@@ -135,8 +135,8 @@ def log_of(appliance: Appliance) -> set[int]:
 def test_another_machine_keeps_the_log(lab: Lab, folder: Path, isolation: str) -> None:
     """Over TLS with certificates on both sides rsyslog gets every record, also those made while it was away.
 
-    Syslog cannot confirm records that rsyslog read but did not write before its end. So earlier records are checked
-    while it runs. Its file is valid as proof: `rosrv audit verify --checkpoints`.
+    Syslog has no confirmations: rsyslog may read a record and end before it writes it. So earlier records are checked
+    while it runs. Its file is a valid proof for `rosrv audit verify --checkpoints`.
     """
     machine, node = lab.host("machine", "10.83.0.2/24"), lab.host("node", "10.83.0.10/24")
     keeper = Keeper(lab.host("keeper", f"{KEEPER}/24"), folder)

@@ -41,7 +41,7 @@ def chromium() -> str:
     return need_program("chromium", "chromium")
 
 
-@pytest.fixture(scope="module")  # it has an event loop: other tests of this process want none
+@pytest.fixture(scope="module")  # its event loop must not outlive the file
 def playwright() -> Iterator[Playwright]:
     """Start Playwright for the tests of a file."""
     with sync_playwright() as driver:

@@ -52,7 +52,7 @@ class Reader:
         self.context = browser.new_context(
             viewport={"width": width, "height": height},
             color_scheme=theme,  # type: ignore[arg-type]  # one of its literals
-            ignore_https_errors=True,  # the certificate is the appliance's own; test_rest_network looks at it
+            ignore_https_errors=True,  # test_rest_network checks the certificate
             accept_downloads=True,
         )
         self.context.set_default_timeout(LIMIT)

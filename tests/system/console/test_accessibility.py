@@ -55,7 +55,7 @@ def test_axe_finds_nothing(theme: str, width: int, opened: Callable[..., Reader]
 
 
 def test_words_of_the_navigation_have_room(opened: Callable[..., Reader]) -> None:
-    """Also on a telephone, none touches its neighbour or the edge of the window."""
+    """No word touches its neighbour or the edge of the window, not even on a telephone."""
     page = opened(width=390).go("now")
     words = """() => [...document.querySelectorAll(".nav a > span:not(.key, .count)")].map((word) => {
       const range = document.createRange();

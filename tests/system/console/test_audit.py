@@ -42,7 +42,7 @@ def test_records_come_while_it_is_followed(
     expect(page.get_by_text("No record matches")).to_be_visible()
 
     def made_before(route: Route) -> None:
-        """Return whether the stream has begun, which is when there are records that the list did not have."""
+        """Return whether the stream has begun: it has once there are records that were not in the list."""
         refuse(attempt, "/other")
         refuse(attempt, "/live_1")
         appliance.recorded("--deny", caller_id="/live_1")
@@ -120,7 +120,7 @@ def test_the_log_is_proven_and_exported(opened: Callable[..., Reader], attempt: 
 
 
 def test_evidence_of_a_time_is_exported(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
-    """After a time is chosen, the export is an evidence bundle."""
+    """Once a time is chosen, the export is an evidence bundle for it."""
     refuse(attempt, "/evident")
     reader = opened()
     page = reader.go("audit")
@@ -169,7 +169,7 @@ def test_the_list_goes_by_keys(opened: Callable[..., Reader], attempt: Callable[
 def test_the_readers_own_looks_are_not_what_is_shown_first(
     opened: Callable[..., Reader], attempt: Callable[..., Any]
 ) -> None:
-    """The newest record shown is a host's act; the console's own queries appear only on request."""
+    """The newest record shown is of a host; the records of the console's own queries appear only on request."""
     reader = opened()
     refuse(attempt, "/before_the_looks")
     for view in ("monitors", "hosts", "policy"):
@@ -197,7 +197,7 @@ def test_short_names_are_not_broken(opened: Callable[..., Reader], attempt: Call
 
 
 def test_it_opens_on_what_matters(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
-    """Denials are shown and lookups are not; one press shows all, another people's changes; a search can be saved."""
+    """Denials are shown, lookups are not. Buttons show all records, or changes by people; a search can be saved."""
     refuse(attempt, "/matters")
     refuse(attempt, "/matters_too")  # the time line has marks from the first to the last
     attempt("getParam", "/matters_not", "/nothing")

@@ -64,7 +64,7 @@ def appliance() -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def recording(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Let /lout publish something rude while /voice publishes; the monitor drops it, and the recorder records it."""
+    """Let /lout publish a rude message while /voice publishes: the monitor drops it, and the recorder saves it."""
     with RosSession(appliance.master_uri, tmp_path_factory.mktemp("ros")) as ros:
         ear = ros.listener("rospy", "/chatter", name="ear")
         ros.listener("rospy", "/rude", name="prude")
@@ -86,7 +86,7 @@ def recording(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) ->
 def press(locator: Locator, key: str = "Enter") -> None:
     """Press a key on an element, as a user without a pointer does.
 
-    One action of the browser's driver: between two, the live view may replace the focused element.
+    This is a single driver action: between two actions the live view may replace the focused element.
     """
     locator.press(key)
 

@@ -86,7 +86,7 @@ def test_a_switch_changed_by_another_user_is_not_overwritten(
 ) -> None:
     """A change that the page has not shown yet is not overwritten; then the page shows it."""
     reader = opened()
-    deaf = threading.Event()  # it hears nothing of what others do, nor what it has asked for by then
+    deaf = threading.Event()  # the page gets no changes by others, and no answers to its earlier requests
 
     def tell(route: Route) -> None:
         answer = route.fetch()

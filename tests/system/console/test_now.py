@@ -51,7 +51,7 @@ def test_several_relays_are_numbered(opened: Callable[..., Reader]) -> None:
 
 
 def test_rates_are_of_more_than_a_moment(opened: Callable[..., Reader]) -> None:
-    """Samples may come five in a second, and the relay's counts once: a steady flow is neither zero nor a spike."""
+    """Samples may come five times a second, the relay's counts once: a steady flow shows neither zeros nor spikes."""
     page = opened().go("now")
     growth = """async (samples) => {
       const { growth } = await import("/console/static/js/numbers.js");

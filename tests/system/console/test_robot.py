@@ -19,7 +19,7 @@ _ALL_IN_FRAME = """() => {
     frame.left <= box.left && box.right <= frame.right && frame.top <= box.top && box.bottom <= frame.bottom);
 }"""
 
-# For each line of a denied attempt, the boxes that it runs behind, except those at its ends.
+# For each line of a denied attempt: the boxes that hide a part of it, except those at its ends.
 _BEHIND = """() => {
   const boxes = [...document.querySelectorAll(".box")].map((one) => [one.dataset.key, one.querySelector(".shape")]);
   return [...document.querySelectorAll("g.attempt path.line")].map((line) => {
@@ -171,7 +171,7 @@ def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, 
 
 
 def _smallest_name(page: Page) -> float:
-    """Return the size of the smallest name, in pixels on the screen."""
+    """Return the size of the smallest name in the drawing, in pixels on the screen."""
     return float(
         page.evaluate(
             "Math.min(...[...document.querySelectorAll('.box-name')].map((one) =>"

@@ -87,7 +87,7 @@ def test_denials_of_the_visitor_name_the_rule(attacks: dict[str, dict[str, Any]]
 
 
 def test_source_addresses_are_preserved(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
-    """Source addresses are preserved: a registration is recorded with its container's address.
+    """A registration is recorded with its container's address.
 
     A host that may read parameters may do so under any unused name.
     """
@@ -123,7 +123,7 @@ def test_only_documented_ports_are_published(site: Site, demo: Compose) -> None:
 def test_this_machine_reaches_the_console_and_the_laptop_does_not(
     site: Site, demo: Compose, tmp_path: Path
 ) -> None:
-    """127.0.0.1:8443 answers over TLS on the machine to the first token; hosts on its network cannot connect."""
+    """On the machine, 127.0.0.1:8443 answers the first token over TLS; hosts on its network cannot connect."""
     token = demo.exec("appliance", "cat", "/var/lib/rosrv/first-token").stdout.strip()
     certificate = tmp_path / "certificate.pem"
 

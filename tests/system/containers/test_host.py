@@ -33,7 +33,7 @@ def beside(site: Site, tmp_path: Path) -> Iterator[Compose]:
 def test_nodes_of_the_machine_work_and_its_ports_are_closed(
     site: Site, beside: Compose, tmp_path: Path
 ) -> None:
-    """With the three commands of the file's head, nodes communicate, and unknown hosts see no port of the machine."""
+    """After the three commands in the head of the file, nodes communicate; unknown hosts see no port of the machine."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     rules = beside.exec("appliance", "rosrv", "protect", "--appliance", APPLIANCE).stdout
 

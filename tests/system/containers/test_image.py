@@ -82,7 +82,7 @@ def test_there_is_no_compiler_and_no_way_to_fetch_programs(
 
 
 def test_nothing_of_the_build_is_left(contents: list[tuple[str, tarfile.TarInfo, bool]]) -> None:
-    """No package lists, no caches, and only running parts of the checkout remain."""
+    """The image has no package lists or caches, and only those parts of the checkout that run."""
     left = [path for path, entry, _ in contents if entry.isfile() and entry.size and path.startswith(CACHES)]
     assert left == []
     ours = [path for path, _, _ in contents if re.search(r"/(tests|\.git|requirements\.lock)(/|$)", path)]

@@ -108,7 +108,7 @@ def test_down_leaves_nothing(site: Site, tmp_path: Path) -> None:
 
 
 def test_the_state_is_copied_and_restored(alone: Compose, tmp_path: Path) -> None:
-    """With the commands of docs/next-to-your-robot.md, an appliance on the copy continues as the original."""
+    """After the commands of docs/next-to-your-robot.md, an appliance on the copy continues as the original."""
 
     def tar(what: str) -> None:
         volumes = ("--volume", "alone_state:/state", "--volume", f"{tmp_path}:/copy")
@@ -205,7 +205,7 @@ def hung_relay_ends(compose: Compose, seconds: float) -> bool:
 
 
 def test_a_hanging_process_is_ended_with_the_kill_capability(alone: Compose) -> None:
-    """KILL is for processes of other users: with it a hanging relay is replaced, without it the relay hangs on."""
+    """Processes of other users can be killed only with KILL: without it a hanging relay is not replaced."""
     assert hung_relay_ends(alone, 30)
     without(alone, "KILL")
     alone.wait_healthy()

@@ -84,9 +84,7 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
 
 
 def test_no_token_is_made_that_no_host_can_use(alone: Compose) -> None:
-    """REST is published for this machine only, so no host could use a token: the command says so, and expects no
-    host.
-    """
+    """REST is published for this machine only: the command says that no host could use a token, and adds no host."""
     add = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE)
     done = alone.exec("appliance", *add, "--token", "--out", "-", check=False)
     assert done.returncode == 1

@@ -317,7 +317,7 @@ def test_two_hosts_with_one_certificate(site: TunnelSite, kit: Path) -> None:
         with thief:
             site.trail.wait_for(_up_from(ATTACKER), since=mark)
             mark = site.mark
-            # The owner's host asks again, as any host that has lost its tunnel.
+            # The owner's host starts its tunnel again, as any host does that has lost it.
             site.trail.wait_for(_up_from(OCU), since=mark)
             assert len([row for row in site.hosts() if row["address"] == owner.address]) == 1
         assert thief.address == owner.address

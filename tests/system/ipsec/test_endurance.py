@@ -1,4 +1,4 @@
-"""Tunnels in everyday trouble: hosts that move, ends that restart in either order, new keys during traffic."""
+"""Tunnels under everyday faults: hosts that move, ends that restart in either order, new keys during traffic."""
 
 import contextlib
 import signal

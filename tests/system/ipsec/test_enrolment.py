@@ -76,7 +76,7 @@ def row(site: TunnelSite, name: str) -> dict[str, Any]:
 
 
 def test_a_laptop_joins_renews_and_leaves(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """With token and script the key is made there, nodes communicate, the certificate is renewed, leaving cleans up."""
+    """The script makes the key on the laptop; nodes communicate, the certificate is renewed, and leaving cleans up."""
     script = tmp_path / "join.sh"
     before = laptop.files()
     token = awaited(site, "laptop", script)
@@ -230,7 +230,7 @@ def test_a_man_in_the_middle_gets_nothing(site: TunnelSite, laptop: ScriptHost, 
 
 
 def test_everything_over_rest(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """A kit joins under an unusual name; a later kit has no key; a new one closes the tunnel; a revoked host is out."""
+    """A kit joins under an unusual name; a repeated kit has no key; a new one closes the tunnel, as revoking does."""
     rest, ask = site.rest(), site.attacker.run
     seen = ask(lambda: rest.get("/v1/hosts"))
     new = {"name": "re.st_e-D", "endpoint": MIDDLE, "how": "kit"}
@@ -299,7 +299,7 @@ def test_a_short_lived_certificate_is_renewed_in_time(
     site.recorded(mark, event="host renewed")
     second = row(site, "brief")
     assert second["serial"] != first["serial"]
-    assert second["expires"] >= first["expires"]  # in whole seconds, and a quick machine takes less
+    assert second["expires"] >= first["expires"]  # whole seconds: equal on a quick machine
     down = site.recorded(mark, event="tunnel down")
     site.trail.wait_for(
         lambda event: event.get("event") == "tunnel up" and event["sequence"] > down["sequence"],

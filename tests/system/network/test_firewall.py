@@ -269,7 +269,7 @@ def test_only_the_flooding_host_is_slowed_down(
 def test_hosts_without_a_bucket_have_one_common_limit(
     lab: Lab, protected: Host, attacker: Host, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """nft: when every bucket is in use, further hosts share one; a host with a bucket keeps it."""
+    """With nft, further hosts share one bucket when all others are in use; a host with a bucket keeps it."""
     monkeypatch.setattr("appliance.network.firewall.nft._METER_SIZE", 1)
     others = [lab.host(f"other{number}", f"10.77.0.{number}/24", f"fd77::{number}/64") for number in (11, 12)]
     firewall = Firewall(protected.namespace, "nft")
@@ -312,7 +312,7 @@ def test_legacy_xtables_are_in_force_on_a_kernel_without_ipv6(
 ) -> None:
     """With one address family, the report is intact until a rule is removed."""
     monkeypatch.setattr("appliance.network.firewall.iptables._families", lambda: (4,))
-    protected.namespace.sysctl("net.ipv6.conf.all.disable_ipv6", "1")  # no listener is possible on it either
+    protected.namespace.sysctl("net.ipv6.conf.all.disable_ipv6", "1")  # no listener can use IPv6 either
     firewall = Firewall(protected.namespace, "iptables")
     firewall.install(settings(11312, tunnel_only=("10.77.0.9", "fd77::9")))
     assert firewall.report().intact
@@ -435,7 +435,7 @@ def test_without_any_back_end_there_is_no_firewall(protected: Host, monkeypatch:
 
 @pytest.mark.parametrize("kind", [NftBackend, IptablesBackend])
 def test_the_proof_leaves_nothing(protected: Host, kind: type[NftBackend] | type[IptablesBackend]) -> None:
-    """The trial of a back end leaves the rules of the namespace unchanged."""
+    """The test of a back end leaves the rules of the namespace unchanged."""
     before = ruleset(protected)
     prove(kind(protected.namespace), protected.namespace)
     assert ruleset(protected) == before

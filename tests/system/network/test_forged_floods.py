@@ -63,8 +63,8 @@ def accepted(server: socket.socket, port: int) -> socket.socket:
 def unharmed(robot: Host, attacker: Host, protected: Host, ports: tuple[int, ...], backlog: int) -> None:
     """Flood each port under the robot's address, on both families; assert that the robot's calls are answered at once.
 
-    A forged half-open connection on the very port that the robot then chooses costs that call a second: a hundredth of
-    the calls may meet one.
+    A forged half-open connection on the port that the robot then chooses delays that call by a second. Up to
+    a hundredth of the calls may be delayed in this way.
     """
     for target, named in ((protected.address, robot.address), (protected.address6, robot.address6)):
         for port in ports:

@@ -115,7 +115,7 @@ def test_a_continuous_tunnel_follows_the_rules(bare: Host, node: Host, tmp_path:
     """
     family = socket.AF_INET6 if ":" in wildcard else socket.AF_INET
     target = (bare.address6 if ":" in wildcard else bare.address, 4500)
-    # a translating rule as of a container engine, so that every conversation is remembered
+    # a NAT rule such as a container engine's: the connection tracker then remembers every conversation
     rules = (
         "add table inet other; add chain inet other in { type nat hook prerouting priority -90; };"
         " add rule inet other in udp dport 9 redirect to :10"

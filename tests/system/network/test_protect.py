@@ -128,7 +128,7 @@ def test_missing_syn_cookies_are_reported(robot: Host, gateway: Host) -> None:
 
 
 def test_the_check_from_outside_finds_open_ports(robot: Host, gateway: Host, attacker: Host) -> None:
-    """The scan finds the listeners before, none after, and its exit status and JSON say so."""
+    """The scan finds the listeners before --apply and none after; its exit status and JSON say so."""
     arguments = ("--check", robot.address, "--ports", FEW, "--json")
     with listening(robot, INSIDE, KEPT):
         before = json.loads(protect(attacker, *arguments, status=1))

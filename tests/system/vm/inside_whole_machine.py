@@ -137,7 +137,7 @@ def test_a_host_joins_and_leaves_by_its_kit(lab: Lab, tmp_path: Path) -> None:
 
 
 class _Joined:
-    """The machine as nodes on it see it: by its virtual address."""
+    """The machine under its virtual address, as nodes on it see it."""
 
     def __init__(self, address: str, machine: Host) -> None:
         self.address = address

@@ -13,7 +13,7 @@ from tests.support.machine_disk import ROOT
 
 HERE = "tests/system/vm"
 PLUGINS = ("env", "PYTEST_DISABLE_PLUGIN_AUTOLOAD=1")
-# Alone none takes two minutes; with emulation and other load, ten were not enough.
+# Without other load no test takes two minutes; with emulation and load, ten were not enough.
 SECONDS = 1500.0
 
 pytestmark = pytest.mark.timeout(2400)  # the first one makes the machine's disk
@@ -62,6 +62,6 @@ def test_the_firewall_in_debians_kernel(machine: Machine) -> None:
 
 
 def test_the_machine_is_alone(machine: Machine) -> None:
-    """It runs Debian's cloud kernel and has no network card, so its effects stay inside."""
+    """The machine runs Debian's cloud kernel and has no network card, so the tests' effects stay inside."""
     assert machine.run("uname", "-r").output.strip().endswith("cloud-amd64")
     assert machine.run("ls", "/sys/class/net").output.split() == ["lo"]
