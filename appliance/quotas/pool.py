@@ -134,7 +134,7 @@ class Pool(Generic[Holder]):
         """Take an amount from `host`. Raises ValueError if it has less."""
         quota_class, mine = self._look_up(host)
         if amount > mine:
-            raise ValueError(f"{host} gives back {amount} {self.what} and has {mine}")
+            raise ValueError(f"{host} returns {amount} {self.what} and has {mine}")
         self._set(host, quota_class, mine, mine - amount)
 
     def held(self, host: Holder) -> int:

@@ -52,7 +52,7 @@ def test_a_host_that_registers_frees_the_quota_of_unknown_hosts() -> None:
 def test_a_host_cannot_release_more_than_it_has() -> None:
     """A mistake of the caller raises an error."""
     shared = pool({}, Bounds(whole=1, host=1, unknown=1, kept=0))
-    with pytest.raises(ValueError, match="gives back 1 connections and has 0"):
+    with pytest.raises(ValueError, match="returns 1 connections and has 0"):
         shared.give_back("host")
 
 
