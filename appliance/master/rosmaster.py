@@ -68,7 +68,7 @@ class BatchingClient:
         parts: list[Value] = [{"methodName": method, "params": list(params)} for method, params in calls]
         values = await self._client.call("system.multicall", parts)
         if not isinstance(values, list) or len(values) != len(calls):
-            raise CallFailedError("the ROS master answered a multicall with another number of answers")
+            raise CallFailedError("the ROS master answered a multicall with the wrong number of answers")
         return [_outcome(method, value) for (method, _params), value in zip(calls, values, strict=True)]
 
     def _send_waiting(self) -> None:
@@ -101,7 +101,7 @@ def _outcome(method: str, value: Value) -> "Value | CallFailedError":
         case {"faultString": str(text)}:
             return CallFailedError(f"the ROS master answered {method} with a fault: {text}")
         case _:
-            return CallFailedError(f"the ROS master answered {method} with nonsense")
+            return CallFailedError(f"the ROS master answered {method} with an invalid response")
 
 
 def _settle(answer: "asyncio.Future[Value]", outcome: "Value | CallFailedError | EncodingError") -> None:

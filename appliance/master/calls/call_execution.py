@@ -269,12 +269,12 @@ class Execution:
             case PeerError():
                 return self._malformed(call, caller, caller.caller_id, error)
             case EncodingError():
-                wrong = ProtocolError(f"cannot be passed on: {error}")
+                wrong = ProtocolError(f"cannot be forwarded: {error}")
                 return self._malformed(call, caller, caller.caller_id, wrong)
             case CallFailedError():
                 # The text contains the hidden ROS master's address, so it is only logged.
                 _log.error("call failed", call=call.name, caller_id=caller.caller_id, error=str(error))
-                return [0, "the ROS master does not answer; the appliance is bringing it back", call.denial]
+                return [0, "the ROS master does not answer; the appliance is restarting it", call.denial]
         raise error
 
     def _unknown(self, caller: Caller, method: str, params: Sequence[Value]) -> Answer:

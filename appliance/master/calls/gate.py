@@ -81,7 +81,7 @@ class CallGate:
         known = self._registry.find(caller.caller_id, caller.peer.host, api.text)
         if known is not None and known.life is Life.REPLACED:
             return _no(
-                f"this call is late: the node {known.name} at {api.text} was replaced by another of its name"
+                f"this call is late: the node {known.name} at {api.text} was replaced by another node of its name"
             )
         return None
 
@@ -167,7 +167,7 @@ def _of_own_node(attempt: Attempt) -> Decision:
     caller_id, call = attempt.caller.caller_id, attempt.call
     known = False
     if caller_id != ROSOUT:
-        what = f"speak as {caller_id[:80] or 'nobody'}"
+        what = f"speak as {caller_id[:80] or 'an unnamed node'}"
     elif call.verb in {CallVerb.REGISTER, CallVerb.UNREGISTER} and call.kind is not None:
         known = rosout_may_have(call.kind, attempt.resource)
         what = f"have the {call.kind} {attempt.resource}"
@@ -184,7 +184,7 @@ def _unreachable(caller: Caller, api: ApiUri) -> Decision | None:
     if caller.peer.host.is_loopback or not _is_loopback(api.uri.host):
         return None
     return _no(
-        f"{caller.caller_id} listens on its own machine's loopback only ({api.text[:80]}): nobody else can "
+        f"{caller.caller_id} listens on its own machine's loopback only ({api.text[:80]}): no other host can "
         f"call it; start it with ROS_IP={caller.peer.text}, or without ROS_IP and ROS_HOSTNAME"
     )
 

@@ -36,7 +36,7 @@ class MonitorCalls:
     async def monitor_control(self, caller: Caller, word: str, names: list[str]) -> Answer:
         """`monitorControl(caller_id, "enable"|"disable", [names])` → the names that were switched."""
         if word not in _WORDS:
-            return [-1, f"{word[:80]!r} is not to be done with monitors: enable or disable", []]
+            return [-1, f"{word[:80]!r} is not a valid order for monitors: use enable or disable", []]
         try:
             order = MonitorSwitch(names, _WORDS[word])
             changed = (await self.monitors.switch(order, f"{caller.caller_id} ({caller.peer.text})")).names
@@ -44,7 +44,7 @@ class MonitorCalls:
             return [-1, str(error), []]
         return [
             1,
-            f"{word}d {', '.join(changed) or 'nothing: it was so already'}",
+            f"{word}d {', '.join(changed) or 'nothing: no change was needed'}",
             cast(list[Value], changed),
         ]
 

@@ -55,7 +55,7 @@ class NodeCalls:
         names = [protocol[0] for protocol in protocols if protocol]
         if "TCPROS" not in names:
             offered = ", ".join(str(name)[:40] for name in names) or "nothing"
-            return [0, f"only TCPROS is carried through the appliance; the subscriber offers {offered}", []]
+            return [0, f"the appliance relays only TCPROS; the subscriber offers {offered}", []]
         own = target.own or self.gate.is_own_subscriber(caller, topic)  # reached through the relay only
         if not own and not self.mediation.carries_topic(topic):
             return await self._negotiated_directly(target, topic, caller)
@@ -95,7 +95,7 @@ class NodeCalls:
         if target.of_monitors:
             return [
                 0,
-                f"{target.name} publishes for the appliance's monitors; `rosrv monitor` takes those back",
+                f"{target.name} publishes for the appliance's monitors; remove these with `rosrv monitor`",
                 0,
             ]
         try:

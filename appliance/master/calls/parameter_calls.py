@@ -115,7 +115,11 @@ class ParameterCalls:
             self.rights.recorded(caller, _SEARCH, found, places[found])
         if answer[0] != 1 and hidden:
             why = self.rights.recorded(caller, _SEARCH, hidden[0], places[hidden[0]])
-            return [-1, f"Cannot find parameter [{key}] in an upwards search of what may be read: {why}", ""]
+            return [
+                -1,
+                f"Cannot find parameter [{key}] in an upwards search of the readable parameters: {why}",
+                "",
+            ]
         return answer
 
     def _next_readable(self, key: str, places: dict[str, Decision], hidden: str) -> str | None:

@@ -153,6 +153,6 @@ class Delivery:
                 await asyncio.sleep(pause)
                 pause *= 3
         if heard:
-            _log.info("a node refused what it was told", node=incarnation.name, call=call.method, why=failure)
+            _log.info("a node rejected a call", node=incarnation.name, call=call.method, why=failure)
         else:
             self._troubled(incarnation, call, failure)

@@ -240,4 +240,7 @@ class AdvertisedAddresses:
             async with asyncio.timeout(_ANSWER_SECONDS):
                 self._routes[peer.host] = await self._route_to(peer.text)
         except TimeoutError:
-            _log.warning("the supervisor does not say how a host reaches us", host=peer.text)
+            _log.warning(
+                "the supervisor did not report the address at which a host reaches the appliance",
+                host=peer.text,
+            )

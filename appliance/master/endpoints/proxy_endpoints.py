@@ -91,5 +91,5 @@ class MasterSideApi:
     def acknowledge(self, request: HttpRequest) -> bytes:
         """Acknowledge a call of the ROS master; return a fault for an unknown path."""
         if request.path != PUBLISHER_PATH and self._registry.by_key(request.path.strip("/")) is None:
-            return build_fault(1, "nobody is here")
+            return build_fault(1, "this address serves no calls")
         return build_response([1, "", 0])

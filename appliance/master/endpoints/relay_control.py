@@ -337,7 +337,7 @@ class RelayControl:
     async def _find_upstream(self, post: RelayOutbox, key: str, topic: str) -> None:
         incarnation = self.registry.by_key(key)
         if incarnation is None or (Kind.PUBLICATION, topic) not in incarnation.registrations:
-            post.send(messages.UpstreamRefused(key, topic, "the node does not publish this topic any more"))
+            post.send(messages.UpstreamRefused(key, topic, "the node no longer publishes this topic"))
             return
         try:
             answer = await self.nodes.call(incarnation, "requestTopic", RELAY_NAME, topic, [["TCPROS"]])
@@ -387,4 +387,4 @@ def tcpros_port(answer: Value) -> int:
             return port
         case [int(), str(text), *_]:
             raise CallFailedError(f"the publisher refused: {text[:200]}")
-    raise CallFailedError("the publisher's answer to requestTopic is not of the ROS form")
+    raise CallFailedError("the publisher's answer to requestTopic is not valid")

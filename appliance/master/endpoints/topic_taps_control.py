@@ -31,7 +31,7 @@ class TapRequests:
     ) -> list[messages.MessageSeen]:
         """Return the next `count` messages of a topic, or those that came in time. Raises `TooManyTapsError`."""
         if len(self._open) >= MOST:
-            raise TooManyTapsError(f"{MOST} looks into topics are under way: try again")
+            raise TooManyTapsError(f"{MOST} queries of topics' messages are running: try again")
         self._number += 1
         number, seen, enough = self._number, list[messages.MessageSeen](), asyncio.Event()
         self._open[number] = count, seen, enough

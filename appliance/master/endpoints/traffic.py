@@ -136,7 +136,7 @@ class RelayTraffic:
         if connections:
             self._trail.happened(
                 "records lost",
-                f"{connections} connections through a relay ended unrecorded while it had no control",
+                f"{connections} connections through a relay ended unrecorded while it was not connected to control",
                 lost=connections,
             )
 
@@ -204,7 +204,7 @@ class RelayTraffic:
         """Record that a relay did not keep the latched message of a publisher at this address."""
         self._trail.happened(
             "limit exceeded",
-            "its latched message is not kept for later subscribers: its host has no memory left for such in the relay",
+            "its latched message is not stored for later subscribers: its host has no memory left for it in the relay",
             severity=Severity.ALARM,
             decision="deny",
             host=host,
@@ -221,13 +221,13 @@ class RelayTraffic:
         self._limited_topics.add(name := topic if known else OTHERS)
         self.limited_messages[name, row.part] += row.messages
         whose = {
-            "publisher": "the publishers of a host may send",
-            "subscriber": "a subscriber gets",
-            "topic": "all publishers together may send",
+            "publisher": "a host's publishers",
+            "subscriber": "a subscriber",
+            "topic": "all publishers together",
         }[row.part]
         self._trail.happened(
             "rate limited",
-            f"messages beyond what {whose} were dropped",
+            f"messages beyond the limit for {whose} were dropped",
             severity=Severity.INFO if row.part == "subscriber" else Severity.WARNING,
             host=row.host or None,
             caller_id=row.caller_id or None,

@@ -133,7 +133,7 @@ class RosGraph:
             *self._close(incarnation),
             _record(
                 "takeover" if other else "replaced",
-                f"{by.name} of {by.host} took the place of the one of {incarnation.host}",
+                f"{by.name} of {by.host} replaced the node of this name of {incarnation.host}",
                 by,
                 severity=Severity.NOTICE if other else Severity.INFO,
             ),

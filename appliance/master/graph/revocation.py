@@ -140,7 +140,7 @@ class Revocation:
     def _decide(self, incarnation: Incarnation, kind: Kind, resource: str) -> Decision:
         if incarnation.own:
             known = incarnation.of_monitors or rosout_may_have(kind, resource)
-            return Decision(known, None, OWN if known else f"{OWN} does not have this any more")
+            return Decision(known, None, OWN if known else f"{OWN} no longer has this")
         return may_keep(self.policy(), self._registered(incarnation, kind, resource))
 
     def _decide_grant(self, row: PermissionRow) -> Decision:

@@ -164,7 +164,7 @@ class Enactor:
 
 
 def _not_told(node: Incarnation, error: CallFailedError) -> None:
-    _log.warning("the ROS master was not told", node=node.name, error=str(error))
+    _log.warning("a call to the ROS master failed", node=node.name, error=str(error))
 
 
 @dataclass(frozen=True, slots=True)

@@ -80,7 +80,9 @@ class MasterRegistrations:
         try:
             async with self._rosmaster.alone():
                 if (await self._rosmaster.call_now("getPid", NAME))[2] != self.pid:
-                    raise CallFailedError("the ROS master is new: the next round tells it everything")
+                    raise CallFailedError(
+                        "the ROS master was restarted: the next round registers everything again"
+                    )
                 values = await together(put(registration) for registration in registrations)
         except CallFailedError:
             self._rosmaster.doubtful.set()

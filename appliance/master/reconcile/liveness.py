@@ -81,7 +81,7 @@ class Watchlist:
 
     def could_not_tell(self, node: Incarnation, call: NodeCall, why: str) -> None:
         """Store a call that did not reach a node, and check the node. Once it answers, it gets the present state."""
-        _log.info("a node could not be told", node=node.name, call=call.method, why=why)
+        _log.info("a call to a node failed", node=node.name, call=call.method, why=why)
         missed = self._missed.setdefault(node.key, MissedUpdates())
         if call.method == "publisherUpdate":
             missed.topics.add(str(call.parameters[0]))
@@ -270,7 +270,7 @@ class Liveness:
         if when != incarnation.touched:
             self._processes[incarnation.key] = incarnation.touched, process
         elif process != before:
-            raise RefusedError(f"process {process} answers in the place of {before}")
+            raise RefusedError(f"process {process} answers in place of {before}")
 
     async def _lose(self, incarnation: Incarnation, why: str) -> None:
         if not incarnation.registrations and not incarnation.shelf:

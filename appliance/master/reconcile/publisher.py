@@ -69,7 +69,7 @@ class OwnPublisher:
             try:
                 await self._settle()
             except (CallFailedError, NoPortError) as error:
-                _log.error("what monitors publish is not registered", error=str(error))
+                _log.error("the publications of monitors are not registered", error=str(error))
                 await asyncio.sleep(_AGAIN_SECONDS)
                 self._woken.set()
 

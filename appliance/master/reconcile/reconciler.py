@@ -115,7 +115,7 @@ class Reconciler:
         self.enactor.carry_out(self.graph.tell_everybody())
         if made:
             text = (
-                f"a new ROS master was told {made} registrations and {len(tree)} parameter namespaces again"
+                f"{made} registrations and {len(tree)} parameter namespaces were restored in a new ROS master"
             )
             self.trail.happened("reconciled", text, registrations=made)
 

@@ -140,4 +140,4 @@ def test_no_protocol_in_common(pair: tuple[str, str], protocols: list[Any]) -> N
     """
     answers = asked(pair, ("requestTopic", TESTER, "/chatter", protocols))
     assert (answers.plain[0], answers.plain[2]) == (answers.appliance[0], answers.appliance[2]) == (0, [])
-    assert "only TCPROS is carried" in answers.appliance[1]
+    assert "relays only TCPROS" in answers.appliance[1]

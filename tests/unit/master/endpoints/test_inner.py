@@ -45,7 +45,7 @@ async def test_calls_of_rosmaster_reach_no_node(method: str, params: tuple[Value
 @pytest.mark.anyio
 async def test_a_path_without_a_node() -> None:
     """A path without a node is answered with a fault."""
-    with pytest.raises(FaultReceived, match="nobody is here"):
+    with pytest.raises(FaultReceived, match="this address serves no calls"):
         await call(
             MasterSideApi((await ControlParts.begun()).registry), "/other/", "shutdown", ("/master", "reason")
         )
