@@ -123,9 +123,9 @@ class Administration:
 
     def _in_force(self, error: PolicyRefusedError | SpecificationsRefusedError) -> str:
         if isinstance(error, PolicyRefusedError):
-            return f"the policy was refused; revision {self._looks.policies.revision} stays in force"
+            return f"the policy was rejected; revision {self._looks.policies.revision} stays in force"
         revision = self._looks.parts.monitors.revision
-        return f"refused; revision {revision} of the specifications stays in force"
+        return f"rejected; revision {revision} of the specifications stays in force"
 
 
 def _trouble(error: Exception) -> admin.Trouble:

@@ -38,13 +38,13 @@ class Challenges:
         begun, _dot, mac = challenge.rpartition(".")
         if not hmac.compare_digest(mac.encode(), self._mac(begun).encode()):
             raise ChallengeRefusedError(
-                "RVMaster has not given this challenge since it started: ask for another one"
+                "RVMaster has not issued this challenge since it started: request another one"
             )
         ends = float(begun.rpartition(".")[0])
         if ends <= now:
-            raise ChallengeRefusedError("the challenge has ended: ask for another one")
+            raise ChallengeRefusedError("the challenge has expired: request another one")
         if challenge in self._taken:
-            raise ChallengeRefusedError("the proof was used already: each is good once")
+            raise ChallengeRefusedError("the proof was already used: each is valid once")
         for old in [taken for taken, end in self._taken.items() if end <= now]:
             del self._taken[old]
         if len(self._taken) >= _MOST_TAKEN:

@@ -40,10 +40,10 @@ class ClockCheck:
         if synchronised is False and before is not False:
             self._trail.happened(
                 "clock not synchronised",
-                "no time service keeps the machine's clock: run chrony or systemd-timesyncd",
+                "no time service synchronises the machine's clock: run chrony or systemd-timesyncd",
             )
         elif synchronised and before is False:
-            text = "a time service keeps the machine's clock again"
+            text = "a time service synchronises the machine's clock again"
             self._trail.happened("clock synchronised", text)
 
     def state(self) -> ClockState:
@@ -64,14 +64,15 @@ class ClockCheck:
         if ahead > _STEP_SECONDS:
             self._trail.happened(
                 "clock set forward",
-                f"the machine's clock went {ahead:.0f} s further than time has passed; that of monitors did not",
+                f"the machine's clock advanced {ahead:.0f} s more than the time that passed;"
+                " the clock of monitors did not",
                 seconds=round(ahead, 3),
             )
         behind = self.state().behind_seconds
         if behind and not self._set_back:
             self._trail.happened(
                 "clock set back",
-                f"the machine's clock stands {behind:.0f} s before the last record; ids and sequence go on",
+                f"the machine's clock is {behind:.0f} s behind the last record; ids and sequence still increase",
                 seconds=round(behind, 3),
             )
         self._set_back = behind > 0

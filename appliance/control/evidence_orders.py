@@ -52,5 +52,5 @@ class EvidenceOrders:
             reason = f"the signer has not answered within {SEAL_SECONDS:g} s ({why})"
         if reason is not None:
             raise NotSealedError(
-                f"the newest records cannot be sealed, so that nothing would prove them: {reason}"
+                f"the newest records cannot be sealed, so nothing would prove them: {reason}"
             )

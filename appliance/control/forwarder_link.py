@@ -31,7 +31,7 @@ class ForwarderLink:
         report = self._report or messages.ForwardingReported()
         trouble = report.trouble
         if self.link.channel is None or self._report is None:
-            trouble = trouble or "the forwarder does not run yet"
+            trouble = trouble or "the forwarder is not running yet"
         fields = msgspec.structs.asdict(report) | {"trouble": trouble}
         return ForwardingState(**fields, to=self._wanted.to, send=self._wanted.send)
 
@@ -42,7 +42,7 @@ class ForwarderLink:
             count = report.missed - before.missed
             self._trail.happened(
                 "forwarding gap",
-                f"retention removed {count} records before {self._wanted.to} had them",
+                f"retention removed {count} records before {self._wanted.to} received them",
                 count=count,
             )
         if report.trouble and self._failing is None:
@@ -54,7 +54,7 @@ class ForwarderLink:
             if self._failure_recorded:
                 self._failure_recorded = False
                 self._trail.happened(
-                    "forwarding resumed", f"{self._wanted.to} has the log again", behind=report.behind
+                    "forwarding resumed", f"{self._wanted.to} receives the log again", behind=report.behind
                 )
 
     def _still_failing(self) -> None:

@@ -59,7 +59,7 @@ class Current(Generic[T]):
     def __call__(self) -> T:
         """Return the value. Raises `RuntimeError` before it is set."""
         if not self._values:
-            raise RuntimeError("this part of control is used before it is made")
+            raise RuntimeError("this part of control is used before it is created")
         return self._values[0]
 
 

@@ -114,7 +114,7 @@ class ListenerLimits:
     def refuse(self, peer: Peer) -> Refusal | None:
         """Return the refusal for a peer that is not served, or None."""
         if self._unhidden:
-            fault = build_fault(1, f"the appliance does not serve: {self._unhidden}")
+            fault = build_fault(1, f"the appliance does not serve nodes: {self._unhidden}")
             return lambda _beginning: fault
         # The rosout aggregator calls from this machine, which the policy need not name.
         if peer.here or self._policy().knows(peer.host):

@@ -36,7 +36,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
 _KEPT = (
-    "this is revision {0.revision}, which {0.who} brought into force while the appliance ran. To give it up, start with"
+    "this is revision {0.revision}, which {0.who} brought into force while the appliance ran. To discard it, start with"
     " the version and configuration that took it, run `rosrv policy reload` there, and start again"
 )
 
@@ -61,7 +61,7 @@ class RevisionChangedError(Exception):
     """The revision in force is not the one that the change is for; the message has both numbers."""
 
     def __init__(self, expected: int, found: int) -> None:
-        super().__init__(f"revision {found} is in force, not {expected}: look at it before you change it")
+        super().__init__(f"revision {found} is in force, not {expected}: read it before you change it")
 
 
 class Policies(Revisions[RevisionRow]):

@@ -114,7 +114,7 @@ class Queries:
             raise UnknownThingError(f"no node publishes or subscribes to {request.topic[:200]}")
         if not topic.mediated:
             raise SenselessError(
-                f"the messages of {topic.name} go past the appliance (relaying: monitored), which cannot show them"
+                f"the messages of {topic.name} do not pass the appliance (relaying: monitored), so it cannot show them"
             )
         self._record_look(topic.name, who)
         seen = await self.parts.endpoints.relay.look(

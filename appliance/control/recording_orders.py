@@ -88,7 +88,7 @@ class RecordingOrders:
         after = self._rules.after if request.after is None else request.after
         if not 0 <= before <= self._rules.longest or not 0 < after <= self._rules.longest:
             raise SenselessError(
-                f"before is 0 to {self._rules.longest:g} seconds, after more than 0 (recorder.longest)"
+                f"before must be 0 to {self._rules.longest:g} seconds, after more than 0 (recorder.longest)"
             )
         text = f"{who}: {request.note}" if request.note else who
         begun = await self._begin("order", request.note[:_LONGEST_NOTE], text, who, (before, after))
@@ -161,7 +161,7 @@ class RecordingOrders:
         )
         failure = await self._trail.durable()
         if failure is not None:
-            raise RecorderAwayError(f"nothing can be fetched while that cannot be recorded: {failure}")
+            raise RecorderAwayError(f"nothing can be fetched while the order cannot be recorded: {failure}")
         return recording
 
     @admin.answers(admin.RecordingOfMemory, who=True)
@@ -172,12 +172,12 @@ class RecordingOrders:
         since, until = request.since or 0, now if request.until is None else request.until
         record = self._trail.happened(
             "recording ordered",
-            f"of what is in memory, not to be kept, by {who}",
+            f"from the messages in memory, temporary, by {who}",
             who=who,
             before=min(self._rules.before, max(0, now - since) / 1e9),
             after=0.0,
         )
-        trigger = Trigger(now, "order", record, f"{who}: of what is in memory", OPERATORS)
+        trigger = Trigger(now, "order", record, f"{who}: from the messages in memory", OPERATORS)
         lent = await self._ask(
             lambda number: messages.MemoryWanted(number, trigger, since, until), messages.MemoryLent
         )
@@ -199,13 +199,13 @@ class RecordingOrders:
                 "the flight recorder is off: `recorder: {enabled: true}` in appliance.yaml turns it on"
             )
         if self.link.channel is None:
-            raise RecorderAwayError("the flight recorder does not run at the moment")
+            raise RecorderAwayError("the flight recorder is not running now")
 
     def _find(self, recording_id: str) -> Recording:
         known = self._kept | self._lent
         if recording_id == self._begun:
             raise UnknownThingError(
-                f"recording {recording_id} is still being made: what happens meanwhile makes it longer"
+                f"recording {recording_id} is still being made: further triggers make it longer"
             )
         if recording_id not in known:
             raise UnknownThingError(f"there is no recording {recording_id[:40]}")

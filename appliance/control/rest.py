@@ -125,7 +125,7 @@ class RestLink:
     def _begin(self, channel: Channel | None, made: RequestMade) -> None:
         """Serve concurrently a request that waits for charon, the signer, the recorder or a topic's messages."""
         if len(self._slow) >= _MOST_SLOW:
-            text = "too many requests that take a while are under way: try again"
+            text = "too many long requests are running: try again"
             self._send_answer(made.number, AdminAnswer(False, error=text, trouble="busy"))
             return
         task = asyncio.get_running_loop().create_task(self._serve(channel, made))

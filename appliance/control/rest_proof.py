@@ -89,7 +89,7 @@ class RequestAuthenticator:
                 good = await self._is_token(shown, parsed[1], row)
             if good and self._tokens.usable_row(row.id) is not None:  # it may have ended since
                 return row
-        raise UnprovenError("no token that can be used was shown")
+        raise UnprovenError("no valid token was presented")
 
     async def _is_token(self, shown: str, secret: str, row: TokenRow) -> bool:
         if row.keys is not None:
@@ -106,7 +106,7 @@ class RequestAuthenticator:
     def _require_order(self, made: RequestMade, row: TokenRow) -> None:
         asked = made.asked
         if asked is None:
-            raise UnprovenError("an order without the request that asked for it", row.name, Severity.ALARM)
+            raise UnprovenError("an order without its HTTP request", row.name, Severity.ALARM)
         if asked.proof:
             self._require_proof_of(asked, row)
         elif reading_id(made.shown) is not None:
@@ -117,14 +117,16 @@ class RequestAuthenticator:
         try:
             order = filled_in(meant(asked), made.request)
         except NoOrderError as error:
-            raise UnprovenError(f"not what was asked: {error}", row.name, Severity.ALARM) from None
+            raise UnprovenError(
+                f"the order does not match its request: {error}", row.name, Severity.ALARM
+            ) from None
         if order != made.request:
-            text = f"{asked.method} {asked.target[:200]} does not mean this order"
+            text = f"{asked.method} {asked.target[:200]} does not request this order"
             raise UnprovenError(text, row.name, Severity.ALARM)
 
     def _require_proof_of(self, asked: ClientRequest, row: TokenRow) -> None:
         if row.keys is None:
-            raise UnprovenError("this token is of a version without proofs: make another one", row.name)
+            raise UnprovenError("this token is from a version without proofs: create another one", row.name)
         try:
             challenge, signature = parse_proof(asked.proof)
             stated = statement(
@@ -136,7 +138,7 @@ class RequestAuthenticator:
                 body=asked.body,
             )
             if not is_signed(row.keys.verifying, stated, signature):
-                raise BadProofError("the proof is not of this request: it was signed otherwise")
+                raise BadProofError("the proof does not fit this request: another request was signed")
             self._challenges.take(challenge, time.monotonic())
         except (BadProofError, ChallengeRefusedError) as error:
             raise UnprovenError(str(error), row.name) from None

@@ -112,7 +112,7 @@ class ControlLifeline:
             self._closed()
 
     def _closed(self) -> None:
-        _log.warning("the supervisor is gone")
+        _log.warning("the link to the supervisor is closed")
         self._stopping.set()
 
     def _received(self, message: Any, descriptors: tuple[int, ...]) -> None:

@@ -87,7 +87,7 @@ class SupervisorMessages:
             case "recorder":
                 self._parts.endpoints.recordings.link.attach(Channel(sock, messages.RecorderLink))
             case _:
-                _log.error("a link leads to a process that control does not know", role=role)
+                _log.error("a link leads to a process unknown to control", role=role)
                 sock.close()
 
     def _relay_link(self, index: int, channel: Channel) -> None:
@@ -104,16 +104,16 @@ class SupervisorMessages:
                 await self._reload_policy()
             except PolicyRefusedError as error:
                 _log.error(
-                    "the policy was rejected, the last good one stays in force", findings=error.findings
+                    "the policy was rejected, the previous one stays in force", findings=error.findings
                 )
             except StoreError as error:
-                _log.error("the policy is in force and not kept", reason=str(error))
+                _log.error("the policy is in force and not stored", reason=str(error))
             try:
                 await self._operators.hosts.reload(HostsReload(), "disk")
             except HostRefusedError as error:
                 _log.error("hosts.yaml was rejected", reason=str(error))
             except StoreError as error:
-                _log.error("hosts.yaml is in force and not kept", reason=str(error))
+                _log.error("hosts.yaml is in force and not stored", reason=str(error))
 
     async def _reload_policy(self) -> None:
         while True:

@@ -44,7 +44,7 @@ def off_now(monitors: SpecificationManager, policies: Policies) -> Iterator[Swit
     for decider in DECIDERS:
         if policy.audit_only(decider.categories[0]):
             what = f"section [{decider.name}] of the policy is audit-only"
-            again = "take `audit-only` out of the policy, and load it"
+            again = "remove `audit-only` from the policy, and load it"
             yield SwitchedOff("policy", decider.name, what, again, now, None, False)
 
 

@@ -119,7 +119,7 @@ class TokenOrders:
             known = (
                 ", ".join(sorted(token.name for token in self._rows.values() if token.usable(now))) or "none"
             )
-            raise TokenRefusedError(f"there is no token {name[:80]!r} that can be used; there are: {known}")
+            raise TokenRefusedError(f"there is no token {name[:80]!r} that is valid; there are: {known}")
         revoked = self._end(row)
         await self._store.settled()
         return answers.Token(*_fields(revoked))

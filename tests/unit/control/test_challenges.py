@@ -20,8 +20,8 @@ def test_each_is_valid_once_and_until_its_end() -> None:
     first, second = challenges.give(100.0), challenges.give(100.0)
     assert refusal(challenges, first, 100.0 + SECONDS - 0.01) == ""
     assert "already" in refusal(challenges, first, 100.0 + SECONDS - 0.01)
-    assert "ended" in refusal(challenges, second, 100.0 + SECONDS)
-    assert "ended" in refusal(challenges, first, 100.0 + SECONDS)
+    assert "expired" in refusal(challenges, second, 100.0 + SECONDS)
+    assert "expired" in refusal(challenges, first, 100.0 + SECONDS)
 
 
 @pytest.mark.parametrize("text", ["", ".", "..", "9e9.x.y", "nan.x.y", "é", "99999999.000.x." + "0" * 64])
@@ -29,9 +29,9 @@ def test_only_this_process_makes_valid_ones(text: str) -> None:
     """Rejected are invented ones, those with another end, and those of an earlier process."""
     challenges = Challenges()
     given = challenges.give(1.0)
-    assert "has not given this challenge" in refusal(challenges, text, 1.0)
-    assert "has not given this challenge" in refusal(challenges, given.replace("61.000", "99961.000"), 1.0)
-    assert "has not given this challenge" in refusal(Challenges(), given, 1.0)
+    assert "has not issued this challenge" in refusal(challenges, text, 1.0)
+    assert "has not issued this challenge" in refusal(challenges, given.replace("61.000", "99961.000"), 1.0)
+    assert "has not issued this challenge" in refusal(Challenges(), given, 1.0)
     assert refusal(challenges, given, 1.0) == ""
 
 

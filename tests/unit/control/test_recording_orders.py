@@ -92,7 +92,7 @@ async def test_a_missing_recorder_is_reported() -> None:
     state = away.orders.state()
     assert state is not None
     assert not state.running
-    with pytest.raises(RecorderAwayError, match="does not run"):
+    with pytest.raises(RecorderAwayError, match="is not running now"):
         await away.orders.now(admin.RecordNow(), "eve")
 
 
@@ -109,7 +109,7 @@ async def test_a_call_of_the_service_is_an_order() -> None:
 
     scene = Scene()
     away = await scene.orders.called(call)
-    assert (away.success, away.text) == (False, "the flight recorder does not run at the moment")
+    assert (away.success, away.text) == (False, "the flight recorder is not running now")
     assert scene.trail.events == []
     recorder = scene.attach(answer)
     assert await scene.orders.called(call) == messages.OwnServiceAnswered(7, True, KEPT.id)
