@@ -53,7 +53,7 @@ def make_core(base: Foundation) -> Core:
         stand_ins=settings.mediation == "full",
     )
     rights = ParameterRights(policy, base.trail)
-    graph = RosGraph(registry, grants, mediation, may_be_told=rights.may_be_told)
+    graph = RosGraph(registry, grants, mediation, may_read_value=rights.may_read_value)
     limits = HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host)
     parameters = _make_mirror(base)
     return Core(

@@ -34,7 +34,7 @@ class Rosout:
     clock: Callable[[], float] = time.monotonic
     _sequence: int = 0
     _second: int = 0
-    _told: int = 0
+    _published: int = 0
     _left_out: int = 0
 
     def reported(self, event: MonitorEvent) -> None:
@@ -44,16 +44,18 @@ class Rosout:
             return
         second = int(self.clock())
         if second != self._second:
-            left, self._second, self._told, self._left_out = self._left_out, second, 0, 0
+            left, self._second, self._published, self._left_out = self._left_out, second, 0, 0
             if left:
-                self._say(event.time, WARN, f"{left} more lines of monitors; the audit log has them", "")
-        if self._told >= _A_SECOND:
+                self._publish_line(
+                    event.time, WARN, f"{left} more lines of monitors; the audit log has them", ""
+                )
+        if self._published >= _A_SECOND:
             self._left_out += event.count or 1
             return
-        self._told += 1
-        self._say(event.time, level, text, event.monitor)
+        self._published += 1
+        self._publish_line(event.time, level, text, event.monitor)
 
-    def _say(self, time_ns: int, level: int, text: str, monitor: str) -> None:
+    def _publish_line(self, time_ns: int, level: int, text: str, monitor: str) -> None:
         self._sequence += 1
         data = log_message(
             self._sequence, time_ns, level, self.node, text, file=self.file_of(monitor), function=monitor

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from appliance.policy import commands
-from appliance.policy.model import Category, Decision, Request, Rule, told_of
+from appliance.policy.model import Category, Decision, Request, Rule, text_for_caller
 from appliance.policy.policy import CompiledRule, Policy
 from appliance.policy.rate_limits import NO_LIMIT, LimitScope
 from appliance.policy.rights import Right, decide_right, rights_of
@@ -81,7 +81,7 @@ def _explain(policy: Policy, right: Right) -> DecisionExplanation:
     namespace = policy.decide_parameter(request, namespace=True) if parameter and decision.allowed else None
     if namespace is not None and namespace.allowed:
         namespace = None
-    told = None if decision.allowed else told_of(decision, policy.tell)
+    told = None if decision.allowed else text_for_caller(decision, policy.tell)
     limit = _limit(policy, request) if decision.allowed else ""
     return DecisionExplanation(request, decision, through, lost, (), namespace, told, limit)
 

@@ -44,7 +44,7 @@ class Relays(Protocol):
     async def carried_out(self) -> None:
         """Wait until every relay has carried out its messages."""
 
-    def carried_now(self) -> set[Resource]:
+    def live_resources(self) -> set[Resource]:
         """Return the topics and services of live nodes."""
 
     def withdraw(self, moves: Sequence[Move]) -> None:
@@ -170,11 +170,11 @@ class Rollout:
         """Have every relay take these specifications; return the monitors that began again because they moved. Absent
         relays get them when they return. After `SpecificationsRefusedError` nothing has changed.
         """
-        plan = self.allocation.plan(coming.checked, self.relays.carried_now())
+        plan = self.allocation.plan(coming.checked, self.relays.live_resources())
         self._began = set()
         for _ in range(_TRIES):
             await self._try(coming, plan)
-            shadowed, plan = plan, self.allocation.plan(coming.checked, self.relays.carried_now())
+            shadowed, plan = plan, self.allocation.plan(coming.checked, self.relays.live_resources())
             if plan == shadowed:
                 return self._settle(coming, plan)
             for relay in plan.losing - shadowed.losing:

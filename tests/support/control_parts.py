@@ -186,7 +186,7 @@ class Inner:
     def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
         return self._registry.find(caller.caller_id, caller.peer.host, api.text)
 
-    def nobody(self) -> str:
+    def unassigned_uri(self) -> str:
         return node_uri("127.0.0.1", _INNER_PORT, "/nobody/")
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
@@ -247,7 +247,7 @@ class Addresses:
     async def learn(self, _peer: Peer) -> None:
         """Do nothing."""
 
-    def told_to(self, _peer: Peer) -> str:
+    def address_for(self, _peer: Peer) -> str:
         return "10.0.0.1"
 
 
@@ -282,7 +282,7 @@ class ControlParts:
         trail = cast(Any, self.records)
         rights = ParameterRights(lambda: self.current, trail)
         self.graph = RosGraph(
-            self.registry, self.grants, cast(Any, self.mediation), may_be_told=rights.may_be_told
+            self.registry, self.grants, cast(Any, self.mediation), may_read_value=rights.may_read_value
         )
         self.revocation = Revocation(
             self.registry, self.grants, self.graph, lambda: self.current, lambda: self.parameters.tree

@@ -15,7 +15,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, cast, overload
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.graph.registry import Kind
 from appliance.policy.commands import ALIASES, policy_call
-from appliance.policy.model import Category, Decision, Request, told_of
+from appliance.policy.model import Category, Decision, Request, text_for_caller
 from appliance.policy.rights import request_of
 from roswire import names
 from roswire.errors import InvalidNameError, PeerError, ProtocolError
@@ -349,7 +349,7 @@ def served(calls: Iterable[RosCall[S]], part: S) -> dict[str, ServedCall]:
 
 def denial_text(decision: Decision, record: str, tell: str) -> str:
     """Return the text for a denied caller: as much of the reason as the policy allows, and the record's id."""
-    return with_record(told_of(decision, tell), record)
+    return with_record(text_for_caller(decision, tell), record)
 
 
 def with_record(text: str, record: str) -> str:

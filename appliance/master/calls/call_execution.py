@@ -229,7 +229,7 @@ class Execution:
             reads=call.verb is CallVerb.READ and request.category is Category.COMMAND,
             **attempt.about,
         )
-        return None if decision.allowed else [0, self._told(decision, record), call.denial]
+        return None if decision.allowed else [0, self._denial_text(decision, record), call.denial]
 
     async def _obstacle(self) -> str | None:
         """Wait until the records are on disk; return the text of a denial if they cannot be, else None."""
@@ -237,7 +237,7 @@ class Execution:
             return None
         return f"denied: {NOT_RECORDED}"
 
-    def _told(self, decision: Decision, record: str) -> str:
+    def _denial_text(self, decision: Decision, record: str) -> str:
         return denial_text(decision, record, self.policy().tell)
 
     # --- perform, and what can go wrong ---
@@ -281,7 +281,7 @@ class Execution:
         caller = caller.as_named(claimed_name(params))
         decision = Decision(False, None, f"{method[:200]!r} is not a call that is served here")
         record = self.trail.decided(caller.asker, method, Category.COMMAND.value, method[:200], decision)
-        return [0, self._told(decision, record), 0]
+        return [0, self._denial_text(decision, record), 0]
 
     def _malformed(self, call: RosCall[object], caller: Caller, claimed: str, error: PeerError) -> Answer:
         self.trail.happened(

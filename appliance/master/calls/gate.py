@@ -126,7 +126,7 @@ class CallGate:
         denial = self._too_many_names(host)
         if denial is not None:
             return denial
-        if self._is_one_too_many(caller, api) and self._registry.spare_of(host) is None:
+        if self._is_one_too_many(caller, api) and self._registry.evictable_of(host) is None:
             return _no(f"{host} has {self._limits.nodes} nodes, the limit for one host")
         return None
 
@@ -152,7 +152,7 @@ class CallGate:
 
     def to_make_room(self, caller: Caller, api: ApiUri) -> Incarnation | None:
         """Return an unused or lost node of the caller's host to evict, if a new node would exceed the limit."""
-        return self._registry.spare_of(caller.peer.host) if self._is_one_too_many(caller, api) else None
+        return self._registry.evictable_of(caller.peer.host) if self._is_one_too_many(caller, api) else None
 
     def _is_one_too_many(self, caller: Caller, api: ApiUri) -> bool:
         host = caller.peer.host

@@ -38,7 +38,7 @@ class LookupCalls:
         holder = self.registry.holder(node)
         if holder is None:
             return [-1, f"unknown node [{node}]", ""]
-        told = self.addresses.told_to(caller.peer)
+        told = self.addresses.address_for(caller.peer)
         return [1, "node api", holder.uri_for(told, hidden=self.mediation.stand_ins)]
 
     async def lookup_service(self, caller: Caller, service: str) -> Answer:
@@ -50,7 +50,7 @@ class LookupCalls:
             granted = self.graph.service_granted(provider, service, caller.peer.host, caller.caller_id)
             self.enactor.carry_out(granted)
             port = self.relay.port(provider, Kind.SERVICE, service)
-            uri = service_uri(self.addresses.told_to(caller.peer), port)
+            uri = service_uri(self.addresses.address_for(caller.peer), port)
         else:
             port = int(provider.registrations[Kind.SERVICE, service].detail)
             uri = service_uri(str(provider.host), port)
@@ -83,7 +83,7 @@ class LookupCalls:
 
     async def get_uri(self, caller: Caller) -> Answer:
         """`getUri(caller_id)` → RVMaster's own, at the address the caller knows it by."""
-        return [1, "", node_uri(self.addresses.told_to(caller.peer), self.port)]
+        return [1, "", node_uri(self.addresses.address_for(caller.peer), self.port)]
 
     async def get_pid(self, _caller: Caller) -> Answer:
         """`getPid(caller_id)` → RVMaster's own."""

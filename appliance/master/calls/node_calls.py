@@ -61,7 +61,7 @@ class NodeCalls:
             return await self._negotiated_directly(target, topic, caller)
         granted = self.graph.topic_granted(target, topic, caller.peer.host, caller.caller_id)
         self.enactor.carry_out(granted)
-        address = self.addresses.told_to(caller.peer)
+        address = self.addresses.address_for(caller.peer)
         port = self.relay.port(target, Kind.PUBLICATION, topic)
         return [1, f"ready on {address}:{port}", ["TCPROS", address, port]]
 
@@ -110,11 +110,11 @@ class NodeCalls:
 
     async def get_uri(self, caller: Caller) -> Answer:
         """`getUri(caller_id)` → the outer URI."""
-        return [1, "", _target(caller).outer_uri(self.addresses.told_to(caller.peer))]
+        return [1, "", _target(caller).outer_uri(self.addresses.address_for(caller.peer))]
 
     async def get_master_uri(self, caller: Caller) -> Answer:
         """`getMasterUri(caller_id)` → RVMaster's."""
-        uri = node_uri(self.addresses.told_to(caller.peer), self.port)
+        uri = node_uri(self.addresses.address_for(caller.peer), self.port)
         return [1, uri, uri]
 
     async def get_subscriptions(self, caller: Caller) -> Answer:
@@ -127,7 +127,7 @@ class NodeCalls:
 
     async def get_bus_info(self, caller: Caller) -> Answer:
         """`getBusInfo(caller_id)` → `[[id, other end, direction, transport, topic, connected, text], …]`."""
-        target, address = _target(caller), self.addresses.told_to(caller.peer)
+        target, address = _target(caller), self.addresses.address_for(caller.peer)
         rows: list[Value] = []
         for connection in self.relay.carried.connections.values():
             if connection.kind != TOPIC_CONNECTION:

@@ -32,7 +32,7 @@ class ParameterRights:
         decision = self._to_read(caller.peer.host, caller.caller_id, key, answer[2])
         return None if decision.allowed else self.recorded(caller, call, key, decision)
 
-    def may_be_told(self, incarnation: Incarnation, key: str, value: Value) -> bool:
+    def may_read_value(self, incarnation: Incarnation, key: str, value: Value) -> bool:
         """Whether a node that subscribed to `key`, or to a key above it, may read the new value; denials are recorded.
 
         The value of a deleted parameter is an empty namespace.

@@ -128,22 +128,22 @@ class RegistrationCalls:
     async def unsubscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
         """`unsubscribeParam(caller_id, caller_api, key)`."""
         node = self.arrivals.known(caller, caller_api)
-        inner = self.faces.inner_uri(node) if node is not None else self.faces.nobody()
+        inner = self.faces.inner_uri(node) if node is not None else self.faces.unassigned_uri()
         answer = await self.rosmaster.call("unsubscribeParam", caller.caller_id, inner, key)
         if answer[0] == 1 and node is not None:
             self.enactor.carry_out(self.graph.unregistered(node, Kind.PARAMETER, key))
         return answer
 
     async def _unregister(self, caller: Caller, kind: Kind, topic: str, caller_api: ApiUri) -> Answer:
-        node = self.arrivals.known(caller, caller_api) or self._told_as(caller, caller_api)
-        inner = self.faces.inner_uri(node) if node is not None else self.faces.nobody()
+        node = self.arrivals.known(caller, caller_api) or self._by_lookup_uri(caller, caller_api)
+        inner = self.faces.inner_uri(node) if node is not None else self.faces.unassigned_uri()
         answer = await self.rosmaster.call(CALLS[kind][1], caller.caller_id, topic, inner)
         _speak_as_asked(answer, inner, caller_api)
         if answer[0] == 1 and node is not None:
             self.enactor.carry_out(self.graph.unregistered(node, kind, topic))
         return answer
 
-    def _told_as(self, caller: Caller, api: ApiUri) -> Incarnation | None:
+    def _by_lookup_uri(self, caller: Caller, api: ApiUri) -> Incarnation | None:
         """Return the node whose URI from lookupNode the caller gives, like `rosnode cleanup` on the node's host."""
         holder = self.registry.holder(caller.caller_id)
         meant = holder is not None and (holder.host, holder.outer_port) == (caller.peer.host, api.uri.port)
@@ -154,9 +154,9 @@ class RegistrationCalls:
 
         If the host is at its limit, a new incarnation replaces one of the host that is unused or gone.
         """
-        spare = self.gate.to_make_room(caller, api)
-        if spare is not None:
-            self.enactor.carry_out(self.graph.forgotten(spare))
+        evicted = self.gate.to_make_room(caller, api)
+        if evicted is not None:
+            self.enactor.carry_out(self.graph.forgotten(evicted))
         return EvictionGuard(await self.arrivals.incarnation_for(caller, api))
 
 

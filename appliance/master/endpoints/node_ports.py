@@ -222,7 +222,7 @@ class AdvertisedAddresses:
         self._route_to = route_to
         self._routes: dict[Address, str | None] = {}
 
-    def told_to(self, peer: Peer) -> str:
+    def address_for(self, peer: Peer) -> str:
         """Return the appliance's address for this peer."""
         for network, address in self._advertised:
             if peer.host in network:
@@ -231,7 +231,7 @@ class AdvertisedAddresses:
         return self._routes.get(peer.host) or self.listen or peer.local
 
     async def learn(self, peer: Peer) -> None:
-        """Find out once at which address this peer reaches the appliance; call this before `told_to`."""
+        """Find out once at which address this peer reaches the appliance; call this before `address_for`."""
         if self._route_to is None or peer.host in self._routes:
             return
         if len(self._routes) > 10_000:

@@ -35,7 +35,7 @@ class ProxyEndpoints:
         """Return the URI by which the ROS master knows the incarnation."""
         return node_uri("127.0.0.1", self.inner_port, f"/{incarnation.key}/")
 
-    def nobody(self) -> str:
+    def unassigned_uri(self) -> str:
         """Return a master-side URI without an incarnation, for unregistering what was never registered."""
         return node_uri("127.0.0.1", self.inner_port, "/nobody/")
 

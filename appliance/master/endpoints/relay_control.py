@@ -101,7 +101,7 @@ class RelayControl:
     own_call: Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]]
     _posts: tuple[RelayOutbox, ...] = field(init=False)
     _asking: set[asyncio.Task[None]] = field(default_factory=set)
-    _looks: TapRequests = field(default_factory=TapRequests)
+    _taps: TapRequests = field(default_factory=TapRequests)
 
     def __post_init__(self) -> None:
         """Create an entry for each relay."""
@@ -159,13 +159,13 @@ class RelayControl:
     ) -> list[messages.MessageSeen]:
         """Return the next messages of a topic, as its subscribers get them. Raises `TooManyTapsError`."""
         send = self._post(TOPIC, topic).send
-        return await self._looks.look(topic, count, seconds, send, latched=latched)
+        return await self._taps.look(topic, count, seconds, send, latched=latched)
 
     def carries(self, relay: int, kind: str, resource: str) -> bool:
         """Whether this relay carries a topic or service."""
         return self.allocation.of(kind, resource) == relay
 
-    def carried_now(self) -> set[Resource]:
+    def live_resources(self) -> set[Resource]:
         """Return the topics and services of live nodes."""
         return {
             (_WORDS[registration.kind], registration.resource)
@@ -310,7 +310,7 @@ class RelayControl:
             case messages.OrdersCarriedOut():
                 post.carried_out()
             case messages.MessageSeen():
-                self._looks.seen(message)
+                self._taps.seen(message)
             case messages.PublicationRefused():
                 self.carried.publication_refused(message)
             case _:

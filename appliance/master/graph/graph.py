@@ -42,14 +42,14 @@ _CARRIED = (Kind.PUBLICATION, Kind.SERVICE)
 
 @dataclass(frozen=True, slots=True)
 class RosGraph:
-    """The changes of the graph. `may_be_told(node, key, value)`: whether the policy lets a node read a parameter's
+    """The changes of the graph. `may_read_value(node, key, value)`: whether the policy lets a node read a parameter's
     value.
     """
 
     registry: Registry
     grants: Grants
     mediation: Mediation
-    may_be_told: Callable[[Incarnation, str, Value], bool]
+    may_read_value: Callable[[Incarnation, str, Value], bool]
 
     def registered(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> Effects:
         """Record a registration that the ROS master accepted."""
@@ -302,7 +302,7 @@ class RosGraph:
                     continue
                 if update.key not in calls:
                     calls[update.key] = _param_update(update.key, settled(update.value))
-                if self.may_be_told(subscriber, update.key, update.value):
+                if self.may_read_value(subscriber, update.key, update.value):
                     effects.append(TellNode(subscriber, calls[update.key]))
         return effects
 
@@ -311,7 +311,7 @@ class RosGraph:
 
         The subscription was decided by the keys that existed at that time, so the value is checked again.
         """
-        told = self.may_be_told(subscriber, key, value)
+        told = self.may_read_value(subscriber, key, value)
         return [TellNode(subscriber, _param_update(key, value))] if told else []
 
     def renew(self, subscriber: Incarnation, topic: str, absent: Collection[Incarnation]) -> Effects:

@@ -93,7 +93,7 @@ class Incarnation:
     calls: int = 0  # the number of its registering calls under way
 
     @property
-    def spare(self) -> bool:
+    def evictable(self) -> bool:
         """Whether it can be evicted: it is replaced, or has no registrations, withdrawn ones or calls under way."""
         return not (self.registrations or self.shelf or self.calls or self.own) or self.life is Life.REPLACED
 
@@ -255,17 +255,17 @@ class Registry:
         """Return the number of known incarnations of a host, for the limit per host."""
         return self._nodes_of.get(host, 0)
 
-    def spare_of(self, host: Address) -> Incarnation | None:
-        """Return the incarnation of a host to evict first: a spare one, or else the one that was lost first."""
+    def evictable_of(self, host: Address) -> Incarnation | None:
+        """Return the incarnation of a host to evict first: an evictable one, or else the one that was lost first."""
         mine = [incarnation for incarnation in self._by_key.values() if incarnation.host == host]
-        idle = next((incarnation for incarnation in mine if incarnation.spare), None)
+        idle = next((incarnation for incarnation in mine if incarnation.evictable), None)
         gone = (incarnation for incarnation in mine if incarnation.life is not Life.LIVE)
         return idle or min(gone, key=lambda incarnation: incarnation.changed, default=None)
 
-    def spare(self, host: Address) -> Incarnation | None:
-        """Return the incarnation to evict for a new one of this host: its own, or a spare one of another host."""
-        return self.spare_of(host) or next(
-            (incarnation for incarnation in self._by_key.values() if incarnation.spare), None
+    def evictable_for(self, host: Address) -> Incarnation | None:
+        """Return the incarnation to evict for a new one of this host: its own, or an evictable one of another host."""
+        return self.evictable_of(host) or next(
+            (incarnation for incarnation in self._by_key.values() if incarnation.evictable), None
         )
 
     @property

@@ -42,7 +42,7 @@ class Arrivals:
         incarnation = self.registry.find(*identity)
         if incarnation is not None and incarnation.life is Life.LIVE:
             incarnation.touched = time.monotonic()
-            incarnation.told = self.addresses.told_to(caller.peer)
+            incarnation.told = self.addresses.address_for(caller.peer)
             return incarnation
         if incarnation is not None and incarnation.life is Life.SHADOW:
             if self.registry.holder(incarnation.name) is None:
@@ -69,7 +69,7 @@ class Arrivals:
             host=caller.peer.host,
             api=api.uri,
             api_text=api.text,
-            told=self.addresses.told_to(caller.peer),
+            told=self.addresses.address_for(caller.peer),
             outer_port=outer_port,
             relay_port=relay_port,
             more_relay_ports=tuple(more),
@@ -81,15 +81,15 @@ class Arrivals:
         return incarnation
 
     def _open_ports(self, host: Address) -> tuple[int, ...]:
-        """Return ports for a node of this host; evict spare incarnations if necessary. Raises `NoPortError`."""
+        """Return ports for a node of this host; evict unused incarnations if necessary. Raises `NoPortError`."""
         while True:
             try:
                 return self.places.open(host)
             except NoPortError:
-                spare = self.registry.spare(host)
-                if spare is None:
+                evicted = self.registry.evictable_for(host)
+                if evicted is None:
                     raise
-                self.enactor.carry_out(self.graph.forgotten(spare))
+                self.enactor.carry_out(self.graph.forgotten(evicted))
 
 
 class EvictionGuard:

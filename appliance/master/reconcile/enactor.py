@@ -136,7 +136,7 @@ class Enactor:
         try:
             values = await self.entries.put_back(node, registrations)
         except CallFailedError as error:
-            _not_told(node, error)
+            _log_failed_call(node, error)
             return
         for key, value in values:
             self.carry_out(self.graph.tell_parameter(node, key, value))
@@ -146,7 +146,7 @@ class Enactor:
         try:
             await self.entries.end_lost(node, registrations)
         except CallFailedError as error:
-            _not_told(node, error)
+            _log_failed_call(node, error)
 
     async def _tell_master(self, effect: PutBack | TakeBack, before: asyncio.Task[None] | None) -> None:
         if before is not None:
@@ -160,10 +160,10 @@ class Enactor:
         try:
             await self.entries.end(node, taken.kind, taken.resource)
         except CallFailedError as error:
-            _not_told(node, error)
+            _log_failed_call(node, error)
 
 
-def _not_told(node: Incarnation, error: CallFailedError) -> None:
+def _log_failed_call(node: Incarnation, error: CallFailedError) -> None:
     _log.warning("a call to the ROS master failed", node=node.name, error=str(error))
 
 

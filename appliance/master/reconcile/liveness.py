@@ -129,7 +129,7 @@ class Liveness:
         self._answered: dict[str, float] = {}
         # For each node: the time of its last registration, and the process that answered then.
         self._processes: dict[str, tuple[float, int]] = {}
-        self._looks: dict[str, asyncio.Task[None]] = {}
+        self._checks: dict[str, asyncio.Task[None]] = {}
         self._turns = Turns(PROBES.bounds, quota_class)
 
     async def run(self) -> None:
@@ -167,10 +167,10 @@ class Liveness:
         The publisher for monitors is not checked: it is control itself, and the firewall lets only the ROS master call
         it.
         """
-        if incarnation.key not in self._looks and not incarnation.of_monitors:
+        if incarnation.key not in self._checks and not incarnation.of_monitors:
             task = asyncio.get_running_loop().create_task(self.look(incarnation))
-            self._looks[incarnation.key] = task
-            task.add_done_callback(lambda _done: self._looks.pop(incarnation.key, None))
+            self._checks[incarnation.key] = task
+            task.add_done_callback(lambda _done: self._checks.pop(incarnation.key, None))
 
     async def probe(self, incarnation: Incarnation) -> Probe:
         """Probe now whether a node is there."""

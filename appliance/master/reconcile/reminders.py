@@ -73,9 +73,9 @@ class RelayMoves:
         """Wait until every relay has carried out its orders."""
         await self._relay.carried_out()
 
-    def carried_now(self) -> set[Resource]:
+    def live_resources(self) -> set[Resource]:
         """Return the topics and services of live nodes."""
-        return self._relay.carried_now()
+        return self._relay.live_resources()
 
     def withdraw(self, moves: Sequence[Move]) -> None:
         """Withdraw moving topics and services from the relays, before the new allocation is adopted."""

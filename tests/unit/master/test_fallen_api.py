@@ -285,5 +285,6 @@ async def test_a_token_of_an_earlier_version_stays_valid(world: World) -> None:
     assert not (await api.ask(order, token[:-1] + ("A" if token[-1] != "A" else "B"), LOAD)).ok
     assert not (await api.ask(admin.PolicyWanted(), reading_key(token))).ok
     assert (
-        "create another one" in (await api.ask(order, token, msgspec.structs.replace(LOAD, proof="x y"))).error
+        "create another one"
+        in (await api.ask(order, token, msgspec.structs.replace(LOAD, proof="x y"))).error
     )

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from appliance.policy.commands import COMMANDS, DECIDED_ELSEWHERE, NAMED_ONLY
-from appliance.policy.model import Address, Category, Decision, Request, told_of
+from appliance.policy.model import Address, Category, Decision, Request, text_for_caller
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of
@@ -75,10 +75,10 @@ default = few
                 if decision.allowed:
                     continue
                 denied += 1
-                told = told_of(decision, policy.tell).replace(host, "")
+                told = text_for_caller(decision, policy.tell).replace(host, "")
                 assert not re.search(r"[0-9]+\.[0-9]+\.[0-9]+|2001:|few|bot|robot", told), told
-                assert told_of(decision, "full") == decision.reason
-                assert told_of(decision, "id") == "denied"
+                assert text_for_caller(decision, "full") == decision.reason
+                assert text_for_caller(decision, "id") == "denied"
     assert denied > 20
 
 

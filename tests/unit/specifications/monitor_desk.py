@@ -152,7 +152,7 @@ class Taking:
         """When the desk says so."""
         await self.desk.carried_out.wait()
 
-    def carried_now(self) -> set[Resource]:
+    def live_resources(self) -> set[Resource]:
         """Nothing is carried."""
         return set()
 

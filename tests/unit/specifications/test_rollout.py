@@ -84,7 +84,7 @@ class Fleet:
     async def carried_out(self) -> None:
         """As `Relays`."""
 
-    def carried_now(self) -> set[Resource]:
+    def live_resources(self) -> set[Resource]:
         """As `Relays`."""
         return self.carried
 

@@ -30,7 +30,7 @@ class Site:
             "graph": self,
             "enactor": SimpleNamespace(carry_out=lambda _effects: None),
             "relay": SimpleNamespace(port=lambda one, _kind, _name: one.relay_port),
-            "addresses": SimpleNamespace(told_to=lambda _peer: "10.0.0.1"),
+            "addresses": SimpleNamespace(address_for=lambda _peer: "10.0.0.1"),
         }
         self.calls = LookupCalls(**parts, port=11311, stop=lambda _reason: None, unseen=unseen)
 

@@ -27,7 +27,7 @@ def peer(host: str, local: str) -> Peer:
 )
 def test_the_appliance_listens_on_the_address_in_answers(listen: str, local: str, told: str) -> None:
     """It is the address the peer connected to, but not loopback, where proxy endpoints and relay may not listen."""
-    assert AdvertisedAddresses([], None, listen).told_to(peer("127.0.0.1", local)) == told
+    assert AdvertisedAddresses([], None, listen).address_for(peer("127.0.0.1", local)) == told
 
 
 def test_configured_and_translated_addresses_come_first() -> None:
@@ -40,6 +40,6 @@ def test_configured_and_translated_addresses_come_first() -> None:
     addresses = AdvertisedAddresses(advertised, route, "0.0.0.0")
     for host in ("10.0.0.5", "10.0.0.6", "172.16.0.1"):
         asyncio.run(addresses.learn(peer(host, "10.0.0.1")))
-    assert addresses.told_to(peer("10.0.0.5", "10.0.0.1")) == "192.168.1.7"
-    assert addresses.told_to(peer("10.0.0.6", "10.0.0.1")) == "10.0.0.1"
-    assert addresses.told_to(peer("172.16.0.1", "10.0.0.1")) == "172.16.0.9"
+    assert addresses.address_for(peer("10.0.0.5", "10.0.0.1")) == "192.168.1.7"
+    assert addresses.address_for(peer("10.0.0.6", "10.0.0.1")) == "10.0.0.1"
+    assert addresses.address_for(peer("172.16.0.1", "10.0.0.1")) == "172.16.0.9"

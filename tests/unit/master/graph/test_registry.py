@@ -87,11 +87,11 @@ def test_the_node_that_was_lost_first_makes_room() -> None:
     for one in known:
         registry.add(one)
         registry.register(one, Kind.PUBLICATION, "/x", "t")
-    assert registry.spare_of(HOSTS[0]) is None
+    assert registry.evictable_of(HOSTS[0]) is None
     registry.overshadow(known[2], 5.0)
     registry.overshadow(known[1], 7.0)
-    assert registry.spare_of(HOSTS[0]) is known[2]
-    assert registry.spare_of(HOSTS[1]) is None
+    assert registry.evictable_of(HOSTS[0]) is known[2]
+    assert registry.evictable_of(HOSTS[1]) is None
 
 
 def test_a_node_without_registrations_makes_room_first() -> None:
@@ -102,17 +102,17 @@ def test_a_node_without_registrations_makes_room_first() -> None:
         registry.add(one)
         registry.register(one, Kind.PUBLICATION, "/x", "t")
     registry.overshadow(lost, 5.0)
-    assert registry.spare(HOSTS[1]) is None
+    assert registry.evictable_for(HOSTS[1]) is None
     for one in (idle, busy):
         registry.unregister(one, Kind.PUBLICATION, "/x")
     busy.calls = 1
-    assert registry.spare_of(HOSTS[0]) is idle
-    assert registry.spare(HOSTS[1]) is idle
+    assert registry.evictable_of(HOSTS[0]) is idle
+    assert registry.evictable_for(HOSTS[1]) is idle
     registry.forget(idle)
-    assert registry.spare(HOSTS[1]) is None
-    assert registry.spare(HOSTS[0]) is lost
+    assert registry.evictable_for(HOSTS[1]) is None
+    assert registry.evictable_for(HOSTS[0]) is lost
     busy.calls = 0
-    assert registry.spare(HOSTS[1]) is busy
+    assert registry.evictable_for(HOSTS[1]) is busy
 
 
 def test_forgetting_one_incarnation_keeps_the_next() -> None:
