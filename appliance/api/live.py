@@ -104,7 +104,7 @@ async def _follow(services: Services, bearer: Bearer, graph: bool) -> AsyncItera
             except TimeoutError:
                 continue  # control is slow; check whether the token is still valid
             number = seen.number
-            yield _told(seen)
+            yield _state_event(seen)
             if graph and seen.away is None and time.monotonic() >= graph_due:
                 began = time.monotonic()
                 drawn = await _graph(services, bearer)
@@ -113,7 +113,7 @@ async def _follow(services: Services, bearer: Bearer, graph: bool) -> AsyncItera
                     yield drawn
 
 
-def _told(seen: LastSample) -> ServerSentEvent:
+def _state_event(seen: LastSample) -> ServerSentEvent:
     if seen.status is None or seen.sample is None:
         return ServerSentEvent(event="away", data=json.dumps({"reason": seen.away}))
     now = _Now(seen.status, open_alarms(seen.status), seen.sample)

@@ -112,11 +112,11 @@ class _Api:
                 self._control.state_pin(pin_of(self._settings.state / "api"))
             await listener.start(self._socket, context)
         except (OSError, ValueError) as error:
-            self._say(messages.Failed(f"REST cannot be served: {error}"))
+            self._report(messages.Failed(f"REST cannot be served: {error}"))
             await self._stopping.wait()
             return
         self._await_control()
-        self._say(messages.Ready({"tls": self._settings.api_tls}))
+        self._report(messages.Ready({"tls": self._settings.api_tls}))
         running = [loop.create_task(self._flush()), loop.create_task(history.run())]
         if context is not None:
             running.append(loop.create_task(self._renew(context)))
@@ -168,7 +168,7 @@ class _Api:
             _log.error("control was not connected for a long time: the api is restarted")
             self._stopping.set()
 
-    def _say(self, message: messages.Message) -> None:
+    def _report(self, message: messages.Message) -> None:
         try:
             self._lifeline.send(message)
         except ChannelClosedError:
@@ -177,7 +177,7 @@ class _Api:
     def _received(self, message: Any, descriptors: tuple[int, ...]) -> None:
         match message:
             case messages.Ping(number):
-                self._say(messages.Pong(number))
+                self._report(messages.Pong(number))
             case messages.Stop():
                 self._end()
             case messages.SocketRestored(name) if name == "api":

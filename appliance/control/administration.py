@@ -83,18 +83,18 @@ class Administration:
 
     def __init__(
         self,
-        looks: Queries,
+        queries: Queries,
         *orders: Orders,
         durable: Callable[[], Awaitable[object]],
         require_room: Callable[[], None],
     ) -> None:
-        self._looks = looks
+        self._queries = queries
         self._durable = durable
         self._require_room = require_room
         self._methods: dict[type, _Taken] = {}
-        for part in (looks, *orders):
+        for part in (queries, *orders):
             for mark, method in admin.methods_of(type(part)):
-                self._methods[mark.request] = _Taken(partial(method, part), mark.who, part is not looks)
+                self._methods[mark.request] = _Taken(partial(method, part), mark.who, part is not queries)
 
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
         """Carry out a request of `who` (the name of a token, or `operator` for the admin socket). An order is in the
@@ -123,8 +123,8 @@ class Administration:
 
     def _in_force(self, error: PolicyRefusedError | SpecificationsRefusedError) -> str:
         if isinstance(error, PolicyRefusedError):
-            return f"the policy was rejected; revision {self._looks.policies.revision} stays in force"
-        revision = self._looks.parts.monitors.revision
+            return f"the policy was rejected; revision {self._queries.policies.revision} stays in force"
+        revision = self._queries.parts.monitors.revision
         return f"rejected; revision {revision} of the specifications stays in force"
 
 

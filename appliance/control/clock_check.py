@@ -34,7 +34,7 @@ class ClockCheck:
         self._started = started
         self._seen = started()
 
-    def told(self, synchronised: bool | None) -> None:
+    def synchronisation_reported(self, synchronised: bool | None) -> None:
         """Record a change in the supervisor's report of the time service; None if that is unknown."""
         before, self._synchronised = self._synchronised, synchronised
         if synchronised is False and before is not False:

@@ -49,7 +49,7 @@ class PolicyRefusedError(Exception):
         self.findings = findings
 
 
-def _said(error: OSError | UnicodeDecodeError) -> str:
+def _error_text(error: OSError | UnicodeDecodeError) -> str:
     return (
         error.strerror or str(error)
         if isinstance(error, OSError)
@@ -253,7 +253,7 @@ class Policies(Revisions[RevisionRow]):
         except FileNotFoundError:
             pass
         except (OSError, UnicodeDecodeError) as fault:
-            error = f"the policy's tests cannot be read: {_said(fault)}"
+            error = f"the policy's tests cannot be read: {_error_text(fault)}"
         return replace(known, cases_file=str(cases), cases=text, cases_error=error)
 
     # --- inside ---
@@ -287,7 +287,9 @@ class Policies(Revisions[RevisionRow]):
         try:
             return read_given_text(self.file), read_signature(self.file)
         except (OSError, UnicodeDecodeError) as error:
-            raise PolicyRefusedError([f"{self.file}: the policy cannot be read: {_said(error)}"]) from error
+            raise PolicyRefusedError(
+                [f"{self.file}: the policy cannot be read: {_error_text(error)}"]
+            ) from error
 
     def _tested(
         self, read: Callable[[], tuple[str, str]], file: str, known: PolicyContext

@@ -112,7 +112,7 @@ class _Control:
             sockets[INNER], inner.handle, guarded=False, at_once=inner.acknowledge, keep=False
         )
         if base.lifeline.announced:
-            operators.tokens.told()
+            operators.tokens.first_token_shown()
         if _ADMIN in sockets:
             # Keep a reference, otherwise the garbage collector closes it.
             self._admin = await AdminServer(operators.administration).start(sockets[_ADMIN].dup())

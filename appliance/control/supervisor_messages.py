@@ -46,9 +46,9 @@ class SupervisorMessages:
                 self._reloading.add(task)  # referenced until it is done
                 task.add_done_callback(self._reloading.discard)
             case messages.Announced():
-                self._operators.tokens.told()
+                self._operators.tokens.first_token_shown()
             case messages.ClockRead(synchronised):
-                self._operators.clock.told(synchronised)
+                self._operators.clock.synchronisation_reported(synchronised)
             case messages.ProbeFailed(reason):
                 self._base.listener_limits.probed(reason)
             case messages.ProbePassed():

@@ -73,7 +73,7 @@ class TokenOrders:
             await self.revoke(admin.TokenRevoke(FIRST_NAME))
         return (await self.add(admin.TokenAdd(FIRST_NAME, "admin", DEFAULT_SECONDS))).token
 
-    def told(self) -> None:
+    def first_token_shown(self) -> None:
         """Note that the first token was shown to the person who started the appliance."""
         if self._untold:
             self._untold = False

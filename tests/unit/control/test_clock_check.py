@@ -34,7 +34,7 @@ def test_an_unsynchronised_clock_is_recorded_once(trail: Trail) -> None:
     """A record marks its beginning and its end; an unknown state has none."""
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
     for synchronised in (None, False, False, True, True, None, False):
-        clock.told(synchronised)
+        clock.synchronisation_reported(synchronised)
         assert clock.state() == ClockState(synchronised, 0.0)
     assert trail.events == ["clock not synchronised", "clock synchronised", "clock not synchronised"]
 
@@ -42,7 +42,7 @@ def test_an_unsynchronised_clock_is_recorded_once(trail: Trail) -> None:
 def test_a_right_clock_is_not_recorded(trail: Trail) -> None:
     """A start with a right clock makes no record."""
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
-    clock.told(True)
+    clock.synchronisation_reported(True)
     clock.look()
     assert trail.events == []
 
@@ -77,7 +77,7 @@ def test_a_clock_before_the_build_date_is_reported(
     """The machine has no time yet, and no earlier record shows the error."""
     made = Path(shipped.__file__).stat().st_mtime
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
-    clock.told(True)
+    clock.synchronisation_reported(True)
     monkeypatch.setattr(time, "time", lambda: made - days * 86_400)
     told = doubted_clock(clock.state())
     assert (told or "").startswith(said or "")

@@ -66,7 +66,7 @@ async def test_an_announced_token_stays(lives: Lives) -> None:
     """No later control makes another, whether or not it knows of the announcement."""
     tokens = lives.next()
     text = await tokens.first()
-    tokens.told()
+    tokens.first_token_shown()
     assert lives.store is not None
     await lives.store.settled()
     later = lives.next()
@@ -78,7 +78,7 @@ async def test_a_late_notice_of_the_announcement_counts(lives: Lives) -> None:
     """Control died before the supervisor's notice: the next one gets it first, and makes no other token."""
     text = await lives.next().first()
     tokens = lives.next()
-    tokens.told()
+    tokens.first_token_shown()
     assert await tokens.first() is None
     assert opens(tokens, text)
 
