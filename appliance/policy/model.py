@@ -110,9 +110,9 @@ class Decision:
 
     `rule` is the rule that decided, or None if no rule matches the request. `reason` is a sentence for a person, in the
     audit record, `rosrv policy explain` and the console. `told` is the same without other hosts' names and addresses,
-    for the answer to the caller; None if the reason has none (`text_for_caller`). `would_deny` is set in audit-only mode
-    if the rules deny the request; `allowed` is then True. `needs` is the further right that decided, if it was not the
-    request itself (`write /arm/**`).
+    for the answer to the caller; None if the reason has none (`text_for_caller`). `would_deny` is set in audit-only
+    mode if the rules deny the request; `allowed` is then True. `needs` is the further right that decided, if it was not
+    the request itself (`write /arm/**`).
     """
 
     allowed: bool
