@@ -18,13 +18,14 @@ import heapq
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Generator, Hashable
+from operator import itemgetter
 from typing import Any, Generic, TypeVar
 
 from appliance.policy.model import Address
 from appliance.quotas.table import RVMASTER_TIME
 
 TURN_SECONDS = RVMASTER_TIME.bounds.whole / 1e6
-_MOST_KEPT = 1024  # entries of use, before those without a debt are removed
+_MOST_KEPT = 1024  # entries of use, before all but the largest debts are removed
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
@@ -60,7 +61,9 @@ class Line(Generic[Key, Item]):
         """Add to the use of a key."""
         self._used[key] = self.used(key) + seconds
         if len(self._used) > _MOST_KEPT:
-            self._used = {one: used for one, used in self._used.items() if used > self.start}
+            # Half, so that the next removal is far away.
+            largest = heapq.nlargest(_MOST_KEPT // 2, self._used.items(), key=itemgetter(1))
+            self._used = {one: used for one, used in largest if used > self.start}
 
     def forget(self) -> None:
         """Forget what all keys have used."""

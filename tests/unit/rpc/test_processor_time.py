@@ -130,6 +130,26 @@ def test_no_host_saves_time_and_debts_stay() -> None:
     assert order[0] == "guest"
 
 
+def test_a_charge_costs_the_same_for_any_number_of_hosts() -> None:
+    """Each host of a flood has a new address, so all owe; charging one does not look at all others each time."""
+    looked_at = 0
+
+    class Host(int):
+        def __hash__(self) -> int:
+            nonlocal looked_at
+            looked_at += 1
+            return int(self)
+
+    line: Line[Host, None] = Line()
+    debtor, waiting = Host(1), Host(0)
+    line.put(waiting, None)
+    line.charge(debtor, 60.0)
+    for number in range(2, 5000):
+        line.charge(Host(number), 1.0)
+    assert looked_at < 10 * 5000
+    assert line.used(debtor) == 60.0, "a debt of one host was forgotten for the small ones of many"
+
+
 async def test_steps_of_coroutines_are_charged_and_wait(loop: Loop) -> None:
     """A long handler that gives way between its pieces delays another host's by a piece or two, not by its length."""
 
