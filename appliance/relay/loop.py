@@ -127,6 +127,7 @@ class EventLoop:
         self._running = False
         self._processor_time = processor_time
         self._since = _UNKNOWN  # when the running handler began
+        self._alone = False  # whether its descriptor is the only ready one
         self.clock = time.monotonic
 
     def watch(self, descriptor: int, events: int, handler: Handler, payer: str = SYSTEM) -> None:
@@ -191,8 +192,14 @@ class EventLoop:
         return self.used() >= QUANTUM
 
     def charge(self, payer: str, used: int) -> None:
-        """Charge this processor time to a payer, besides the one whose handler runs."""
-        self._payer(payer).spent += used
+        """Charge this processor time to a payer, besides the one whose handler runs.
+
+        While no other descriptor is ready, that takes time from nobody and leaves no debt.
+        """
+        found = self._payer(payer)
+        found.spent += used
+        if self._alone:
+            self._floor = max(self._floor, found.spent)
 
     def stop(self) -> None:
         """End `run` after this turn."""
@@ -260,7 +267,9 @@ class EventLoop:
         """Serve the only ready descriptor; a short handler is not even charged."""
         self._since, began = _UNKNOWN, self.clock()
         handler, payer, _ = self._watched[number]
+        self._alone = True
         handler(events)
+        self._alone = False
         took = self.clock() - began
         if took > _LITTLE and payer is not None:
             used = int(took * 1e9)

@@ -253,6 +253,26 @@ def test_a_charge_for_a_new_connection_delays_its_host(costs: Costs) -> None:
     assert costs.order.count("robot") >= 29
 
 
+def test_connections_made_while_alone_leave_no_debt(costs: Costs) -> None:
+    """The robot connected for hours while no other host did anything; a new guest does not come before it."""
+
+    def accept(_events: int) -> None:
+        costs.used += 50_000
+        costs.loop.charge("robot", 50_000)
+
+    ours, theirs = socket.socketpair()
+    costs.loop.watch(ours.fileno(), READ, accept, ACCEPTING)
+    theirs.send(b"x")
+    for _ in range(1000):
+        costs.loop.turn(0)
+    costs.loop.discard(ours)
+    theirs.close()
+    costs.ready("guest", QUANTUM)
+    costs.ready("robot", QUANTUM, times=1)
+    costs.turns_until(lambda: "robot" in costs.order)
+    assert costs.order.count("guest") <= 2
+
+
 def test_timers_that_are_due_together_are_called_a_quantum_at_a_time(costs: Costs) -> None:
     """Ten thousand timers delay a message by one quantum."""
     called: list[None] = []
