@@ -202,7 +202,7 @@ def test_other_threads_go_on_while_a_module_is_translated() -> None:
 
 
 def test_a_view_outlives_its_machine() -> None:
-    """Nobody reads what is not there any more."""
+    """A view of closed memory still has its bytes."""
     one = made("")
     view = one.memory[10:20]
     view[0] = 3

@@ -84,13 +84,13 @@ class NearAuthority(Authority):
         self.lists = 0
 
     async def certificate(self) -> bytes:
-        """Its certificate."""
+        """Return the authority's certificate."""
         return self._near.certificate
 
     async def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> CertificateMade:
-        """A certificate, or the refusal as it comes over the link; `meanwhile` happens before."""
+        """Return a certificate, or the refusal as it comes over the link; `meanwhile` runs before."""
         self.meanwhile()
         await asyncio.sleep(0)
         try:
@@ -100,7 +100,7 @@ class NearAuthority(Authority):
         return CertificateMade(0, issued.certificate, issued.serial, issued.expires)
 
     async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
-        """The list; how often it was signed is counted."""
+        """Return the list; the signatures of it are counted."""
         self.lists += 1
         await asyncio.sleep(0)
         return self._near.revocations(revoked)
@@ -170,7 +170,7 @@ class Bench:
     def token(
         self, name: str, *, seconds: float = 60, new: bool = True
     ) -> Coroutine[Any, Any, EnrolmentToken]:
-        """A one-time token."""
+        """Return a one-time token."""
         return self.hosts.token(HostToken(name, "10.0.0.1", token_seconds=seconds, new=new), "tester")
 
     def enrol(self, token: str, name: str) -> Coroutine[Any, Any, KitParts]:
@@ -188,7 +188,7 @@ class Bench:
         return self.hosts.itself.renewed(HostRenewed(name, "10.113.11.2"))
 
     def recorded(self, event: str) -> list[str]:
-        """The reasons of all records of an event."""
+        """Return the reasons of all records of an event."""
         return [fields["reason"] for name, fields in self.trail.heard if name == event]
 
     def _said(self, message: Message) -> None:
@@ -211,14 +211,14 @@ class Bench:
 
 
 def sign(key: bytes, request: str) -> bytes:
-    """The proof of a renewal, as `openssl pkeyutl` makes it."""
+    """Return the proof of a renewal, as `openssl pkeyutl` makes it."""
     private = load_pem_private_key(key, None)
     assert isinstance(private, ec.EllipticCurvePrivateKey)
     return private.sign(request.encode(), ec.ECDSA(hashes.SHA384()))
 
 
 def request_of(name: str) -> str:
-    """A signing request for a new key."""
+    """Return a signing request for a new key."""
     return signing_request(make_key(), name).decode()
 
 
@@ -232,7 +232,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 @pytest.fixture(autouse=True)
 def nobody_waits_for_charon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """There is none here: its answer is not awaited."""
+    """Wait for no answer of charon, which does not run here."""
     monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 0.0)
 
 
@@ -250,7 +250,7 @@ def run(directory: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **o
 
 
 async def test_addresses_are_given_in_order_and_kept(bench: Bench) -> None:
-    """The first is the appliance's; declared ones are kept free; a revoked host's is given to no other."""
+    """The first is the appliance's. Declared addresses are reserved; a revoked host's address is not used again."""
     bench.declared.write_text("hosts:\n  - name: laptop\n    address: 10.113.11.3\n")
     await bench.reload()
     assert (await bench.add("a")).address == "10.113.11.2"
@@ -279,12 +279,10 @@ async def test_addresses_are_given_in_order_and_kept(bench: Bench) -> None:
         ("ROSRV-Appliance", None, "no name"),
     ],
 )
-async def test_a_name_or_an_address_that_cannot_be_had_is_refused(
+async def test_an_unavailable_name_or_address_is_refused(
     bench: Bench, name: str, address: str | None, why: str
 ) -> None:
-    """Above all not the appliance's own: a host with its name could stand for it. IKE compares names without regard to
-    case, so no second host may answer to the first one's; an address is in the pool and free.
-    """
+    """The appliance's name is reserved, and case does not distinguish names, as in IKE. An address must be free."""
     await bench.add("laptop")
     with pytest.raises(HostRefusedError, match=why):
         await bench.hosts.add(
@@ -322,8 +320,8 @@ def test_a_master_that_tunnels_cannot_reach_is_reported(tmp_path: Path) -> None:
     run(tmp_path, work, listen="192.168.1.20")
 
 
-async def test_revoked_is_out_of_the_policy_before_anything_is_awaited(bench: Bench) -> None:
-    """The policy first, then what the host has; and its certificate is on the list for good."""
+async def test_a_revoked_host_leaves_the_policy_first(bench: Bench) -> None:
+    """Its connections and tunnel follow; its certificate stays on the list of revoked ones."""
     await bench.add("a")
     bench.order.clear()
     body = await bench.revoke("a")
@@ -335,7 +333,7 @@ async def test_revoked_is_out_of_the_policy_before_anything_is_awaited(bench: Be
 
 
 async def test_a_new_certificate_revokes_the_one_before(bench: Bench) -> None:
-    """The address stays; there is no second enrolment of a name that is enrolled."""
+    """The address stays; an enrolled name cannot be enrolled again."""
     first = await bench.add("a")
     with pytest.raises(HostRefusedError, match="rosrv host kit a"):
         await bench.add("a")
@@ -351,8 +349,8 @@ async def test_a_bad_request_enrols_no_host(bench: Bench) -> None:
     assert bench.hosts.rows() == []
 
 
-async def test_declared_and_not_enrolled_is_shown(bench: Bench) -> None:
-    """The list has both kinds of divergence from the baseline."""
+async def test_divergences_from_the_declared_hosts_are_listed(bench: Bench) -> None:
+    """Both declared hosts without enrolment and enrolled hosts without declaration are listed."""
     bench.declared.write_text("hosts:\n  - name: laptop\n")
     await bench.reload()
     await bench.add("a")
@@ -366,7 +364,7 @@ async def test_declared_and_not_enrolled_is_shown(bench: Bench) -> None:
 
 
 async def test_a_one_time_token_enrols_once(bench: Bench, tmp_path: Path) -> None:
-    """Used again, or after a newer one of the name, it opens nothing; it is nowhere in the state."""
+    """A used or replaced token is invalid; the stored state does not contain it."""
     first = await bench.token("a")
     second = await bench.token("a")
     for text in (first.token, "rosrv-enrol_000000000000_" + "x" * 43, "rubbish"):
@@ -384,8 +382,8 @@ async def test_a_one_time_token_enrols_once(bench: Bench, tmp_path: Path) -> Non
             assert secret not in file.read_bytes(), file
 
 
-async def test_two_who_bring_a_token_at_once_get_one_certificate(bench: Bench) -> None:
-    """It is used up before the authority is asked."""
+async def test_two_simultaneous_uses_of_a_token_get_one_certificate(bench: Bench) -> None:
+    """The token is used up before the authority is asked."""
     text = (await bench.token("a")).token
     both = await asyncio.gather(
         bench.hosts.itself.enrol(HostEnrol(text, request_of("a"), "10.9.9.8")),
@@ -452,7 +450,7 @@ async def test_revoked_while_a_certificate_is_made(bench: Bench, how: str) -> No
 
 
 async def test_a_host_renews_itself(bench: Bench) -> None:
-    """In its tunnel and with its key: both certificates are good until it says that the new one is in place."""
+    """In its tunnel and with its key; both certificates are valid until the host reports the new one in place."""
     key = make_key()
     first = await bench.add("a", key=key)
     request = request_of("a")
@@ -504,8 +502,8 @@ async def test_a_short_life_needs_a_short_wait(bench: Bench, monkeypatch: pytest
         monkeypatch.setattr(time, "time", lambda now=now: now + 6)
 
 
-async def test_nobody_renews_for_another(bench: Bench) -> None:
-    """Another address, another host's tunnel, another key, another name, no tunnels at all: refused and recorded."""
+async def test_a_host_renews_only_its_own_certificate(bench: Bench) -> None:
+    """Another address, tunnel, key or name, or no tunnels at all: the renewal is refused and recorded."""
     key, other = make_key(), make_key()
     await bench.add("a", key=key)
     await bench.add("b", key=other)
@@ -564,7 +562,7 @@ async def test_the_list_is_signed_once_however_often_it_is_asked_for(bench: Benc
 
 
 async def test_a_full_list_replaces_no_certificate(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refused with the day when there is room; a host that is new needs none, and revoking one makes some."""
+    """The refusal names the day with space again; a new host needs no space, and revoking a host frees some."""
     monkeypatch.setattr("appliance.hosts.revoked_certificates.ENTRIES_BYTES", 120)
     for name in ("a", "b"):
         await bench.add(name)
@@ -581,7 +579,7 @@ async def test_a_full_list_replaces_no_certificate(bench: Bench, monkeypatch: py
 
 
 async def test_a_change_for_another_state_is_refused(bench: Bench) -> None:
-    """Two engineers cannot overwrite each other: the revision grows with every change, over restarts."""
+    """Two engineers cannot overwrite each other: the revision grows with every change, also over restarts."""
     seen = (await bench.hosts.listed(HostList())).revision
     await bench.add("a")
     for late in (
@@ -604,7 +602,7 @@ async def test_odd_names_that_are_names(bench: Bench, name: str) -> None:
 
 
 def test_two_hundred_hosts(tmp_path: Path) -> None:
-    """Each has an address of its own, and all of them are there after a restart."""
+    """Each has its own address, and all exist after a restart."""
 
     async def work(bench: Bench) -> None:
         request = request_of("x")
@@ -621,7 +619,7 @@ def test_two_hundred_hosts(tmp_path: Path) -> None:
 
 
 async def test_a_tunnel_that_is_not_wanted_stays_closed(bench: Bench) -> None:
-    """On reload a host goes out of the policy and loses what it has; wanted again it is back; none is lost."""
+    """A reload takes an unwanted host out of the policy and closes its tunnel; wanted again, it returns."""
     await bench.add("a")
     await bench.add("b")
     bench.order.clear()
@@ -713,10 +711,10 @@ async def test_removing_a_host_answers_once_its_connections_are_closed(
     await asked
 
 
-async def test_only_what_charon_took_of_this_life_counts_as_taken(
+async def test_only_configurations_of_this_control_count_as_taken(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its process may report a greater number of an earlier life of control: the clock was set back since."""
+    """After the clock was set back, charon's process may report a greater number from an earlier control."""
     monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 0.05)
     ours, theirs = socket.socketpair()
     link, charon = Channel(ours, TunnelLink), Channel(theirs, TunnelLink)

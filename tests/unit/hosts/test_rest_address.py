@@ -52,7 +52,7 @@ def test_in_a_namespace_hosts_renew_without_any_setting() -> None:
     assert rest_address(Settings(isolation="netns")).inner_port == 8443
 
 
-def test_a_port_that_is_not_published_is_there_for_tunnels() -> None:
-    """They end in the container, past what its engine publishes."""
+def test_tunnels_reach_an_unpublished_port() -> None:
+    """Tunnels end in the container, behind the ports that its engine publishes."""
     settings = {"api": "0.0.0.0:8443", "isolation": "container", "api_networks": NET, "api_published": False}
     assert rest_address(read(settings)).inner_port == 8443

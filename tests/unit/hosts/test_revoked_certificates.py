@@ -21,7 +21,7 @@ _NUMBERS = itertools.count(1 << 70)
 
 
 def serials(count: int) -> list[str]:
-    """Serial numbers as the authority makes them."""
+    """Return serial numbers as the authority makes them."""
     return [f"{next(_NUMBERS):x}" for _ in range(count)]
 
 
@@ -34,7 +34,7 @@ def store(tmp_path: Path) -> Iterator[StateStore]:
 
 
 def bytes_of_list(revoked: RevokedCertificates, enrolled: set[str], directory: Path) -> int:
-    """How long the list becomes that charon is given."""
+    """Return the length of the list that charon gets."""
     directory.mkdir()
     rows = [(row.serial, row.moment) for row in revoked.listed(enrolled)]
     signed = x509.load_pem_x509_crl(CertificateAuthority(directory).revocations(rows))
@@ -42,8 +42,8 @@ def bytes_of_list(revoked: RevokedCertificates, enrolled: set[str], directory: P
     return len(signed.public_bytes(Encoding.DER))
 
 
-def test_a_certificate_is_on_the_list_until_it_has_ended(store: StateStore) -> None:
-    """And a day longer, for clocks differ."""
+def test_a_certificate_is_on_the_list_until_it_has_expired(store: StateStore) -> None:
+    """It stays a day longer, because clocks differ."""
     revoked = RevokedCertificates(store.hosts)
     now = time.time()
     for serial, expires in (("a1", now + DAY), ("a2", now - DAY / 2), ("a3", now - 2 * DAY)):
@@ -53,10 +53,10 @@ def test_a_certificate_is_on_the_list_until_it_has_ended(store: StateStore) -> N
     assert {row.serial for row in revoked.listed({"a"})} == {"a1", "a2"}
 
 
-def test_a_clock_that_stood_too_late_lets_no_certificate_in_again(
+def test_a_clock_that_was_ahead_unrevokes_no_certificate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Somebody set the wrong year, and then the right one: what was revoked is on the list, also after a restart."""
+    """After a wrong year was set and corrected, revoked certificates are still listed, also after a restart."""
     now = time.time()
     store = StateStore(tmp_path, failed=pytest.fail)
     RevokedCertificates(store.hosts).add("a", "a1", now + DAY)
@@ -95,7 +95,7 @@ def test_revoked_certificates_are_kept_over_restarts(tmp_path: Path) -> None:
 
 
 def test_a_list_of_thousands_is_not_too_long_for_charon(store: StateStore, tmp_path: Path) -> None:
-    """Certificates of names that are not enrolled give way first; all that charon could let in are on it."""
+    """Certificates of names that are not enrolled are dropped first; all that charon could accept stay."""
     revoked = RevokedCertificates(store.hosts)
     expires = time.time() + 90 * DAY
     for serial in serials(2_000):
@@ -109,8 +109,8 @@ def test_a_list_of_thousands_is_not_too_long_for_charon(store: StateStore, tmp_p
     assert bytes_of_list(revoked, {"enrolled"}, tmp_path / "ca") <= LONGEST
 
 
-def test_there_is_room_or_a_day_when_there_is(store: StateStore, tmp_path: Path) -> None:
-    """Certificates are replaced until the list is full and not longer; whatever is left out then is counted."""
+def test_a_full_list_says_when_it_has_space_again(store: StateStore, tmp_path: Path) -> None:
+    """Certificates are replaced until the list is full; revoked certificates beyond that are counted as missing."""
     revoked = RevokedCertificates(store.hosts)
     expires = time.time() + 90 * DAY
     count = 0
@@ -129,8 +129,8 @@ def test_there_is_room_or_a_day_when_there_is(store: StateStore, tmp_path: Path)
     assert bytes_of_list(revoked, {"a"}, tmp_path / "ca") <= LONGEST
 
 
-def test_numbers_of_another_length_fit_too(store: StateStore, tmp_path: Path) -> None:
-    """Serial numbers of 160 bits, as certificates had before, are fewer on the list."""
+def test_longer_serial_numbers_fit(store: StateStore, tmp_path: Path) -> None:
+    """The list has space for fewer serial numbers of 160 bits, as in older certificates."""
     revoked = RevokedCertificates(store.hosts)
     for number in range(3_000):
         revoked.add("", f"{(1 << 158) + number:x}", time.time() + DAY)

@@ -14,7 +14,7 @@ from appliance.ipsec.requests import make_key, signing_request
 
 
 def test_an_ed25519_authority_makes_certificates_and_lists(tmp_path: Path) -> None:
-    """By choice the authority's key is Ed25519; hosts' keys are what they are."""
+    """The authority's key can be Ed25519; the kinds of the hosts' keys do not change."""
     authority = CertificateAuthority(tmp_path, "ed25519")
     own = x509.load_pem_x509_certificate(authority.certificate)
     assert isinstance(own.public_key(), ed25519.Ed25519PublicKey)
@@ -27,8 +27,8 @@ def test_an_ed25519_authority_makes_certificates_and_lists(tmp_path: Path) -> No
     assert CertificateAuthority(tmp_path, "ed25519").certificate == authority.certificate
 
 
-def test_another_kind_than_the_key_that_is_there_is_an_error(tmp_path: Path) -> None:
-    """A setting that could have no effect is refused, and says what it must be."""
+def test_a_kind_that_differs_from_the_existing_key_is_an_error(tmp_path: Path) -> None:
+    """The setting could have no effect; the error says which value is valid."""
     CertificateAuthority(tmp_path)
     with pytest.raises(SignerKeyError, match=r"kind ecdsa, and ipsec\.ca is ed25519: set it to ecdsa"):
         CertificateAuthority(tmp_path, "ed25519")
@@ -47,7 +47,7 @@ def test_the_key_is_encrypted_by_its_passphrase(tmp_path: Path) -> None:
     assert (tmp_path / KEY_FILE).read_bytes() == before
 
 
-def test_a_key_in_the_clear_is_encrypted_when_there_is_a_passphrase(tmp_path: Path) -> None:
+def test_a_clear_key_is_encrypted_once_there_is_a_passphrase(tmp_path: Path) -> None:
     """The authority stays the same; from then on the file needs the passphrase."""
     made = CertificateAuthority(tmp_path)
     assert CertificateAuthority(tmp_path, passphrase=b"late").certificate == made.certificate
@@ -61,8 +61,8 @@ def test_a_key_in_the_clear_is_encrypted_when_there_is_a_passphrase(tmp_path: Pa
 @pytest.mark.parametrize(
     ("text", "error"), [(b"", "empty"), (b"\nsecond\n", "empty"), (b"x" * 1100, "longer")]
 )
-def test_a_file_that_has_no_passphrase_is_an_error(tmp_path: Path, text: bytes, error: str) -> None:
-    """Nothing is encrypted with nothing."""
+def test_a_file_without_a_passphrase_is_an_error(tmp_path: Path, text: bytes, error: str) -> None:
+    """The key is never encrypted with an empty passphrase."""
     path = tmp_path / "passphrase"
     path.write_bytes(text)
     with pytest.raises(SignerKeyError, match=error):
@@ -70,7 +70,7 @@ def test_a_file_that_has_no_passphrase_is_an_error(tmp_path: Path, text: bytes, 
 
 
 def test_the_first_line_is_the_passphrase(tmp_path: Path) -> None:
-    """With the line end of any editor."""
+    """The line may end as in any editor."""
     path = tmp_path / "passphrase"
     path.write_bytes(b"one two\r\nthree\n")
     assert read_passphrase(os.open(path, os.O_RDONLY)) == b"one two"

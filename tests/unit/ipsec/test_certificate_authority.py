@@ -27,7 +27,7 @@ from appliance.ipsec.proof_of_possession import RequestRefusedError
 def request_of(
     key: ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey | rsa.RSAPrivateKey, name: str = "whoever"
 ) -> bytes:
-    """A signing request by this key that also asks to be an authority."""
+    """Return a signing request by this key that also asks to be an authority."""
     digest = None if isinstance(key, ed25519.Ed25519PrivateKey) else hashes.SHA384()
     return (
         x509.CertificateSigningRequestBuilder()
@@ -40,8 +40,8 @@ def request_of(
 
 
 @pytest.mark.parametrize("kind", ["p384", "ed25519"])
-def test_a_certificate_has_the_key_of_the_request_and_nothing_else_of_it(tmp_path: Path, kind: str) -> None:
-    """Name, uses and alternative names are the authority's; the requester's wish to be an authority is not heard."""
+def test_a_certificate_takes_only_the_key_from_the_request(tmp_path: Path, kind: str) -> None:
+    """The authority sets name, uses and alternative names; a request to be an authority is ignored."""
     authority = CertificateAuthority(tmp_path)
     key = ec.generate_private_key(ec.SECP384R1()) if kind == "p384" else ed25519.Ed25519PrivateKey.generate()
     issued = authority.issue(request_of(key), "ocu-1", 90)
@@ -88,7 +88,7 @@ def test_an_invalid_request_is_refused(tmp_path: Path, request_text: bytes) -> N
 
 
 def with_another_version(request: bytes) -> bytes:
-    """The same request saying that it is of version 3 (PKCS #10 knows the first only, written as 0)."""
+    """Return the same request with version 3 (PKCS #10 has only the first, written as 0)."""
     der = x509.load_pem_x509_csr(request).public_bytes(Encoding.DER)
     start = der.index(b"\x02\x01\x00")
     text = base64.encodebytes(der[:start] + b"\x02\x01\x02" + der[start + 3 :])
@@ -96,7 +96,7 @@ def with_another_version(request: bytes) -> bytes:
 
 
 def test_a_request_of_another_version_is_refused(tmp_path: Path) -> None:
-    """A version that there is not is what is wrong with the request, in words."""
+    """The error says that this is not a signing request."""
     authority = CertificateAuthority(tmp_path)
     request = with_another_version(request_of(ec.generate_private_key(ec.SECP384R1())))
     with pytest.raises(RequestRefusedError, match="not a signing request"):
@@ -104,7 +104,7 @@ def test_a_request_of_another_version_is_refused(tmp_path: Path) -> None:
 
 
 def test_limits_of_a_request(tmp_path: Path) -> None:
-    """Too long a request, an odd name, and a life beyond the limit are refused."""
+    """A request that is too long, an invalid name, and a validity beyond the limit are refused."""
     authority = CertificateAuthority(tmp_path)
     good = request_of(ec.generate_private_key(ec.SECP384R1()))
     for name in ("", "-x", "a b", "x" * 64, "../x", "a\n", 'a"b'):
@@ -131,7 +131,7 @@ def test_the_list_of_revoked_certificates_is_signed_and_complete(tmp_path: Path)
 
 
 def number_of(revocations: bytes) -> int:
-    """The number of a list."""
+    """Return the number of a list."""
     extension = x509.load_pem_x509_crl(revocations).extensions.get_extension_for_class(x509.CRLNumber)
     return extension.value.crl_number
 
@@ -139,7 +139,7 @@ def number_of(revocations: bytes) -> int:
 def test_the_number_of_the_list_grows_whatever_the_clock_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """charon keeps the list it has when one with a lower number comes: what was revoked since would be good there."""
+    """charon ignores a list with a lower number, and would accept certificates that were revoked since."""
     numbers = [number_of(CertificateAuthority(tmp_path).revocations([]))]
     an_hour_ago = time.time_ns() - 3_600_000_000_000
     monkeypatch.setattr(time, "time_ns", lambda: an_hour_ago)

@@ -18,14 +18,14 @@ from appliance.ipsec.strongswan import connection_name
 
 
 class Standing(NamedTuple):
-    """A tunnel that stands: of which connection, the numbers of it and of what it carries."""
+    """An open tunnel: the name of its connection, the number of its IKE SA, and that of its child SA."""
 
     tunnel: str
     ike: int
     child: int
 
     def listed(self) -> bytes:
-        """How charon says so."""
+        """Return charon's entry of the tunnel in its list."""
         name, child = b"list-sa", {"state": "INSTALLED", "uniqueid": str(self.child)}
         row = {"state": "ESTABLISHED", "uniqueid": str(self.ike), "child-sas": {f"ros-{self.child}": child}}
         said: bytes = Message.serialize({self.tunnel: row})

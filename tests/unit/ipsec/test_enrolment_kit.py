@@ -66,7 +66,7 @@ def test_a_host_that_made_its_key_gets_none() -> None:
 
 @pytest.mark.parametrize("script", ["join.sh", "leave.sh", "keep.sh", "renew.sh"])
 def test_scripts_are_complete_shell(script: str) -> None:
-    """The shell reads them without a complaint, and what stands for a value was replaced."""
+    """The shell reads them without an error, and every placeholder was replaced."""
     text = unpack(KIT)[f"rosrv-ocu-1/{script}"][0]
     done = subprocess.run(["/bin/sh", "-n"], input=text, text=True, capture_output=True, check=False)
     assert done.stderr == ""
@@ -74,15 +74,15 @@ def test_scripts_are_complete_shell(script: str) -> None:
         assert word not in text
 
 
-def test_join_tells_what_ros_needs() -> None:
+def test_join_prints_the_settings_for_ros() -> None:
     """The last lines of join.sh have the master and the address of this host."""
     assert (
         "ROS_MASTER_URI=http://10.113.11.1:11311 ROS_IP=10.113.11.2" in unpack(KIT)["rosrv-ocu-1/join.sh"][0]
     )
 
 
-def test_the_tunnel_carries_the_way_to_the_appliance_only() -> None:
-    """The selectors are the virtual address and the appliance's; weaker proposals are not in the file."""
+def test_the_tunnel_leads_to_the_appliance_only() -> None:
+    """The selectors are the virtual address and the appliance's; the file has no weaker proposals."""
     text = swanctl_conf(KIT)
     assert "remote_ts = 10.113.11.1/32" in text
     assert "local_ts = dynamic" in text
@@ -105,8 +105,8 @@ def test_the_firewall_of_a_host_names_the_appliance_in_the_tunnel() -> None:
     ]
 
 
-def test_the_script_takes_out_the_rule_that_is_never_right() -> None:
-    """One of two stays, for where ESP runs: on a kernel without IPsec the other could not even be loaded."""
+def test_the_script_removes_the_rule_that_does_not_apply() -> None:
+    """The rule that stays depends on where ESP runs: a kernel without IPsec cannot even load the other one."""
     files = unpack(KIT)
     script, text = files["rosrv-ocu-1/join.sh"][0], files["rosrv-ocu-1/protect.nft"][0]
     patterns = re.findall(r"""^    never=(?:'(.*)'|"(.*)")$""", script, re.MULTILINE)
@@ -118,7 +118,7 @@ def test_the_script_takes_out_the_rule_that_is_never_right() -> None:
 
 
 def test_a_kit_says_where_its_certificate_is_renewed() -> None:
-    """URL and pin of REST in the tunnel; where that cannot be reached, the script says so instead of trying."""
+    """The kit has URL and pin of REST in the tunnel; where it is unreachable, the script says so instead."""
     host = structs.replace(HOST, rest_url="https://10.113.11.1:8443", pin="sha256//pin=")
     text = unpack(replace(KIT, host=host))["rosrv-ocu-1/renew.sh"][0]
     assert 'rest="https://10.113.11.1:8443"' in text

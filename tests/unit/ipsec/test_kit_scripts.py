@@ -15,7 +15,7 @@ SCRIPTS = sorted(FOLDER.glob("*.sh"))
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
 def test_it_is_for_the_plainest_shell(script: Path) -> None:
-    """It is read by dash, as /bin/sh is on Debian and Ubuntu, and uses nothing of bash."""
+    """dash, which is /bin/sh on Debian and Ubuntu, can read it; it uses no feature of bash."""
     text = script.read_text()
     assert text.startswith("#!/bin/sh\n")
     done = subprocess.run(["/bin/dash", "-n", str(script)], capture_output=True, text=True, check=False)

@@ -30,27 +30,27 @@ _LIMIT_SECONDS = 30
 
 
 class Conversation:
-    """Accepts the configuration unless tunnels are queried meanwhile, or shortly after."""
+    """A stand-in for the connection to charon; notes whether a query interrupts the configuration."""
 
     def __init__(self) -> None:
         self._busy = threading.Event()
         self.interrupted = threading.Event()
 
     def provision(self, _stated: TunnelsStated) -> None:
-        """Is asked for the tunnels in the middle, or is not."""
+        """Wait a little for a query of the tunnels."""
         self._busy.set()
         self.interrupted.wait(0.3)
         self._busy.clear()
 
     def seen(self) -> list[TunnelSeen]:
-        """None; notes whether something else is being asked."""
+        """Return no tunnels; note whether the configuration is in progress."""
         if self._busy.is_set():
             self.interrupted.set()
         return []
 
 
 class Bench(process.TunnelProcess):
-    """The process, with the stand-in in the place of charon."""
+    """The process with the stand-in in place of charon."""
 
     conversation = Conversation()
 
@@ -59,7 +59,7 @@ class Bench(process.TunnelProcess):
 
 
 async def test_charon_gets_one_request_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The query of tunnels waits for the configuration: each would read the other's answers."""
+    """A query of the tunnels waits for the configuration: otherwise each would read the other's answers."""
     monkeypatch.setattr(process, "REPORT_SECONDS", 0.01)
     (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
     own, supervisor, link = (

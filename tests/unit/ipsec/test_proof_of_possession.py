@@ -13,7 +13,7 @@ from appliance.ipsec.requests import make_key, signing_request
 
 
 def sign(key: bytes, request: bytes) -> bytes:
-    """As `openssl pkeyutl -sign -rawin -digest sha384` does."""
+    """Sign as `openssl pkeyutl -sign -rawin -digest sha384` does."""
     private = load_pem_private_key(key, None)
     assert isinstance(private, ec.EllipticCurvePrivateKey)
     return private.sign(request, ec.ECDSA(hashes.SHA384()))
@@ -28,8 +28,8 @@ def test_the_present_key_asks_for_the_next(tmp_path: Path) -> None:
     assert following.serial != present.serial
 
 
-def test_nobody_else_does(tmp_path: Path) -> None:
-    """Another key, another request, no proof, another name, another authority's or an ended certificate: refused."""
+def test_any_other_proof_is_refused(tmp_path: Path) -> None:
+    """Another key, request, name or authority, a missing proof, and an expired certificate are refused."""
     (tmp_path / "mine").mkdir()
     (tmp_path / "foreign").mkdir()
     authority, foreign = CertificateAuthority(tmp_path / "mine"), CertificateAuthority(tmp_path / "foreign")

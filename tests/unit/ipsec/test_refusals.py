@@ -20,7 +20,7 @@ def refusals(text: str) -> list[Refusal]:
 
 
 def test_the_reason_belongs_to_the_packet_of_its_thread() -> None:
-    """Lines of two packets are mixed; the refusal has the address and the reasons of its own."""
+    """Where lines of two packets are mixed, each refusal has the address and the reasons of its own packet."""
     (found,) = refusals(REVOKED)
     assert found.remote == "10.88.0.20"
     assert found.reason.startswith("authentication failed; ")
@@ -53,7 +53,7 @@ def test_unknown_lines_of_the_log_are_skipped() -> None:
 
 
 def test_packets_that_esp_dropped() -> None:
-    """A packet that was sent again, and one under an address that its tunnel is not for; each by its address."""
+    """A replayed packet, and one with a source address outside its tunnel, are each reported with the address."""
     found = refusals("""\
 16[ESP] ESP sequence number verification failed:
 16[ESP]   src 10.88.0.20, dst 10.88.0.2, SPI 7ce6406b [seq 2]

@@ -26,7 +26,7 @@ class Desk:
             self.now += _DAY
 
     def text(self, *, removed: int | None, time: int = 1, number: int | None = None) -> bytes:
-        """The text of the next checkpoint; it says of its time what control likes: 1970."""
+        """Return the text of the next checkpoint, with a wrong time that control chose: 1970."""
         number = number or len(self.texts) + 1
         previous = hashlib.sha256(self.texts[-1]).hexdigest() if self.texts else "0" * 64
         version, line = (1, "") if removed is None else (2, f"removed {removed}\n")
@@ -65,7 +65,7 @@ def test_nothing_goes_that_is_kept_for_ever(tmp_path: Path) -> None:
         desk.approve(1)
 
 
-def test_for_the_size_enough_must_come_after(tmp_path: Path) -> None:
+def test_a_removal_by_size_leaves_enough_records(tmp_path: Path) -> None:
     """By size only so much goes that what is left can have that size."""
     desk = Desk(tmp_path, RetentionLimits(size=3 * _STEP * LARGEST_RECORD))
     assert desk.approve(7).endswith("bytes\n")
@@ -73,8 +73,8 @@ def test_for_the_size_enough_must_come_after(tmp_path: Path) -> None:
         desk.approve(8)
 
 
-def test_a_future_that_was_not_signed_counts_for_nothing(tmp_path: Path) -> None:
-    """An invented newest checkpoint makes no room."""
+def test_an_unsigned_newest_checkpoint_is_ignored(tmp_path: Path) -> None:
+    """An invented newest checkpoint allows no removal."""
     desk = Desk(tmp_path, RetentionLimits(size=3 * _STEP * LARGEST_RECORD))
     with pytest.raises(RemovalRefusedError, match="too few came after"):
         desk.removals.approve(desk.texts[7], desk.text(removed=0, number=1000))
@@ -91,8 +91,8 @@ def test_only_signed_checkpoints_allow_a_removal(tmp_path: Path) -> None:
         desk.removals.approve(b"", desk.texts[-1])
 
 
-def test_a_checkpoint_says_no_more_is_removed_than_was_approved(tmp_path: Path) -> None:
-    """Control cannot have it sealed that records are gone whose removal was not approved, or leave it out."""
+def test_a_checkpoint_claims_only_approved_removals(tmp_path: Path) -> None:
+    """Control can neither claim a removal that was not approved, nor leave out the number of removed records."""
     desk = Desk(tmp_path, RetentionLimits(days=5))
     with pytest.raises(CheckpointRefusedError, match="approved was the removal up to 0"):
         desk.sign(removed=_STEP)
@@ -105,8 +105,8 @@ def test_a_checkpoint_says_no_more_is_removed_than_was_approved(tmp_path: Path) 
     desk.sign(removed=300)
 
 
-def test_a_log_begun_before_removals_were_signed_goes_on(tmp_path: Path) -> None:
-    """Where checkpoints did not say what is removed, the first that does is believed, and held to from then on."""
+def test_a_log_older_than_signed_removals_goes_on(tmp_path: Path) -> None:
+    """The first checkpoint that states the removed records is accepted; later ones are compared with it."""
     desk = Desk.__new__(Desk)
     desk.now, desk.texts = 1000 * _DAY, []
     desk.signed = CheckpointMemory(tmp_path, clock=lambda: desk.now)

@@ -29,7 +29,7 @@ printf '%s' "${code-}"
 
 
 class Host:
-    """A host with a certificate, and what the appliance answers it."""
+    """A host with a certificate, and the appliance's answers to it."""
 
     def __init__(self, folder: Path) -> None:
         self.swanctl, self.answers, self._programs = folder / "swanctl", folder / "answers", folder / "bin"
@@ -75,7 +75,7 @@ class Host:
 
     @property
     def list_of_revoked(self) -> Path:
-        """Where charon finds the list."""
+        """Return the path where charon finds the list."""
         return self.swanctl / "x509crl" / "rosrv.crl"
 
 
@@ -94,8 +94,8 @@ def test_the_authoritys_list_of_revoked_certificates_is_kept(host: Host) -> None
     assert host.list_of_revoked.read_bytes() == given.public_bytes(Encoding.DER)
 
 
-def test_a_list_of_an_earlier_kit_is_taken_away(host: Host) -> None:
-    """It stood under another name, and strongSwan would take whichever it finds first."""
+def test_a_list_of_an_earlier_kit_is_removed(host: Host) -> None:
+    """It has another name, and strongSwan would use whichever list it finds first."""
     earlier = host.swanctl / "x509crl" / "rosrv-crl.pem"
     earlier.parent.mkdir()
     earlier.write_bytes(host.authority.revocations([]))
@@ -105,7 +105,7 @@ def test_a_list_of_an_earlier_kit_is_taken_away(host: Host) -> None:
 
 @pytest.mark.parametrize("forged", ["another authority's", "no list"])
 def test_a_list_that_the_authority_did_not_sign_replaces_nothing(host: Host, forged: str) -> None:
-    """The list that is there stays when REST gives one that another key signed, or rubbish."""
+    """The present list stays if REST returns rubbish, or a list that another key signed."""
     assert host.renew().returncode == 0
     kept = host.list_of_revoked.read_bytes()
     host.answer("revocations", b"rubbish" if forged == "no list" else host.another.revocations([("ab", 1.0)]))

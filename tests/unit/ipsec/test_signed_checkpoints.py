@@ -70,8 +70,8 @@ def test_refused(tmp_path: Path, text: bytes, reason: str) -> None:
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_logs_are_apart_and_bounded(tmp_path: Path) -> None:
-    """Each log has its own past; control cannot fill the signer's disk with invented logs."""
+def test_logs_are_separate_and_bounded(tmp_path: Path) -> None:
+    """Each log has its own history; control cannot fill the signer's disk with invented logs."""
     signed = CheckpointMemory(tmp_path, time.time_ns)
     for number in range(MOST_LOGS):
         signed.approve(checkpoint(1, log=f"{number:032x}"))

@@ -86,7 +86,7 @@ class SignerProcess:
         return self.links[-1]
 
     def end(self) -> int:
-        """Stop it; its exit status."""
+        """Stop it and return its exit status."""
         for link in self.links:
             link.close()
         with contextlib.suppress(ChannelClosedError):
@@ -96,7 +96,7 @@ class SignerProcess:
 
 
 def hear(channel: Channel) -> Any:
-    """The next message on a channel."""
+    """Return the next message on a channel."""
     assert select.select([channel], [], [], _LIMIT_SECONDS)[0], "no answer"
     ((message, _descriptors),) = channel.receive()
     return message
@@ -201,7 +201,7 @@ def test_supervisor_gone(tmp_path: Path) -> None:
 
 
 def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
-    """Checkpoints made while the signer was away are signed when it is there, and the log proves itself with them."""
+    """Checkpoints made while the signer was away are signed when it is back, and the log is verifiable."""
     path = tmp_path / "audit.db"
     link: list[Channel] = []
     log = AuditLog(
@@ -233,7 +233,7 @@ def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
 async def test_an_unexpected_parser_error_is_a_refusal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The refusal has words, and other requests in the same read are answered."""
+    """The refusal has a reason, and other requests in the same read are answered."""
 
     class OddError(Exception):
         """An error of an unexpected kind."""

@@ -45,7 +45,7 @@ def test_nothing_weak_is_offered() -> None:
 
 
 def test_charon_loads_what_it_needs_and_runs_no_programs() -> None:
-    """ESP in user space comes before the kernel's where it is wanted; scripts and fetching are not there at all."""
+    """ESP in user space comes before the kernel's where wanted; plugins for scripts and fetching are not loaded."""
     in_user_space, in_kernel = plugins("user space").split(), plugins("kernel").split()
     assert in_user_space.index("kernel-libipsec") < in_user_space.index("kernel-netlink")
     assert "kernel-libipsec" not in in_kernel
@@ -53,8 +53,8 @@ def test_charon_loads_what_it_needs_and_runs_no_programs() -> None:
     assert "socket = unix:///state/ipsec/vici.sock" in configuration(Path("/state/ipsec"), "kernel")
 
 
-def test_a_connection_that_is_not_ours_is_nobodys() -> None:
-    """A handshake before it is known whose it is has no host."""
+def test_an_unknown_connection_has_no_host() -> None:
+    """A handshake whose peer is still unknown has no host."""
     assert host_of("host-ocu-1") == "ocu-1"
     assert host_of("(unnamed)") is None
 
@@ -71,7 +71,7 @@ def test_ml_kem_is_offered_where_charon_has_it() -> None:
 
 
 def test_two_hundred_addresses_leave_handshakes_for_hosts() -> None:
-    """However many handshakes each of them begins, they have at most half of those that may be under way."""
+    """Their handshakes, however many, use at most half of those that may be in progress."""
     said = configuration(Path("/state/ipsec"), "kernel")
     limits = dict(line.strip().split(" = ") for line in said.splitlines() if " = " in line)
     each, whole = int(limits["block_threshold"]), int(limits["init_limit_half_open"])

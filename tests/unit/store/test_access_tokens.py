@@ -5,8 +5,8 @@ import pytest
 from appliance.store.access_tokens import BadTokenNameError, is_secret, make_token, parse_token
 
 
-def test_a_token_proves_itself_and_nothing_else_does() -> None:
-    """Its secret matches what is kept; another token's, a changed one's and the kept hash do not."""
+def test_only_its_own_secret_proves_a_token() -> None:
+    """Another token's secret, a changed one, and the stored hash do not match."""
     row, text = make_token("alice", "viewer", now=1000.0, seconds=60)
     parsed = parse_token(text)
     assert parsed is not None
@@ -27,8 +27,8 @@ def test_the_stored_row_does_not_have_the_secret() -> None:
     assert (row.salt, row.hash, row.id) != (again.salt, again.hash, again.id)
 
 
-def test_it_ends_in_time() -> None:
-    """Usable until its end or until it is revoked."""
+def test_a_token_is_valid_until_its_end_or_revocation() -> None:
+    """After that it is invalid."""
     row, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
     assert row.usable(1059.9)
     assert not row.usable(1060.0)
@@ -44,7 +44,7 @@ def test_an_invalid_token_is_none(text: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "disk", "operator", "a b", "-a", "a" * 64, "a\n", "é", "../x"])
-def test_names_that_would_confuse_are_refused(name: str) -> None:
-    """A name is short, plain, and none of those that stand for something else in a record."""
+def test_misleading_names_are_refused(name: str) -> None:
+    """A name is short and plain, and has no other meaning in a record."""
     with pytest.raises(BadTokenNameError, match="is no name for a token"):
         make_token(name, "viewer", now=0.0, seconds=1)

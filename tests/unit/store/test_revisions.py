@@ -67,24 +67,24 @@ def keeper(tmp_path: Path) -> Iterator[Keeper]:
     store.close()
 
 
-async def test_without_a_number_it_is_the_one_before(keeper: Keeper) -> None:
-    """The last that is kept below the present one, also where numbers are missing."""
+async def test_a_rollback_without_a_number_takes_the_previous_revision(keeper: Keeper) -> None:
+    """It is the last stored revision below the present one, also where numbers are missing."""
     assert await keeper.wanted(None) == row(5)
     assert await keeper.wanted(4) == row(4)
 
 
 @pytest.mark.parametrize(("asked", "said"), [(None, "before this one"), (0, "0"), (6, "6")])
-async def test_the_error_says_what_was_asked_for_and_what_there_is(
+async def test_the_error_names_the_missing_and_the_stored_revisions(
     keeper: Keeper, asked: int | None, said: str
 ) -> None:
-    """Revision 0 is a number as any other."""
+    """Revision 0 is a number like any other."""
     keeper.in_force = row(4)
     with pytest.raises(RefusedError) as caught:
         await keeper.wanted(asked)
     assert caught.value.args == ([f"there is no revision {said}; kept are: 4, 5, 7"],)
 
 
-async def test_a_change_on_a_change_goes_back_to_the_last_that_needed_no_confirmation(keeper: Keeper) -> None:
+async def test_two_unconfirmed_changes_roll_back_to_the_last_confirmed_one(keeper: Keeper) -> None:
     """The limit starts again with the second change; a change without a limit ends it."""
     begun = time.time()
     for number, within in ((8, 300.0), (9, 600.0)):

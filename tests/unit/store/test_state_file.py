@@ -27,12 +27,12 @@ def incarnation(key: str) -> IncarnationRow:
 
 
 def reopened(directory: Path) -> StateStore:
-    """The store as the next control finds it."""
+    """Return the store as the next control finds it."""
     return StateStore(directory, failed=pytest.fail)
 
 
 def killed_after(work: Callable[[StateStore], None], directory: Path) -> None:
-    """A process opens the store, works, and is killed: its writer writes nothing after that."""
+    """Let a process open the store, work, and be killed: its writer thread writes nothing after that."""
     child = os.fork()
     if not child:
         try:
@@ -97,8 +97,8 @@ def test_statements_of_a_killed_process_are_repeated_from_any_of_them_on(
         again.close()
 
 
-def test_a_forgotten_incarnation_takes_all_it_had_with_it(tmp_path: Path) -> None:
-    """Registrations and grants of a forgotten incarnation are gone, another's stay."""
+def test_forgetting_an_incarnation_removes_its_rows(tmp_path: Path) -> None:
+    """Its registrations and grants are removed; those of another stay."""
     store = reopened(tmp_path)
     for key in ("k1", "k2"):
         store.save_incarnation(incarnation(key))
@@ -127,7 +127,7 @@ def test_parameters_keep_their_types(tmp_path: Path) -> None:
 
 
 def test_revisions_are_listed_newest_first(tmp_path: Path) -> None:
-    """Every policy that was in force is kept with who loaded it."""
+    """Every policy that was in force is stored with the user who loaded it."""
     store = reopened(tmp_path)
     rows = [RevisionRow(n, f"text {n}", "p.ini", float(n), "disk", "note") for n in (1, 2, 3)]
     for row in rows:
@@ -139,7 +139,7 @@ def test_revisions_are_listed_newest_first(tmp_path: Path) -> None:
 
 
 def test_a_parameter_that_was_just_set_outlasts_the_process(tmp_path: Path) -> None:
-    """Changes are there for the next control, in order, though the tree was not kept since and nothing was closed."""
+    """The next control has the changes, in order, though the tree was not saved since and nothing was closed."""
 
     def first(store: StateStore) -> None:
         store.save_parameters({"a": 1})
@@ -178,8 +178,8 @@ def test_owners_of_parameters_outlast_the_process(tmp_path: Path) -> None:
     last.close()
 
 
-def test_the_whole_tree_takes_the_place_of_its_changes(tmp_path: Path) -> None:
-    """Once the tree is kept the changes before it are gone; those after it stay."""
+def test_saving_the_tree_removes_its_earlier_changes(tmp_path: Path) -> None:
+    """Changes after the tree was saved stay."""
     store = reopened(tmp_path)
     store.note_parameter("/a", 1)
     store.save_parameters({"a": 1})

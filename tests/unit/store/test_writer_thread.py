@@ -93,7 +93,7 @@ async def test_a_write_that_fails_is_tried_again_until_it_succeeds(
 
 
 def test_a_failing_write_does_not_delay_the_end(tmp_path: Path, failures: list[str]) -> None:
-    """While another process holds the file, closing takes as long as it may, says what is left, and loses nothing."""
+    """While another process locks the file, closing ends in time, reports the unwritten rest, and loses nothing."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append)
     database.query("SELECT 1")
     blocker = sqlite3.connect(tmp_path / "state.db", isolation_level=None)
@@ -202,7 +202,7 @@ def test_statements_queued_by_a_killed_process_are_there_after_the_next_start(tm
 def test_rows_of_one_table_are_one_statement(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However many follow each other; what stands between them is carried out between them."""
+    """This holds for any number of consecutive rows; statements between them are carried out in their order."""
     numbers: list[int] = []
     append = WriteAhead.append
 
@@ -264,7 +264,7 @@ async def test_the_file_of_statements_on_their_way_is_empty_once_all_are_in(
 
 
 def test_a_statement_torn_by_the_crash_is_left_out(tmp_path: Path) -> None:
-    """Half a statement at the end was never answered for: the whole ones before it are carried out."""
+    """Half a statement at the end was never confirmed; the complete ones before it are carried out."""
     ahead = WriteAhead(tmp_path / "state.ahead")
     ahead.append([("INSERT OR REPLACE INTO thing VALUES ('whole', 1)", ())])
     ahead.close()
@@ -277,7 +277,7 @@ def test_a_statement_torn_by_the_crash_is_left_out(tmp_path: Path) -> None:
 
 
 class _Gate:
-    """The operations on one file, and its lock: a write waits until another thread closes the file, or waits to."""
+    """Operations on one file: a write waits until another thread closes the file, or is about to."""
 
     def __init__(self) -> None:
         self.writing, self.closing = threading.Event(), threading.Event()

@@ -37,7 +37,7 @@ def publisher() -> Iterator[socket.socket]:
 
 
 def _nothing(_what: object) -> None:
-    """Nobody publishes, and no monitor comes."""
+    """Do nothing: there are no publishers and no monitors."""
 
 
 @pytest.fixture

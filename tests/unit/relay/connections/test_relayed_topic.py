@@ -31,11 +31,11 @@ class RecordedUpstream(Upstream):
         self.announced: tuple[list[str], str] = ([], "")
 
     def connect(self) -> None:
-        """Somebody is there."""
+        """Note the request to connect."""
         self.asked.append("want")
 
     def release(self) -> None:
-        """Nobody is there."""
+        """Note the request to release the connection."""
         self.asked.append("spare")
 
     def pause(self, seconds: float) -> None:
