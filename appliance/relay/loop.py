@@ -194,7 +194,7 @@ class EventLoop:
     def charge(self, payer: str, used: int) -> None:
         """Charge this processor time to a payer, besides the one whose handler runs.
 
-        While no other descriptor is ready, that takes time from nobody and leaves no debt.
+        While no other descriptor is ready, that takes time from no other host and leaves no debt.
         """
         found = self._payer(payer)
         found.spent += used
