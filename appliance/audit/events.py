@@ -13,7 +13,7 @@ EVENTS: dict[str, str] = {
     "revoked": "A registration, grant or connection was revoked because the policy no longer allows it.",
     "node lost": "A node no longer answers; its registrations are suspended until it returns or is removed.",
     "node returned": "A lost node answers again.",
-    "replaced": "A node registered again under its name from the same host; the earlier node was told to shut down.",
+    "replaced": "A node registered again under its name from the same host; the earlier node got a shutdown call.",
     "takeover": "A node registered under a name that another host holds.",
     "policy loaded": "A policy came into force; `detail` has who loaded it, its source, and the hash of its text.",
     "policy confirmed": "A policy that was loaded with commit-confirm was confirmed and stays in force.",

@@ -15,7 +15,7 @@ def lines_of(record: AuditRecord) -> Iterator[str]:
     who = [part for part in (record.caller_id, record.host and f"on {record.host}") if part]
     if who or sent:
         message = f"message {', '.join(sent)} of " if sent else ""
-        yield f"by: {message}{' '.join(who) or 'nobody'}"
+        yield f"by: {message}{' '.join(who) or 'unknown'}"
     if record.rule is not None:
         yield f"rule: {rule_text(record.rule)}"
     places = list_of(detail.get("at"))
@@ -33,12 +33,12 @@ def lines_of(record: AuditRecord) -> Iterator[str]:
     if "handler" in detail:
         yield f"in the handler of: {detail['handler']}"
     if "withheld" in detail:
-        yield "what messages said is not for this role"
+        yield "this role may not read contents of messages"
         return
     yield from lines_of_why(mapping_of(detail.get("why")))
     is_verdict = record.event == "monitor verdict" or detail.get("would") == "verdict" or "handler" in detail
     if is_verdict and "why" not in detail and "count" not in detail:
-        yield "because: which events made it so is not known any more, or too many verdicts were told in that second"
+        yield "because: the causing events are no longer known, or that second had too many verdicts to record them"
 
 
 def _valued(values: object) -> str:

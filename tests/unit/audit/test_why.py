@@ -35,7 +35,7 @@ def test_a_verdict_is_explained() -> None:
 def test_missing_explanations_are_reported() -> None:
     """Covers a verdict without an explanation, one without events, and one with too many events."""
     bare = AuditRecord(id="1", time=1, event="monitor verdict", reason="bad")
-    assert list(lines_of(bare))[-1].startswith("because: which events made it so is not known")
+    assert list(lines_of(bare))[-1].startswith("because: the causing events are no longer known")
     silent = AuditRecord(
         id="1", time=1, event="monitor verdict", reason="bad", detail={"why": {"events": []}}
     )
