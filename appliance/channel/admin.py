@@ -213,7 +213,7 @@ class RegistrationsWanted(AdminRequest[graph_answers.Registrations], frozen=True
 
 @rest("viewer", "GET", "/v1/graph", name="graph")
 class GraphWanted(AdminRequest[graph_answers.Graph], frozen=True, tag="graph"):
-    """Nodes, topics and services, who is mediated, and rates."""
+    """Nodes, topics and services, whether they are mediated, and rates."""
 
 
 @rest(
@@ -221,7 +221,7 @@ class GraphWanted(AdminRequest[graph_answers.Graph], frozen=True, tag="graph"):
     problems={404: "No node publishes or subscribes to it."}, tag="graph",
 )  # fmt: skip
 class TopicLook(WaitingRequest[graph_answers.TopicMessages], frozen=True, tag="topic look"):
-    """The next messages of a topic as subscribers get them, read as fields. It is recorded who looked."""
+    """The next messages of a topic as subscribers get them, read as fields. The query is recorded."""
 
     topic: Annotated[str, parameter("name of the topic", max_length=500, examples=["/scan"])]
     messages: Annotated[int, parameter("maximum number of messages", ge=1, le=20)] = 1
@@ -302,7 +302,7 @@ class MonitorReplace(AdminRequest[monitor_answers.Replacement], frozen=True, tag
     admin_with={"prune": "removing files that the folder does not have"},
 )  # fmt: skip
 class MonitorReload(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor reload"):
-    """Take what the folder has now; what it does not have stays, unless an admin says `prune`."""
+    """Load the files of the folder; files that it does not have stay in force unless an admin sets `prune`."""
 
     expected: str | None = None
     prune: Annotated[bool, parameter("also remove files that the folder does not have")] = False
@@ -362,8 +362,8 @@ class MonitorRevisionWanted(AdminRequest[monitor_answers.RevisionTexts], frozen=
 _SWITCH = """
 Enable or disable a monitor, put it into shadow mode (`{"shadow": true}`) or from there into force (`false`).
 
-`{"enabled": false, "for_seconds": 600}` disables it for ten minutes. `{"held": false}` lets the topics that it
-holds go on.
+`{"enabled": false, "for_seconds": 600}` disables it for ten minutes. `{"held": false}` resumes the topics that it
+holds.
 """
 _ONE = "/v1/monitors/{name}"
 _SEVERAL = "/v1/monitors"
@@ -497,7 +497,7 @@ class TokenRevoke(AdminRequest[token_answers.Token], frozen=True, tag="token rev
 
 
 @rest(
-    "admin", "POST", "/v1/hosts", name="enrol_host", words="Let a host in: by a one-time token that it brings with"
+    "admin", "POST", "/v1/hosts", name="enrol_host", words="Enrol a host: by a one-time token that it presents with"
     " its own signing request, or by a kit.", body=bodies.NewHost, says={"how": "token"}, fixed={"new": True},
     of=HOSTS, status=201, good="Enrolled: the kit (how=kit); or a one-time token (how=token)",
     seconds=_CHARON_SECONDS,
@@ -600,7 +600,7 @@ class HostKit(AdminRequest[host_answers.KitParts], frozen=True, tag="host kit"):
 
 @rest("admin", "DELETE", "/v1/hosts/{name}", name="revoke_host", of=HOSTS, problems=_NO_HOST)
 class HostRevoke(AdminRequest[host_answers.Revoked], frozen=True, tag="host revoke"):
-    """Let a host in no more: its certificate, tunnel, registrations and connections end within a second."""
+    """Exclude a host: its certificate, tunnel, registrations and connections end within a second."""
 
     name: OneHost
     expected: int | None = None

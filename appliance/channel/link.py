@@ -61,7 +61,7 @@ class Link:
         answer = self._asked[number] = asyncio.get_running_loop().create_future()
         try:
             if not self.send(question(number)):
-                raise ChannelClosedError("nobody is there")
+                raise ChannelClosedError("the link is not connected")
             async with asyncio.timeout(seconds):
                 return await answer
         finally:

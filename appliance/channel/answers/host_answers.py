@@ -56,7 +56,7 @@ class Machine(msgspec.Struct, frozen=True):
 
 
 class Hosts(msgspec.Struct, frozen=True):
-    """All hosts, and how the tunnels stand."""
+    """All hosts, and the state of the tunnels."""
 
     revision: Annotated[int, doc("the number in the ETag")]
     hosts: list[Host]
@@ -118,7 +118,7 @@ class Renewed(msgspec.Struct, frozen=True):
 
 
 class NewCertificate(msgspec.Struct, frozen=True):
-    """The certificate for the new key; the one before is good until `renewed` is called."""
+    """The certificate for the new key; the previous one stays valid until `renewed` is called."""
 
     name: str
     serial: str
@@ -128,7 +128,7 @@ class NewCertificate(msgspec.Struct, frozen=True):
 
 
 class Revoked(msgspec.Struct, frozen=True):
-    """A host was let out for good; `serial` is empty for one that was awaited only."""
+    """A host was excluded permanently; `serial` is empty if it was only awaited."""
 
     revision: int
     name: str
@@ -156,7 +156,7 @@ class Reloaded(msgspec.Struct, frozen=True):
 
 
 class Endpoint(msgspec.Struct, frozen=True):
-    """At which address hosts reach the appliance, and why that one."""
+    """The address at which hosts reach the appliance, and why it was chosen."""
 
     endpoint: str
     reason: str

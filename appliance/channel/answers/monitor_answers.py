@@ -147,7 +147,7 @@ class RevisionTexts(MonitorRevision, frozen=True):
 
 
 class Switched(msgspec.Struct, frozen=True):
-    """The monitors that were not so already."""
+    """The monitors whose state changed."""
 
     names: list[str]
     revision: int

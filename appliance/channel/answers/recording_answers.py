@@ -86,7 +86,7 @@ class Recordings(msgspec.Struct, frozen=True):
 
 
 class Sender(msgspec.Struct, frozen=True):
-    """A node that published, and its machine; of what monitors published the host is empty."""
+    """A node that published, and its machine; the host is empty for messages that monitors published."""
 
     node: str
     host: str

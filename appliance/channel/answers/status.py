@@ -1,4 +1,4 @@
-"""How the running appliance stands: its processes, isolation, policy, graph, tunnels, audit log."""
+"""The state of the running appliance: its processes, isolation, policy, graph, tunnels, audit log."""
 
 from typing import Annotated, Literal
 
@@ -27,7 +27,7 @@ class ProcessInfo(msgspec.Struct, frozen=True):
 
 
 class FirewallRule(msgspec.Struct, frozen=True):
-    """A rule with what it has matched so far; `in_force` is false when the kernel has it no more."""
+    """A rule with what it has matched so far; `in_force` is false if the kernel no longer has it."""
 
     chain: str
     purpose: str

@@ -37,7 +37,7 @@ class Tokens(msgspec.Struct, frozen=True):
 
 
 class NewToken(Token, frozen=True, kw_only=True):
-    """A token that was made, with its text: the only place where that ever stands."""
+    """A new token with its text, which is shown only here."""
 
     token: str
 
