@@ -78,7 +78,7 @@ class DataPlane:
         self._by_grant: dict[PeerGrant, set[Subscriber | ServiceClient]] = {}
         self._services: dict[tuple[str, str], ServiceTraffic] = {}
         self.incoming_connections: set[IncomingConnection] = set()
-        self.waiting: dict[str, set[IncomingConnection]] = {}
+        self.waiting: dict[str, dict[str, set[IncomingConnection]]] = {}  # by incarnation and host
         self.refused_connections: set[RefusedConnection] = set()
         self._link: LoopLink | None = None
         self._last_rows: list[messages.TopicTraffic] = []
@@ -159,7 +159,7 @@ class DataPlane:
         elif isinstance(message, messages.GrantInstalled):
             self._limit_subscriber(message)
         if self.waiting and message.key in self.waiting:
-            self._recheck_waiting(message.key)
+            self._recheck_waiting(message)
 
     def _restated(self, epoch: int) -> None:
         for message in self._table.end(epoch):
@@ -421,7 +421,7 @@ class DataPlane:
             reason = missing(self._table, incoming.key, incoming.host, fields)
             if reason and (patient or self._not_all_is_stated()):
                 incoming.wait(self._limits.grant_seconds, lambda: self._judge(incoming, patient=False))
-                self.waiting.setdefault(incoming.key, set()).add(incoming)
+                self.waiting.setdefault(incoming.key, {}).setdefault(incoming.host, set()).add(incoming)
                 return
         self._forget_incoming(incoming)
         sock = incoming.take()
@@ -438,18 +438,26 @@ class DataPlane:
         """Whether control may still state a grant that is missing."""
         return self._table.restating or self.interceptor.preparing
 
-    def _recheck_waiting(self, key: str) -> None:
-        """Serve the waiting peers that the latest statements about this incarnation allow."""
-        for incoming in list(self.waiting.get(key, ())):
-            if not missing(self._table, key, incoming.host, incoming.fields):
+    def _recheck_waiting(self, message: Statement) -> None:
+        """Serve the waiting peers that this statement about their incarnation allows: a grant, those of its host."""
+        hosts = self.waiting[message.key]
+        if isinstance(message, messages.GrantInstalled | messages.ClientGranted):
+            found = list(hosts.get(message.host, ()))
+        else:
+            found = [incoming for waiting in hosts.values() for incoming in waiting]
+        for incoming in found:
+            if not missing(self._table, message.key, incoming.host, incoming.fields):
                 self._judge(incoming, patient=True)
 
     def _forget_incoming(self, incoming: IncomingConnection) -> None:
         self.incoming_connections.discard(incoming)
-        waiting = self.waiting.get(incoming.key)
+        hosts = self.waiting.get(incoming.key, {})
+        waiting = hosts.get(incoming.host)
         if waiting is not None:
             waiting.discard(incoming)
             if not waiting:
+                del hosts[incoming.host]
+            if not hosts:
                 del self.waiting[incoming.key]
 
     def _serve_client(

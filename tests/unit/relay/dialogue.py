@@ -168,7 +168,10 @@ class Dialogue:
         assert not [one for one in self.world.told if type(one).__name__ == kind]
 
     def _waiting(self, many: str) -> None:
-        self.world.until(lambda: sum(map(len, self.world.engine.waiting.values())) == int(many))
+        by_key = self.world.engine.waiting
+        self.world.until(
+            lambda: sum(len(peers) for hosts in by_key.values() for peers in hosts.values()) == int(many)
+        )
 
     def _arriving(self, many: str) -> None:
         self.world.until(lambda: len(self.world.engine.incoming_connections) == int(many))

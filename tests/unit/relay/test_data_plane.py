@@ -8,7 +8,7 @@ import random
 import socket
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,7 +41,9 @@ from appliance.channel.messages import (
     UpstreamRefused,
     UpstreamWanted,
 )
+from appliance.relay.connections.admission import missing
 from appliance.relay.connections.upstream import PublisherConnection
+from appliance.relay.grant_table import GrantTable
 from appliance.relay.relay_limits import MIB
 from appliance.relay.transport.frames import Batch
 from roswire.tcpros import (
@@ -776,3 +778,26 @@ def test_a_second_is_reported_although_tidying_up_takes_many_turns(
     monkeypatch.setattr(world.loop, "over", lambda: True)
     world.connect(encode_header(ASK))
     world.hears(TrafficReported)
+
+
+def test_a_grant_is_compared_with_the_waiting_peers_of_its_host(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hosts that wait for a grant that never comes do not make the grants of others dear."""
+    hosts = ["127.0.0.2", "127.0.0.3"]
+    for host in hosts:
+        world.connect(encode_header({**ASK, "callerid": "/stranger"}), host=host)
+    world.until(lambda: len(world.engine.waiting.get("k", ())) == len(hosts))
+    compared: list[str] = []
+
+    def counted(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -> str:
+        compared.append(host)
+        return missing(table, key, host, fields)
+
+    monkeypatch.setattr("appliance.relay.data_plane.missing", counted)
+    for number in range(50):
+        world.state(GrantInstalled("k", "/chatter", LOOPBACK, f"/other{number}"))
+    assert not compared
+    world.state(GrantInstalled("k", "/chatter", hosts[1], "/stranger"))
+    assert set(compared) == {hosts[1]}
+    assert list(world.engine.waiting["k"]) == [hosts[0]]
