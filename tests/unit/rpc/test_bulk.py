@@ -30,7 +30,7 @@ VALUES: st.SearchStrategy[Value] = st.recursive(
 
 
 async def test_room_for_one_of_a_host_and_two_in_all() -> None:
-    """A host with a place keeps it; another host waits for a free place only, and each host for its own."""
+    """A host keeps its place. Another host waits only for a free place, and each host only for its own."""
     turns = bulk_turns(lambda _host: QuotaClass.REGISTERED)
     inside: list[Any] = []
     go = asyncio.Event()
@@ -73,8 +73,8 @@ def test_a_value_has_the_same_weight_as_in_the_mirror(value: Value) -> None:
     assert weigh(value, 1 << 30) == measure(value)[0]
 
 
-def test_counting_ends_when_it_is_enough() -> None:
-    """A look at a huge value is short."""
+def test_counting_ends_at_the_limit() -> None:
+    """Counting a huge value is short."""
     wide: Value = [list(range(1000)) for _ in range(1000)]
     assert 5000 <= weigh(wide, 5000) < 20_000
     assert 5000 <= weigh(dict.fromkeys(map(str, range(100_000)), 1), 5000) < 6000

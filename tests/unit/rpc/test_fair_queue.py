@@ -58,7 +58,7 @@ async def test_one_host_never_has_all_slots() -> None:
 
 
 async def test_turns_balance() -> None:
-    """Whatever is entered, left and given up: no slot is lost and none is made."""
+    """Whatever requests enter, leave or give up, no slot is lost and none is added."""
     turns = slots(3, 2)
 
     async def request(host: Any, number: int) -> None:

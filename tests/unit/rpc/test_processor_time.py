@@ -17,7 +17,7 @@ PIECE = TURN_SECONDS / 4
 
 
 class Loop:
-    """Processor time with a clock that only `spend` moves; what ran, in its order, and the time of each turn."""
+    """Processor time with a clock that only `spend` moves, the work that ran, in order, and the time of each turn."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -26,7 +26,7 @@ class Loop:
         self.time = ProcessorTime(lambda host: "unknown" if host in UNKNOWN else host, lambda: self.now)
 
     def work(self, host: Address, seconds: float = PIECE) -> Callable[[], None]:
-        """Work that takes so long."""
+        """Return work that takes this long."""
 
         def run() -> None:
             self.order.append(host)
@@ -49,7 +49,7 @@ def loop() -> Loop:
 
 
 async def test_a_turn_of_the_loop_is_bounded(loop: Loop) -> None:
-    """However much waits, a turn runs work for its length and one piece more; between turns the loop does the rest."""
+    """However much work waits, a turn runs for its length and one piece more; then the loop handles other events."""
     ran = [loop.time.run(GUEST, loop.work(GUEST)) for _ in range(500)]
     assert sum(ran) == 4
     await loop.all()

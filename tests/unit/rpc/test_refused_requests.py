@@ -78,8 +78,8 @@ async def test_large_refused_body_still_gets_its_answer() -> None:
         assert server.beginnings == [b"x" * 4096]
 
 
-async def test_a_refusal_sees_what_was_asked_for() -> None:
-    """The beginning of the body is given to what makes the answer, in one piece or in several; nothing is served."""
+async def test_a_refusal_gets_the_beginning_of_the_body() -> None:
+    """The refusing function gets it in one piece or in several; nothing is served."""
     async with serving(refusal=b"<fault/>") as server:
         for pieces in ([post(b"<methodCall/>")], [post(b"", length=13), b"<method", b"Call/>"]):
             client = await server.connect()
@@ -130,7 +130,7 @@ async def test_more_framing_than_body(framing: bytes) -> None:
 
 
 async def test_endless_trailer() -> None:
-    """A trailer is part of what a request may have beside its body."""
+    """A trailer counts towards the limit of data beside the body."""
     async with serving(limits=replace(LIMITS, head_bytes=4096, body_bytes=1 << 16)) as server:
         client = await server.connect()
         client.writer.write(

@@ -64,7 +64,7 @@ TEXTS = {
 
 
 async def here(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    """The compiler, in this process."""
+    """Compile in this process."""
     return await asyncio.to_thread(check, sources, site_keys)
 
 
@@ -96,7 +96,7 @@ class Desk:
         folder: bool = True,
         site_keys: Sequence[str] = (),
     ) -> SpecificationManager:
-        """A control starts."""
+        """Start a control."""
         relay = Taking(self)
         relay.monitors = SpecificationManager(
             self.folder if folder else None,
@@ -125,7 +125,7 @@ class Desk:
 
 
 class Taking:
-    """One relay, which takes everything, or refuses it with the findings of the desk; or is away."""
+    """One relay, which accepts everything, refuses it with the findings of the desk, or is away."""
 
     monitors: SpecificationManager
 
@@ -133,7 +133,7 @@ class Taking:
         self.desk = desk
 
     def send(self, message: messages.Message, relay: int) -> bool:
-        """It answers in the next turn of the loop."""
+        """Accept a statement; the answer comes in the next turn of the loop."""
         if self.desk.away:
             return False
         self.desk.sent.append(message)
@@ -149,18 +149,18 @@ class Taking:
         return True
 
     async def carried_out(self) -> None:
-        """When the desk says so."""
+        """Wait until the desk lets the relay confirm."""
         await self.desk.carried_out.wait()
 
     def live_resources(self) -> set[Resource]:
-        """Nothing is carried."""
+        """Return none: nothing is carried."""
         return set()
 
     def withdraw(self, moves: Sequence[Move]) -> None:
-        """Nothing is carried."""
+        """Do nothing: nothing is carried."""
 
     def place(self, moves: Sequence[Move]) -> None:
-        """Nothing is carried."""
+        """Do nothing: nothing is carried."""
 
 
 _ORDERS: dict[str, tuple[str, type[Any], dict[str, Any]]] = {
@@ -251,7 +251,7 @@ class Dialogue:
 
     @property
     def monitors(self) -> SpecificationManager:
-        """The monitors of the control that started last."""
+        """Return the monitors of the control that started last."""
         assert self._monitors is not None
         return self._monitors
 

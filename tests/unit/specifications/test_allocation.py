@@ -13,7 +13,7 @@ from appliance.specifications.specification_files import (
 
 
 def spec(name: str, *topics: str, body: str = "", variables: str = "") -> str:
-    """A specification with an event on each topic."""
+    """Return a specification with an event on each topic."""
     events = "".join(
         f"event e{number}() {topic} std_msgs/String '{{}}' {{ {body} }}"
         for number, topic in enumerate(topics)
@@ -27,7 +27,7 @@ def checked(**files: str) -> CheckedSpecifications:
 
 
 def together(**files: str) -> list[set[str]]:
-    """The groups of files."""
+    """Return the groups of files."""
     return [{name.removesuffix(".rv") for name in group.files} for group in groups_of(checked(**files))]
 
 
@@ -79,8 +79,8 @@ def test_a_fresh_start_is_balanced_and_kept() -> None:
         assert not Allocation(2).restore(broken)
 
 
-def test_a_specification_comes_to_the_topics_that_are_carried() -> None:
-    """Nothing moves when it has one topic, or all its topics are on one relay; else as few as can be."""
+def test_a_specification_goes_to_the_relay_of_its_topics() -> None:
+    """No topic moves if all its topics are on one relay; otherwise as few as possible move."""
     allocation = Allocation(4)
     here = {f"/t{number}": allocation.of(TOPIC, f"/t{number}") for number in range(64)}
     assert set(here.values()) == {0, 1, 2, 3}
@@ -96,8 +96,8 @@ def test_a_specification_comes_to_the_topics_that_are_carried() -> None:
     assert allocation.plan(CheckedSpecifications(), set()).resources == {}
 
 
-def test_monitors_that_run_move_only_when_they_must_and_the_fewest() -> None:
-    """Where two relays' monitors are joined, those of the relay with more stay, whatever topics that moves."""
+def test_running_monitors_move_only_when_they_must() -> None:
+    """Where monitors of two relays are joined, those of the relay with more stay, whatever topics that moves."""
     allocation = Allocation(2)
     first = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
     allocation.adopt(allocation.plan(checked(**first)))

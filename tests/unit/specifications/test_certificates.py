@@ -22,7 +22,7 @@ GUARD = """guard() {
 
 
 def test_a_wrong_automaton_loads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The finding has the place of the formula, and whose defect it is."""
+    """The finding has the position of the formula, and says whose defect it is."""
 
     def compile_wrong(source: Source) -> FiniteProperty:
         return FiniteProperty(source, ("violation", "validation"), Automaton(0, ((0, 0),), ((),)))

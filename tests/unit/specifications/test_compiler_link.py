@@ -21,7 +21,7 @@ pytestmark = pytest.mark.anyio
 
 
 class Scene:
-    """Control's end; a compiler comes when it is called, and does with a question what the next of `acts` does."""
+    """Control's end, and a compiler that starts when called; the next of `acts` handles its question."""
 
     def __init__(self, *acts: Callable[[Channel, Any], None]) -> None:
         self.calls = 0
@@ -30,12 +30,12 @@ class Scene:
         self.compiler = SpecificationCompiler(self.called)
 
     def called(self) -> None:
-        """Another one comes, in the next turn of the loop."""
+        """Start another compiler, in the next turn of the loop."""
         self.calls += 1
         asyncio.get_running_loop().call_soon(self.come)
 
     def come(self) -> None:
-        """It is linked."""
+        """Link a compiler."""
         ours, theirs = socket.socketpair()
         channel = Channel(theirs, messages.CompilerLink)
         self._channels.append(channel)
@@ -47,28 +47,28 @@ class Scene:
         self.compiler.attach(Channel(ours, messages.CompilerLink))
 
     def close(self) -> None:
-        """All of them end."""
+        """End all compilers."""
         for channel in self._channels:
             channel.close()
 
 
 def finds(channel: Channel, wanted: messages.ContentsWanted) -> None:
-    """It is in order."""
+    """Answer that the question is valid."""
     channel.send(messages.ContentsFound(wanted.number, FOUND))
 
 
 def refuses(channel: Channel, wanted: messages.ContentsWanted) -> None:
-    """It is wrong."""
+    """Answer that the question is invalid."""
     channel.send(messages.CompilationRefused(wanted.number, ["a.rv:1:1: error: no"]))
 
 
 def dies(channel: Channel, _wanted: messages.ContentsWanted) -> None:
-    """It is killed while it works."""
+    """Die while compiling."""
     channel.close()
 
 
 async def test_the_compiler_is_started_for_the_first_question() -> None:
-    """Once for all questions, and not for no files."""
+    """It is started once for all questions, and not if there are no files."""
     scene = Scene(finds, refuses, finds)
     assert (await scene.compiler.check(Sources(), ())).monitors == {}
     assert scene.calls == 0
@@ -81,7 +81,7 @@ async def test_the_compiler_is_started_for_the_first_question() -> None:
 
 
 async def test_a_compiler_that_just_ended_is_replaced() -> None:
-    """The next is asked the same."""
+    """The next compiler gets the same question."""
     scene = Scene(dies, finds)
     assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
     assert scene.calls == 2
@@ -89,7 +89,7 @@ async def test_a_compiler_that_just_ended_is_replaced() -> None:
 
 
 async def test_only_texts_that_crash_it_are_refused() -> None:
-    """Nothing is in force that could not be read."""
+    """A text that crashes the compiler never comes into force."""
     scene = Scene(dies, dies, finds)
     with pytest.raises(SpecificationsRefusedError, match="the compiler ended while it read them"):
         await scene.compiler.check(SOURCES, ())
@@ -100,7 +100,7 @@ async def test_only_texts_that_crash_it_are_refused() -> None:
 async def test_a_silent_or_missing_compiler_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The answer is a refusal; the next time the compiler is started again."""
+    """The answer is a refusal; the next question starts the compiler again."""
     monkeypatch.setattr(module, "_WORK_SECONDS", 0.05)
     monkeypatch.setattr(module, "_START_SECONDS", 0.05)
     scene = Scene(lambda _channel, _wanted: None)
@@ -122,7 +122,7 @@ class Told:
         self.heard: asyncio.Queue[Any] = asyncio.Queue()
 
     def __call__(self, channel: Channel, wanted: Any) -> None:
-        """Take a question."""
+        """Accept a question."""
         self.heard.put_nowait(wanted)
         if not wanted.dry_run:
             finds(channel, wanted)
@@ -141,8 +141,8 @@ async def test_an_order_ends_a_dry_run() -> None:
     scene.close()
 
 
-async def test_a_dry_run_begins_after_the_orders_and_the_dry_runs_before_it() -> None:
-    """While an order is compiled no dry run begins, and one dry run goes at a time."""
+async def test_a_dry_run_begins_after_earlier_orders_and_dry_runs() -> None:
+    """No dry run begins while an order is compiled, and dry runs are compiled one at a time."""
     heard: list[tuple[Channel, Any]] = []
     scene = Scene(*[lambda channel, wanted: heard.append((channel, wanted))] * 3)
 
@@ -166,7 +166,7 @@ async def test_a_dry_run_begins_after_the_orders_and_the_dry_runs_before_it() ->
 
 
 async def test_a_compilation_ends_when_its_order_is_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A load whose client was killed keeps the compiler from no other order."""
+    """A load whose client was killed does not delay other orders."""
     monkeypatch.setattr(module, "_LOOK_SECONDS", 0.01)
     heard: asyncio.Queue[Any] = asyncio.Queue()
     scene = Scene(lambda _channel, wanted: heard.put_nowait(wanted), finds)

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.anyio
 
 
 def spec(name: str, *topics: str) -> str:
-    """A specification with an event on each topic."""
+    """Return a specification with an event on each topic."""
     events = "".join(
         f"event e{number}() {topic} std_msgs/String '{{}}' {{ }}" for number, topic in enumerate(topics)
     )
@@ -33,7 +33,7 @@ def spec(name: str, *topics: str) -> str:
 
 
 def revision(number: int, **files: str) -> Revision:
-    """A revision with files of these names."""
+    """Return a revision with files of these names."""
     sources = Sources({f"{name}.rv": text for name, text in files.items()})
     return Revision(number, sources, check(sources, ()))
 
@@ -49,7 +49,7 @@ def files_of(message: messages.SpecificationsStated) -> list[str]:
 
 
 class Fleet:
-    """Two relays and what was done with them, in order; `answer(relay, statement)` is what one says to it."""
+    """Two relays and the calls to them, in order; `answer(relay, statement)` returns a relay's answer."""
 
     def __init__(self, trail: AuditTrail) -> None:
         self.rollout = Rollout(
@@ -70,7 +70,7 @@ class Fleet:
         )
 
     def send(self, message: messages.Message, relay: int) -> bool:
-        """As `Relays`; the relay answers in the next turn of the loop."""
+        """Note the statement; the relay answers in the next turn of the loop."""
         if relay in self.away:
             return False
         assert isinstance(message, messages.SpecificationsStated)
@@ -122,8 +122,8 @@ def world(tmp_path: Path) -> Iterator[World]:
     world.log.close()
 
 
-async def test_a_relay_whose_specifications_are_the_same_is_given_the_same(world: World) -> None:
-    """Whatever comes to the other one: it goes on with what it has."""
+async def test_a_relay_with_unchanged_specifications_gets_the_same_statement(world: World) -> None:
+    """A change for the other relay does not affect it."""
     other = world.rollout.relay_of("b")
     before = {relay: world.rollout.statement(relay).part for relay in range(2)}
     await world.rollout.take(revision(2, **world.files, c=spec("c", "/a")))
@@ -190,7 +190,7 @@ async def test_a_topic_moves_only_between_monitors(world: World) -> None:
 
 
 async def test_crossing_moves_go_one_way_and_are_tried_first(world: World) -> None:
-    """Two loads in one that join monitors of both relays: every topic is placed where its monitors are already."""
+    """If two loads at once join monitors of both relays, each topic is placed where its monitors already are."""
     files = {name: spec(name, f"/{name}") for name in "abcd"}
     await world.rollout.take(revision(2, **files))
     world.fleet.carried = {(TOPIC, f"/{name}") for name in "abcd"}
@@ -202,10 +202,10 @@ async def test_crossing_moves_go_one_way_and_are_tried_first(world: World) -> No
     assert {one[2] for one in world.fleet.story if one[0] == "placed"} == {0}
 
 
-async def test_a_relay_that_comes_while_a_load_is_tried_has_it_before_anything_is_placed(
+async def test_a_relay_that_starts_during_a_load_gets_it_before_any_topic(
     world: World,
 ) -> None:
-    """It would carry topics past the monitors that moved to it until it has compiled them."""
+    """Without it, topics would bypass the monitors that moved to this relay until it has compiled them."""
     relay, world.fleet.away = 0, {0}
     stated: list[messages.SpecificationsStated] = []
 
@@ -220,7 +220,7 @@ async def test_a_relay_that_comes_while_a_load_is_tried_has_it_before_anything_i
     assert stated[0].revision == 2
 
 
-async def test_a_load_is_over_when_those_that_gave_something_up_have_it(world: World) -> None:
+async def test_a_load_ends_once_the_relays_that_lost_topics_confirm(world: World) -> None:
     """A relay that does not confirm in time is reported as having other specifications in force."""
     world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
     await world.rollout.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
@@ -233,8 +233,8 @@ async def test_a_load_is_over_when_those_that_gave_something_up_have_it(world: W
     assert world.rollout.refused == []
 
 
-async def test_a_topic_that_comes_while_a_load_is_tried_moves_as_well(world: World) -> None:
-    """The plan was made without it: another is made, and tried, before anything is carried elsewhere."""
+async def test_a_topic_published_during_a_load_moves_as_well(world: World) -> None:
+    """The old plan did not have it: a new plan is made and tried before any topic moves."""
     world.fleet.carried = set()
 
     def answer(_relay: int, statement: messages.SpecificationsStated) -> messages.Message:
@@ -247,10 +247,10 @@ async def test_a_topic_that_comes_while_a_load_is_tried_moves_as_well(world: Wor
     assert world.fleet.story[-1] == ("placed", "/b", 0)
 
 
-async def test_an_answer_to_the_try_before_is_none_to_this_one(
+async def test_an_answer_to_an_earlier_try_does_not_count(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two tries of one revision are two statements: one that came too late does not bring another text into force."""
+    """Two tries of a revision are two statements: a late answer to the first brings no wrong text into force."""
     monkeypatch.setattr("appliance.specifications.rollout._RELAY_SECONDS", 0.01)
     world.fleet.answer = lambda _relay, _statement: None
     with pytest.raises(SpecificationsRefusedError, match="try again"):
@@ -322,10 +322,10 @@ async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) 
     log.close()
 
 
-async def test_a_crash_of_control_in_the_middle_of_a_change_leaves_no_topic_without_its_monitors(
+async def test_a_crash_during_a_change_leaves_no_topic_without_its_monitors(
     world: World,
 ) -> None:
-    """The allocation of a removal was kept, its revision was not: the monitor is in force, and where its topic goes."""
+    """The allocation of a removal was saved, its revision was not: the monitor stays in force, with its topic."""
     kept: list[str] = []
     allocation = Allocation(2, kept.append)
     names = [f"/t{number}" for number in range(20)]
@@ -340,7 +340,7 @@ async def test_a_crash_of_control_in_the_middle_of_a_change_leaves_no_topic_with
 
 
 async def test_a_withdrawn_load_leaves_nothing_in_memory(world: World) -> None:
-    """However many clients load large sets and do not wait for the answer."""
+    """This holds for any number of clients that load large sets without waiting for the answer."""
     before = dict(world.rollout.compiled_parts)
     with awaited(lambda: True), pytest.raises(WithdrawnError):
         await world.rollout.take(revision(2, **world.files, c=spec("c", "/c")))

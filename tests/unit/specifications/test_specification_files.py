@@ -68,7 +68,7 @@ def test_a_folder_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
 
 @pytest.fixture
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """The folders that were read, in order."""
+    """Return the folders that were read, in order."""
     done: list[Path] = []
 
     def noted(folder: Path) -> Sources:

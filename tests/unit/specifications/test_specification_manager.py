@@ -41,7 +41,7 @@ ORDERS = transcripts(Path(__file__).with_name("orders.txt"))
 
 @pytest.mark.parametrize("title", ORDERS, ids=ORDERS)
 async def test_orders(desk: Desk, title: str) -> None:
-    """Each order has the effects below it, all of them and in that order (`monitor_desk.py` has the form)."""
+    """Each order has exactly the effects below it, in that order (`monitor_desk.py` describes the form)."""
     assert await played(ORDERS[title], Dialogue(desk).say) == ORDERS[title]
 
 
@@ -181,7 +181,7 @@ async def test_a_switch_is_answered_when_the_relay_has_carried_it_out(desk: Desk
 
 
 async def test_one_of_two_concurrent_changes_is_made(desk: Desk) -> None:
-    """They arrive together, and the first takes long."""
+    """Both arrive together, and the first takes long."""
     (desk.folder / "b.rv").write_text(B)
     monitors = await desk.monitors()
     monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
@@ -227,8 +227,8 @@ def sources(**texts: str) -> Sources:
     return Sources(files, {}, {name: signed(text) for name, text in files.items()})
 
 
-async def test_where_the_site_signs_nothing_else_comes_into_force(desk: Desk) -> None:
-    """Start, load, reload, removal, rollback, and the start after a crash: each asks for the site's signatures."""
+async def test_with_site_keys_only_signed_specifications_come_into_force(desk: Desk) -> None:
+    """Start, load, reload, removal, rollback, and the start after a crash each require the site's signatures."""
     unsigned = "a.rv:1:1: error: it has no signature of the site"
     with pytest.raises(SpecificationsRefusedError, match=unsigned):
         await desk.monitors(site_keys=[LINE])

@@ -28,18 +28,18 @@ class Log:
         self.budget = Budget(lambda host: QuotaClass.UNKNOWN if host == UNKNOWN else QuotaClass.NAMED)
 
     def record(self, record: Any) -> str:
-        """Take it."""
+        """Accept a record."""
         self.budget.charge(record)
         self.records.append(record)
         return str(record.id)
 
     async def wait_durable(self) -> str | None:
-        """Say why not."""
+        """Return why the log cannot be written."""
         return self.failed
 
 
 def trail(log: Log, *, deny: bool, recordings: Recordings = lambda *_: {}) -> AuditTrail:
-    """As control makes it."""
+    """Return a trail as control makes it."""
     return AuditTrail(
         log,  # type: ignore[arg-type]  # stands for the log
         strict=True,
@@ -79,7 +79,7 @@ def test_refusals_of_unknown_hosts_are_marked() -> None:
 
 
 def test_an_event_has_the_severity_of_the_registry() -> None:
-    """Unless its call says another; what the registry says nothing of is for information."""
+    """A severity in the call takes precedence; an event that is not in the registry is informational."""
     log = Log()
     one = trail(log, deny=True)
     one.happened("tunnel refused", "no certificate")
