@@ -29,36 +29,36 @@ def slow_paths(compiled: Compiled) -> list[SlowPath]:
     """Return the messages that a set leaves to the interpreter, by topic. Faults and due output always are."""
     module = written_of(compiled)
     found: dict[SlowPath, None] = {}
-    ways = dict.fromkeys(
-        event.way for one in compiled.specifications for event in one.events if event.way is not None
+    channels = dict.fromkeys(
+        event.channel for one in compiled.specifications for event in one.events if event.channel is not None
     )
-    for way in ways:
+    for channel in channels:
         specifications = [
-            one for one in compiled.specifications if any(event.way == way for event in one.events)
+            one for one in compiled.specifications if any(event.channel == channel for event in one.events)
         ]
-        error = module.refused.get(way)
+        error = module.refused.get(channel)
         if error is not None:
-            found[SlowPath(way, "", _position(compiled, way, error), error.reason)] = None
+            found[SlowPath(channel, "", _position(compiled, channel, error), error.reason)] = None
             continue
         sliced = [one for one in specifications if one.slicing is not None]
         for one in sliced:
-            found[SlowPath(way, "", one.position, "has a parametric specification")] = None
+            found[SlowPath(channel, "", one.position, "has a parametric specification")] = None
         for one in specifications if not sliced else ():
-            found |= dict.fromkeys(_partly(compiled, module.left, way, one))
+            found |= dict.fromkeys(_partly(compiled, module.left, channel, one))
     return list(found)
 
 
 def _partly(
     compiled: Compiled,
     left: Mapping[str, Sequence[NotCompiledError]],
-    way: str,
+    channel: str,
     specification: SpecificationCode,
 ) -> Iterator[SlowPath]:
     """Yield the messages of a compiled topic that one specification leaves."""
     codes = [
         (f"event {specification.name}.{event.name}", event.function)
         for event in specification.events
-        if event.way == way
+        if event.channel == channel
     ]
     codes += [
         (f"handler @{category} of {specification.name}", code.handlers[category])
@@ -69,12 +69,12 @@ def _partly(
     for code, function in codes:
         for name in _called(compiled, function):
             for error in left.get(name, ()):
-                yield SlowPath(way, code, _position(compiled, way, error), error.reason)
+                yield SlowPath(channel, code, _position(compiled, channel, error), error.reason)
     for declared in specification.properties:
         reason = _of_property(declared)
         if reason:
             source = declared.property.source
-            yield SlowPath(way, f"{source.logic} property of {specification.name}", source.origin, reason)
+            yield SlowPath(channel, f"{source.logic} property of {specification.name}", source.origin, reason)
 
 
 def _of_property(code: PropertyCode) -> str:
@@ -99,7 +99,9 @@ def _called(compiled: Compiled, function: str) -> list[str]:
     return names
 
 
-def _position(compiled: Compiled, way: str, error: NotCompiledError) -> Position:
+def _position(compiled: Compiled, channel: str, error: NotCompiledError) -> Position:
     if error.site >= 0:
         return compiled.sites[error.site].position
-    return next(event.position for one in compiled.specifications for event in one.events if event.way == way)
+    return next(
+        event.position for one in compiled.specifications for event in one.events if event.channel == channel
+    )

@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rosmop.form import nodes
-from rosmop.form.connected_groups import sharing, way_of
+from rosmop.form.connected_groups import channel_of, sharing
 from rosmop.form.positions import Diagnostic, Position
 from rosmop.form.sites import Site, Symbols
 from rosmop.logics.interface import CompiledProperty
@@ -40,9 +40,9 @@ class EventCode:
     """Whether the action does more than change the slice's own variables."""
 
     @property
-    def way(self) -> str | None:
-        """Return the topic or the part of a service (see `way_of`) of the messages; None for a timer."""
-        return self.topic if self.topic is None or self.part is None else way_of(self.topic, self.part)
+    def channel(self) -> str | None:
+        """Return the topic or the part of a service (see `channel_of`) of the messages; None for a timer."""
+        return self.topic if self.topic is None or self.part is None else channel_of(self.topic, self.part)
 
 
 @dataclass(frozen=True)

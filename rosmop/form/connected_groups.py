@@ -30,6 +30,6 @@ def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
     return together.values()
 
 
-def way_of(service: str, part: str) -> str:
+def channel_of(service: str, part: str) -> str:
     """Return the name that replaces a topic for the `request` or `response` of a service; no topic has a blank."""
     return f"{service} {part}"

@@ -28,7 +28,7 @@ def groups(specifications: Sequence[SpecificationCode]) -> Iterator[Specificatio
         [
             specification.name,
             *specification.uses,
-            *(event.way for event in specification.events if event.way is not None),
+            *(event.channel for event in specification.events if event.channel is not None),
         ]
         for specification in specifications
     ])  # fmt: skip
@@ -52,8 +52,8 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
             and specification.slicing is None
         ]
         for index, event in enumerate(specification.events):
-            if event.way is not None:
-                topics.setdefault(event.way, []).append((number, index))
+            if event.channel is not None:
+                topics.setdefault(event.channel, []).append((number, index))
     rows = []
     topics = {
         topic: events

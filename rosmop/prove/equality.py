@@ -91,8 +91,8 @@ def findings_of(
     in_module = {numbers for group in found for events in group.events for numbers in events}
     for number, specification in enumerate(compiled.specifications):
         for index, event in enumerate(specification.events):
-            if event.way is not None and (number, index) not in in_module:
-                yield ProofFinding(event.way, f"{specification.name}.{event.name}", IN_PYTHON)
+            if event.channel is not None and (number, index) not in in_module:
+                yield ProofFinding(event.channel, f"{specification.name}.{event.name}", IN_PYTHON)
 
 
 class Validation:

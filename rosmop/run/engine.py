@@ -22,7 +22,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from rosmop.form.compiled import Compiled, EventCode
-from rosmop.form.connected_groups import way_of
+from rosmop.form.connected_groups import channel_of
 from rosmop.form.positions import Diagnostic
 from rosmop.form.specification_groups import groups
 from rosmop.run.execution import Asked, MonitorExecution, OnFault
@@ -185,7 +185,7 @@ class MonitorSet:
     def monitors(self) -> tuple[MonitorInstance, ...]:
         """Return the running specifications in order, with their state in Python."""
         for monitor in self._monitors:
-            monitor.come_home()
+            monitor.move_to_python()
         return self._monitors
 
     @property
@@ -266,7 +266,7 @@ class MonitorSet:
     def service_type_of(self, service: str, *, shadowed: bool = False) -> str | None:
         """Return the type of a service with an enabled event, or None. Shadow mode counts only if `shadowed`."""
         for part in ("request", "response"):
-            for step in self.steps.get(way_of(service, part), ()):
+            for step in self.steps.get(channel_of(service, part), ()):
                 if shadowed or not isinstance(step, _Tap):
                     return step.event.service_type
         return None
@@ -304,7 +304,7 @@ class MonitorSet:
         return self._contexts.get(topic, ())
 
     def lane(self, topic: str) -> FastLane | None:
-        """Return the lane for a topic, or `way_of` a service; None if there is none."""
+        """Return the lane for a topic, or `channel_of` a service; None if there is none."""
         return self._lanes.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
 
     def lane_ready(self, lane: FastLane, time_ns: int) -> bool:
@@ -323,7 +323,7 @@ class MonitorSet:
     def value(self, name: str, variable: str) -> Any:
         """Return the value of a shared variable of a running specification; raises KeyError."""
         monitor = self.monitor(name)
-        monitor.come_home()
+        monitor.move_to_python()
         return self.interpreter.variables[monitor.code.variables[variable]]
 
     # Changes
@@ -504,7 +504,7 @@ class MonitorSet:
             if wanted is monitor.enabled:
                 continue
             changed.append(monitor)
-            monitor.come_home()
+            monitor.move_to_python()
             monitor.touch()
             monitor.enabled = wanted
             if wanted:
@@ -559,8 +559,8 @@ class MonitorSet:
         prepare: Callable[[FastLane], BatchOptions],
         fuel: int = MESSAGE_FUEL,
     ) -> Outcome | None:
-        """Process a message on a topic, or `way_of` a service, if its lane takes it (`FastLane.process_message`, with
-        the options from `prepare` and this fuel); None: nothing was done.
+        """Process a message on a topic, or `channel_of` a service, if its lane takes it (`FastLane.process_message`,
+        with the options from `prepare` and this fuel); None: nothing was done.
         """
         lane = self.lane(topic)
         if lane is None or not self.lane_ready(lane, time_ns):
@@ -571,7 +571,7 @@ class MonitorSet:
         self, service: str, part: str, buffer: Buffer, time_ns: int, sender: MessageSender = NOBODY
     ) -> Outcome:
         """Process the `request` or `response` (the `part`) of a service."""
-        return self.process(way_of(service, part), buffer, time_ns, sender)
+        return self.process(channel_of(service, part), buffer, time_ns, sender)
 
     @property
     def next_due(self) -> int | None:
@@ -611,7 +611,7 @@ class MonitorSet:
         standing = {monitor.name: monitor.steps for monitor in self._monitors if monitor.enabled}
         standing |= {shadow.names[0]: self._taps(shadow) for shadow in self.shadows}
         for step in (step for name in self.names for step in standing.get(name, ())):
-            steps.setdefault(step.event.way or "", []).append(step)
+            steps.setdefault(step.event.channel or "", []).append(step)
         for found in steps.values():
             acting = [step for step in found if not isinstance(step, _Tap)]
             for place, step in enumerate(acting):
@@ -620,12 +620,12 @@ class MonitorSet:
                 if isinstance(step, _Tap):
                     step.monitor = acting[0].monitor  # whose state must be copied back to Python
         self._tapped_ways = frozenset(
-            way for way, found in steps.items() if any(isinstance(step, _Tap) for step in found)
+            channel for channel, found in steps.items() if any(isinstance(step, _Tap) for step in found)
         )
-        self.steps = {way: tuple(found) for way, found in steps.items()}
+        self.steps = {channel: tuple(found) for channel, found in steps.items()}
         self._contexts = {
-            way: tuple(step.monitor.context for step in found if step.first)
-            for way, found in self.steps.items()
+            channel: tuple(step.monitor.context for step in found if step.first)
+            for channel, found in self.steps.items()
         }
 
     def _taps(self, shadow: "MonitorSet") -> tuple[Step, ...]:
@@ -649,8 +649,10 @@ class MonitorSet:
 def _groups(compiled: Compiled, monitors: Sequence[MonitorInstance]) -> Iterator[MonitorGroup]:
     for found in groups(compiled.specifications):
         own = tuple(monitors[number] for number in found.specifications)
-        ways = {step.event.way for monitor in own for step in monitor.steps if step.event.way is not None}
-        group = MonitorGroup(own, frozenset(ways))
+        channels = {
+            step.event.channel for monitor in own for step in monitor.steps if step.event.channel is not None
+        }
+        group = MonitorGroup(own, frozenset(channels))
         for monitor in own:
             monitor.group = group
         yield group

@@ -81,7 +81,7 @@ class MonitorExecution:
 
     def message(self, steps: Sequence[Step], buffer: Buffer, outcome: Outcome, sender: MessageSender) -> None:
         """Process a message received at the time of the outcome; `steps` is not empty."""
-        steps[0].monitor.come_home()
+        steps[0].monitor.move_to_python()
         steps[0].monitor.touch()
         self._turn.now = outcome.time
         self._turn.begin()
@@ -110,7 +110,7 @@ class MonitorExecution:
         """Process a tick; the caller calls `collect`."""
         self._sender = NOBODY
         self._taking_back.clear()
-        step.monitor.come_home()
+        step.monitor.move_to_python()
         step.monitor.touch()
         outcome = Outcome(time=time_ns)
         outcome.timer = step.name
@@ -143,7 +143,7 @@ class MonitorExecution:
         slice's verdict is explained only if `explains`.
         """
         self._sender, self._bound = NOBODY, None
-        monitor.come_home()
+        monitor.move_to_python()
         monitor.touch()
         if running is None:
             assert monitor.slices is not None  # noqa: S101  only they have deadlines of their own

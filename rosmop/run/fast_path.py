@@ -138,7 +138,7 @@ class FastLane(Protocol):
 
 
 class Lanes(NamedTuple):
-    """The lanes of a set by topic (see `EventCode.way`), and the memory to receive frames into, if there is one."""
+    """The lanes of a set by topic (see `EventCode.channel`), and the memory to receive frames into, if there is one."""
 
     of_topic: Mapping[str, FastLane] = MappingProxyType({})
     area: memoryview | None = None

@@ -62,12 +62,12 @@ class StateHolder(Protocol):
 class MonitorGroup:
     """Monitors that share topics or variables, so that a message changes the state of at most one group.
 
-    `ways` are their topics and parts of services. `changed`: the state may have changed outside the module since it was
-    last saved.
+    `channels` are their topics and parts of services. `changed`: the state may have changed outside the module since
+    it was last saved.
     """
 
     monitors: tuple["MonitorInstance", ...]
-    ways: frozenset[str]
+    channels: frozenset[str]
     home: StateHolder | None = None
     changed: bool = True
 
@@ -187,7 +187,7 @@ class MonitorInstance:
         if self.group is not None:
             self.group.changed = True
 
-    def come_home(self) -> None:
+    def move_to_python(self) -> None:
         """Move its state to Python, before Python reads the state of this monitor or of others on its topics."""
         if self.home is not None:
             self.home.leave()

@@ -157,7 +157,7 @@ def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: 
 
 def shape(monitor: MonitorInstance, variables: Mapping[str, Any]) -> bytes:
     """Return a state without times, to compare it with the initial one."""
-    monitor.come_home()
+    monitor.move_to_python()
     runs = [
         kept(running.run)[0][:1] if hasattr(running.run, "state") else kept(running.run)
         for running in monitor.properties

@@ -144,7 +144,7 @@ class Agenda:
             elif monitor.enabled:
                 for running in monitor.properties:
                     if running.code.property.timed:
-                        monitor.come_home()
+                        monitor.move_to_python()
                     deadline = running.run.deadline
                     if deadline is not None and (found is None or deadline < found[0]):
                         found = (deadline, monitor, running)

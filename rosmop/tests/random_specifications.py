@@ -72,7 +72,7 @@ def definitions() -> Definitions:
 
 @dataclass(frozen=True)
 class Traffic:
-    """Messages of one topic (`EventCode.way`) as frames one after the other, and how many."""
+    """Messages of one topic (`EventCode.channel`) as frames one after the other, and how many."""
 
     topic: str
     frames: bytes
@@ -247,7 +247,7 @@ class Specifications:
 
 
 class Messages:
-    """Random messages of the two topics, and of a service (`EventCode.way`)."""
+    """Random messages of the two topics, and of a service (`EventCode.channel`)."""
 
     def __init__(self, seed: int) -> None:
         self._random = Random(seed)  # noqa: S311  draws examples, not keys

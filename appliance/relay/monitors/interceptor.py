@@ -35,7 +35,7 @@ from appliance.relay.monitors.shadow import ShadowMonitors
 from appliance.relay.monitors.state_keeper import StateKeeper
 from appliance.relay.monitors.time_budget import TimeBudget
 from appliance.relay.report import Reporter
-from rosmop.form.connected_groups import way_of
+from rosmop.form.connected_groups import channel_of
 from rosmop.run.outcomes import MessageSender
 from rosmop.runtime.action_context import Published
 
@@ -316,7 +316,7 @@ class Interceptor:
             return ServiceVerdict(body)
         now, due = self.now(), self.monitors.next_due
         view = memoryview(body)
-        outcome = self._walked(self.monitors, point, way_of(service, part), body, now)
+        outcome = self._walked(self.monitors, point, channel_of(service, part), body, now)
         if outcome is None:
             self.invalidate_prepared()
             time_budget = self.time_budget(point)
@@ -333,7 +333,7 @@ class Interceptor:
                 self.shadow.wait(point, None)
         elif self.monitors.next_due != due:
             self.invalidate_prepared()
-        self.keep(way_of(service, part))
+        self.keep(channel_of(service, part))
         self.observer.report(outcome, point)
         self.schedule()
         if outcome.result == "dropped":

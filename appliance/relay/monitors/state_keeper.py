@@ -78,7 +78,7 @@ class StateKeeper:
         self._left = [own] if _has_head(own) else [*earlier]
         self._monitors: MonitorSet | None = None
         self._entries: list[_Entry] = []
-        self._by_way: dict[str, _Entry] = {}
+        self._by_channel: dict[str, _Entry] = {}
 
     @property
     def offset(self) -> int:
@@ -127,17 +127,17 @@ class StateKeeper:
         """Keep the state of these monitors from now on."""
         self._monitors = monitors
         self._entries = [_Entry(group, slices=_parts(monitors, group)) for group in monitors.groups]
-        self._by_way = {way: entry for entry in self._entries for way in entry.group.ways}
+        self._by_channel = {channel: entry for entry in self._entries for channel in entry.group.channels}
         self._lay_out()
 
     def take_nothing(self) -> None:
         """Keep no state, because there are no monitors."""
-        self._monitors, self._entries, self._by_way = None, [], {}
+        self._monitors, self._entries, self._by_channel = None, [], {}
         self._lay_out()
 
-    def keep(self, way: str) -> None:
-        """Keep the state of the monitors that have judged messages on a topic (`EventCode.way`)."""
-        entry = self._by_way.get(way)
+    def keep(self, channel: str) -> None:
+        """Keep the state of the monitors that have judged messages on a topic (`EventCode.channel`)."""
+        entry = self._by_channel.get(channel)
         if entry is not None:
             self._keep(entry)
 
@@ -195,7 +195,7 @@ class StateKeeper:
         ):
             rest = [entry for entry in self._entries if not entry.refused]
             if not rest:
-                self._entries, self._by_way = [], {}
+                self._entries, self._by_channel = [], {}
                 self._memory.lay_out(self._head(_NO_ROOM), [])
                 return
             largest = max(rest, key=lambda entry: sum(len(data) for data, _ in _sections(entry)))
