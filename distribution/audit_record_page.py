@@ -12,18 +12,18 @@ from appliance.audit.schema import FIELDS, json_schema
 _HASH = {"type": "string", "pattern": "^[0-9a-f]{64}$"}
 CHAIN: dict[str, Any] = {
     "type": "object",
-    "description": "in an export: the place in the hash chain, as far as a signed checkpoint",
+    "description": "in an export: the position in the hash chain, up to a signed checkpoint",
     "properties": {
         "previous": _HASH | {"description": "hash of the record before"},
         "hash": _HASH | {"description": "hash of this record"},
         "then": {
             "type": ["array", "null"],
             "items": _HASH,
-            "description": "content hashes of the records after it that are left out; null: version 0.1.0 wrote them",
+            "description": "content hashes of the omitted records after it; null: version 0.1.0 wrote them",
         },
         "checkpoint": {
             "type": ["object", "null"],
-            "description": "the signed checkpoint that seals what is up to here, as `rosrv audit checkpoints` gives it",
+            "description": "signed checkpoint that seals the records up to this one (see `rosrv audit checkpoints`)",
         },
     },
     "required": ["previous", "hash", "then"],

@@ -20,7 +20,7 @@ _FILES = """\
 The configuration; \\fBrosrv config show\\fR prints every setting.
 .TP
 .I /etc/rosrv/policies, /etc/rosrv/monitors, /etc/rosrv/ipsec/hosts.yaml
-What an operator edits.
+Files that an operator edits.
 .TP
 .I /var/lib/rosrv
 The state: registrations, audit log, keys.

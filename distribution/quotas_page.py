@@ -38,7 +38,7 @@ def _tables() -> Iterator[str]:
         lambda row: (row.at_limit, row.between, row.alarm),
     )
     yield _table(
-        "What counts as a host, as unknown, or as kept, where it differs from the rule above",
+        "Definition of host, unknown or kept, where it differs from the rule above",
         ("resource", "rule"),
         lambda row: (row.counting,) if row.counting else None,
     )
