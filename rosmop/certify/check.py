@@ -73,8 +73,8 @@ def certify(logic: str, formula: str, events: Sequence[str], tables: AutomatonTa
     except UnsupportedFormulaError as error:
         return Certificate(False, False, f"the certifier does not read it ({error}): tested, not proved")
     except WorkLimitError:
-        return Certificate(False, False, "there is too much to look at: tested, not proved")
-    return Certificate(True, False, f"proved: its automaton is what is written ({pairs} cases followed)")
+        return Certificate(False, False, "there are too many cases to check: tested, not proved")
+    return Certificate(True, False, f"proved: its automaton matches its definition ({pairs} cases checked)")
 
 
 def _look_at_form(logic: str, events: Sequence[str], tables: AutomatonTables) -> None:
@@ -86,23 +86,23 @@ def _look_at_form(logic: str, events: Sequence[str], tables: AutomatonTables) ->
     if len(tables.verdicts) != len(tables.table) or (
         tables.timeouts and len(tables.timeouts) != len(tables.table)
     ):
-        raise _WrongError("it has not as many verdicts, or limits of time, as states")
+        raise _WrongError("the number of its verdicts or time limits differs from the number of its states")
     if limits and logic != "tfsm":
-        raise _WrongError("it has limits of time, and its logic has none")
+        raise _WrongError("it has time limits, but its logic has none")
     for state, row in enumerate(tables.table):
         if len(row) != len(events):
-            raise _WrongError(f"state {state} has {len(row)} ways on, and there are {len(events)} events")
+            raise _WrongError(f"state {state} has {len(row)} transitions, but there are {len(events)} events")
     reached = itertools.chain((tables.initial,), *tables.table, (target for _, target in limits))
     if not all(map(range(len(tables.table)).__contains__, reached)):
-        raise _WrongError("it leads to a state that it has not")
+        raise _WrongError("a transition leads to a state that does not exist")
 
 
 _NO_AUTOMATON = {
-    "cfg": "grammars are not followed",
+    "cfg": "grammars are not checked",
     "ptcaret": "it has a stack",
     "srs": "it has no automaton",
-    "mtl": "it has bounds of time",
-    "pattern": "it has a bound of time",
+    "mtl": "it has time bounds",
+    "pattern": "it has a time bound",
 }
 
 

@@ -75,7 +75,7 @@ class WordReader:
     def expect(self, word: str) -> None:
         """Take this word; raises `UnsupportedFormulaError` for another one."""
         if not self.accept(word):
-            raise UnsupportedFormulaError(f"{self.word!r} where {word!r} belongs")
+            raise UnsupportedFormulaError(f"{self.word!r} where {word!r} is expected")
 
     def duration(self) -> int:
         """Take a number and its unit (default: seconds); return nanoseconds."""
@@ -87,7 +87,7 @@ class WordReader:
     def end(self) -> None:
         """Raise `UnsupportedFormulaError` if something is left."""
         if self.word:
-            raise UnsupportedFormulaError(f"{self.word!r} behind the end")
+            raise UnsupportedFormulaError(f"{self.word!r} after the end")
 
 
 _BOOLEAN: tuple[Mapping[str, str], ...] = (

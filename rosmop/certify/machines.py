@@ -29,12 +29,12 @@ class StateMachineFollower:
                 words.expect("=")
                 self._aliases[name] = self._read_members(words)
             else:
-                raise UnsupportedFormulaError(f"{name!r} begins no state")
+                raise UnsupportedFormulaError(f"{name!r} does not begin a state")
         self.initial = next(iter(self._moves), FAIL)
 
     def _read_state(self, words: WordReader, state: str) -> None:
         if state in self._moves:
-            raise UnsupportedFormulaError(f"the state {state!r} stands twice")
+            raise UnsupportedFormulaError(f"the state {state!r} is defined twice")
         moves = self._moves.setdefault(state, {})
         while not words.accept("]"):
             event = words.take()

@@ -33,7 +33,7 @@ def meaning(formula: str, events: Sequence[str]) -> Node:
     if opens is None:
         return inside
     if opens == closes:
-        raise UnsupportedFormulaError("one event opens and closes the scope, which no formula of ltl says")
+        raise UnsupportedFormulaError("one event opens and closes the scope, which ltl cannot express")
     opened = _weak(("not", opens), ("and", opens, ("next", inside)))
     if closes is None:
         return opened

@@ -216,7 +216,7 @@ class _Bench:
         try:
             self._try(first, behind, cell, self._out, end, case.now)
         except WasmTrap as trap:
-            self._differs(case, one, first, f"it is stopped: {trap}")
+            self._differs(case, one, first, f"it stopped: {trap}")
         expected = []
         at = notes
         for place, state in enumerate(range(first, behind)):
@@ -274,9 +274,9 @@ class _Bench:
         number = after if after is None or isinstance(after, int) else after[0]
         clock = self._clock(one) if one is not None and self._topic.clocked else ()
         for found, right, what_of in (
-            (answer, expected.answer | begins[expected.position], "what it answers"),
-            (notes, wanted, "which functions it calls, in which order"),
-            ([(who, what)] if effect else [], effect, "what it drops"),
+            (answer, expected.answer | begins[expected.position], "its result"),
+            (notes, wanted, "the functions it calls, in order"),
+            ([(who, what)] if effect else [], effect, "the messages it drops"),
             (None if one is None else cell, number, "the next state"),
             (clock, after[1:] if clock else (), "the clock"),
         ):
@@ -302,7 +302,7 @@ class _Bench:
         wanted = tuple(count for row_of in rows for count in row_of)
         found = struct.unpack_from(f"<{len(wanted)}q", self._memory, self._feed.counters)
         if found != wanted:
-            self._differs(case, one, 0, f"what it counts: {found}, not {wanted}")
+            self._differs(case, one, 0, f"its counters: {found}, not {wanted}")
 
     def _differs(self, case: StepCase, one: PropertyStep | None, state: int, text: str) -> None:
         formula = "" if one is None else f", `{one.compiled.logic}: {one.compiled.formula}` in state {state}"

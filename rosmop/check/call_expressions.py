@@ -165,8 +165,8 @@ def _check_referenced(value: Value, kind: value_types.Type, function: HelperFunc
     if variable is not None and variable.shared and variable.name in function.names:
         raise SpecificationError.at(
             value.position,
-            f"`{function.name}` names `{variable.name}` itself, and a reference is a copy until it returns;"
-            " use one of the two ways",
+            f"`{function.name}` uses `{variable.name}` directly, and a reference is a copy until it returns;"
+            " use only one of the two",
         )
 
 
@@ -175,8 +175,8 @@ def _check_apart(one: Value, other: Value, function: HelperFunction) -> None:
     if all(step == beside for step, beside in zip(path(one), path(other), strict=False)):
         raise SpecificationError.at(
             other.position,
-            f"`{path(other)[0]}` is handed to two references of `{function.name}`,"
-            " which are copies until it returns; hand over different variables",
+            f"`{path(other)[0]}` is passed to two references of `{function.name}`,"
+            " which are copies until it returns; pass different variables",
         )
 
 
@@ -199,7 +199,7 @@ def _macro(scope: FunctionScope, node: tree.CallExpression, macro: re.Match[str]
         guard = nodes.Throttle(nodes.Literal(value_types.DOUBLE, math.inf), scope.site(node))
     if stream:
         if len(arguments) != 1:
-            raise SpecificationError.at(node.position, f"`{macro[0]}` takes what is printed: `a << b`")
+            raise SpecificationError.at(node.position, f"`{macro[0]}` takes the values to print: `a << b`")
         value = streamed(scope, node, level, arguments[0])
     else:
         value = _log(scope, node, level, tuple(arguments))
@@ -213,7 +213,7 @@ def _log(
     scope: FunctionScope, node: tree.CallExpression, level: str, arguments: Sequence[tree.Expression]
 ) -> Value:
     if not arguments:
-        raise SpecificationError.at(node.position, "there is nothing to print; write a text")
+        raise SpecificationError.at(node.position, "there is nothing to print; write a string")
     template, *rest = (scope.value_of(argument) for argument in arguments)
     line = nodes.Log(level, formatted(scope, template, rest), scope.site(node))
     return Value(line, node.position)
@@ -291,7 +291,7 @@ def construct(
         character = convert(scope, values[1], value_types.CHAR)
         return Value(nodes.Call(kind, "e_repeat", (count, character), site), position)
     if len(arguments) != 1 or len(values) != 1 or isinstance(kind, value_types.VoidType):
-        raise SpecificationError.at(position, f"{kind} cannot be made from this")
+        raise SpecificationError.at(position, f"{kind} cannot be constructed from this")
     return Value(convert(scope, values[0], kind), position)
 
 
@@ -308,7 +308,7 @@ def _vector(
         return convert(scope, values[0], kind, site)
     if not values or len(values) > 2 or not value_types.is_number(values[0].type):
         raise SpecificationError.at(
-            arguments[0].position, f"a {kind} is made from a size, and a value for all"
+            arguments[0].position, f"a {kind} is constructed from a size, and a value for all elements"
         )
     count = number(values[0].form, value_types.ULONG)
     if len(values) == 1:

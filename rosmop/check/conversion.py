@@ -60,7 +60,7 @@ def refusal(source: Type, target: Type) -> str:
         ),
     )
     if isinstance(source, value_types.VoidType):
-        return "this function has no value"
+        return "this function returns no value"
     hint = next((hint for fits, hint in hints if fits), "")
     return f"{source} cannot become {target}" + (f"; {hint}" if hint else "")
 

@@ -70,7 +70,9 @@ def algorithm(scope: FunctionScope, name: str, values: Sequence[Value], at: tupl
     if name == "accumulate":
         return _sum(values, span, at)
     if len(values) != 2:
-        raise SpecificationError.at(values[2].position, f"`{name}` with a function of one's own is not known")
+        raise SpecificationError.at(
+            values[2].position, f"`{name}` with a comparison function is not supported"
+        )
     if name == "sort" and not value_types.is_scalar(kind.element):
         raise SpecificationError.at(position, f"a {kind} has no order to sort by")
     return _changed(scope, base, nodes.Call(value_types.VOID, f"k_{name}", span, site), position)

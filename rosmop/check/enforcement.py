@@ -13,8 +13,8 @@ from rosmop.text.errors import SpecificationError
 from rosmop.types.messages import nearest, shown
 
 _TAKES = {
-    "pattern": "it takes `enforced by f` after `within`, with a function f that publishes what is due",
-    "mtl": "it takes a `pattern: … causes … within … enforced by f`, with a function f that publishes what is due",
+    "pattern": "write `enforced by f` after `within`, with a function f that publishes the due message",
+    "mtl": "write a `pattern: … causes … within … enforced by f`, with a function f that publishes the due message",
 }
 
 
@@ -27,7 +27,7 @@ def blocking_refused(
         return refused
     for index, event in enumerate(specification.events):
         if isinstance(event.trigger, tree.TimerTrigger) and category in compiled.categories_after(index):
-            return f"the timer {shown(event.name)} can bring @{category} about, and it has no message to drop"
+            return f"the timer {shown(event.name)} can cause @{category}, and it has no message to drop"
     return None
 
 
@@ -43,7 +43,7 @@ def enforcement(
     """
     if compiled.remedy is not None:
         topics = ", ".join(published)
-        return f"enforced: at the deadline {compiled.remedy} publishes what was due ({topics})"
+        return f"enforced: at the deadline {compiled.remedy} publishes the due message ({topics})"
     category = "violation" if "violation" in compiled.categories else "fail"
     graph = graph_of(compiled)
     if graph is not None and shortest_trace_to(compiled, category) is None:
@@ -56,7 +56,7 @@ def enforcement(
         if category not in dropping:
             said += f"; to enforce it write `@{category} {{ DROP; }}`"
         return f"{said}; {_COUNTS[compiled.suppresses]}"
-    takes = "it takes an event on a topic for the timer"
+    takes = "use an event on a topic instead of the timer"
     if compiled.blocking_refused(category) is not None:
         takes = _TAKES[compiled.logic]
         if isinstance(compiled, TimedPattern):
@@ -65,7 +65,7 @@ def enforcement(
 
 
 _COUNTS = {
-    True: "a dropped message has not happened for it",
+    True: "a dropped message does not count for it",
     False: "a dropped message counts for it, as if it had been passed on",
 }
 

@@ -164,7 +164,7 @@ def _bind(
         if parameter.name not in named:
             raise SpecificationError.at(
                 parameter.position,
-                f"the parameter {shown(parameter.name)} is bound to no field; write `field:{parameter.name}`",
+                f"the parameter {shown(parameter.name)} is not bound to a field; write `field:{parameter.name}`",
             )
     return bound
 
@@ -264,7 +264,7 @@ def _body(
                 except SpecificationError as error:
                     scope.shared.findings += error.findings
             if scope.changes_anything():
-                raise SpecificationError.at(when.position, "`when` only looks; assign in the action")
+                raise SpecificationError.at(when.position, "`when` only tests; assign in the action")
     with scope.nested() as action:
         write(scope, event.action)
     return conditions, action

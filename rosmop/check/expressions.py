@@ -166,7 +166,7 @@ def _message(scope: FunctionScope, node: tree.Expression) -> Value:
             "handler": "a handler has no message; copy it in the action: `v = MESSAGE;`",
             "timer": "a timer has no message",
             "init": "there is no message yet",
-            "function": "a function has no message; pass it what it needs",
+            "function": "a function has no message; pass it the values it needs",
         }.get(scope.role, "there is no message here")
         raise SpecificationError.at(node.position, f"`MESSAGE` has no meaning here: {hint}")
     scope.pending = scope.pending or scope.symbols.fresh("u")

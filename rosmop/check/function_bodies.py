@@ -48,7 +48,7 @@ def _shared_variable(
     if automatic and _constant(scope, declarator) is None:
         raise SpecificationError.at(
             declaration.position,
-            "a shared variable needs a type; `auto` is for local ones, and for constants that are written down",
+            "a shared variable needs a type; `auto` is for local variables, and for constants with a literal value",
         )
     value = declarator.value if automatic or (declarator.is_array and declarator.size is None) else None
     if declarator.is_array and value is None and isinstance(declarator.value, tree.InitializerList):

@@ -74,7 +74,7 @@ class MemberCall:
         require_place(self.base, f"`{self.name}`")
         if isinstance(self.base.type, value_types.VectorType) and self.base.type.length is not None:
             raise SpecificationError.at(
-                self.position, f"`{self.name}`: an array of fixed length stays so long"
+                self.position, f"`{self.name}`: an array of fixed length cannot change its length"
             )
         change = marked(mark(self.scope, self.base), self.called(value_types.VOID, function, *arguments))
         return Value(change, self.position)

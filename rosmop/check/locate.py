@@ -25,7 +25,7 @@ def type_of_path(messages: MessageTypes, record: str, path: tuple[tree.PathStep,
         if step.index is not None:
             if not isinstance(kind, value_types.VectorType):
                 raise SpecificationError.at(
-                    step.position, f"`{step.name}` is {kind}, no array; leave out the index"
+                    step.position, f"`{step.name}` is {kind}, not an array; leave out the index"
                 )
             if kind.length is not None and step.index >= kind.length:
                 raise SpecificationError.at(

@@ -83,7 +83,7 @@ def write_range_for(scope: FunctionScope, node: tree.RangeForStatement, write: W
         for each in first:
             scope.evaluate(each)
     if not isinstance(values.type, value_types.VectorType | value_types.StringType):
-        raise SpecificationError.at(values.position, f"{values.type} has no elements to go through")
+        raise SpecificationError.at(values.position, f"{values.type} has no elements to iterate over")
     element = values.type.element if isinstance(values.type, value_types.VectorType) else value_types.CHAR
     kind = element if node.type.name == ("auto",) else resolve(node.type, scope.messages)
     _enter(scope, node, LoopScope(None))
@@ -120,7 +120,7 @@ def _first_index(scope: FunctionScope, node: tree.RangeForStatement, values: Val
     """Return the name of a new index that is before the first element."""
     if not isinstance(values.type, value_types.VectorType) or values.place is None:
         raise SpecificationError.at(
-            node.values.position, "a reference goes through a vector variable; leave out the `&`"
+            node.values.position, "a reference needs a vector variable to iterate over; leave out the `&`"
         )
     if values.type.element != kind:
         raise SpecificationError.at(node.type.position, f"the elements are {values.type.element}, not {kind}")
@@ -195,7 +195,7 @@ def _cases(
         if not -(1 << kind.bits - 1) <= constant < 1 << kind.bits:
             raise SpecificationError.at(
                 case.value.position,
-                f"case {int(constant)} can never be: {kind} holds {kind.least} to {kind.most}",
+                f"case {int(constant)} can never match: {kind} holds {kind.least} to {kind.most}",
             )
         wanted = wrap(int(constant), kind.bits, kind.signed)
         if wanted in table:
@@ -223,7 +223,7 @@ def write_continue(scope: FunctionScope, position: Position) -> None:
 def _enter(scope: FunctionScope, node: tree.SyntaxNode, loop: LoopScope) -> None:
     if len(scope.loops) >= MAX_NESTED:
         raise SpecificationError.at(
-            node.position, f"more than {MAX_NESTED} loops inside each other; use helper functions"
+            node.position, f"more than {MAX_NESTED} nested loops; use helper functions"
         )
     scope.enter(loop)
 

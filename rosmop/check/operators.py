@@ -126,7 +126,7 @@ def _put_together(function: str, operands: Operands) -> Value:
         if isinstance(value.type, value_types.CharactersType) and isinstance(
             other.type, value_types.IntegerType | value_types.FloatingType
         ):
-            hint = "; there is no arithmetic of pointers: write `std::string(…).substr(1)`"
+            hint = "; there is no pointer arithmetic: write `std::string(…).substr(1)`"
             raise operands.refused("+", hint)
     texts = (_joined(operands, operands.left), _joined(operands, operands.right))
     return operands.value(nodes.Call(value_types.STRING, function, texts, operands.site))

@@ -27,7 +27,7 @@ def formatted(scope: FunctionScope, template: Value, arguments: Sequence[Value])
     if not isinstance(template.constant, bytes):
         if arguments or not isinstance(template.type, _TEXTS):
             raise SpecificationError.at(
-                template.position, 'the format must be a literal; write `"%s", …` and the text behind it'
+                template.position, 'the format must be a literal; write `"%s", …` and the string after it'
             )
         return convert(scope, template, value_types.STRING)
     pieces: list[bytes] = []

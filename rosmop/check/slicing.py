@@ -138,14 +138,14 @@ def unsliceable(compiled: CompiledProperty) -> str | None:
     """Return why slices cannot run a property; None if they can."""
     if isinstance(compiled, PastProperty) and compiled.timed:
         return (
-            "a formula with several bounds of time, or with one that neither begins at 0 nor ends at `inf`, cannot be "
-            "sliced: what a slice keeps of it has no bound; write a property for each bound"
+            "a formula with several time bounds, or with one that neither begins at 0 nor ends at `inf`, cannot be "
+            "sliced: the state of a slice would be unbounded; write a property for each bound"
         )
     if isinstance(compiled, PastProperty):
         return "the formula has too many states to be sliced; split it into several properties"
     if isinstance(compiled, BoundedProperty) and any(compiled.folded.bounds):
         return (
-            "a formula that looks back and forward within bounds of time cannot be sliced: what a slice keeps of it "
+            "a formula that looks back and forward within time bounds cannot be sliced: what a slice keeps of it "
             "has no bound; write a property for each"
         )
     return None

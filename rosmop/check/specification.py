@@ -197,7 +197,7 @@ def _check_head(shared: CompilationContext, specification: tree.Specification) -
         word = modifier.parts[0]
         if word in IGNORED_MODIFIERS:
             shared.findings.append(
-                Diagnostic(modifier.position, "warning", f"{shown(word)} means nothing here")
+                Diagnostic(modifier.position, "warning", f"{shown(word)} has no meaning here")
             )
         elif word not in MODIFIERS:
             text = f"{shown(word)} is not a modifier of a specification{nearest(word, MODIFIERS)}"
@@ -206,7 +206,7 @@ def _check_head(shared: CompilationContext, specification: tree.Specification) -
         text = "`hold` and `begin` exclude each other: leave one of them out"
         shared.findings.append(Diagnostic(specification.position, "error", text))
     if specification.name == _TAKEN:
-        text = f"no specification can be called {shown(_TAKEN)}: over REST /v1/monitors/{_TAKEN} is their history"
+        text = f"a specification cannot be named {shown(_TAKEN)}: the REST path /v1/monitors/{_TAKEN} is the history"
         shared.findings.append(Diagnostic(specification.position, "error", text))
     if not specification.events:
         text = f"the specification {shown(specification.name)} has no event; write `event name() /topic …`"
@@ -221,7 +221,7 @@ def _check_head(shared: CompilationContext, specification: tree.Specification) -
         for modifier in event.modifiers:
             if specification.parameters and modifier.parts == ("creation",):
                 continue
-            text = f"the modifier {shown(modifier.parts[0])} of an event means nothing here"
+            text = f"the modifier {shown(modifier.parts[0])} of an event has no meaning here"
             shared.findings.append(Diagnostic(modifier.position, "warning", text))
 
 
@@ -269,7 +269,7 @@ def _property(
                 at[category],
                 "warning",
                 f"when @{category} drops the message, `__RESET;` does nothing: for `{compiled.logic}` a dropped message"
-                " has not happened; leave `__RESET;` out",
+                " does not count; leave `__RESET;` out",
             )
             for category in dropping
             if nodes.Reset in made[category]

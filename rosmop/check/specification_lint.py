@@ -45,8 +45,9 @@ def kept_slices(
         Diagnostic(
             event.position,
             "warning",
-            f"the slices of {shown(name)} never end: the timer {shown(event.name)} does more than to change their"
-            " variables, so each may act again at any time; give the time to a property (`pattern … within`, `tfsm`)",
+            f"the slices of {shown(name)} never end: the timer {shown(event.name)} does more than change their"
+            " variables, so each may act again at any time;"
+            " put the time limit into a property (`pattern … within`, `tfsm`)",
         )
         for event in events
         if event.period_ns is not None and event.acts
@@ -57,8 +58,8 @@ def kept_slices(
             Diagnostic(
                 handler.position,
                 "warning",
-                f"@{handler.category} is empty and for good: a binding that comes to it keeps its slice for ever, and"
-                " each later event of it is a verdict; leave the handler out",
+                f"@{handler.category} is empty and permanent: a binding that reaches it keeps its slice forever, and"
+                " each later event is a verdict; leave the handler out",
             )
             for handler in node.handlers
             if handler.category in for_good and not handler.body.statements

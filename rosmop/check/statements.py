@@ -148,7 +148,7 @@ def _array(
             length = len(declarator.value.value)
             raise SpecificationError.at(
                 declarator.value.position,
-                f"a text of {length} characters and its zero need `{declarator.name}[{length + 1}]`",
+                f"a string of {length} characters and its terminating zero need `{declarator.name}[{length + 1}]`",
             )
         return value_types.CHARACTERS, nodes.Call(value_types.CHARACTERS, "e_filled", (zeros, text), site)
     if size is None:
@@ -172,7 +172,7 @@ def _array_size(scope: FunctionScope, declarator: tree.Declarator) -> int | None
     if not isinstance(size, int) or isinstance(size, bool) or not 0 < size <= 1 << 24:
         raise SpecificationError.at(
             declarator.size.position,
-            "the size of an array is a number; write a `std::vector` for another size",
+            "the size of an array must be a constant number; write a `std::vector` for other sizes",
         )
     return size
 
@@ -239,7 +239,9 @@ def _return_value(scope: FunctionScope, node: tree.ReturnStatement) -> None:
     void = isinstance(scope.result, value_types.VoidType)
     if void != (node.value is None):
         hint = (
-            "this function has no value; write `return;`" if void else f"this function returns {scope.result}"
+            "this function returns no value; write `return;`"
+            if void
+            else f"this function returns {scope.result}"
         )
         raise SpecificationError.at(node.position, hint)
     nothing = nodes.Literal(value_types.VOID, None)
@@ -273,7 +275,7 @@ def _publish(scope: FunctionScope, node: tree.PublishStatement) -> None:
     kind = record(node.type_position, node.type, scope.messages)
     value = scope.value_of(node.value)
     if value.type != kind:
-        raise SpecificationError.at(value.position, f"this is {value.type}, but {kind} is to be published")
+        raise SpecificationError.at(value.position, f"this is {value.type}, but {kind} is published here")
     scope.add(nodes.Publish(scope.lines.site, node.topic, kind, value.form, scope.temporary()))
     scope.published(node.topic, node.type, node.position)
 

@@ -96,7 +96,9 @@ def _vector_insert(call: MemberCall) -> Value:
 
 def _refuse_fixed(call: MemberCall) -> None:
     if _vector(call).length is not None:
-        raise SpecificationError.at(call.position, f"`{call.name}`: an array of fixed length stays so long")
+        raise SpecificationError.at(
+            call.position, f"`{call.name}`: an array of fixed length cannot change its length"
+        )
 
 
 def _nothing(call: MemberCall) -> Value:

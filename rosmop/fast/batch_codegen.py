@@ -379,7 +379,7 @@ class TopicCodegen:
                 left |= handled.states
         table = tuple(-1 if state in left else state for state in advance.table)
         if not self._written[number].passes and max(table) < 0:
-            raise NotCompiledError("comes to a verdict with each message")
+            raise NotCompiledError("reaches a verdict with each message")
         idle = advance.clock is None and not self._handled(advance) and table == tuple(range(len(table)))
         return None if idle else self._known_tables.address(table)
 

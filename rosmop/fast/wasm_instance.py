@@ -122,7 +122,7 @@ class WasmInstance:
         """Call an exported function of integers (signed) by its name or number, and return the result.
 
         Each argument is a signed 64-bit integer; if the function takes 32 bits, the low ones are given. Raises
-        `WasmTrap`; `WasmError` where there is no such function or the machine is closed; `struct.error` where the
+        `WasmTrap`; `WasmError` where there is no such function or the instance is closed; `struct.error` where the
         arguments are not as many as it takes or too large.
         """
         function = self.function(name)
@@ -148,7 +148,7 @@ class WasmInstance:
     def _asked(self) -> tuple[int, Any]:
         """Return the C name of the memory."""
         if self._store is None or self._memory is None:
-            raise WasmError("the machine is closed")
+            raise WasmError("the instance is closed")
         return self._store.context, ctypes.byref(self._memory, _Export.of.offset)
 
 
@@ -226,7 +226,7 @@ def load() -> ctypes.PyDLL:
     """Load the C functions of wasmtime. Raises `WasmError` for another version."""
     package, found = find_spec("wasmtime"), version("wasmtime")
     if package is None or package.origin is None or not found.startswith(VERSION):
-        raise WasmError(f"wasmtime {VERSION}x is needed, and {found} is here")
+        raise WasmError(f"wasmtime {VERSION}x is required, but {found} is here")
     folder = f"linux-{os.uname().machine}"
     file = str(Path(package.origin).with_name(folder) / "_libwasmtime.so")
     library = ctypes.PyDLL(file)

@@ -84,7 +84,7 @@ class _Learner:
         rhythms = {topic: TopicRhythm() for topic in self._fields}
         self._times(self._trained, rhythms)
         if not any(rhythm.count for rhythm in rhythms.values()):
-            raise LearningError("no message on any of these topics is in the recordings that are learnt from")
+            raise LearningError("the recordings to learn from have no message on any of these topics")
         known = self._contents(rhythms)
         candidates = list(known.candidates())
         rows = list(specifications(candidates, known))
@@ -104,7 +104,7 @@ class _Learner:
                 left_out.append(replace(candidate, alarms=count))
         if not kept:
             raise LearningError(
-                "nothing in these recordings holds often enough to propose it: record for longer"
+                "no condition holds often enough in these recordings to propose it: record for longer"
             )
         rows = list(specifications(kept, known))
         names = {candidate.key: name for name, _, group in rows for candidate in group}
@@ -160,7 +160,9 @@ class _Learner:
                 known.contents[topic].add(data, time, window)
             except MessageError as error:
                 kind = self._types[topic]
-                raise LearningError(f"{part.name}: a message on {topic} is no {kind}: {error}") from error
+                raise LearningError(
+                    f"{part.name}: a message on {topic} is not of type {kind}: {error}"
+                ) from error
             known.orders.add(topic, time, window)
 
     def _messages(self, part: RecordingPart) -> Iterator[Received]:

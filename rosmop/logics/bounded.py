@@ -546,10 +546,7 @@ class BoundedProperty(CompiledProperty):
         super().blocking_refused(category)
         if category not in self._failing:
             return None
-        return (
-            f"`{category}` may come when a bound of time passes, and the message that would have to be stopped has"
-            " long been passed on then"
-        )
+        return f"`{category}` may be decided when a time bound passes, long after the message to drop was passed on"
 
 
 _CONTAINERS = (deque, list, dict, SinceWindow)
@@ -616,7 +613,7 @@ class BoundedRun:
                 raise ValueError("the deadline has passed: expire the run first")
             self._now = time_ns
         if sum(len(operator.rows) for operator in self.operators.values()) >= self._compiled.most:
-            raise RunFaultError(f"more than {self._compiled.most} events wait for what follows them")
+            raise RunFaultError(f"more than {self._compiled.most} events wait for later events")
         self.place += 1
         self._places = self._compiled.folded.take(self._at_once, event, self._now)
         self._values = {}

@@ -33,9 +33,8 @@ LOGICS: Mapping[str, Logic] = MappingProxyType(
 )
 
 _REFUSED = {
-    "dl": "`dL` (differential dynamic logic) is not supported: what is proved with it is proved elsewhere. Write the"
-    " condition that the proof gives as a test of numbers in an event, and what must follow in time as `mtl` or"
-    " `pattern`"
+    "dl": "`dL` (differential dynamic logic) is not supported: prove with another tool. Write the proved condition as"
+    " a numeric test in an event, and its time limits as `mtl` or `pattern`"
 }
 
 

@@ -88,9 +88,7 @@ def _read_state(
     name = reader.expect("name", "the name of a state")
     reserved = (FAIL, TIMEOUT) if timed else (FAIL,)
     if name.text in reserved:
-        reader.note(
-            name, f"`{name.text}` is a category of its own and cannot name a state; choose another name"
-        )
+        reader.note(name, f"`{name.text}` is already a category and cannot name a state; choose another name")
     if name.text in machine.states:
         reader.note(name, f"state `{name.text}` is defined twice; put all its transitions into one `[ … ]`")
     if machine.aliases:
@@ -148,7 +146,7 @@ def _read_alias(reader: TokenReader, machine: StateMachineText, used: list[Formu
     reader.take()
     name = reader.expect("name", "the name of an alias")
     if name.text in machine.states or name.text in (FAIL, TIMEOUT):
-        reader.note(name, f"alias `{name.text}` has the name of a category that exists; choose another name")
+        reader.note(name, f"alias `{name.text}` has the name of an existing category; choose another name")
     if name.text in machine.aliases:
         reader.note(name, f"alias `{name.text}` is defined twice; put all its states into one list")
     reader.expect("=", "`=` and the states of the alias")

@@ -175,7 +175,7 @@ class TokenReader:
         if nanoseconds.denominator != 1:
             raise self.source.error(number.offset, "a duration finer than a nanosecond; round it")
         if nanoseconds > MAX_DURATION_NS:
-            raise self.source.error(number.offset, "a duration of more than 31 years; is the unit right?")
+            raise self.source.error(number.offset, "a duration of more than 31 years; is the unit correct?")
         return int(nanoseconds)
 
     def _glued(self, number: FormulaToken) -> bool:

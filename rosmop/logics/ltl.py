@@ -62,9 +62,7 @@ def compile_ltl(source: Source) -> FiniteProperty:
     future = past.replaced(formula)
     guesses = 1 << len(past.propositions)
     if len(classes) * guesses > MOST_LETTERS:
-        raise source.error(
-            0, f"{len(past.propositions)} different operators about the past; write a smaller formula"
-        )
+        raise source.error(0, f"{len(past.propositions)} different past operators; write a smaller formula")
     of_class = [((1 << guesses) - 1) << letter * guesses for letter in range(len(classes))]
     atoms = {named[index]: of_class[letter] for letter, index in enumerate(classes) if index >= 0}
     letters = range(len(classes) * guesses)

@@ -41,7 +41,7 @@ def compile_mtl(source: Source) -> CompiledProperty:
         if node.bounds is None or node.bounds[1] is None:
             raise source.error(
                 node.offset,
-                f"`{node.operator}` has no upper bound, so its verdict might never come; write"
-                f" `{node.operator}[0,10s]` with the time that there is, or `ltl` for what may come at any time",
+                f"`{node.operator}` has no upper bound, so its verdict might never be reached; write"
+                f" `{node.operator}[0,10s]` with your time limit, or `ltl` for events that may come at any time",
             )
     return BoundedProperty(source, formula) if future else compile_past(source, formula)

@@ -204,10 +204,7 @@ class TimedPattern(ClockedProperty):
         comes_along = kind == "no" or self.pattern.enforced
         if kind in ("requires", "forbids") or (category == "violation" and comes_along):
             return None
-        return (
-            f"`{kind} … within` is decided by a deadline, when the message that would have to be stopped "
-            "has long been passed on"
-        )
+        return f"`{kind} … within` is decided at a deadline, long after the message to drop was passed on"
 
 
 def compile_pattern(source: Source) -> CompiledProperty:
@@ -237,17 +234,14 @@ def _read_remedy(reader: TokenReader, kind: str, within: int | None) -> str:
     if kind not in _DUE:
         reader.note(
             word,
-            f"`{kind}` leaves nothing due that could be published: what violates it comes with a message;"
-            " write `@violation { DROP; }`",
+            f"`{kind}` has no due message to publish: a message violates it; write `@violation {{ DROP; }}`",
         )
     elif within is None:
-        reader.note(
-            word, "`enforced by` needs to know when it is due; write `within` and a duration before it"
-        )
+        reader.note(word, "`enforced by` needs a deadline; write `within` and a duration before it")
     if reader.token.text != "by":
-        raise reader.unexpected("`by` and the function that publishes what is due")
+        raise reader.unexpected("`by` and the function that publishes the due message")
     reader.take()
-    return reader.expect("name", "the function that publishes what is due").text
+    return reader.expect("name", "the function that publishes the due message").text
 
 
 def _untimed(source: Source, pattern: Pattern) -> FiniteProperty:

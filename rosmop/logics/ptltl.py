@@ -9,7 +9,7 @@ from rosmop.logics.formula import NOT, Level, Syntax, boolean_levels, read_formu
 from rosmop.logics.interface import CompiledProperty, Source
 from rosmop.logics.past_monitors import compile_past
 
-_FUTURE = "is about the future; write `ltl:` as the logic, or a past operator: (*) <*> [*] S"
+_FUTURE = "is a future operator; write `ltl:` as the logic, or a past operator: (*) <*> [*] S"
 
 SYNTAX = Syntax(
     unary={**NOT, "(*)": "previously", "~(*)": "dual previously", "<*>": "once", "[*]": "historically"},

@@ -126,7 +126,7 @@ def compile_srs(source: Source) -> RewritingProperty:
             if number not in made:
                 raise source.error(
                     0,
-                    f"`{names[number]}` is neither an event nor on the right side of a rule: no string has it",
+                    f"`{names[number]}` is neither an event nor on the right side of a rule: no string contains it",
                 )
     reader.finish()
     return RewritingProperty(source, rules)
@@ -138,7 +138,7 @@ def _read_rule(reader: TokenReader, numbers: dict[str, int]) -> RewriteRule:
     if not left:
         raise reader.unexpected("an event or a symbol: a rule rewrites at least one")
     ends = reader.accept("$")
-    reader.expect("->", "`->` and what the rule writes instead")
+    reader.expect("->", "`->` and the replacement")
     verdict = ""
     right: tuple[int, ...] = ()
     if reader.accept("#"):

@@ -50,7 +50,7 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 EQUAL = "equal"
-IN_PYTHON = "no module: messages of this topic are judged in Python"
+IN_PYTHON = "not compiled: Python evaluates the messages of this topic"
 PATIENCE = 5.0
 """Default number of seconds for each event."""
 
@@ -137,8 +137,8 @@ class Validation:
         left = either(done.trapped, done.bits == _ELSEWHERE)
         unknown = either(*meant.unknown.values())
         wrong = {
-            "it looks beyond the message": done.outside,
-            "it goes on where the form faults": both(opposite(left), meant.left),
+            "it reads beyond the message": done.outside,
+            "it continues where the specification faults": both(opposite(left), meant.left),
         }
         others = {
             "whether it happened": _bit(done.bits, _HAPPENED) != meant.happened,
@@ -150,9 +150,9 @@ class Validation:
                 f"the variable at {place}": opposite(_same(done.cells[place], value))
                 for place, value in self._ends(meant)
             },
-            "how much is put out": done.said != meant.said,
+            "the size of the output": done.said != meant.said,
             **{
-                f"what is put out ({place})": both(noted.alive, opposite(_among(noted, done.lines)))
+                f"the output ({place})": both(noted.alive, opposite(_among(noted, done.lines)))
                 for place, noted in enumerate(meant.noted)
             },
         }
@@ -235,7 +235,7 @@ class Validation:
     def _check_undone(self, done: ModuleResult, topic: str) -> None:
         taken_back = {address for address, _ in self._module.feeds[topic].undo}
         for address in sorted(done.stored - set(self._module.budgets.values()) - taken_back):
-            raise DiffersError(f"what it writes at {address} is not taken back")
+            raise DiffersError(f"its write at {address} is not undone")
 
 
 def _holds(conditions: Sequence[Term], guess: Any) -> bool:

@@ -602,7 +602,7 @@ class FormTerms:
         """Leave output that is due to Python; ignore output that is not due."""
         last = self._beginning.throttles.get((self._function.context, node.site))
         if last is None:
-            raise UnknownError("output at most so often")
+            raise UnknownError("output with a rate limit")
         seconds = self._converted(
             self._value(node.seconds, state), node.seconds.type, value_types.FloatingType(64)
         )

@@ -253,9 +253,7 @@ class ModuleExecution:
         if value is MIXED:
             raise NotProvedError("uses a variable for an address and a number")
         if how or value is None or not _fits(value, family):
-            raise DiffersError(
-                f"it reads {each_name(family, how)} at {place}, where nothing of that kind stands"
-            )
+            raise DiffersError(f"it reads {each_name(family, how)} at {place}, where no such value is stored")
         return value
 
     def _store(  # noqa: PLR0917  as the instruction has them
@@ -278,10 +276,10 @@ class ModuleExecution:
         before = state.slots.get(("cell", place))
         if how or before is None or not _fits(before, family):
             raise DiffersError(
-                f"it writes {each_name(family, how)} at {place}, where nothing of that kind stands"
+                f"it writes {each_name(family, how)} at {place}, where no such value is stored"
             )
         if place == SAID and (not isinstance(value, Pointer) or value.place != "lines"):
-            raise DiffersError("what is put out is noted elsewhere")
+            raise DiffersError("the output is logged elsewhere")
         state.slots["cell", place] = value
         if place != SAID:
             self._stored.add(place)
@@ -294,7 +292,7 @@ class ModuleExecution:
         if any(place in string for string in self._strings) or (self._strings and not known):
             raise NotProvedError("uses a constant string, or one that is kept")
         if not known:
-            raise DiffersError("it looks at an address that is nowhere in the message")
+            raise DiffersError("it reads an address outside the message")
         return place
 
     def _within(self, pointer: Pointer, offset: int, size: int, state: State) -> Term:
@@ -313,7 +311,7 @@ class ModuleExecution:
             or not _same(note.position, position)
             or not _same(note.old, old if size == 8 else z3.ZeroExt(64 - 8 * size, old))
         ):
-            raise DiffersError("it writes bytes of the message that were not noted before")
+            raise DiffersError("it writes bytes of the message that were not logged before")
         state.slots[_MESSAGE] = with_number(message, position, z3.Extract(8 * size - 1, 0, _bits(value)))
 
     def _note(self, pointer: Pointer, offset: int, size: int, value: Any, state: State) -> None:
@@ -321,7 +319,7 @@ class ModuleExecution:
         begin = state.slots["cell", UNDO].offset
         part = z3.simplify(pointer.offset + offset - begin)
         if not z3.is_bv_value(part) or (part.as_long(), size) not in ((0, 4), (4, 4), (8, 8)):
-            raise DiffersError("it writes beside the next note of the log")
+            raise DiffersError("it writes outside the next entry of the log")
         state.slots["part", part.as_long()] = value
 
     def _add_note(self, value: Any, state: State) -> None:
@@ -336,7 +334,7 @@ class ModuleExecution:
             or not z3.is_bv_value(size)
             or old is None
         ):
-            raise DiffersError("the end of the log is put where no note ends")
+            raise DiffersError("the end of the log is set where no entry ends")
         state.slots[_NOTE] = _Note(state.alive, address.offset, size.as_long(), old)
         state.slots["cell", UNDO] = value
         for part in (0, 4, 8):
@@ -355,7 +353,7 @@ def _stored(value: Any, size: int) -> Term:
     """Return a number of the machine, or an address in the message, as bytes."""
     if isinstance(value, Pointer):
         if value.place != "message":
-            raise DiffersError("it notes an address that is nowhere in the message")
+            raise DiffersError("it logs an address outside the message")
         value = AT + value.offset
     elif z3.is_fp(value):
         value = z3.fpToIEEEBV(value)

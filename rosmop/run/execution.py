@@ -436,7 +436,7 @@ class MonitorExecution:
             why = f" ({monitor.why_held})" if monitor.why_held else ""
             outcome.reason = f"{monitor.name} holds its topics until it is resumed{why}"
         elif monitor.broken and self.on_fault == "drop":
-            outcome.reason = f"{monitor.name} could not begin: its first values or `init` faulted"
+            outcome.reason = f"{monitor.name} could not start: its initial values or `init` faulted"
         if outcome.reason is not None:
             outcome.dropped_at = monitor.code.position
             message.dropped = True

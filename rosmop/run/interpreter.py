@@ -384,7 +384,7 @@ class _Maker:
 
         def run(v: Variables) -> None:
             if v["n"] > MAX_CALLS:
-                raise FaultError(site, f"`{name}` calls itself without end")
+                raise FaultError(site, f"`{name}` calls itself endlessly")
 
         return run
 

@@ -359,7 +359,7 @@ class Slices:
         if self._holder is None:
             return f"more than {self.limit} slices"
         held = self.quota.held(self._holder)
-        return f"its host has {held} of {self.limit} slices, which is as many as are left for all others"
+        return f"its host has {held} of {self.limit} slices, as many as are left for all other hosts"
 
     def _has_room(self, most: int) -> bool:
         """Return whether the host may have this number of slices more, or can forget some of its own."""
@@ -416,8 +416,8 @@ class Slices:
             return ""
         self._forgotten, self._told = 0, time_ns
         return (
-            f"{number} of its oldest slices are forgotten to make room for new ones of the same host; "
-            f"there may be {self.limit} slices"
+            f"{number} of its oldest slices were removed to make room for new ones of the same host; "
+            f"the limit is {self.limit} slices"
         )
 
     # Deadlines

@@ -181,11 +181,11 @@ def restore(
     fits = partial(_fits, ValueCodec(compiled.messages))
     properties = monitor.properties if monitor.slices is None else ()
     if (len(state.runs), len(state.timers)) != (len(properties), len(monitor.timers)):
-        raise ValueError("it has other properties or timers")
+        raise ValueError("its properties or timers differ")
     if values.keys() != code.variables.keys() or not all(
         fits(types[code.variables[name]], value) for name, value in values.items()
     ):
-        raise ValueError("it has other variables")
+        raise ValueError("its variables differ")
     runs = [
         run_of(running.code.property, data, time_ns)
         for running, data in zip(properties, state.runs, strict=True)

@@ -148,7 +148,7 @@ class _Reader:
 
     def _fill_operators(self, run: BoundedRun, entries: list[Any]) -> None:
         if [number for number, *_ in entries] != [*run.operators]:
-            raise ValueError("the property has other operators")
+            raise ValueError("the operators of the property differ")
         for number, *fields in entries:
             self._fill(run.operators[number], run.operators[number].keeps, fields)
 

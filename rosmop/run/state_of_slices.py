@@ -117,7 +117,7 @@ def restore_slices(
 
     def check(kinds: Sequence[Type], values: Sequence[Any]) -> None:
         if len(kinds) != len(values) or not all(map(fits, kinds, values)):
-            raise ValueError("a slice has other values than its specification")
+            raise ValueError("the values of a slice differ from those of its specification")
 
     check(parameters, first[0])
     check(own, first[1])
@@ -125,14 +125,14 @@ def restore_slices(
     ended: list[tuple[Binding, str | None]] = []
     for record in sorted(records, key=lambda record: record.number):
         if not 0 <= record.domain < 1 << len(parameters):
-            raise ValueError("a slice has a parameter that its specification has not")
+            raise ValueError("a slice has a parameter that its specification does not have")
         check([kind for place, kind in enumerate(parameters) if record.domain >> place & 1], record.key)
         key = of_nan((True, *record.key))
         if record.ended:
             ended.append(((record.domain, key), record.holder))
             continue
         if len(record.runs) != len(code.properties):
-            raise ValueError("a slice has other properties than its specification")
+            raise ValueError("the properties of a slice differ from those of its specification")
         check(own, record.values)
         runs = [
             run_of(declared.property, data, time_ns)
@@ -144,4 +144,4 @@ def restore_slices(
     try:
         slices.restore(first[0], first[1], live, ended)
     except KeyError as error:
-        raise ValueError("a slice has a binding that there cannot be") from error
+        raise ValueError("a slice has an impossible binding") from error

@@ -99,7 +99,7 @@ class Agenda:
         outcome = self._execution.tick(timer.step, due)
         ticks[id(timer)] = ticks.get(id(timer), 0) + 1
         if ticks[id(timer)] >= MAX_TICKS and timer.due <= time_ns:
-            self._skip(timer, time_ns, "the time has made a leap")
+            self._skip(timer, time_ns, "the clock has jumped")
         self._execution.collect(outcome)
         return outcome
 
@@ -118,7 +118,7 @@ class Agenda:
         left_out = (time_ns - due) // timer.period + 1
         timer.due = due + left_out * timer.period
         timer.step.monitor.touch()
-        text = f"{left_out} ticks of {timer.step.name} are left out: {reason}"
+        text = f"{left_out} ticks of {timer.step.name} were skipped: {reason}"
         self._execution.warn(timer.step.monitor, text)
 
     def _next_timer(self) -> Timer | None:

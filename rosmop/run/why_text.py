@@ -18,10 +18,10 @@ def lines_of_why(why: Mapping[str, Any]) -> Iterator[str]:
         yield f"because: {named(mapping_of(event))}"
     if "since" in why:
         yield (
-            f"but: this is enough only for the property as it was at {why['since']}; what came before is not kept"
+            f"but: this is enough only for the property as it was at {why['since']}; earlier events are not kept"
         )
     if why.get("fewest") is False:
-        yield "but: fewer of them might do"
+        yield "but: fewer of them might suffice"
     for part in list_of(why.get("decided")):
         yield f"so: {part}"
 

@@ -190,13 +190,13 @@ class Context:
         """Charge instructions to the budget; fault if it is used up."""
         self.budget -= instructions
         if self.budget < 0:
-            self._go_on(site, "; is there a loop without end?")
+            self._go_on(site, "; is there an endless loop?")
 
     def walk(self, elements: int) -> None:
         """Charge for reading elements of arrays one by one, to reach a field after them."""
         self.budget -= elements
         if self.budget < 0:
-            self._go_on(-1, ": too many elements stand before a field")
+            self._go_on(-1, ": too many elements precede a field")
 
     def _go_on(self, site: int, otherwise: str) -> None:
         """Release the next step of the budget; fault if the budget is used up or the time is over."""
@@ -254,4 +254,4 @@ class Context:
         return sum(measures[name](value) for name, value in variables.items() if name in measures)
 
 
-_TOO_LARGE = f"the values of a specification may hold {MAX_BYTES >> 20} MiB together"
+_TOO_LARGE = f"the values of a specification may hold {MAX_BYTES >> 20} MiB in total"

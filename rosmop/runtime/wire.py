@@ -69,7 +69,7 @@ def elements(
     """Return `number` values decoded with `decode`, and their end; `check` is called now and then."""
     if number > _MAX_DECODED:
         raise MalformedError(
-            f"an array of {number} elements; at most {_MAX_DECODED} that are no numbers are read"
+            f"an array of {number} elements; at most {_MAX_DECODED} that are not numbers are read"
         )
     values = []
     for index in range(number):

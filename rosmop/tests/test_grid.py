@@ -77,8 +77,8 @@ SLOW = {
     "no automaton": (
         f"{EVENT} {{ }} {EVENT.replace('e(', 'f(').replace('/t', '/u')} {{ }} cfg: S -> e S f | epsilon @fail {{ }}",
         [
-            ("/t", "", 1, "comes to a verdict with each message"),
-            ("/u", "", 1, "comes to a verdict with each message"),
+            ("/t", "", 1, "reaches a verdict with each message"),
+            ("/u", "", 1, "reaches a verdict with each message"),
         ],
     ),
 }

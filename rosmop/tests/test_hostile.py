@@ -13,8 +13,8 @@ from rosmop.text.errors import SpecificationError
 
 PATIENCE = 20.0  # seconds of processor time; an endless loop is endless
 
-BUDGET = "more than 1000000 instructions for one message; is there a loop without end?"
-MEMORY = "the values of a specification may hold 16 MiB together"
+BUDGET = "more than 1000000 instructions for one message; is there an endless loop?"
+MEMORY = "the values of a specification may hold 16 MiB in total"
 
 SPENT_WHOLE = (
     "for (;;) x++;",
@@ -27,8 +27,8 @@ BOMBS = [
     ("for (;;) x++;", "", BUDGET),
     ("do { continue; } while (1);", "", BUDGET),
     ("for (int i = 0; i < 100000; i++) for (int j = 0; j < 100000; j++) x++;", "", BUDGET),
-    ("f();", "void f() { f(); }", "`f` calls itself without end"),
-    ("f();", "void f() { g(); } void g() { f(); }", "calls itself without end"),
+    ("f();", "void f() { f(); }", "`f` calls itself endlessly"),
+    ("f();", "void f() { g(); } void g() { f(); }", "calls itself endlessly"),
     ("f0();", "".join(f"void f{i}() {{ f{i + 1}(); f{i + 1}(); }} " for i in range(40)) + "void f40() { }", BUDGET),
     ("f(30);", "void f(int n) { if (n > 0) { f(n - 1); f(n - 1); } }", BUDGET),
     ('std::string s = "x"; while (1) s += s;', "", MEMORY),
@@ -176,7 +176,7 @@ REFUSED = [
     ("if (x) " * 3000 + "x = 1;", "nested more than 100 deep"),
     ("{" * 3000 + "}" * 3000, "nested more than 100 deep"),
     ("x = " + "x ? 1 : " * 3000 + "2;", "nested more than 100 deep"),
-    ("while (x) " * 30 + "x = 1;", "more than 15 loops inside each other"),
+    ("while (x) " * 30 + "x = 1;", "more than 15 nested loops"),
     ("x = x + 1; " * 40000, "the file has more than 128 Ki characters"),
     ("x = " + "9" * 5000 + ";", "is not a number"),
     ("std::vector<" * 200 + "int" + "> " * 200 + "v;", "nested more than 100 deep"),
@@ -256,7 +256,7 @@ def test_a_walk_over_millions_of_elements_is_charged_before_it_is_made(
         took.append(time.process_time() - began)
     assert min(took) < 0.05
     assert (outcome.result, len(outcome.faults)) == ("dropped", 1)
-    assert "too many elements stand before a field" in outcome.faults[0].text
+    assert "too many elements precede a field" in outcome.faults[0].text
 
 
 def test_few_elements_before_a_field_cost_nothing_and_many_their_number() -> None:

@@ -71,7 +71,7 @@ def test_a_guest_that_makes_up_ids_pushes_out_its_own() -> None:
     outcomes = [send(monitors, "/goal", f"g{number}", GUEST) for number in range(1000)]
     assert not any(one.faults or one.result == "dropped" for one in outcomes)
     assert [line.text for one in outcomes for line in one.log] == [
-        "1 of its oldest slices are forgotten to make room for new ones of the same host; there may be 100 slices"
+        "1 of its oldest slices were removed to make room for new ones of the same host; the limit is 100 slices"
     ]
     assert live(monitors) == 50
     assert send(monitors, "/goal", "r", ROBOT).verdicts

@@ -86,7 +86,7 @@ _PLAIN = {"\u2212": "-", "\u2260": "!=", "\u2264": "<=", "\u2265": ">=", "\u00d7
           "\u2227": "&&", "\u2228": "||", "\u00ac": "!", "\u2019": "'", "\u2018": "'", "\u201e": '"'}  # fmt: skip
 _HINTS = {
     "&": "there are no addresses; pass the variable itself",
-    "*": "there are no pointers but `char *`; use the value itself (of an iterator: `for (auto& x : v) { … }`)",
+    "*": "there are no pointers except `char *`; use the value itself (of an iterator: `for (auto& x : v) { … }`)",
     "@": "a handler belongs to a property: `logic: formula @category { … }`",
     '"': "a string ends on the line it begins on",
 }
@@ -179,7 +179,7 @@ def misplaced(text: str, offset: int, word: str) -> tuple[int, str]:
             offset,
             f"`{word}` is not allowed outside of a specification, `name() {{ … }}`; move this into one",
         )
-    return offset, f"`{word}` is a word of the language: it is not allowed here, and not as a name"
+    return offset, f"`{word}` is a keyword: it is not allowed here or as a name"
 
 
 def _refused(text: str, begin: int, end: int, advice: str) -> str:
@@ -195,7 +195,7 @@ def _hint(before: str, piece: str, accepted: Set[str]) -> str:
     if not piece.isascii():
         plain = _PLAIN.get(piece) or unicodedata.normalize("NFKC", piece)
         name = f"this is U+{ord(piece[0]):04X}, {unicodedata.name(piece[0], 'a character without a name')}"
-        return f"{name}; " + (f"write `{plain}`" if plain.isascii() else "names are of letters of ASCII")
+        return f"{name}; " + (f"write `{plain}`" if plain.isascii() else "names have only ASCII letters")
     if piece == "'" and "QUOTE" not in accepted and "STRING" in accepted:
         return "a character literal is one character; write a string in double quotes"
     return FORBIDDEN.get(piece, _HINTS.get(piece, ""))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 _POINTERS = "there are no pointers; declare the value itself, `std_msgs::Int32 x;`, which `x = y;` copies"
 _LOOKUP = (
     "use two vectors, one of the keys and one of the values, or a specification with a parameter, `name(std::string id)"
-    " { … }`, which has its variables for each value"
+    " { … }`, which has its own variables for each value"
 )
 _VECTOR = "use a `std::vector`"
 _NO_THREADS = "messages come one at a time; leave it out"
@@ -45,14 +45,14 @@ _NAMES = _TEMPLATES | {
     "cin scanf getline getchar gets": "there is no input but messages",
     "mutex recursive_mutex lock_guard unique_lock scoped_lock atomic condition_variable thread async future"
     " pthread_t pthread_mutex_t boost::mutex::scoped_lock": _NO_THREADS,
-    "system popen fork execv": "there are no programs to start",
+    "system popen fork execv": "programs cannot be started",
     "exit abort quit _exit ros::shutdown": "an action cannot end the program; write `return;`",
     "assert static_assert ROS_ASSERT ROS_ASSERT_MSG ROS_BREAK": (
         "write `if (!(condition)) { ROS_ERROR(…); return; }`"
     ),
     "getenv": "there is no environment; write the value into the specification, `const double NAME = …;`",
     "rand srand random mt19937 rand_r": (
-        "verdicts are functions of what was received; there is no chance in them"
+        "verdicts depend only on the received messages; they are never random"
     ),
     "time clock gettimeofday clock_gettime now WallTime SteadyTime system_clock steady_clock get_time rospy::Time": (
         "write `ros::Time::now()`"
@@ -62,10 +62,12 @@ _NAMES = _TEMPLATES | {
     "Rate WallRate Timer WallTimer SteadyTimer": _TIMER,
     "Publisher": "publish with `PUBLISH(/topic, package/Type, value);`, without declaring it",
     "Subscriber": "an `event` subscribes; leave this out",
-    "ServiceServer ServiceClient service::call": "no service is called; `event … service` sees the calls of others",
+    "ServiceServer ServiceClient service::call": (
+        "services cannot be called; `event … service` observes the calls of other nodes"
+    ),
     "NodeHandle AsyncSpinner CallbackQueue spin spinOnce ok rospy roscpp ros::init": _NO_NODE,
     "param::get param::param param::set": (
-        "parameters of the Master are not seen; write the value into the specification, `const double NAME = …;`"
+        "ROS master parameters are not available; write the value into the specification, `const double NAME = …;`"
     ),
     "__SKIP": "write `DROP;`",
     "RESET": "write `__RESET;`",
@@ -92,8 +94,8 @@ _NAMES = _TEMPLATES | {
 }  # fmt: skip
 _INSTEAD = {name: advice for names, advice in _NAMES.items() for name in names.split()}
 _FAMILIES = {
-    "ros": "of roscpp there are `ros::Time`, `ros::Duration` and the macros `ROS_…`",
-    "boost": "of boost there is nothing; the C++ library's part is in docs/reference/rv-language.md",
+    "ros": "of roscpp, only `ros::Time`, `ros::Duration` and the macros `ROS_…` are available",
+    "boost": "boost is not available; the supported part of the C++ library is in docs/reference/rv-language.md",
     "Eigen": "use the message types, or a variable for each number",
     "tf": "transforms are not looked up; write an event for `/tf`, of type `tf2_msgs/TFMessage`",
     "tf2": "transforms are not looked up; write an event for `/tf`, of type `tf2_msgs/TFMessage`",
@@ -158,7 +160,7 @@ _TEMPLATE = "|".join(name for names in _TEMPLATES for name in names.split())
 _SHAPES = (
     _shape(
         r"\bnew\b(?!\s*=)\s*(?:[\w:]+(?:\s*<[^;]*>)?)?",
-        "there are no pointers; declare the variable itself: it is there from the start",
+        "there are no pointers; declare the variable itself: it exists from the start",
     ),
     _shape(r"\b0[bB][01](?:'?[01])*", _hexadecimal),
     _shape(r"\b0[oO][0-7]+", _replaced("[oO]", "")),
@@ -175,7 +177,7 @@ _SHAPES = (
     _shape(r"\b(?:u8|[uUL])(?=[\"'])", "strings are bytes; leave it out"),
     _shape(
         r"'[^'\n{][^'\n]+'",
-        _replaced("'", '"', "a character is one; write a string in double quotes, `{}`"),
+        _replaced("'", '"', "a character literal is one character; write a string in double quotes, `{}`"),
         2,
     ),
     _shape(r"\[\[[^\[\]\n]*\]\]", "there are no attributes; leave it out"),
@@ -199,7 +201,7 @@ _SHAPES = (
     ),
     _shape(
         r"\b(?:std|boost)\s*::\s*(?!vector\b|numeric_limits\b)\w+\s*<[^;{}()]*",
-        "of templates there is `std::vector<T>`",
+        "the only template is `std::vector<T>`",
     ),
     _shape(rf"\b{_SCOPED}::\s*\w+\s*\*+\s*\w+(?=\s*[=;,)])", _POINTERS),
     _shape(rf"\b{_SCOPED}\s*->\s*\w+", _replaced(r"\s*->\s*", ".", "there are no pointers; write `{}`"), 2),
@@ -209,7 +211,7 @@ _SHAPES = (
     ),
     _shape(
         rf"\b{_NOT_A_TYPE}{_TYPE}\s*&&?\s*\w+\s*=",
-        "there are no references but parameters of functions and `for (auto& x : v)`; without `&` it is a copy",
+        "there are no references except parameters of functions and `for (auto& x : v)`; without `&` it is a copy",
     ),
     _shape(
         rf"\b{_NOT_A_TYPE}{_TYPE}\s+\w+\s*\([^;{{}}]*\)\s*(?:const\s*)?(?=\{{)",
@@ -229,9 +231,9 @@ _SHAPES = (
         "parameters have no default values; give the argument in each call",
         1,
     ),
-    _shape(r"\.\.\.", "a function has the parameters that it names", 1),
+    _shape(r"\.\.\.", "a function has a fixed list of parameters", 1),
     _shape(r"\bauto\s+\w+\s*\([^(){};]*\)\s*->\s*[\w:]+", "write the type first: `int f() { … }`", 1),
-    _shape(r"(?<=\))\s*const\b", "functions belong to no object; leave `const` out", 1),
+    _shape(r"(?<=\))\s*const\b", "functions do not belong to an object; leave `const` out", 1),
     _shape(r"\.\.\.", "write each value separately", 2),
     _shape(r"\bcase\b[^;:{}]*\.\.", "write each value separately", 2),
     _shape(r"\b(?:DROP|__RESET)\s*\(\s*\)?", _replaced(r"\W.*", ";"), 2),

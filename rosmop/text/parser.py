@@ -144,7 +144,7 @@ def _check_directives(text: str, file: str) -> None:
             if conditions:
                 word, place = conditions[0]
                 raise _directive_error(
-                    text, file, place, f"#{word}", "leave what you want there, without conditions"
+                    text, file, place, f"#{word}", "keep the lines that you want, without conditions"
                 )
             if piece["name"]:
                 used.add(piece["name"])

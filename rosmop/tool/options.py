@@ -31,7 +31,7 @@ Dot = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automat
 Svg = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata as a picture (.svg)")]
 Bag = Annotated[Path, typer.Option(metavar="FILE", help="The recording", show_default=False)]
 Output = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Write what subscribers would have received")
+    Path | None, typer.Option(metavar="FILE", help="Write the messages that subscribers would have received")
 ]
 Topics = Annotated[
     list[str] | None,

@@ -61,7 +61,7 @@ def resolve(name: tree.TypeName, messages: MessageTypes) -> Type:
     if name.pointer:
         if built_in != value_types.CHAR:
             raise SpecificationError.at(
-                name.position, f"there are no pointers but `char *`; write `{' '.join(name.name)}`"
+                name.position, f"there are no pointers except `char *`; write `{' '.join(name.name)}`"
             )
         return value_types.CHARACTERS
     return built_in or named_type(name.name) or _message(name, messages)

@@ -184,7 +184,7 @@ def test_a_missing_message_is_published_at_the_deadline(
     """The appliance publishes it, with a record; and `check` predicts it."""
     spec = tmp_path / "watch.rv"
     spec.write_text(WATCH)
-    said = "enforced: at the deadline raise_alarm publishes what was due (/alarm)"
+    said = "enforced: at the deadline raise_alarm publishes the due message (/alarm)"
     assert said in appliance.rosrv("monitor", "check", str(spec), state=False).stdout
     appliance.rosrv("monitor", "load", str(spec))
     alarm = ros.listener("rospy", "/alarm")

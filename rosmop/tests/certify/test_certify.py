@@ -227,9 +227,9 @@ def test_a_fault_is_shown_by_a_trace() -> None:
 @pytest.mark.parametrize(
     ("logic", "formula", "why"),
     [
-        ("cfg", "S -> a S b | epsilon", "grammars are not followed"),
-        ("mtl", "once[0,1s] a", "it has bounds of time"),
-        ("pattern", "globally: a causes b within 1s", "it has a bound of time"),
+        ("cfg", "S -> a S b | epsilon", "grammars are not checked"),
+        ("mtl", "once[0,1s] a", "it has time bounds"),
+        ("pattern", "globally: a causes b within 1s", "it has a time bound"),
         ("pattern", "after a until a: some b", "one event opens and closes the scope"),
     ],
 )
@@ -249,7 +249,7 @@ def test_a_machine_that_is_too_large_is_not_proved() -> None:
     formula = " ".join(f"s{number} [ default s{(number + 1) % states} ]" for number in range(states))
     certificate = certificate_of(compile_property("fsm", formula, events, ORIGIN))
     assert (certificate.proved, certificate.wrong) == (False, False)
-    assert certificate.text == "there is too much to look at: tested, not proved"
+    assert certificate.text == "there are too many cases to check: tested, not proved"
 
 
 def test_an_expression_that_is_too_large_is_not_proved() -> None:
@@ -258,7 +258,7 @@ def test_an_expression_that_is_too_large_is_not_proved() -> None:
         "ere", "(a|b)* a (a|b)^30 c", ["a", "b", "c"], AutomatonTables(0, [[0, 0, 0]], [()])
     )
     assert (certificate.proved, certificate.wrong) == (False, False)
-    assert certificate.text == "there is too much to look at: tested, not proved"
+    assert certificate.text == "there are too many cases to check: tested, not proved"
 
 
 SPECIFICATION = """
@@ -285,7 +285,7 @@ def test_each_property_has_a_certificate() -> None:
     lines, wrong = certified()
     proved, tested = lines["guard"]
     assert proved.startswith("ltl: proved: ")
-    assert tested == "mtl: it has bounds of time: tested, not proved"
+    assert tested == "mtl: it has time bounds: tested, not proved"
     assert not wrong
 
 

@@ -160,5 +160,5 @@ def test_functions_in_another_order_are_rejected() -> None:
     of = compiled(GUARD)
     whole = module(of)
     walk = whole.feeds["/plain"]
-    with pytest.raises(StepDiffersError, match="which functions it calls"):
+    with pytest.raises(StepDiffersError, match="the functions it calls"):
         check_steps(of, replace(whole, feeds={"/plain": replace(walk, functions=walk.functions[::-1])}))

@@ -188,7 +188,7 @@ def test_nothing_to_learn_from_is_an_error() -> None:
     with pytest.raises(LearningError, match="no message"):
         learn([replace(DRIVES[0], topics={})], standard_definitions(), 0.3, lambda _: None)
     broken = replace(DRIVES[0], rows=(("/speed", START, b"abc"), *DRIVES[0].rows[1:]))
-    with pytest.raises(LearningError, match="drive 1: a message on /speed is no std_msgs/Float64"):
+    with pytest.raises(LearningError, match="drive 1: a message on /speed is not of type std_msgs/Float64"):
         learn([broken, DRIVES[1]], standard_definitions(), 0.3, lambda _: None)
 
 

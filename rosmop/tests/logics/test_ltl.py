@@ -152,7 +152,7 @@ def test_long_traces_of_random_formulas() -> None:
 
 def test_a_formula_with_too_many_operators_about_the_past_is_rejected() -> None:
     """Other errors are in `formulas.txt`."""
-    assert "10 different operators about the past" in refusal("ltl", "[](a => " + "(*) " * 10 + "b)")[0]
+    assert "10 different past operators" in refusal("ltl", "[](a => " + "(*) " * 10 + "b)")[0]
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,8 @@ def test_a_verdict_is_explained() -> None:
         "at: x.rv:1:2",
         "where: x.rv:3:4, x = 2",
         "because: go at 12:00, on /t, by /a, on 10.0.0.1 seq 7 -> bad",
-        "but: this is enough only for the property as it was at 11:00; what came before is not kept",
-        "but: fewer of them might do",
+        "but: this is enough only for the property as it was at 11:00; earlier events are not kept",
+        "but: fewer of them might suffice",
         "so: a is true",
     ]
 
