@@ -12,7 +12,7 @@ const SINCE = /** @type {[string, string][]} */ ([["", "Any time"], ["15m", "Las
 const DECISIONS = /** @type {[string, string][]} */ ([["", "Any decision"], ["deny", "Deny"], ["would deny", "Would deny"], ["allow", "Allow"]]);
 const SEVERITIES = /** @type {[string, string][]} */ ([["", "Any"], ["debug", "Debug and up"], ["info", "Info and up"], ["notice", "Notice and up"], ["warning", "Warning and up"], ["alarm", "Alarm"]]);
 const LOOKS = /** @type {[string, string][]} */ ([["", "Hidden"], ["1", "Shown"]]);
-const LABELS = { text: "Text", decision: "Decision", since: "Since", until: "Until", host: "Host", caller_id: "Node", resource: "Resource", category: "Category", event: "Event", severity: "Severity", rule: "Rule", who: "Who", looks: "REST looks" };
+const LABELS = { text: "Text", decision: "Decision", since: "Since", until: "Until", host: "Host", caller_id: "Node", resource: "Resource", category: "Category", event: "Event", severity: "Severity", rule: "Rule", who: "Who", looks: "REST queries" };
 
 /** @param {URLSearchParams} query @returns {Record<string, string>} those that are set */
 export function filterOf(query) {

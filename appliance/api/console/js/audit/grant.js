@@ -35,6 +35,6 @@ export function Grant({ id }) {
   if (!found) return html`<div class="row"><${Button} onClick=${ask}>Grant this</${Button}><span class="muted small">Shows what would change; nothing is changed yet.</span></div>`;
   if (!found.added.length) return html`<p role="status">The policy in force grants it: it was denied for another reason, or before this revision.</p>`;
   return html`<section class="stack-tight" aria-label="What would grant it"><${UnifiedDiff} lines=${found.diff} />
-    ${found.findings.length > 0 && html`<p>The policy's tests refuse it:</p><ul class="plain-list">${found.findings.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${300} mono /></li>`)}</ul>`}
-    <div class="row"><${Button} role="operator" tone="primary" onClick=${edit}>${unsaved ? "Replace that text" : "Open in the editor"}</${Button}><span class="muted small" role="status">${unsaved ? "The editor has a text that is not loaded; it would be lost." : "A dry run there says whom it touches; load it on trial."}</span></div></section>`;
+    ${found.findings.length > 0 && html`<p>The policy's tests fail with it:</p><ul class="plain-list">${found.findings.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${300} mono /></li>`)}</ul>`}
+    <div class="row"><${Button} role="operator" tone="primary" onClick=${edit}>${unsaved ? "Replace that text" : "Open in the editor"}</${Button}><span class="muted small" role="status">${unsaved ? "The editor has unloaded changes, which would be lost." : "A dry run there lists the affected hosts; load it with automatic rollback."}</span></div></section>`;
 }

@@ -28,7 +28,7 @@ export function Presets({ filter }) {
   return html`<div class="row presets" role="group" aria-label="Searches">
     ${PRESETS.map(([name, one]) => html`<button key=${name} class="button small" aria-pressed=${String(same(one, filter))} onClick=${() => go(auditPath(one))}>${name}</button>`)}
     ${kept.map((one) => html`<span key=${nameOf(one)} class="row kept"><button class="button small" aria-pressed=${String(same(one, filter))} onClick=${() => go(auditPath(one))}>${nameOf(one)}</button><button class="button plain small" aria-label=${`Forget the search ${nameOf(one)}`} onClick=${() => keep(kept.filter((other) => other !== one))}><${Icon} name="close" size=${12} /></button></span>`)}
-    ${!known && html`<button class="link small" onClick=${() => keep([...kept, filter].slice(-MOST))}>Keep this search</button>`}</div>`;
+    ${!known && html`<button class="link small" onClick=${() => keep([...kept, filter].slice(-MOST))}>Save this search</button>`}</div>`;
 }
 
 /** What was kept; anything else that stands there is nothing. @returns {Record<string, string>[]} */

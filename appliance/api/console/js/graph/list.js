@@ -19,7 +19,7 @@ export function TopicList({ topics, denials, choose, chosen }) {
       <td class="first"><button class="link" onClick=${() => choose(`t${one.name}`)}><${Given} value=${one.name} mono most=${80} /></button></td><td data-label="Type"><${Given} value=${one.type} most=${60} mono /></td>
       <td data-label="Path">${one.mediated ? html`<${Badge} word="mediated" tone="note" />` : html`<${Badge} word="direct" />`}</td>
       <td data-label="Publishers"><div><${Names} names=${one.publishers.map((/** @type {any} */ each) => each.node)} /></div></td><td data-label="Subscribers"><div><${Names} names=${one.subscribers} /></div></td>
-      <td data-label="Denied"><div><${Names} names=${[...new Set(denials.filter((/** @type {any} */ each) => each.resource === one.name).map((/** @type {any} */ each) => each.caller_id || each.host))]} none="nobody" /></div></td>
+      <td data-label="Denied"><div><${Names} names=${[...new Set(denials.filter((/** @type {any} */ each) => each.resource === one.name).map((/** @type {any} */ each) => each.caller_id || each.host))]} none="no one" /></div></td>
       <td class="number" data-label="Per second"><div>${rate(sum(one, "messages_per_second"))}</div><div class="muted small nowrap">${bytes(sum(one, "bytes_per_second"))}</div></td></tr>`)}</tbody></table></div>
     ${pages > 1 && html`<div class="panel-body row"><button class="button small" disabled=${at === 0} onClick=${() => setPage(at - 1)}>Back</button>
       <span class="muted small">${at * PAGE + 1} to ${Math.min(topics.length, (at + 1) * PAGE)} of ${counted(topics.length, "topic")}</span>

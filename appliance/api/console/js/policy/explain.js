@@ -51,7 +51,7 @@ function Explained(/** @type {{found: any, pick: (place: any) => void}} */ { fou
       ${found.through.length > 0 && html`<dt>Matched text</dt><dd><${Given} value=${found.through.join(" → ")} mono /></dd>`}
       ${found.limit && html`<dt>Limit</dt><dd><${Given} value=${found.limit} most=${300} /></dd>`}</dl>
     ${found.lost.length > 0 && html`<div><h3>Overridden rules</h3><ul class="stack-tight">${found.lost.map((/** @type {any} */ one, /** @type {number} */ index) => html`<li key=${index} class="row"><${Badge} word=${one.would} /><${Place} rule=${one.rule} pick=${pick} /><span class="muted"><${Given} value=${one.why} most=${300} /></span></li>`)}</ul></div>`}
-    ${found.command && html`<div class="nested"><h3>The call that it uses</h3><${Explained} found=${found.command} pick=${pick} /></div>`}
+    ${found.command && html`<div class="nested"><h3>The call used</h3><${Explained} found=${found.command} pick=${pick} /></div>`}
     ${found.node && html`<div class="nested"><h3>The node's name</h3><${Explained} found=${found.node} pick=${pick} /></div>`}</div>`;
 }
 

@@ -64,7 +64,7 @@ export function PolicyView() {
         <div class="panel-head">${changed ? html`<${Badge} word="changed here, not loaded" tone="warn" />` : html`<${Badge} word="as in force" tone="allow" />`}<span class="muted small path"><${Given} value=${live.policy_file} most=${120} mono /></span>
           <span class="end">${changed && html`<button class="button small plain" onClick=${discard}>Discard</button>`}
             <${Button} small role="operator" onClick=${dry} title="Check, test, and list what would be decided differently (Ctrl S)">Dry run</${Button}>
-            <${Button} small role="admin" tone="primary" disabled=${!changed} why="The text is that of the policy in force" onClick=${() => setLoading(true)}>Load</${Button}></span></div>
+            <${Button} small role="admin" tone="primary" disabled=${!changed} why="The text is the policy in force" onClick=${() => setLoading(true)}>Load</${Button}></span></div>
         <${Editor} label="Access policy" language="policy" value=${text} change=${write} findings=${findings.filter((one) => !one.file.includes(".tests."))} line=${line} dry=${() => may("operator") && dry()} height="calc(100dvh - 250px)" />
       </section>
       <section class="panel" aria-label="About the policy"><${Tabs} label="About the policy" tabs=${TABS} chosen=${tab} choose=${setTab}>
@@ -93,8 +93,8 @@ function Standing(/** @type {{live: any, stale: boolean, showDiff: () => void}} 
   };
   return html`<div class="standing">
     ${live.confirm_by && html`<${Notice} tone="warn" title=${`Revision ${live.revision} rolls back in ${lasting(live.confirm_by - now / 1000)} unless confirmed`}>
-      <div class="row"><${Button} small role="operator" tone="primary" onClick=${act("confirm", undefined, "The policy is kept")}>Keep it</${Button}><${Button} small role="operator" onClick=${act("rollback", {}, "The policy before is back")}>Roll back now</${Button}></div></${Notice}>`}
-    ${live.differs_from_file && html`<${Notice} title="The policy in force is not what the file says"><div class="row"><span><${Given} value=${live.policy_file} mono most=${120} /> stays as it is until it is read again.</span><${Button} small role="operator" onClick=${act("reload", undefined, "The file was read again")}><${Icon} name="again" size=${14} />Reload from the file</${Button}></div></${Notice}>`}
+      <div class="row"><${Button} small role="operator" tone="primary" onClick=${act("confirm", undefined, "The policy is kept")}>Keep it</${Button}><${Button} small role="operator" onClick=${act("rollback", {}, "The previous policy is back in force")}>Roll back now</${Button}></div></${Notice}>`}
+    ${live.differs_from_file && html`<${Notice} title="The policy in force differs from the file"><div class="row"><span><${Given} value=${live.policy_file} mono most=${120} /> is not read again until you reload it.</span><${Button} small role="operator" onClick=${act("reload", undefined, "The file was read again")}><${Icon} name="again" size=${14} />Reload from the file</${Button}></div></${Notice}>`}
     ${live.warnings.length > 0 && html`<details class="notice warn"><summary>${live.warnings.length} ${live.warnings.length === 1 ? "warning" : "warnings"} about the policy in force</summary><ul class="plain-list">${live.warnings.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${400} /></li>`)}</ul></details>`}
     ${stale && html`<${Notice} tone="warn" title=${`Revision ${live.revision} came into force while you wrote`}><div class="row"><span>Look at the difference; then keep your text and load it over that revision, or discard it.</span><button class="button small" onClick=${() => (rebase(), showDiff())}>Keep my text, show the difference</button></div></${Notice}>`}</div>`;
 }

@@ -53,7 +53,7 @@ export function Lanes({ line, at, move, zoom, all, topics, choose, about }) {
     <div class="lane-search"><input class="input" data-search type="search" aria-label="Search the topics" placeholder=${`Search ${counted(line.topics.length, "topic")}`} value=${search} onInput=${(/** @type {any} */ event) => setSearch(event.target.value)} />
       ${topics.length > 0 && html`<button class="button small" onClick=${() => choose([])}>All topics</button>`}</div>
     ${seen.slice(0, most).map((/** @type {any} */ one) => html`<${Lane} key=${`${one.topic} ${one.type}`} name=${one.topic} counts=${one.counts} tone="flow" what="message" senders=${one.senders} picked=${topics.includes(one.topic)} pick=${() => toggle(one.topic)} ...${draw} />`)}
-    ${!seen.length && html`<p class="muted small lane-note">${line.topics.length ? "No topic has that in its name." : "No message was recorded."}</p>`}
+    ${!seen.length && html`<p class="muted small lane-note">${line.topics.length ? "No topic name matches." : "No message was recorded."}</p>`}
     ${seen.length > most && html`<div class="lane-note"><button class="button small" onClick=${() => setMost(most + MORE)}>${counted(seen.length - most, "more topic")}</button></div>`}
     ${line.more_topics > 0 && html`<p class="muted small lane-note">${counted(line.more_topics, "topic")} with fewer messages are in the bag only.</p>`}</div>`;
 }

@@ -37,11 +37,11 @@ export function Messages({ path, at, topics, clear, span }) {
     };
   }, [path, reading, at, page, topics]);
   const messages = reading ? found?.messages ?? [] : [];
-  return html`<section class="panel" aria-labelledby="said"><div class="panel-head"><h2 id="said">What was said</h2>${topics.length > 0 && html`<span class="small"><${Given} value=${topics.join(", ")} mono most=${80} /> <button class="link" onClick=${clear}>all topics</button></span>`}
+  return html`<section class="panel" aria-labelledby="said"><div class="panel-head"><h2 id="said">Messages</h2>${topics.length > 0 && html`<span class="small"><${Given} value=${topics.join(", ")} mono most=${80} /> <button class="link" onClick=${clear}>all topics</button></span>`}
       <span class="end">${reading && html`<button class="button small" disabled=${!messages.length} onClick=${() => setPage(messages[0].place)}>Earlier</button><button class="button small" disabled=${!messages.length} onClick=${() => setPage(messages[messages.length - 1].place)}>Later</button>`}
         <${Button} small role="investigator" onClick=${() => setReading(!reading)}>${reading ? "Stop reading" : "Read messages"}</${Button}></span></div>
     <div class="panel-body stack-tight">${error ? html`<${Failure} error=${error} />` : null}
-      ${!reading ? html`<p class="muted small">As they were sent, before monitors changed or dropped them. It is recorded who reads.</p>` : !messages.length && !error ? html`<p class="muted small" role="status">${found ? "No message." : "Reading."}</p>` : null}
+      ${!reading ? html`<p class="muted small">As sent, before monitors changed or dropped them. The audit log records who reads them.</p>` : !messages.length && !error ? html`<p class="muted small" role="status">${found ? "No message." : "Reading."}</p>` : null}
       <ul class="said" aria-label="Messages">${messages.map((/** @type {any} */ one, /** @type {number} */ place) => html`<li key=${one.place}><details open=${place === found.chosen || place === found.chosen - 1}>
         <summary class=${place === found.chosen ? "chosen" : ""}><span class="mono small">${clock(one.time / 1e9, Math.min(span, 0.5))}</span> <${Given} value=${one.topic} mono most=${80} /> <span class="muted small"><${Given} value=${`${one.sender.node} ${one.sender.host}`} most=${120} />, ${bytes(one.size)}</span></summary>
         ${one.why && html`<p class="small"><${Given} value=${one.why} most=${400} /></p>`}<pre class="bytes" tabindex="0" aria-label="Its fields">${lines(one.fields)}</pre></details></li>`)}</ul></div></section>`;

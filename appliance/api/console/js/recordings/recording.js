@@ -79,12 +79,12 @@ function Events(/** @type {any} */ { line, chosen, pick, row }) {
   }, [place, most]);
   const span = (row.ended - row.began) / 1e9;
   return html`<section class="panel" aria-labelledby="happened"><div class="panel-head"><h2 id="happened">What happened</h2><span class="muted small end">j, k: next, previous</span></div>
-    ${!line ? html`<${Loading} />` : !events.length ? html`<p class="panel-body muted">Nothing but messages in this time.</p>`
+    ${!line ? html`<${Loading} />` : !events.length ? html`<p class="panel-body muted">Only messages in this period.</p>`
       : html`<ul class="event-list tall happened" ref=${list}>${events.slice(0, most).map((/** @type {any} */ one) => html`<li key=${one.record} class=${`event${one === chosen ? " chosen" : ""}`}>
         <button class="event-pick" aria-pressed=${String(one === chosen)} onClick=${() => pick(one)}><span class="event-time mono small">${clock(one.time / 1e9, span)}</span><span class="event-badge"><${Badge} word=${one.kind === "notice" ? "else" : one.kind} tone=${kindOf(one.kind).tone} /></span>
         <span class="event-body"><${Given} value=${one.resource} mono most=${80} none="" /> <span class="event-reason"><${Given} value=${one.reason || one.event} most=${140} /></span></span></button></li>`)}</ul>
         ${events.length > most ? html`<div class="panel-body"><button class="button" onClick=${() => setMost(most + SHOWN)}>More events</button></div>` : null}
-        ${line.more_events > 0 && html`<p class="panel-body muted small">${counted(line.more_events, "further event")} of this time: go nearer to list them.</p>`}`}</section>`;
+        ${line.more_events > 0 && html`<p class="panel-body muted small">${counted(line.more_events, "further event")} in this period: zoom in to list them.</p>`}`}</section>`;
 }
 
 function Event(/** @type {{event: any}} */ { event }) {

@@ -57,5 +57,5 @@ export function OnTimeline({ record }) {
   }, [record.id, asked]);
   if (!found) return null;
   return html`<div class="row"><${Link} class="button" to=${`/console/recordings/${found.id}${closed ? "" : `?record=${record.id}`}`}><${Icon} name="recordings" size=${16} />Time line</${Link}>${closed && html`<${Taking} row=${found} />`}
-    <span class="muted small">What was said around it was recorded.</span></div>`;
+    <span class="muted small">The messages around it were recorded.</span></div>`;
 }

@@ -41,7 +41,7 @@ function List(/** @type {{value: any, error: unknown, again: () => void, running
     <section class="panel" aria-label="Recordings">
       ${off ? html`<${Empty} icon="recordings" title="The flight recorder is off">With <code>recorder: {enabled: true}</code> in appliance.yaml it keeps the robot's messages of the minute before an event.</${Empty}>`
         : error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} rows=${6} />`
-        : !rows.length ? html`<${Empty} icon="recordings" title="No recording yet">What a monitor drops, an alarm, and whatever else <code>recorder.triggers</code> names begins one; so does Record now.</${Empty}>`
+        : !rows.length ? html`<${Empty} icon="recordings" title="No recording yet">A message dropped by a monitor, an alarm and the other triggers in <code>recorder.triggers</code> start one; so does Record now.</${Empty}>`
         : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Began</th><th>Why</th><th class="number">Lasts</th><th class="number">Messages</th><th class="number">Size</th><th>State</th><th><span class="sr-only">Actions</span></th></tr></thead>
           <tbody>${rows.slice(0, shown).map((row) => html`<${Row} key=${row.id} row=${row} again=${again} />`)}</tbody></table></div>
           ${rows.length > shown && html`<div class="panel-body"><button class="button" onClick=${() => setShown(shown + PAGE)}>Older recordings</button></div>`}`}
