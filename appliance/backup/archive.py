@@ -56,7 +56,7 @@ def checked_archive(file: Path, room: int) -> Iterator[tuple[tarfile.TarFile, li
         raise _strange(file, str(error)) from None
     except (OSError, tarfile.TarError, EOFError, ValueError, zlib.error) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise BackupError(f"{file} cannot be put back: {reason}") from error
+        raise BackupError(f"{file} cannot be restored: {reason}") from error
 
 
 def _read_to_the_end(file: Path, raw: BinaryIO, room: int) -> None:
@@ -66,8 +66,8 @@ def _read_to_the_end(file: Path, raw: BinaryIO, room: int) -> None:
             size += len(piece)
             if size > room:
                 raise BackupError(
-                    f"{file} unpacks to more than the {max(0, room) >> 20} MiB that there is room for:"
-                    " nothing is put back"
+                    f"{file} unpacks to more than the {max(0, room) >> 20} MiB of free space:"
+                    " nothing is restored"
                 )
 
 
@@ -79,7 +79,7 @@ def _entries(file: Path, archive: tarfile.TarFile) -> list[tarfile.TarInfo]:
             raise _strange(file, entry.name)
         if len(entries) == MOST_FILES:
             raise BackupError(
-                f"{file} has more than {MOST_FILES} files, which no backup has: nothing is put back"
+                f"{file} has more than {MOST_FILES} files, more than any backup: nothing is restored"
             )
         entries[entry.name] = entry
     folders = {str(folder) for name in entries for folder in PurePosixPath(name).parents}
@@ -91,4 +91,4 @@ def _entries(file: Path, archive: tarfile.TarFile) -> list[tarfile.TarInfo]:
 
 
 def _strange(file: Path, name: str) -> BackupError:
-    return BackupError(f"{file} has {name[:200]!r} in it, which no backup has: nothing is put back")
+    return BackupError(f"{file} contains {name[:200]!r}, which is not part of a backup: nothing is restored")

@@ -38,7 +38,7 @@ def is_database(name: str) -> bool:
 def trouble_with(name: str, size: int) -> str:
     """Return why a file of this name and size (bytes) cannot be in a backup; empty if it can."""
     if not name.isprintable():
-        return "has a name that is not text"
+        return "has a name that is not valid UTF-8"
     if len(name.encode()) > _LONGEST_NAME:
         return f"has a name of more than {_LONGEST_NAME} bytes"
     if size < 0 or (size > LARGEST and not is_database(name)):

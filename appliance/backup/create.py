@@ -60,7 +60,7 @@ def back_up(state: Path, file: Path) -> list[str]:
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     except FileExistsError:
-        raise BackupError(f"{file} is there already: choose another name") from None
+        raise BackupError(f"{file} already exists: choose another name") from None
     except OSError as error:
         raise BackupError(f"{file}: {error.strerror}") from error
     try:
@@ -77,9 +77,7 @@ def back_up(state: Path, file: Path) -> list[str]:
         if isinstance(error, (OSError, sqlite3.Error)):
             reason = f"{error}; {_ADVICE}"
             if _is_full(error):
-                reason = (
-                    f"{file.absolute().parent}: the disk is full; make room there, or name a file elsewhere"
-                )
+                reason = f"{file.absolute().parent}: the disk is full; free space there, or write the file elsewhere"
             raise BackupError(f"the backup was not made: {reason}") from error
         raise
     return names
@@ -100,7 +98,7 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
             with os.fdopen(descriptor, "rb") as file:
                 mode = os.fstat(descriptor).st_mode & 0o777
                 if trouble := trouble_with(name, os.fstat(descriptor).st_size):
-                    raise BackupError(f"{name} {trouble}: see who put it there, and take it away")
+                    raise BackupError(f"{name} {trouble}: find out its origin, and remove it")
                 if is_database(name):
                     copy_database(state / name, os.fstat(descriptor), copy)
                 else:
@@ -133,8 +131,8 @@ def _files(state: Path) -> Iterator[tuple[str, int]]:
     if len(names) > MOST_FILES:
         parts = Counter(name.partition("/")[0] for name in names)
         raise BackupError(
-            f"{state} has more than {MOST_FILES} files, most of them in {parts.most_common(1)[0][0]}: see who put them"
-            " there, and take them away"
+            f"{state} has more than {MOST_FILES} files, most of them in {parts.most_common(1)[0][0]}: find out their"
+            " origin, and remove them"
         )
     for name in names:
         descriptor = opened(state, name) if name != AUDIT_LOG else None
@@ -187,9 +185,7 @@ def _copy_file(name: str, file: BinaryIO, copy: Path, last: dict[str, int]) -> N
         while piece := file.read(_PIECE):
             written.write(piece)
             if written.tell() > LARGEST:  # it grows while it is read
-                raise BackupError(
-                    f"{name} has more than {LARGEST} bytes: see who put it there, and take it away"
-                )
+                raise BackupError(f"{name} has more than {LARGEST} bytes: find out its origin, and remove it")
 
 
 def _raise(error: OSError) -> None:
@@ -227,8 +223,8 @@ def copy_database(path: Path, owner: os.stat_result, copy: Path) -> None:
         with _rights_of(owner):
             if not os.access(path, os.R_OK, effective_ids=True):
                 raise BackupError(
-                    f"{path} cannot be read by user id {owner.st_uid}, whose it is: every folder above it must let"
-                    " that user pass, and it must be a file of that user's own"
+                    f"{path} cannot be read by its owner, user id {owner.st_uid}: that user must own the file and"
+                    " have access to every folder above it"
                 )
             uri = f"{path.absolute().as_uri()}?mode=ro"
             with closing(sqlite3.connect(uri, uri=True, timeout=_BUSY_SECONDS)) as source:

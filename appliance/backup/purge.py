@@ -26,9 +26,9 @@ def purge(state: Path) -> tuple[int, int]:
     try:
         reason = foreign(state)
         if not state.is_dir() or reason is not None:
-            raise BackupError(reason or f"there is no state directory {state}")
+            raise BackupError(reason or f"the state directory {state} does not exist")
         if not any(state.iterdir()):
-            raise BackupError(f"{state} is empty: there is nothing to purge")
+            raise BackupError(f"{state} is empty: nothing to purge")
         lock = StateDirectory(state)
     except StartError as error:
         raise BackupError(str(error)) from None
@@ -45,7 +45,7 @@ def purge(state: Path) -> tuple[int, int]:
         os.sync()
     except OSError as error:
         raise BackupError(
-            f"{error.filename or state}: {error.strerror}; what is left is still there"
+            f"{error.filename or state}: {error.strerror}; the remaining files are unchanged"
         ) from error
     finally:
         lock.close()

@@ -47,7 +47,7 @@ def _room_in(state: Path) -> int:
     """
     try:
         if os.path.lexists(state) and any(entry.name != _OF_THE_DISK for entry in state.iterdir()):
-            raise BackupError(f"{state} is not empty: nothing is written over; name another --state")
+            raise BackupError(f"{state} is not empty, and nothing is overwritten; name another --state")
         here = state.absolute()
         while not os.path.lexists(here):
             here = here.parent

@@ -69,7 +69,7 @@ class AgeClock:
             self._kept = msgspec.json.decode(path.read_bytes(), type=_Kept)
         except (FileNotFoundError, msgspec.MsgspecError) as error:
             if not isinstance(error, FileNotFoundError):
-                _log.warning("what is known of ages cannot be read: they are counted anew", file=str(path))
+                _log.warning("the saved ages cannot be read: they restart from zero", file=str(path))
             now = wall()
             self._kept = _Kept(0, begin() or now, now)
 

@@ -65,7 +65,7 @@ def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | Non
         finally:
             os.close(folder)
     except OSError as error:
-        why = f"it is replaced, and may be as before after a power cut: {error.strerror}"
+        why = f"it is replaced, but a power cut may restore the old content: {error.strerror}"
         raise NotLastingError(error.errno, why, str(path)) from error
 
 

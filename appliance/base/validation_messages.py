@@ -15,7 +15,7 @@ _MUST_BE = {
     "array": "a list",
     "bool": "true or false",
     "byte": "a size, for example 500MB or 2GiB",
-    "dataclass": "a section: its keys stand on the lines below it, indented",
+    "dataclass": "a section: put its keys on the lines below it, indented",
     "enum": "{expected}",
     "finite": "a number",
     "float": "a number",
@@ -31,10 +31,10 @@ _MUST_BE = {
     "object": "an object",
     "path": "the path of a file or folder",
     "str": "a text",
-    "string": "a text; a number or true is one in quotes",
-    "string_pattern_mismatch": "a text that matches {pattern}",
-    "string_too_long": "{max_length} characters at most",
-    "string_too_short": "{min_length} characters at least",
+    "string": "a string; put a number or true in quotes",
+    "string_pattern_mismatch": "a string that matches {pattern}",
+    "string_too_long": "at most {max_length} characters",
+    "string_too_short": "at least {min_length} characters",
     "too_long": "{max_length} at most in number",
     "too_short": "{min_length} at least in number",
 }
@@ -48,7 +48,7 @@ _BODY: dict[str, Callable[..., str]] = {
     ),
     r"Expected `.*` ([<>]=?) (\S+)": lambda bound, limit: f"must be {_BOUNDS[bound]} {_plain(float(limit))}",
     r"(?s)Expected `.*` matching regex '(.*?)(?:\(\?!.*)?'": lambda pattern: (
-        f"must be a text that matches {pattern}"
+        f"must be a string that matches {pattern}"
     ),
     r"(?s)Object missing required field `(.*)`": lambda name: f"the field `{name}` must be given",
     r"(?s)Object contains unknown field `(.*)`": lambda name: f"there is no field `{name}`",
@@ -59,11 +59,11 @@ _BODY: dict[str, Callable[..., str]] = {
 
 _YAML = {
     r"'\\t'": "indent with spaces, not tabs",
-    "mapping values are not allowed": "put a text that has `: ` in quotes, and begin the keys of a section alike",
-    "<block end>": "begin the lines that belong together alike",
-    "but got '<stream end>'|node content": "close the bracket, or write what belongs there",
+    "mapping values are not allowed": "put a string with `: ` in quotes, and indent the keys of a section equally",
+    "<block end>": "indent the lines of a block equally",
+    "but got '<stream end>'|node content": "close the bracket, or complete its content",
     "end of stream": "close the quote",
-    "cannot start any token|undefined alias": "put the text in quotes",
+    "cannot start any token|undefined alias": "put the string in quotes",
 }
 """Advice for messages of the YAML parser."""
 
@@ -94,7 +94,7 @@ def meant(word: str, candidates: Collection[str]) -> str:
 def must_be(error: Mapping[str, Any]) -> str:
     """Return what a value must be, from one of pydantic's `errors()`."""
     kind, context = str(error["type"]), error.get("ctx") or {}
-    wanted = _MUST_BE.get(kind) or _MUST_BE.get(kind.partition("_")[0]) or f"of another form ({kind})"
+    wanted = _MUST_BE.get(kind) or _MUST_BE.get(kind.partition("_")[0]) or f"of another type ({kind})"
     return wanted.format(**{name: _plain(value) for name, value in context.items()})
 
 

@@ -16,7 +16,9 @@ import contextlib
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 
-WITHDRAWN = "its client did not wait any longer, so the order was withdrawn before it took effect: nothing was changed"
+WITHDRAWN = (
+    "the client stopped waiting, so the change was withdrawn before it took effect: nothing was changed"
+)
 
 
 class WithdrawnError(Exception):

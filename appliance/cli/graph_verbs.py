@@ -51,7 +51,7 @@ def list_topics(appliance: Appliance) -> None:
         ends = (
             f"{counted(len(topic.publishers), 'publisher')}, {counted(len(topic.subscribers), 'subscriber')}"
         )
-        past = "" if topic.mediated else "  past the appliance"
+        past = "" if topic.mediated else "  bypasses the appliance"
         say(f"{printable(topic.name):<{name}}  {printable(topic.type):<{kind}}  {ends}, {rate:.1f} Hz{past}")
     if not topics and not appliance.as_json:
         say("no topic is registered")

@@ -74,9 +74,9 @@ def _described(topic: Topic) -> Iterator[str]:
         delay = f"{publisher.delay_seconds * 1e6:.0f} µs in the relay"
         yield f"  published by {printable(publisher.node)}: {rate}, {delay}, {publisher.dropped} not delivered"
     for node in topic.subscribers:
-        yield f"  heard by {printable(node)}"
+        yield f"  received by {printable(node)}"
     if not topic.mediated:
-        yield "  its messages go past the appliance"
+        yield "  its messages bypass the appliance"
 
 
 def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:

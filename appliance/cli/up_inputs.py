@@ -65,7 +65,7 @@ def _require_specifications(folder: Path, site_keys: Sequence[str]) -> None:
         result = answer.read()
     os.waitpid(child, 0)
     if result != _VALID:
-        raise StartError(result or f"{folder}: the process that read the specifications ended early")
+        raise StartError(result or f"{folder}: the process that read the specifications exited early")
 
 
 def _errors_in(folder: Path, site_keys: Sequence[str]) -> str:

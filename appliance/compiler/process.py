@@ -98,7 +98,7 @@ def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | m
     except SpecificationsRefusedError as error:
         return messages.CompilationRefused(wanted.number, error.findings)
     except (MemoryError, SystemError):  # as which Python 3.11 reports some lack of memory
-        text = f"they take more than the {_MEMORY >> 20} MiB of memory that there are to compile them"
+        text = f"they take more than the {_MEMORY >> 20} MiB of memory available to compile them"
     except Exception as error:  # noqa: BLE001  a defect of the compiler is a reason to refuse, no more
         text = f"a defect of rosrv, please report it: {type(error).__name__}: {error}"
     return messages.CompilationRefused(wanted.number, [text])

@@ -135,7 +135,7 @@ class _Gathered:
             line = error.problem_mark.line + 1 if error.problem_mark else 1
             raise ConfigError([Mistake(f"{file}:{line}", not_yaml(error.problem))]) from error
         except RecursionError as error:
-            raise ConfigError([Mistake(str(file), "is nested too deep, or refers to itself")]) from error
+            raise ConfigError([Mistake(str(file), "is nested too deeply, or refers to itself")]) from error
         except (yaml.YAMLError, ValueError) as error:
             raise ConfigError([Mistake(str(file), not_yaml(error))]) from error
         if values is None:
@@ -198,7 +198,7 @@ class _Gathered:
                 place = f"{file}:{key.start_mark.line + 1}"
                 name = str(key.value)
                 if name in seen:
-                    self._mistakes.append(Mistake(place, f"{_dotted((*path, name))} is given a second time"))
+                    self._mistakes.append(Mistake(place, f"{_dotted((*path, name))} is given twice"))
                 seen.add(name)
                 self._places[*path, name] = place
                 self._note_places(file, value, (*path, name))

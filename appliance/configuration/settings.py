@@ -180,7 +180,9 @@ class LimitsSection:
         description="all parameters together, as they are sent; one host may set half of them",
     )
     header_bytes: Size = key(default=64 << 10, description="request line and headers")
-    header_seconds: Seconds = key(default=10.0, description="until request line and headers must be there")
+    header_seconds: Seconds = key(
+        default=10.0, description="until request line and headers must have arrived"
+    )
     idle_seconds: Seconds = key(default=300.0, description="a kept-alive connection without a request")
     connections_per_host: Count = 512
     connections: Count = key(default=4096, description="of all hosts")
@@ -198,33 +200,33 @@ class Syslog:
 
     to: Annotated[str, AfterValidator(_checked_receiver)] | None = key(
         default=None,
-        description="udp://ADDRESS:PORT, tcp://… or tls://…: an address, so that nothing is asked of a name server",
+        description="udp://ADDRESS:PORT, tcp://… or tls://…: an address, so that no name server is needed",
     )
     send: Literal["all", "denials"] = key(
         default="all", description="denials: those, warnings and alarms; signed checkpoints are always sent"
     )
     facility: int = key(default=13, ge=0, le=23, description="13 is `log audit`, 10 `authpriv`, 16 `local0`")
     host_name: str | None = key(
-        default=None, description="the name messages come from; the machine's unless it is given"
+        default=None, description="sender name in messages; default: the machine's name"
     )
     ca: Path | None = key(
         default=None,
-        description="authority of the receiver's certificate (PEM); those the system trusts if not given",
+        description="authority of the receiver's certificate (PEM); default: those the system trusts",
     )
     name: str | None = key(
-        default=None, description="name in the receiver's certificate; its address unless it is given"
+        default=None, description="name in the receiver's certificate; default: its address"
     )
     certificate: Path | None = key(
-        default=None, description="for a receiver that wants to know who sends (PEM)"
+        default=None, description="client certificate, for a receiver that requires one (PEM)"
     )
-    key: Path | None = key(default=None, description="of `certificate`; readable by user rosrv-syslog")
+    key: Path | None = key(default=None, description="key of `certificate`; readable by user rosrv-syslog")
 
     def __post_init__(self) -> None:
         given = [name for name in ("ca", "name", "certificate", "key") if getattr(self, name) is not None]
         if given and (self.to is None or not self.to.startswith("tls://")):
-            raise ValueError(f"{', '.join(given)} would do nothing: only tls:// has certificates")
+            raise ValueError(f"{', '.join(given)} would have no effect: only tls:// uses certificates")
         if (self.certificate is None) != (self.key is None):
-            raise ValueError("certificate and key go together")
+            raise ValueError("certificate and key must be given together")
 
     @property
     def destination(self) -> tuple[str, str, int]:
@@ -240,7 +242,7 @@ class Audit:
         default="batched", description="strict: on disk before the answer; batched: within 50 ms"
     )
     on_audit_failure: Literal["deny", "allow"] = key(
-        default="deny", description="what is answered while the log cannot be written"
+        default="deny", description="answer to requests while the log cannot be written"
     )
     checkpoint_records: Count = key(default=1000, description="records after which a checkpoint is signed")
     checkpoint_seconds: Seconds = key(default=60.0, description="seconds after which a checkpoint is signed")
@@ -252,7 +254,8 @@ class Audit:
     )
     reserve_bytes: SizeOfMebibytes = key(
         default=64 << 20,
-        description="of the disk: below it who causes many records is slowed more, so that the others are recorded",
+        description="of free disk space: below it, hosts that cause many records are slowed more, so that others"
+        " are recorded",
     )
     syslog: Syslog = Syslog()
 
@@ -261,9 +264,11 @@ class Audit:
 class LivenessSection:
     """When a node counts as gone; all in seconds."""
 
-    interval: Seconds = key(default=5.0, description="between two looks at a node")
+    interval: Seconds = key(default=5.0, description="between two checks of a node")
     silent: Seconds = key(default=20.0, description="without an answer until the node is unregistered")
-    shadow: Seconds = key(default=600.0, description="for which a gone node's registration can come back")
+    shadow: Seconds = key(
+        default=600.0, description="for which the registration of a node that is gone can be restored"
+    )
 
 
 @_section
@@ -273,7 +278,7 @@ class Relay:
     connections: Count = key(default=16_384, description="of all hosts")
     connections_per_host: Count = 8_192
     header_bytes: Size = key(default=64 << 10, description="TCPROS connection header")
-    header_seconds: Seconds = key(default=10.0, description="until the connection header must be there")
+    header_seconds: Seconds = key(default=10.0, description="until the connection header must have arrived")
     message_bytes: SizeOfMebibytes = key(default=256 << 20, description="one message")
     queue_messages: Count = key(default=1000, description="messages waiting for one subscriber")
     queue_bytes: Size = key(default=64 << 20, description="bytes waiting for one subscriber")
@@ -293,14 +298,15 @@ class RecorderRules:
 
     enabled: bool = key(default=False, description="whether anything is recorded")
     memory: Annotated[int, _BYTES, Field(ge=16 << 20)] = key(
-        default=64 << 20, description="of all relays together, for what they received last; it survives them"
+        default=64 << 20,
+        description="of all relays together, for the last messages received; it survives a relay's crash",
     )
-    before: WithinAnHour = key(default=60.0, description="seconds before what happened")
-    after: WithinAnHour = key(default=10.0, description="seconds after it")
+    before: WithinAnHour = key(default=60.0, description="seconds before the event")
+    after: WithinAnHour = key(default=10.0, description="seconds after the event")
     longest: WithinAnHour = key(
-        default=600.0, description="seconds of one recording, however much happens in it"
+        default=600.0, description="longest recording in seconds, regardless of further events"
     )
-    topics: list[str] = key(default=["/*"], description="what is recorded: names, `*` is anything")
+    topics: list[str] = key(default=["/*"], description="recorded topics: names, `*` matches anything")
     never: list[str] = key(
         default=[
             "sensor_msgs/Image",
@@ -309,21 +315,23 @@ class RecorderRules:
             "audio_common_msgs/AudioData",
             "audio_common_msgs/AudioDataStamped",
         ],
-        description="names or types that are never recorded; unless it is given: cameras and microphones",
+        description="names or types that are never recorded; default: cameras and microphones",
     )
     triggers: list[Literal["drop", "change", "verdict", "fault", "denial", "alarm", "service"]] = key(
         default=["drop", "verdict", "fault", "alarm", "service"],
-        description="what begins a recording, besides an operator; service: a node's call, if the policy lets it",
+        description="triggers of a recording, besides an operator; service: a node's call, if the policy lets it",
     )
-    per_hour: Count = key(default=6, description="recordings that one host may begin by one kind of trigger")
+    per_hour: Count = key(
+        default=6, description="recordings that one host may start with one kind of trigger"
+    )
     disk: Annotated[int, _BYTES, Field(ge=64 << 20)] = key(
-        default=2 << 30, description="of all recordings; one has an eighth of it at most"
+        default=2 << 30, description="of all recordings; one uses at most an eighth of it"
     )
     days: Seconds | None = key(default=30.0, description="after which a recording is removed; null: never")
 
     def __post_init__(self) -> None:
         if self.longest < self.before + self.after:
-            raise ValueError(f"longest is {self.longest:g}, and before and after are more together")
+            raise ValueError(f"longest is {self.longest:g}, but before and after together are longer")
 
 
 @_section
@@ -331,7 +339,7 @@ class FirewallSection:
     """The firewall around the ROS master (isolation netns and container)."""
 
     backend: Literal["auto", "iptables", "nft"] = key(
-        default="auto", description="auto: what the kernel really enforces"
+        default="auto", description="auto: the back end that the kernel enforces"
     )
 
 
@@ -369,12 +377,12 @@ class Ipsec:
     ] = key(
         default=None,
         description="address or name at which hosts reach the appliance from outside, for their kits;"
-        " found out unless it is given here or with --appliance",
+        " detected unless given here or with --appliance",
     )
 
     ca: Literal["ecdsa", "ed25519"] = key(
         default="ecdsa",
-        description="kind of the authority's key, which is made at the first start: P-384, or Ed25519",
+        description="kind of the authority's key, created at the first start: P-384, or Ed25519",
     )
     ca_passphrase_file: Path | None = key(
         default=None,
@@ -393,7 +401,7 @@ class ApiLimits:
     failures_per_minute: Count = key(default=20, description="requests of one host without a good token")
     connections: Count = key(default=512, description="of all hosts")
     connections_per_host: Count = 64
-    header_seconds: Seconds = key(default=10.0, description="until the request's headers must be there")
+    header_seconds: Seconds = key(default=10.0, description="until the request's headers must have arrived")
     streams: Count = key(default=16, description="clients that follow the audit log, at once")
 
 
@@ -429,8 +437,8 @@ class Settings:
     )
     enable: str = key(
         default="all",
-        description="monitors that no operator has switched, new ones among them: all are enabled, none, NAME,…, or all"
-        " are in shadow mode (shadow)",
+        description="initial state of monitors that no operator has switched, including new ones: all enabled, none,"
+        " NAME,…, or all in shadow mode (shadow)",
     )
     forgotten_after: Seconds | None = key(
         default=86_400.0,
@@ -438,13 +446,13 @@ class Settings:
         " audit-only, before that is an alarm; null: never",
     )
     on_fault: Literal["drop", "pass"] = key(
-        default="drop", description="what becomes of a message at which an action of a monitor faults"
+        default="drop", description="handling of a message at which an action of a monitor faults"
     )
     slices: int = key(
         default=100_000,
         ge=1,
         le=1_000_000,
-        description="slices of a parametric specification: bindings that are monitored at a time, about 700 bytes each",
+        description="slices of a parametric specification: bindings monitored at the same time, about 700 bytes each",
     )
     publish_as: Annotated[str, AfterValidator(_checked_name)] = key(
         default="/rosrv", description="the node name under which monitors publish"
@@ -453,17 +461,17 @@ class Settings:
         default=False,
         description="also put output, verdicts and faults of monitors on /rosout (the audit log always has them)",
     )
-    hide_publisher: bool = key(default=False, description="leave out what monitors publish in getSystemState")
+    hide_publisher: bool = key(default=False, description="omit the monitors' topics from getSystemState")
     site_keys: list[Annotated[str, AfterValidator(checked_key)]] = key(
         default=[],
         description="public keys (`ssh-ed25519 BASE64 COMMENT`); with any, a policy or specification that none of them"
         " signed is refused",
     )
     state: Path = key(
-        default=Path("/var/lib/rosrv"), description="directory of everything that must survive a restart"
+        default=Path("/var/lib/rosrv"), description="directory of all data that must survive a restart"
     )
     listen: Annotated[str, AfterValidator(_checked_address)] = key(
-        default="0.0.0.0:11311", description="where nodes find their master"
+        default="0.0.0.0:11311", description="address where nodes find their master"
     )
     rosmaster_port: int = key(
         # Not 11411, where rosserial's TCP server listens, and below the ports the kernel gives to clients.
@@ -473,7 +481,7 @@ class Settings:
         description="loopback port of the hidden ROS master; 0: any free one",
     )
     isolation: Literal["container", "netns", "none"] = key(
-        default="netns", description="where the appliance lives; none: no firewall, for development only"
+        default="netns", description="isolation of the appliance; none: no firewall, for development only"
     )
     relaying: Literal["all", "monitored"] = key(
         default="all",
@@ -486,7 +494,7 @@ class Settings:
     api: Annotated[str, BeforeValidator(_off_as_text), AfterValidator(_checked_api)] = key(
         default_factory=lambda: Unasked("127.0.0.1:8443"),
         json_schema_extra={"default": "127.0.0.1:8443"},
-        description="HOST:PORT of REST, or off; unless it is given here, another free port when this one is taken",
+        description="HOST:PORT of REST, or off; by default, another free port if this one is in use",
     )
     api_tls: Annotated[bool, AfterValidator(_clear_text_stays_here)] = key(
         default=True, description="off: clear text, on a loopback address only"
@@ -508,7 +516,7 @@ class Settings:
         description="names and addresses for the certificate; other names are refused, addresses are not",
     )
     api_notice: str = key(
-        default="", max_length=4000, description="what the console shows before it asks for a token"
+        default="", max_length=4000, description="notice that the console shows before it asks for a token"
     )
     api_lock_seconds: Seconds = key(
         default=900.0,
@@ -516,7 +524,7 @@ class Settings:
     )
     hosts: Path = key(
         default=Path("ipsec/hosts.yaml"),
-        description="the hosts that are meant to be enrolled; may be missing",
+        description="the hosts to enrol; the file may be missing",
     )
     relays: Annotated[int, Field(gt=0, le=16)] = key(
         default_factory=relays_for_this_machine,
@@ -537,7 +545,7 @@ class Settings:
         if to is not None and self.isolation == "netns" and is_loopback(split_receiver(to)[1]):
             raise ValueError(
                 f"audit.syslog.to: {to} is the loopback of the appliance's own namespace (isolation: netns);"
-                " a receiver on this machine is reached by another of its addresses"
+                " for a receiver on this machine, use another of its addresses"
             )
 
     @property

@@ -126,9 +126,9 @@ class _Bundle:
         ).fetchall()
         self._runs = _runs([sequence for (sequence,) in found])
         if not found:
-            raise BundleError("the log has no record of that time", "unknown")
+            raise BundleError("the log has no record in that period", "unknown")
         if len(found) > MOST_RECORDS:
-            raise BundleError(f"these are more than {MOST_RECORDS} records: export a shorter time", "request")
+            raise BundleError(f"more than {MOST_RECORDS} records match: export a shorter period", "request")
         begin = self._runs[0][0]
         loads = {execute(_LAST_LOAD, (event, begin)).fetchone()[0] for event in (_POLICY, _SPECIFICATIONS)}
         self._policies: set[int] = set()
@@ -179,9 +179,9 @@ class _Bundle:
             digest = hashlib.sha256()
             yield name, _noted(pieces, digest.update)
             if left.pop(name, {}).get("sha256") != digest.hexdigest():
-                raise BundleError(f"{name} was changed while it was exported: export again", "failed")
+                raise BundleError(f"{name} changed during the export: export again", "failed")
         if left:
-            raise BundleError(f"{', '.join(left)} went while it was exported: export again", "failed")
+            raise BundleError(f"{', '.join(left)} disappeared during the export: export again", "failed")
 
     def members(self, manifest: dict[str, Any]) -> Iterator[Member]:
         """Yield all members; add the names of missing ones to the manifest."""
@@ -279,7 +279,7 @@ def _line(connection: sqlite3.Connection, places: ChainReader, sequence: int, fo
     chain = places.place(sequence, following)
     if row is None or chain is None:
         raise LogUnreadableError(
-            f"record {sequence} was removed by retention while it was exported: export again"
+            f"record {sequence} was removed by retention during the export: export again"
         )
     return stored_line(StoredColumns(*row), chain)
 

@@ -72,7 +72,7 @@ def printable(text: str) -> str:
 def unhexed(text: str) -> bytes:
     data = bytes.fromhex(text)
     if data.hex() != text:
-        raise ValueError(f"{text[:80]!a} is not written as a hash is")
+        raise ValueError(f"{text[:80]!a} is not a valid hash")
     return data
 
 
@@ -140,12 +140,12 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
             header[0] == b"PK\3\4" and header[1] in (20, entry[3]) and header[2:8] == (*entry[4:9], told[0])
         )
         if not same or header[8:10] not in (told[1:], (LARGE, LARGE)) or name_here != text:
-            yield f"{name!a}: its header is another than in the directory"
+            yield f"{name!a}: its header differs from the directory's"
         if file.read(header[11]) not in (b"", extra(0, 0), extra(size, packed)):
             yield f"{name!a}: has an extra field"
         at = file.tell() + packed
         if not (ends(file, packed, size) if info.compress_type else packed == size):
-            yield f"{name!a}: there are bytes behind it"
+            yield f"{name!a}: extra bytes follow it"
         file.seek(at)
         forms = ("<4sLQQ", "<4s3L") if max(packed, size) < LARGE else ("<4sLQQ",)
         sealed, after = (
@@ -181,7 +181,7 @@ def require_bounded(archive: zipfile.ZipFile, size: int) -> None:
     if sum(info.compress_size for info in members) > size:
         raise ValueError("its members overlap: it is not a bundle")
     if sum(info.file_size for info in members) > most:
-        raise ValueError(f"it unpacks to more than {most} bytes, which no bundle of its size does")
+        raise ValueError(f"it unpacks to more than {most} bytes: too large for a bundle of its size")
 
 
 def opened(place: Path) -> tuple[list[str], Opener, Iterator[str]]:
@@ -206,7 +206,7 @@ class Runs:
         # At least one record is between two runs.
         steps = (here - before for before, here in zip(edges, edges[1:]))  # noqa: RUF007  Python 3.8
         if any(step < (2, 0)[number % 2] for number, step in enumerate(steps)):
-            raise ValueError("the runs of manifest.json are not in their order")
+            raise ValueError("the runs of manifest.json are not in order")
         self.first, self.last = [first for first, _last in pairs], [last for _first, last in pairs]
         self.missing = sum(last - first + 1 for first, last in pairs)
         self.beside = {edge: False for first, last in pairs for edge in (first - 1, last + 1)}
@@ -241,7 +241,7 @@ class Verifier:
         """Check everything; a member that cannot be read is also a finding."""
         looks = {
             "the ZIP file": self.look_beside, "manifest.json": self.look_at_members, "proof.json": self.look_at_proof,
-            "records.ndjson": self.look_at_records, "what the log has the hashes of": self.look_at_texts,
+            "records.ndjson": self.look_at_records, "the hashes in the log": self.look_at_texts,
         }  # fmt: skip
         for what, look in looks.items():
             try:
@@ -267,12 +267,12 @@ class Verifier:
         self.manifest = json.loads(self.read("manifest.json"))
         members = self.manifest["members"]
         if self.manifest["format"] != FORMAT or {*self.manifest} != FIELDS:
-            self.findings.append(f"manifest.json: is not of the format {FORMAT!r}")
+            self.findings.append(f"manifest.json: its format is not {FORMAT!r}")
         for name, times in sorted(Counter(self.names).items()):
             if name not in members and name not in OWN:
                 self.findings.append(f"{name!a}: does not belong to the bundle")
             if times > 1:
-                self.findings.append(f"{name!a}: is there more than once")
+                self.findings.append(f"{name!a}: is present more than once")
         for name in members.keys() - set(self.names):
             self.findings.append(f"{name!a}: is missing")
         for name in sorted(members.keys() & set(self.names)):
@@ -291,9 +291,9 @@ class Verifier:
         """Check rule 2: the proof."""
         (record,) = self.records("proof.json")
         if record["event"] != "evidence exported":
-            self.findings.append("proof.json: is not the record of an export")
+            self.findings.append("proof.json: is not a record of an export")
         if json.loads(record["detail"])["manifest"] != sha256(self.read("manifest.json")).hex():
-            self.findings.append("manifest.json: is not the one that the log has the hash of")
+            self.findings.append("manifest.json: does not match the hash in the log")
 
     def look_at_records(self) -> None:
         """Check rule 3: the chain of records."""
@@ -308,15 +308,17 @@ class Verifier:
             elif sequence in beside:
                 beside[sequence] = True
                 if since <= record["time"] < until:
-                    self.findings.append(f"record {sequence}: is of this time, and its run ends before it")
+                    self.findings.append(
+                        f"record {sequence}: belongs to this period, but its run ends before it"
+                    )
             self.note_hash(record["event"], record["revision"], json.loads(record["detail"]))
         if missing:
-            self.findings.append(f"records.ndjson: {missing} records of its runs are not there")
+            self.findings.append(f"records.ndjson: {missing} records of its runs are missing")
         first, last = runs.first[0], runs.last[-1]
         if not beside[first - 1] and first > 1:
-            self.notes.append(f"what was before record {first}: retention has removed it")
+            self.notes.append(f"records before {first}: removed by retention")
         if not beside[last + 1]:
-            self.notes.append(f"that record {last} was the last of this time: the log ended there")
+            self.notes.append(f"record {last} as the last of this period: the log ended there")
 
     def note_hash(self, event: str, revision: int, detail: dict[str, Any]) -> None:
         """Store the hash that a record has of a policy, of specifications or of the recording."""
@@ -341,12 +343,12 @@ class Verifier:
             elif wanted is None:
                 self.notes.append(f"{place}: it was loaded by a version that recorded no hash")
             elif found != wanted:
-                self.findings.append(f"{place}: is not what the log has the hash of")
+                self.findings.append(f"{place}: does not match the hash in the log")
         used = {f"policies/{revision}.ini" for revision in self.revisions if revision}
         used |= {"recording/recording.bag"} if self.manifest["recording"] else set()
         self.notes += [f"{place}: the log has no record of it" for place in sorted(used - self.loads.keys())]
         if not any(place.startswith("specifications/") for place in self.loads):
-            self.notes.append("which specifications were in force: the log has no record of a load")
+            self.notes.append("the specifications in force: the log has no record of a load")
 
     def records(self, name: str, runs: Runs | None = None) -> Iterator[dict[str, Any]]:
         """Yield the records of a member, each after its check against the chain."""
@@ -358,7 +360,7 @@ class Verifier:
                 chain, sequence = record["chain"], record["sequence"]
                 written = json.dumps(record, separators=(",", ":")).encode() + b"\n"
                 if line != written or {*record} != {*COLUMNS, "detail", "chain"} or {*chain} - CHAIN:
-                    self.findings.append(f"record {sequence}: is not written as the appliance writes it")
+                    self.findings.append(f"record {sequence}: is not in the appliance's format")
                 detail = record["detail"].encode("utf-8", "surrogateescape")
                 columns = b"\xdc\x00\x13" + b"".join(
                     map(packed, [*(record[column] for column in COLUMNS), detail])
@@ -375,7 +377,7 @@ class Verifier:
                     place, digest = place + 1, sha256(digest + b"2" + unhexed(content))
                 if chain["then"] is None:
                     matters = runs is None or runs.meet(begin, sequence)
-                    text = f"records {begin} to {sequence}: lead to no checkpoint; version 0.1.0 wrote what follows"
+                    text = f"records {begin} to {sequence}: lead to no checkpoint; version 0.1.0 wrote later records"
                     (self.findings if matters else self.notes).append(text)
                     begin = 0
                 elif chain.get("checkpoint"):
@@ -383,20 +385,22 @@ class Verifier:
                     begin = 0
                 yield record
         if begin or not place:
-            self.findings.append(f"{name}: no signed checkpoint seals what begins with record {begin}")
+            self.findings.append(f"{name}: no signed checkpoint seals the records from {begin} on")
 
     def look_at_checkpoint(self, checkpoint: dict[str, Any], sequence: int, digest: str) -> None:
         """Check that the key signed it, that it seals these records, and that it equals the copy from elsewhere."""
         number = checkpoint["number"]
         sealed = checkpoint["log"], checkpoint["sequence"], checkpoint["hash"]
         if sealed != (self.manifest["log"], sequence, digest):
-            self.findings.append(f"checkpoint {number}: seals other records than those up to {sequence} here")
+            self.findings.append(
+                f"checkpoint {number}: does not seal the records up to {sequence} of this bundle"
+            )
         if not self.is_signed(checkpoint) or {*checkpoint} - {*SEALED, "signature", "key"}:
             self.findings.append(f"checkpoint {number}: is not signed with the key")
         copy = self.copies.get(number)
         if copy and any(copy.get(field) != checkpoint.get(field) for field in SEALED):
             but = "" if self.is_signed(copy) else ", which is not signed with the key"
-            self.findings.append(f"checkpoint {number}: is another one than was kept elsewhere{but}")
+            self.findings.append(f"checkpoint {number}: differs from the one kept elsewhere{but}")
         self.checkpoints, self.agreeing = self.checkpoints + 1, self.agreeing + (copy is not None)
 
     def is_signed(self, checkpoint: dict[str, Any]) -> bool:
@@ -421,13 +425,13 @@ def kept_copies(path: Path) -> dict[int, dict[str, Any]]:
 
 def main(arguments: list[str]) -> int:
     """Print the findings; return the exit status."""
-    parser = argparse.ArgumentParser(description="Proves a bundle of evidence of a ROSRV appliance.")
+    parser = argparse.ArgumentParser(description="Verify an evidence bundle of a ROSRV appliance.")
     parser.add_argument(
         "bundle", nargs="?", type=Path, default=Path(__file__).parent, help="ZIP file or folder"
     )
     parser.add_argument("--key", type=Path, help="the appliance's public key (PEM), kept elsewhere")
     parser.add_argument(
-        "--checkpoints", type=Path, help="what `rosrv audit checkpoints` gave, kept elsewhere"
+        "--checkpoints", type=Path, help="output of `rosrv audit checkpoints`, kept elsewhere"
     )
     parser.add_argument("--json", action="store_true", help="one JSON object")
     given = parser.parse_args(arguments)
@@ -454,11 +458,12 @@ def main(arguments: list[str]) -> int:
     for note in notes:
         print(f"unproven  {note}")
     if given.checkpoints:
-        print(f"{verifier.agreeing} of {verifier.checkpoints} checkpoints were kept elsewhere, too")
+        print(f"{verifier.agreeing} of {verifier.checkpoints} checkpoints were also kept elsewhere")
     print(
-        f"key {verifier.raw_key}{'' if given.key else ', from the bundle: compare it with one kept elsewhere'}"
+        f"key {verifier.raw_key}{'' if given.key else ', from the bundle: compare it with a copy kept elsewhere'}"
     )
-    print("not as it was exported" if findings else "right: this is what the appliance has sealed")
+    valid = "valid: the bundle is unchanged since the appliance sealed it"
+    print("invalid: the bundle was changed after the export" if findings else valid)
     return 1 if findings else 0
 
 

@@ -33,11 +33,11 @@ code, .time { font-family: ui-monospace, monospace }
 <h1>Evidence of a ROSRV appliance</h1>
 """
 _PROOF = """\
-<h2>Prove it</h2>
+<h2>Verify it</h2>
 <p>This page proves nothing. On any machine with Python 3.8 and OpenSSL 3.0, in the folder of the bundle:</p>
 <p><code>python3 verify.py --key audit.pub</code></p>
-<p>with the <code>audit.pub</code> and, better, the <code>verify.py</code> that you got elsewhere: whoever changes a
-bundle can change those in it. It names what was changed or is missing.</p>
+<p>Use an <code>audit.pub</code> and preferably a <code>verify.py</code> from another source: an attacker who changes a
+bundle can also change the copies inside it. The command lists the changed and missing parts.</p>
 """
 
 
@@ -79,7 +79,7 @@ class Page:
         }
         parts = [_HEAD, "<table>\n"]
         parts += [f"<tr><th>{name}<td>{_text(value)}\n" for name, value in facts.items() if value]
-        parts += ["</table>\n", *_recorded(self._recording), _PROOF, "<h2>What happened</h2>\n<table>\n"]
+        parts += ["</table>\n", *_recorded(self._recording), _PROOF, "<h2>Events</h2>\n<table>\n"]
         parts += [
             "<tr><th>time<th>record<th>event<th>decision<th>who<th>what<th>reason\n",
             *self._rows,
@@ -89,7 +89,7 @@ class Page:
             parts.append(f"<p>{self._left_out} more of this kind are in records.ndjson only.</p>\n")
         parts.append("<h2>All records by event</h2>\n<table>\n")
         parts += [f"<tr><td>{_text(event)}<td>{count}\n" for event, count in sorted(self._events.items())]
-        parts.append("</table>\n<h2>What is in the bundle</h2>\n<table>\n")
+        parts.append("</table>\n<h2>Contents of the bundle</h2>\n<table>\n")
         parts += [
             f'<tr><td><a href="{_text(name).replace("%", "%25")}">{_text(name)}</a><td>{about["bytes"]} bytes'
             f"<td><code>{about['sha256']}</code>\n"
@@ -106,12 +106,12 @@ def _recorded(recording: Recording | None) -> Iterator[str]:
     """Yield the triggers of the recording and its topics."""
     if recording is None:
         return
-    yield f'<h2>What was said</h2>\n<p>Recording {recording.id}, <a href="recording/recording.bag">a bag</a>\n'
-    yield "for rosbag, rqt_bag, Foxglove or PlotJuggler, has the messages as they were sent, before monitors\n"
+    yield f'<h2>Messages</h2>\n<p>Recording {recording.id}, <a href="recording/recording.bag">a bag</a>\n'
+    yield "for rosbag, rqt_bag, Foxglove or PlotJuggler, contains the messages as sent, before monitors\n"
     yield "changed or dropped them.</p>\n"
     if not recording.complete:
         yield f'<p class="alarm">Not complete: {_text(recording.why_not)}</p>\n'
-    yield "<table>\n<tr><th>time<th>because of<th>record<th>what\n"
+    yield "<table>\n<tr><th>time<th>trigger<th>record<th>what\n"
     for trigger in recording.triggers:
         cells = (trigger.what, trigger.record, trigger.text)
         yield f'<tr><td class="time">{rfc3339(trigger.time)}{"".join(f"<td>{_text(cell)}" for cell in cells)}\n'

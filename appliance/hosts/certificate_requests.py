@@ -52,7 +52,7 @@ class Authority:
 
     async def _ask(self, question: Callable[[int], messages.Message], kind: type[M]) -> M:
         if self._signer.channel is None:
-            raise AuthorityError("the signer is away; it is started again within seconds: try again")
+            raise AuthorityError("the signer is not running; it restarts within seconds: try again")
         try:
             answer = await self._signer.ask(question, _SECONDS)
         except (ChannelClosedError, TimeoutError) as error:
@@ -60,5 +60,5 @@ class Authority:
         if isinstance(answer, messages.CertificateRefused):
             raise AuthorityError(answer.reason, refused=True)
         if not isinstance(answer, kind):
-            raise AuthorityError("the signer answered something else")
+            raise AuthorityError("the signer sent an unexpected answer")
         return answer

@@ -77,7 +77,7 @@ class Certification:
         before = self._revocations[name]
         yield
         if self._revocations[name] != before:
-            raise HostForbiddenError(f"{name} was revoked meanwhile")
+            raise HostForbiddenError(f"{name} was revoked in the meantime")
 
     async def issue(
         self, name: str, request: str, days: float, *, proof: bytes = b"", former: bytes = b""
@@ -95,7 +95,7 @@ class Certification:
         self.keep(name, address, made)
         self.trail.happened(
             "host enrolled",
-            f"{name} may come through its tunnel as {address}",
+            f"{name} may connect through its tunnel as {address}",
             name=name,
             address=address,
             serial=made.serial,
@@ -108,7 +108,7 @@ class Certification:
         """Record that a host has replaced its certificate."""
         self.trail.happened(
             "host renewed",
-            f"{name} has a new certificate; its tunnel comes back with it",
+            f"{name} has a new certificate; its tunnel reconnects with it",
             name=name,
             serial=serial,
             replaced=before,
@@ -133,18 +133,18 @@ class Certification:
             stands = f"{name} is enrolled until then and has no kit: rosrv host kit {name}, or revoke it"
             raise StoreError(f"{error}; {stands}") from error
         taken = await self.tunnels.until_taken()
-        warning = None if taken else "charon does not know it yet; `rosrv status` and the log say why"
+        warning = None if taken else "charon has not loaded it yet; see `rosrv status` and the log"
         return await self.kit(name, warning, kept)
 
     async def kit(self, name: str, warning: str | None, kept: dict[str, str] | None = None) -> KitParts:
         """Return the parts of a host's kit. Raises `HostRefusedError`."""
         if self.rest.inner_port is not None and not await self.until_served():
-            warning = warning or "REST is not there: the kit cannot renew its certificate by itself"
+            warning = warning or "REST is not running: the kit cannot renew its certificate automatically"
         authority = await self.authority_certificate()
         own, rest = self.table.own_address, self.rest
         row, certificate = self.table.rows[name], self.table.certificates.get(name)
         if certificate is None or not certificate.certificate:
-            raise HostRefusedError(f"the certificate of {name} is not kept here: rosrv host kit {name}")
+            raise HostRefusedError(f"the certificate of {name} is not stored here: rosrv host kit {name}")
         return KitParts(
             revision=self.table.revision,
             name=name,
@@ -203,7 +203,8 @@ class Certification:
                 self._warned.add(row.serial)
                 self.trail.happened(
                     "certificate ends soon" if row.expires > now else "certificate ended",
-                    f"the certificate of {row.name} ends at {row.expires:.0f}; renewal or `rosrv host kit {row.name}`",
+                    f"the certificate of {row.name} expires at {row.expires:.0f}; renew it, or run"
+                    f" rosrv host kit {row.name}",
                     name=row.name,
                     serial=row.serial,
                     expires=row.expires,

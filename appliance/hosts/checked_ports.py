@@ -37,7 +37,7 @@ class PortChecks:
         now = time.time()
         checked = now if request.checked is None else request.checked
         if checked > now + _CLOCKS_DIFFER:
-            raise HostRefusedError("the moment of the check is more than a day ahead")
+            raise HostRefusedError("the time of the check is more than a day in the future")
         row = PortsRow(key, state, sorted(set(request.open))[:_MOST_PORTS], min(checked, now), who)
         self._table.keep_ports(row)
         self._trail.happened(

@@ -142,16 +142,16 @@ class HostEnrolment:
                 self._require_not_enrolled(name)
             if not 0 < request.token_seconds <= LONGEST_SECONDS:
                 raise HostRefusedError(
-                    f"a one-time token ends after at most {LONGEST_SECONDS / 86_400:.0f} days"
+                    f"a one-time token is valid for at most {LONGEST_SECONDS / 86_400:.0f} days"
                 )
             if not 0 < request.days <= LONGEST_DAYS:
-                raise HostRefusedError(f"a certificate is good for at most {LONGEST_DAYS} days")
+                raise HostRefusedError(f"a certificate is valid for at most {LONGEST_DAYS} days")
             if self._certification.rest.port is None:
                 raise HostRefusedError(self._certification.rest.trouble)
             if not await self._certification.until_served():
-                raise HostRefusedError("REST is not there: `rosrv status` and the log say why", ours=True)
+                raise HostRefusedError("REST is not running: see `rosrv status` and the log", ours=True)
             if len(self._awaited.rows()) >= MOST:
-                raise HostRefusedError(f"{MOST} hosts are awaited already: revoke some")
+                raise HostRefusedError(f"{MOST} hosts are already awaited: revoke some")
             promised = self._table.address_for(name, request.address, self._awaited.addresses())
             await self._tunnels.open()
             authority = await self._certification.authority_certificate()
@@ -167,7 +167,7 @@ class HostEnrolment:
             self._table.changed()
             self._trail.happened(
                 "host awaited",
-                f"whoever brings the one-time token {row.id} is enrolled as {name}",
+                f"the host that presents the one-time token {row.id} is enrolled as {name}",
                 name=name,
                 address=promised,
                 id=row.id,
@@ -210,7 +210,7 @@ class HostEnrolment:
         taken += self._expel(ipaddress.ip_address(row.address), f"the host {name} was revoked")
         self._trail.happened(
             "host revoked",
-            f"{name} ({row.address}) may no longer come; {taken} registrations and grants were taken back",
+            f"{name} ({row.address}) may no longer connect; {taken} registrations and grants were removed",
             name=name,
             address=row.address,
             serial=row.serial,
@@ -229,7 +229,7 @@ class HostEnrolment:
         try:
             self._table.declared.reload()
         except DeclaredHostsError as error:
-            raise HostRefusedError(f"{error}; what was declared before holds") from error
+            raise HostRefusedError(f"{error}; the previous declaration stays in force") from error
         after = {row.name for row in self._table.admitted()}
         self._table.changed()
         taken = 0
@@ -266,7 +266,7 @@ class HostEnrolment:
         row = self._table.rows.get(name)
         if row is not None and row.revoked is None:
             raise HostRefusedError(
-                f"{name} is enrolled already: `rosrv host kit {name}` gives it a new certificate"
+                f"{name} is already enrolled: `rosrv host kit {name}` issues a new certificate"
             )
 
     async def _await_no_longer(self, awaited: EnrolmentTokenRow, who: str) -> answers.Revoked:
@@ -309,7 +309,7 @@ async def find_endpoint(settings: Settings, look: Callable[[], Awaitable[Endpoin
         raise HostRefusedError("the supervisor did not answer: try again", ours=True) from None
     if found.address is None:
         raise HostRefusedError(
-            f"at which address the host reaches the appliance cannot be told: {found.reason}; give it:"
+            f"the address at which the host reaches the appliance is unknown: {found.reason}; give it:"
             " --appliance ADDRESS (REST: `endpoint`), or for all hosts `ipsec: {endpoint: ADDRESS}` in appliance.yaml"
             " (compose: ROSRV_ENDPOINT=ADDRESS in .env)"
         )

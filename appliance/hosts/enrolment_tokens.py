@@ -60,7 +60,7 @@ class EnrolmentTokens:
         row = rows.get(found[1]) if found is not None else None
         if found is None or row is None or not hmac.compare_digest(_hash(found[2]), row.hash):
             raise BadEnrolmentTokenError(
-                "the token is wrong, was used before, or has ended: ask for another one (rosrv host add NAME --token)"
+                "the token is wrong, already used, or expired: ask for another one (rosrv host add NAME --token)"
             )
         self.forget(row.name)
         return row

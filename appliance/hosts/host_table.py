@@ -119,7 +119,7 @@ class HostTable:
             moment = datetime.datetime.fromtimestamp(until, datetime.UTC)
             raise HostRefusedError(
                 "the list of revoked certificates is full (charon takes 64 KiB): no certificate is replaced before"
-                f" {moment:%Y-%m-%d %H:%M}Z, when the next one on it has ended; revoking a host makes room, too"
+                f" {moment:%Y-%m-%d %H:%M}Z, when the next one on it expires; revoking a host also makes room"
             )
 
     def _enrolled_names(self) -> set[str]:
@@ -131,16 +131,14 @@ class HostTable:
         """Raise `HostRefusedError` if a host cannot have this name, or there are too many hosts."""
         if not _NAME.fullmatch(name) or name.lower() == APPLIANCE_NAME:
             raise HostRefusedError(
-                f"{name[:80]!r} is no name for a host: letters, digits and . _ -, beginning and ending with a"
+                f"{name[:80]!r} is not a valid host name: letters, digits and . _ -, beginning and ending with a"
                 f" letter or digit, at most 63, and not {APPLIANCE_NAME}"
             )
         twin = next((other for other in self.rows if other.lower() == name.lower() and other != name), None)
         if twin is not None:
-            raise HostRefusedError(
-                f"{name} differs from {twin} only in large and small letters, which IKE ignores"
-            )
+            raise HostRefusedError(f"{name} differs from {twin} only in letter case, which IKE ignores")
         if name not in self.rows and len(self.rows) >= MOST_HOSTS:
-            raise HostRefusedError(f"there are {MOST_HOSTS} hosts, revoked ones counted: the table is full")
+            raise HostRefusedError(f"the table is full: {MOST_HOSTS} hosts, including revoked ones")
 
     def address_for(self, name: str, wanted: str | None, awaited: dict[str, str]) -> str:
         """Return the address for a host; `awaited` has the addresses reserved for others, with their names.
@@ -159,11 +157,11 @@ class HostTable:
             for candidate in itertools.islice(self.pool.hosts(), 1, None):
                 if str(candidate) not in taken and str(candidate) not in reserved:
                     return str(candidate)
-            raise HostRefusedError(f"every address of {self.pool} is a host's: take a larger ipsec.pool")
+            raise HostRefusedError(f"no address of {self.pool} is free: set a larger ipsec.pool")
         try:
             address = ipaddress.IPv4Address(wanted)
         except ValueError:
-            raise HostRefusedError(f"{wanted[:80]!r} is no IPv4 address") from None
+            raise HostRefusedError(f"{wanted[:80]!r} is not an IPv4 address") from None
         ends = (self.pool.network_address, self.pool.broadcast_address)
         if address not in self.pool or address in ends or str(address) == self.own_address:
             raise HostRefusedError(f"{address} is not an address of a host in {self.pool}")
@@ -171,7 +169,7 @@ class HostTable:
             raise HostRefusedError(f"{address} is the address of {taken[str(address)]}")
         if before is not None and str(address) != before.address:
             raise HostRefusedError(
-                f"{name} has {before.address} for good: policies and logs mean it by that address"
+                f"{name} keeps {before.address} permanently: policies and logs identify it by that address"
             )
         return str(address)
 
@@ -221,7 +219,7 @@ class HostTable:
     def keep_ports(self, row: PortsRow) -> None:
         """Keep the result of a check of a machine's ports. Raises `HostRefusedError`."""
         if row.name not in self.ports and len(self.ports) >= MOST_MACHINES:
-            raise HostRefusedError(f"the ports of {MOST_MACHINES} machines are known: that is the limit")
+            raise HostRefusedError(f"the limit of {MOST_MACHINES} machines with known ports is reached")
         self.ports[row.name] = row
         self._kept.save_ports(row)
         self.changed()

@@ -93,7 +93,7 @@ def read_declared(path: Path) -> dict[str, DeclaredHost]:
         place = _place(error.problem_mark) if error.problem_mark else "1:1"
         raise DeclaredHostsError(f"{path}:{place}: {not_yaml(error.problem)}") from error
     except (yaml.YAMLError, RecursionError) as error:
-        reason = "nested too deep, or refers to itself" if isinstance(error, RecursionError) else str(error)
+        reason = "nested too deeply, or refers to itself" if isinstance(error, RecursionError) else str(error)
         raise DeclaredHostsError(f"{path}: {not_yaml(reason)}") from error
     if reading.mistakes:
         more = len(reading.mistakes) - _MOST_MISTAKES
@@ -131,7 +131,7 @@ def _groups(value: object) -> tuple[str, ...]:
 def _tunnel(value: object) -> bool:
     if isinstance(value, bool):
         return value
-    raise ValueError("a tunnel is wanted or not: `tunnel: true` or `tunnel: false`")
+    raise ValueError("a tunnel is true or false: `tunnel: true` or `tunnel: false`")
 
 
 _KEYS: dict[str, Callable[[object], object]] = {
@@ -180,11 +180,11 @@ class _Reading:
             values["name"], values.get("address"), values.get("groups", ()), values.get("tunnel", True)
         )
         if host.name in self.found:
-            self._mistake(node, f"{host.name} is declared twice; leave one of them out")
+            self._mistake(node, f"{host.name} is declared twice; remove one of them")
             return
         for other in self.found.values():
             if host.address is not None and other.address == host.address:
-                self._mistake(node, f"{host.name} and {other.name} have the same address; give one another")
+                self._mistake(node, f"{host.name} and {other.name} have the same address; change one of them")
         self.found[host.name] = host
 
     def _pairs(self, node: yaml.Node, known: list[str], form: str) -> Iterator[tuple[str, yaml.Node]]:
@@ -198,7 +198,7 @@ class _Reading:
                 hint = meant(name, known) or f"; known here: {', '.join(known)}"
                 self._mistake(key, f"unknown key {quoted(name)}{hint}")
             elif name in seen:
-                self._mistake(key, f"{name} is given a second time")
+                self._mistake(key, f"{name} is given twice")
             else:
                 yield name, value
             seen.add(name)

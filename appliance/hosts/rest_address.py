@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from appliance.configuration.settings import Settings, is_loopback
 
 NO_TUNNELS = (
-    "isolation: none has no tunnels, for no firewall keeps their addresses from being forged: start the appliance with"
+    "isolation: none has no tunnels, because without a firewall their addresses can be forged: start the appliance with"
     " `isolation: netns` or `container`"
 )
 
@@ -45,7 +45,7 @@ def _trouble_outside(settings: Settings, host: str, port: int, *, everywhere: bo
         return (
             "other machines cannot reach REST (api_published: off). For hosts to enrol themselves publish port"
             f" {port} of the container on an address of this machine, name their network in ROSRV_API_NETWORKS, and set"
-            " ROSRV_API_PUBLISHED (docs/tunnels.md); a kit, without --token, needs none of it"
+            " ROSRV_API_PUBLISHED (docs/tunnels.md); a kit, without --token, needs no REST"
         )
     if not settings.api_networks:
         return (

@@ -76,7 +76,7 @@ class HostSelfService:
             row = self._in_its_tunnel(name, request.peer)
             certificate = self._table.certificates.get(name)
             if certificate is None or not certificate.certificate:
-                raise HostRefusedError(f"the certificate of {name} is not kept here: rosrv host kit {name}")
+                raise HostRefusedError(f"the certificate of {name} is not stored here: rosrv host kit {name}")
             life = row.expires - certificate.made
             self._require_patience(name, life)
             with self._certification.unless_revoked(name):
@@ -103,7 +103,7 @@ class HostSelfService:
         before = self._in_its_tunnel(name, request.peer).serial
         row = self._table.take_next(name)
         if row is None:
-            raise HostRefusedError(f"{name} was given no certificate that is to follow: renew first")
+            raise HostRefusedError(f"{name} has no renewed certificate waiting: renew first")
         self._certification.renewed(name, before, row.serial, row.expires, name)
         await self._certification.store.settled()
         asyncio.get_running_loop().call_later(_ANSWER_SECONDS, self._tunnels.state_anew)
@@ -124,7 +124,7 @@ class HostSelfService:
         wait = life / _RENEWALS
         since = time.time() - self._renewals.get(name, -wait)
         if 0 <= since < wait:  # a clock that was set back delays no request
-            raise HostRefusedError(f"{name} renewed {span(since)} ago: again in {span(wait - since)}")
+            raise HostRefusedError(f"{name} renewed {span(since)} ago: try again in {span(wait - since)}")
 
     def _note_renewal(self, name: str) -> None:
         self._renewals[name] = time.time()

@@ -123,7 +123,7 @@ class Tunnels:
         try:
             await self.open()
         except HostRefusedError as error:
-            _log.error("enrolled hosts stay outside", reason=str(error))
+            _log.error("enrolled hosts cannot connect", reason=str(error))
 
     def answered(self, message: messages.TunnelsEnclosed) -> None:
         """Take the supervisor's answer to `open`."""
@@ -175,7 +175,7 @@ class Tunnels:
             try:
                 await self._state()
             except AuthorityError as error:
-                _log.warning("charon is told later", reason=str(error))
+                _log.warning("charon is updated later", reason=str(error))
                 asyncio.get_running_loop().call_later(_AGAIN_SECONDS, self._dirty.set)
 
     def _until_it_changes(self) -> float:
@@ -256,7 +256,7 @@ class Tunnels:
     def _lost(self, _reason: str) -> None:
         self._certificate = self.charon = None
         for name in list(self.seen):
-            self._went_down(name, "the process that runs charon ended")
+            self._went_down(name, "the process that runs charon exited")
 
     # --- up and down ---
 
@@ -270,7 +270,7 @@ class Tunnels:
             self.seen[name] = messages.TunnelSeen(name, remote, 0, 0, 0)
             self.last[name] = time.time()
             self._trail.happened(
-                "tunnel up", f"{name} is here, from {remote}", host=row.address, name=name, remote=remote
+                "tunnel up", f"{name} is connected from {remote}", host=row.address, name=name, remote=remote
             )
 
     def _reported(self, rows: list[messages.TunnelSeen]) -> None:
@@ -291,7 +291,7 @@ class Tunnels:
         if row.remote != before:
             self._trail.happened(
                 "tunnel moved",
-                f"{row.name} comes from {row.remote} now, before from {before}",
+                f"{row.name} now connects from {row.remote}, previously from {before}",
                 host=self._table.rows[row.name].address,
                 name=row.name,
                 remote=row.remote,

@@ -78,7 +78,7 @@ class HostView:
         if row.revoked is not None:
             return "in hosts.yaml, revoked"
         if declared.address is not None and declared.address != row.address:
-            return f"hosts.yaml keeps {declared.address} for it; it has {row.address} for good"
+            return f"hosts.yaml declares {declared.address}; it keeps {row.address} permanently"
         return None
 
     def ports(self, name: str) -> PortsSeen:
@@ -120,7 +120,8 @@ class HostView:
 
     def _open_ports(self) -> list[str]:
         return [
-            f"ROS ports of {name} are open to others than the appliance (seen by {row.who}): rosrv protect there"
+            f"ROS ports of {name} are open to hosts other than the appliance (checked by {row.who}):"
+            " run rosrv protect there"
             for name, row in self._table.ports.items()
             if row.state == "open" and not ((host := self._table.rows.get(name)) and host.revoked is not None)
         ]
@@ -139,21 +140,21 @@ class HostView:
     def _troubles(self) -> list[str]:
         now, found = time.time(), []
         if self._table.admitted() and not self._tunnels.enclosed:
-            found.append(f"enrolled hosts stay outside: {self._tunnels.obstacle}")
+            found.append(f"enrolled hosts cannot connect: {self._tunnels.obstacle}")
         for row in self._table.enrolled():
             left = row.expires - now
             if left <= 0:
-                found.append(f"the certificate of {row.name} has ended: rosrv host kit {row.name}")
+                found.append(f"the certificate of {row.name} has expired: rosrv host kit {row.name}")
             elif soon(self._table, row, now):
                 found.append(
-                    f"the certificate of {row.name} ends in {span(left)} and was not renewed:"
+                    f"the certificate of {row.name} expires in {span(left)} and was not renewed:"
                     f" rosrv host kit {row.name}"
                 )
         missing = self._table.missing_as_revoked()
         if missing:
             found.append(
-                f"the list of revoked certificates is full: {missing} are not on it, and their hosts' tunnels can be"
-                " opened with them until they end"
+                f"the list of revoked certificates is full: {missing} are not on it, and they can still open"
+                " their hosts' tunnels until they expire"
             )
         if self._table.declared.error:
             found.append(self._table.declared.error)

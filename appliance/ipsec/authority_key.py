@@ -61,7 +61,7 @@ def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | 
     if not path.exists():
         raise SignerKeyError(
             f"{path}: missing, but its certificate is there; restore it from a backup, or remove"
-            f" {certificate_file} to begin with a new authority (every host enrols again)"
+            f" {certificate_file} to start with a new authority (every host enrols again)"
         )
     require_private(path)
     data = path.read_bytes()
@@ -70,8 +70,8 @@ def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | 
     found = _kind(path, key)
     if found != kind:
         raise SignerKeyError(
-            f"{path} is the key of an authority of the kind {found}, and {SETTING} is {kind}: set it to {found}, or"
-            f" remove {path.name} and {certificate_file} to begin with a new authority (every host enrols again)"
+            f"{path} is an authority's key of the kind {found}, but {SETTING} is {kind}: set it to {found}, or"
+            f" remove {path.name} and {certificate_file} to start with a new authority (every host enrols again)"
         )
     if passphrase is not None and not encrypted:
         write_key(path, key, passphrase)

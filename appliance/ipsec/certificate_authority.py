@@ -77,7 +77,7 @@ class CertificateAuthority:
             text = self._list_path.read_bytes()
             if not text.isdigit():
                 raise SignerKeyError(
-                    f"{self._list_path} is damaged, it has no number: restore it from a backup"
+                    f"{self._list_path} is damaged: it has no number: restore it from a backup"
                 )
             self._list_number = int(text)
 
@@ -95,7 +95,7 @@ class CertificateAuthority:
         """
         if not _NAME.fullmatch(name):
             raise RequestRefusedError(
-                f"{name[:80]!r} is not a name for a certificate: letters, digits and . _ -, at most 63"
+                f"{name[:80]!r} is not a valid name for a certificate: letters, digits and . _ -, at most 63"
             )
         if not 0 < days <= LONGEST_DAYS:
             raise RequestRefusedError(f"a certificate is valid for at most {LONGEST_DAYS} days")
@@ -170,7 +170,7 @@ def _key_of(request: bytes) -> ec.EllipticCurvePublicKey | ed25519.Ed25519Public
     except (ValueError, TypeError, UnsupportedAlgorithm, InvalidSignature, x509.InvalidVersion) as error:
         raise RequestRefusedError(f"not a signing request (PKCS #10) in PEM: {error}") from error
     if not signed:
-        raise RequestRefusedError("the signing request is not signed by the key that is in it")
+        raise RequestRefusedError("the signing request is not signed by its own key")
     if isinstance(key, ed25519.Ed25519PublicKey):
         return key
     if isinstance(key, ec.EllipticCurvePublicKey) and isinstance(key.curve, ec.SECP384R1):

@@ -164,7 +164,7 @@ class ViciClient:
         try:
             yield
         except _FAULTS as error:
-            raise CharonError(f"charon did not take {what}: {error}") from error
+            raise CharonError(f"charon rejected {what}: {error}") from error
 
 
 def _der_of(pem: bytes) -> bytes:

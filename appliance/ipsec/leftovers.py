@@ -30,7 +30,7 @@ def clear_leftovers(own: str) -> int:
         _ip("-force", "-batch", "-", text="".join(f"{order}\n" for order in orders))
         left = _orders(own)
         if left:
-            raise LeftoversError(f"the kernel keeps what an earlier charon left: {'; '.join(left)[:400]}")
+            raise LeftoversError(f"the kernel still has state of an earlier charon: {'; '.join(left)[:400]}")
     return len(orders)
 
 
@@ -65,10 +65,10 @@ def _ip(*arguments: str, text: str = "") -> str:
             ["ip", *arguments], input=text, capture_output=True, text=True, timeout=_SECONDS, check=False
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise LeftoversError(f"what an earlier charon left in the kernel is not known: {error}") from error
+        raise LeftoversError(f"the kernel's state of an earlier charon is unknown: {error}") from error
     # A kernel without IPsec rejects the protocol; it has nothing to list.
     if done.returncode and not text and "not supported" not in done.stderr:
         raise LeftoversError(
-            f"what an earlier charon left in the kernel is not known: {done.stderr.strip()[:200]}"
+            f"the kernel's state of an earlier charon is unknown: {done.stderr.strip()[:200]}"
         )
     return done.stdout

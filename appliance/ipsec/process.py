@@ -181,7 +181,7 @@ class TunnelProcess:
         status = await charon.wait()
         how = f"by {signal.Signals(-status).name}" if status < 0 else f"with exit status {status}"
         raise CharonError(
-            f"charon ended {how}; last it printed: {self._output[-1] if self._output else 'nothing'}"
+            f"charon exited {how}; its last output: {self._output[-1] if self._output else 'nothing'}"
         )
 
     def _may_tell(self) -> bool:
@@ -218,7 +218,7 @@ class TunnelProcess:
         if task.cancelled() or self._ended.is_set():
             return
         error = task.exception()
-        _log.error("the tunnels end and are started again", reason=str(error))
+        _log.error("the tunnels are restarted", reason=str(error))
         self._child.fail(str(error), list(self._output))
         self.failed = True
         self._ended.set()

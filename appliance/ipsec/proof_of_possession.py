@@ -32,12 +32,12 @@ def require_proof(
         certificate = x509.load_pem_x509_certificate(former)
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature) as error:
-        raise RequestRefusedError("the present certificate is not one of this authority") from error
+        raise RequestRefusedError("the current certificate is not from this authority") from error
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     if [attribute.value for attribute in names] != [name]:
-        raise RequestRefusedError("the present certificate is in another name")
+        raise RequestRefusedError("the current certificate has a different name")
     if certificate.not_valid_after_utc <= now:
-        raise RequestRefusedError("the present certificate has ended: only a new kit helps (rosrv host kit)")
+        raise RequestRefusedError("the current certificate has expired: create a new kit (rosrv host kit)")
     key = certificate.public_key()
     try:
         if len(proof) > LONGEST_PROOF:
@@ -50,5 +50,5 @@ def require_proof(
             raise InvalidSignature
     except InvalidSignature as error:
         raise RequestRefusedError(
-            "the request is not signed by the key of the present certificate"
+            "the request is not signed by the key of the current certificate"
         ) from error

@@ -91,10 +91,10 @@ def _packet(text: str) -> Refusal | None:
     """Return the packet that ESP dropped, from the line with its addresses."""
     again = _SENT_AGAIN.match(text)
     if again is not None:
-        return Refusal(again[1], "a packet of a tunnel was sent again", packet=True)
+        return Refusal(again[1], "a packet of a tunnel was replayed", packet=True)
     anothers = _UNDER_ANOTHERS.match(text)
     if anothers is not None:
         return Refusal(
-            anothers[1], "a packet under this address came through a tunnel that is not for it", packet=True
+            anothers[1], "a packet from this address came through another host's tunnel", packet=True
         )
     return None

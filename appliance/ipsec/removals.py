@@ -74,7 +74,7 @@ class RemovalApprover:
 
     def _words(self, upto: Checkpoint) -> str:
         if self._kept.days is None and self._kept.size is None:
-            return "records are kept for ever: neither audit.retention_days nor audit.retention_bytes is set"
+            return "records are kept forever: neither audit.retention_days nor audit.retention_bytes is set"
         return (
             f"records up to {upto.sequence} are not old enough for audit.retention_days, and too few came after them"
             " for audit.retention_bytes"

@@ -22,7 +22,7 @@ def signing_request(key: bytes, name: str) -> bytes:
     """Return the request (PKCS #10, PEM) for a certificate in this name, signed by a key of `make_key`."""
     private = load_pem_private_key(key, password=None)
     if not isinstance(private, ec.EllipticCurvePrivateKey):
-        raise ValueError("the key is not an ECDSA key: remove its file, and another is made")
+        raise ValueError("the key is not an ECDSA key: remove its file; a new one is created")
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     request = x509.CertificateSigningRequestBuilder().subject_name(subject).sign(private, hashes.SHA384())
     return request.public_bytes(Encoding.PEM)

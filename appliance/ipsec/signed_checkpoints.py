@@ -31,7 +31,7 @@ def read_checkpoint(text: bytes) -> Checkpoint:
     try:
         return parse_checkpoint(text)
     except ValueError:
-        raise CheckpointRefusedError("what was to be signed is not an audit checkpoint") from None
+        raise CheckpointRefusedError("the data to sign is not an audit checkpoint") from None
 
 
 def newest_signing(directory: Path) -> int | None:
@@ -107,8 +107,8 @@ class CheckpointMemory:
             self.remember_removed(wanted.log, wanted.removed)
         elif wanted.removed > (approved or 0):
             raise CheckpointRefusedError(
-                f"checkpoint {wanted.number} says that records up to {wanted.removed} are removed; approved was the"
-                f" removal up to {approved or 0}"
+                f"checkpoint {wanted.number} says that records up to {wanted.removed} are removed; only removal"
+                f" up to {approved or 0} was approved"
             )
         elif approved is None:
             self.remember_removed(wanted.log, 0)
@@ -123,7 +123,7 @@ class CheckpointMemory:
             place = _NUMBER + (wanted.number - begun) * _NUMBER
             if begun < first or place < _NUMBER or place > os.fstat(descriptor).st_size:
                 raise CheckpointRefusedError(
-                    f"{path} does not go with {path.stem}.signed; restore both from one backup, or remove it"
+                    f"{path} does not match {path.stem}.signed; restore both from one backup, or remove it"
                 )
             os.pwrite(descriptor, self._clock().to_bytes(_NUMBER, "big"), place)
             os.fsync(descriptor)
@@ -162,6 +162,6 @@ def _is_known(descriptor: int, wanted: Checkpoint, first: int, count: int) -> bo
         return True
     if os.pread(descriptor, _HASH, _NUMBER + (count - 1) * _HASH) != bytes.fromhex(wanted.previous):
         raise CheckpointRefusedError(
-            f"checkpoint {wanted.number} does not carry the hash of the one signed before it"
+            f"checkpoint {wanted.number} does not contain the hash of the previous signed one"
         )
     return False

@@ -90,7 +90,7 @@ def protection(
     has a rule for ESP in the kernel and one for ESP in user space; only one of them ever matches.
     """
     if not appliances:
-        raise ValueError("the address of at least one appliance is needed")
+        raise ValueError("give the address of at least one appliance")
     rules, leaving = ['iifname "lo" accept'], []
     for keyword, version in (("ip", 4), ("ip6", 6)):
         found = [text for text in appliances if ipaddress.ip_address(text).version == version]
@@ -107,7 +107,7 @@ def protection(
     return (
         "#!/usr/sbin/nft -f\n"
         f"# Closes the ROS ports of this machine ({ports}) to all but loopback and the appliance\n"
-        f"# ({', '.join(appliances)}), which nobody behind this machine reaches under its address.\n"
+        f"# ({', '.join(appliances)}), whose address no host behind this machine can use.\n"
         "# Made by `rosrv protect`; `rosrv protect --remove` removes it.\n"
         f"table inet {TABLE}\n"
         f"delete table inet {TABLE}\n"

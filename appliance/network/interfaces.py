@@ -30,7 +30,7 @@ def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) 
     try:
         _netlink(
             near,
-            f"making the veth pair {near_name} - {far_name}",
+            f"creating the veth pair {near_name} - {far_name}",
             lambda route: route.link(
                 "add", ifname=near_name, kind="veth", peer={"ifname": far_name, "net_ns_fd": descriptor}
             ),
@@ -45,7 +45,7 @@ def create_bridge(namespace: Namespace, name: str) -> None:
     """Make a bridge without spanning tree, up."""
     _netlink(
         namespace,
-        f"making the bridge {name}",
+        f"creating the bridge {name}",
         lambda route: route.link("add", ifname=name, kind="bridge", br_stp_state=0, br_forward_delay=0),
     )
     set_link(namespace, name, up=True)
@@ -252,7 +252,7 @@ def _held(route: Any, **of: int) -> list[str]:
 def _index(route: Any, name: str) -> int:
     found = route.link_lookup(ifname=name)
     if not found:
-        raise NetworkError(f"there is no interface {name}")
+        raise NetworkError(f"interface {name} does not exist")
     return int(found[0])
 
 

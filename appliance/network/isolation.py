@@ -202,7 +202,7 @@ class Isolation:
         """
         link = self.settings.link
         return tuple(
-            f"{chain} drops what is forwarded by default: let interface {link} pass in it, both ways"
+            f"{chain} drops forwarded packets by default: let interface {link} pass in it, both ways"
             for chain in (*self._backend.foreign_forward_drops(), *iptables.foreign_forward_drops(self._host))
         )
 
@@ -221,8 +221,8 @@ class Isolation:
         used = self._host.run(udp_ports_in_use) & {port.first for port in _TUNNELS}
         if used:
             raise NetworkError(
-                f"the host has a program of its own on UDP {', '.join(map(str, sorted(used)))}, where the appliance's"
-                " tunnels arrive: stop it (a strongSwan of the host?), or run the appliance in a container"
+                f"a program of the host uses UDP {', '.join(map(str, sorted(used)))}, needed by the appliance's"
+                " tunnels: stop it (a strongSwan of the host?), or run the appliance in a container"
             )
         self._install(rules)
 
@@ -275,12 +275,12 @@ class Isolation:
         name, link = self.settings.name, self.settings.link
         if self.namespace.exists():
             raise NetworkError(
-                f"there is a network namespace {name} that this appliance did not make: "
-                f"`sudo ip netns delete {name}` if nobody needs it, or give the appliance another name"
+                f"a network namespace {name} exists that this appliance did not create: "
+                f"`sudo ip netns delete {name}` if it is unused, or give the appliance another name"
             )
         if link in interfaces.links(self._host):
             raise NetworkError(
-                f"there is an interface {link} that this appliance did not make: `ip link delete {link}`"
+                f"an interface {link} exists that this appliance did not create: `ip link delete {link}`"
             )
         in_use = self._host.run(listening_ports)
         clashes = [
@@ -290,7 +290,7 @@ class Isolation:
         ]
         if clashes:
             raise NetworkError(
-                f"the host has programs of its own that listen on TCP {', '.join(clashes[:8])}, which would "
+                f"programs of the host listen on TCP {', '.join(clashes[:8])}, which would "
                 "be forwarded to the appliance: stop them (a roscore?), or give the appliance other ports"
             )
 
@@ -340,9 +340,7 @@ class Isolation:
         except FileNotFoundError:
             return
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise NetworkError(
-                f"{self._record} cannot be read ({error}): look at it and delete it"
-            ) from error
+            raise NetworkError(f"{self._record} cannot be read ({error}): check it and delete it") from error
         self._forwarding.restore(settings)  # before ROSRV-FWD, which keeps the host from routing, is removed
         self._backend.remove()
         interfaces.delete_link(self._host, link)
@@ -381,7 +379,7 @@ def isolation_rules(
             "the host's own loopback", PacketVerdict.RETURN, chain=Chain.ARRIVING, arrives_on=LOOPBACK
         ),
         leaving(
-            "no packet of others under an address of the host",
+            "no packet from elsewhere with an address of the host",
             PacketVerdict.DROP,
             arrives_on=outward,  # local neighbour discovery seems to arrive where it leaves
             local_source=True,
@@ -411,7 +409,9 @@ def _true_sources(family: Family, end: LinkAddresses, inward: Interface) -> tupl
             PacketVerdict.DROP,
             source=end.network,
         ),
-        entering(f"to the appliance: nobody else translates IPv{family} sources", PacketVerdict.KEEP_SOURCE),
+        entering(
+            f"to the appliance: no other rule translates IPv{family} sources", PacketVerdict.KEEP_SOURCE
+        ),
     )
 
 

@@ -86,7 +86,7 @@ class Namespace:
     def __init__(self, name: str) -> None:
         if not _VALID_NAME.fullmatch(name):
             raise ValueError(
-                f"{name!r} is not a name for a network namespace: letters, digits and _ . - only"
+                f"{name!r} is not a valid name for a network namespace: letters, digits and _ . - only"
             )
         self.name = name
         self.path = DIRECTORY / name
@@ -115,10 +115,10 @@ class Namespace:
 
     def create(self) -> "Namespace":
         """Create it, with only `lo`, which is down. Raises `PrivilegeError`, or `NetworkError` if the name exists."""
-        require_privileges(f"making the network namespace {self.name}")
+        require_privileges(f"creating the network namespace {self.name}")
         with _directory_lock():
             if self.exists():
-                raise NetworkError(f"there is a network namespace {self.name} already ({self.path})")
+                raise NetworkError(f"the network namespace {self.name} already exists ({self.path})")
             self.path.touch(mode=0o444)
             try:
                 _in_thread(self._unshare_and_mount)
@@ -215,7 +215,7 @@ class Namespace:
             return os.open(self.path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
             raise NetworkError(
-                f"there is no network namespace {self.name} ({self.path}: {error.strerror})"
+                f"the network namespace {self.name} does not exist ({self.path}: {error.strerror})"
             ) from error
 
     def _enter(self) -> None:

@@ -51,10 +51,10 @@ def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddre
     for version in _VERSIONS:
         of_it = [str(address) for address in found if address.version == version]
         if len(of_it) == 1:
-            return PublicAddress(of_it[0], "the only address here")
+            return PublicAddress(of_it[0], "the only address of this machine")
         if of_it:
-            raise NetworkError(f"there are several addresses here ({', '.join(of_it)})")
-    raise NetworkError("there is no address here but loopback and link-local ones")
+            raise NetworkError(f"this machine has several addresses ({', '.join(of_it)})")
+    raise NetworkError("this machine has only loopback and link-local addresses")
 
 
 def _first(namespace: Namespace, route: interfaces.DefaultRoute, version: int) -> str | None:

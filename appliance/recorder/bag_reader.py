@@ -61,11 +61,11 @@ class BagReader:
         self.connections: dict[int, Mapping[str, str]] = {}
         self.chunks: list[Chunk] = []
         if file.read(len(MAGIC)) != MAGIC:
-            raise ValueError("this is not a bag of format 2.0")
+            raise ValueError("not a bag of format 2.0")
         head = read_fields(file)
         self._end = _U64.unpack(head["index_pos"])[0]
         if head["op"] != BAG or not self._end:
-            raise ValueError("this bag has no index: it was not closed")
+            raise ValueError("the bag has no index: it was not closed")
         file.seek(self._end)
         for _connection in range(_U32.unpack(head["conn_count"])[0]):
             fields, data = self._record(CONNECTION)
@@ -86,13 +86,13 @@ class BagReader:
             try:
                 yield cls(file)
             except (struct.error, LookupError) as error:
-                raise ValueError(f"this is not a bag that the recorder wrote: {error!r}") from None
+                raise ValueError(f"not a bag that the recorder wrote: {error!r}") from None
 
     def index(self, chunk: Chunk) -> Iterator[tuple[int, bytes]]:
         """Yield each connection's number and its entries in a chunk (`INDEX_ENTRY`: seconds, nanoseconds, offset)."""
         self._file.seek(chunk.place)
         if read_fields(self._file)["op"] != CHUNK:
-            raise ValueError("a chunk is not where the index has it")
+            raise ValueError("a chunk is not at the offset in the index")
         self._file.seek(_U32.unpack(self._file.read(4))[0], 1)
         while self._file.tell() < self._end:
             fields = read_fields(self._file)
@@ -147,7 +147,7 @@ class BagReader:
     def _record(self, op: bytes) -> tuple[dict[str, bytes], bytes]:
         fields = read_fields(self._file)
         if fields["op"] != op:
-            raise ValueError("the index of this bag is not in its order")
+            raise ValueError("the index of the bag is not in order")
         return fields, self._file.read(_U32.unpack(self._file.read(4))[0])
 
 

@@ -8,7 +8,7 @@ lists which topics were left out because of a publisher's claim.
 from collections.abc import Collection, Iterable, Mapping
 from fnmatch import fnmatchcase
 
-NAMED = "recorder.never has its name"
+NAMED = "recorder.never lists its name"
 
 _SHIPPED = {
     "sensor_msgs/Image": "060021388200f6f0f447d0fcd9c64743",
@@ -41,8 +41,8 @@ def left_out_because(
     if not fits(never, name):
         return ""
     if name not in sums:
-        return f"its publisher says that it is {name}, a type whose definition is not known here"
-    return f"its publisher says that it is {name}" if header.get("md5sum") == sums[name] else ""
+        return f"its publisher declares the type {name}, whose definition is unknown here"
+    return f"its publisher declares the type {name}" if header.get("md5sum") == sums[name] else ""
 
 
 def fits(globs: Iterable[str], name: str) -> bool:

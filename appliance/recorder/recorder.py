@@ -85,14 +85,12 @@ class Recorder:
             try:
                 self._obey(message)
             except OSError as error:
-                _log.error(
-                    "what control said cannot be done", order=type(message).__name__, reason=str(error)
-                )
+                _log.error("control's request failed", order=type(message).__name__, reason=str(error))
         try:
             for trigger, planned in self._new_triggers():
                 self._triggered(trigger, planned)
         except LogUnreadableError as error:
-            _log.error("the audit log cannot be read; it is tried again", reason=str(error))
+            _log.error("cannot read the audit log; retrying", reason=str(error))
         for making in tuple(self._making):
             try:
                 self._go_on(making)
@@ -150,7 +148,7 @@ class Recorder:
         since = max(self._memory, wanted.since, now - int(self._rules.before * _SECOND))
         until = min(wanted.until, now)
         if since > until:
-            reason = f"the memory has the last {self._rules.before:g} seconds, and nothing of that time"
+            reason = f"the memory has the last {self._rules.before:g} seconds, and none of that period"
             self._answers.append(messages.RecordingRefused(wanted.number, reason, unknown=True))
             return
         if self._store.free < 2 * self._reserve + self._store.largest:
@@ -159,9 +157,7 @@ class Recorder:
         progress = Progress(self._ids.next(), self._memory, since, until, [wanted.trigger])
         try:
             if not self._store.has_temporary_room(now):
-                reason = (
-                    f"others asked for it {MOST_TEMPORARY} times within seconds: try again in half a minute"
-                )
+                reason = f"{MOST_TEMPORARY} requests came within seconds: try again in half a minute"
                 self._answers.append(messages.RecordingRefused(wanted.number, reason))
                 return
             self._store.mark_temporary(progress.id)
@@ -181,7 +177,9 @@ class Recorder:
     def _remove(self, number: int, recording_id: str, who: str) -> None:
         recording = self._store.find(recording_id)
         if recording is None:
-            refused = messages.RecordingRefused(number, f"there is no recording {recording_id}", unknown=True)
+            refused = messages.RecordingRefused(
+                number, f"recording {recording_id} does not exist", unknown=True
+            )
             self._answers.append(refused)
             return
         try:
@@ -223,7 +221,7 @@ class Recorder:
             kept = self._store.find(planned)
             if kept is not None and trigger.time > kept.ended:
                 self._missed(
-                    trigger, f"recording {planned} had ended: {kept.why_not or 'its time was over'}", planned
+                    trigger, f"recording {planned} had ended: {kept.why_not or 'its time expired'}", planned
                 )
             return
         if any(
@@ -307,7 +305,7 @@ class Recorder:
     def _go_on(self, making: RecordingInProgress) -> None:
         now, progress = self._clock(), making.progress
         if now < progress.began:
-            progress.why_not = "the clock was set back while it was made"
+            progress.why_not = "the clock was set back during the recording"
             now = progress.began
         if now <= progress.ends:
             making.step()
@@ -342,7 +340,7 @@ class Recorder:
 
     def _give_up(self, making: RecordingInProgress, error: OSError) -> None:
         """Discard a recording that cannot be written, and report that."""
-        _log.error("a recording cannot be made", reason=str(error))
+        _log.error("a recording cannot be written", reason=str(error))
         making.leave()
         progress = making.progress
         self._store.discard_part(progress.id)
@@ -359,19 +357,19 @@ class Recorder:
             try:
                 progress = load_progress(folder)
             except (OSError, msgspec.MsgspecError):
-                _log.warning("a recording that had only been begun is removed", folder=folder.name)
+                _log.warning("an unfinished recording is removed", folder=folder.name)
                 shutil.rmtree(folder)
                 continue
             try:
                 if progress.memory == self._memory:
                     self._making.append(self._in_progress(progress))
-                    _log.warning("a recording that was begun goes on", recording=progress.id)
+                    _log.warning("an unfinished recording continues", recording=progress.id)
                     continue
-                progress.why_not = "the appliance ended while it was made"
-                _log.warning("a recording that was begun is finished without its end", recording=progress.id)
+                progress.why_not = "the appliance stopped during the recording"
+                _log.warning("an unfinished recording is closed without its end", recording=progress.id)
                 self._finish(RecordingInProgress(folder, progress, (), largest=self._store.largest))
             except OSError as error:
-                _log.error("it cannot be finished; the next start tries again", reason=str(error))
+                _log.error("it cannot be closed; the next start retries", reason=str(error))
 
     def _remove_outdated(self) -> None:
         try:

@@ -108,7 +108,7 @@ class RecordingInProgress:
         self._largest = largest
         self._bag = BagWriter(folder / BAG, dict(enumerate(progress.connections)), progress.size)
         if self._bag.lost:
-            progress.why_not = progress.why_not or "the disk lost what was written last"
+            progress.why_not = progress.why_not or "the disk lost the last data written"
         self._numbers = {_key(header): number for number, header in enumerate(progress.connections)}
         self._headers = sum(map(_length, progress.connections))
         self._left_out = set(progress.left_out)
@@ -226,24 +226,24 @@ class RecordingInProgress:
         reasons = [progress.why_not] if progress.why_not else []
         missed = sum(row.missed for row in progress.topics)
         if missed:
-            reasons.append(f"{missed} messages had no room (see topics)")
+            reasons.append(f"{missed} messages did not fit (see topics)")
         if progress.unconnected:
             reasons.append(f"{progress.unconnected} messages of too many different connections")
         if progress.claims:
             claims = [row.topic for row in progress.left_out if row.why != NAMED][:_MOST_NAMED]
             named = ", ".join(claims) + (" and others" if progress.claims > len(claims) else "")
-            reasons.append(f"left out because of the type that its publisher says (recorder.never): {named}")
+            reasons.append(f"left out because of the publisher's type (recorder.never): {named}")
         if progress.torn:
             named = ", ".join(progress.torn[:_MOST_NAMED]) + (
                 " and others" if progress.torn[_MOST_NAMED:] else ""
             )
-            reasons.append(f"the beginning had left recorder.memory already: {named}")
+            reasons.append(f"the beginning was no longer in recorder.memory: {named}")
         for reader, (missed_before, refused_before) in zip(self._readers, progress.not_there, strict=False):
             missed_now, refused_now = reader.not_there
             if missed_now > missed_before:
                 reasons.append(f"{missed_now - missed_before} messages were too long for recorder.memory")
             if refused_now > refused_before:
-                reasons.append(f"{refused_now - refused_before} connections had no room in recorder.memory")
+                reasons.append(f"{refused_now - refused_before} connections did not fit in recorder.memory")
         return "; ".join(reasons)
 
     def _write_records(self, records: Iterable[LogEntry]) -> None:

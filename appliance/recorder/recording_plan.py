@@ -94,7 +94,9 @@ class HourlyLimit:
 
     def refusal(self, charged_to: str) -> str:
         """Return why `take` returned False."""
-        return f"{charged_to} has begun its {self._most} recordings of this kind in this hour (recorder.per_hour)"
+        return (
+            f"{charged_to} already started {self._most} recordings of this kind this hour (recorder.per_hour)"
+        )
 
 
 class RecordingPlan:
@@ -144,7 +146,7 @@ class RecordingPlan:
             return "", why_not
         others = [name for name, (_id, other) in self._open.items() if name != ROBOT and now <= other.ends]
         if own != ROBOT and len(others) >= _MOST_AT_ONCE:
-            return "", f"{_MOST_AT_ONCE} recordings of other hosts are being made"
+            return "", f"{_MOST_AT_ONCE} recordings of other hosts are in progress"
         if not self._limit.take(charged_to, what, now):
             return "", self._limit.refusal(charged_to)
         ended = found[1].ends if found is not None else self._ended.get(own, 0)

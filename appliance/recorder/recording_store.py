@@ -175,7 +175,7 @@ class RecordingStore:
                 recording = msgspec.json.decode((folder / ABOUT).read_bytes(), type=Recording)
             except (OSError, msgspec.MsgspecError):
                 continue
-            who, reason = "", "the recorder fell meanwhile"
+            who, reason = "", "the recorder crashed during the recording"
             with suppress(OSError, msgspec.MsgspecError):
                 who, reason = msgspec.json.decode((folder / _REMOVED).read_bytes(), type=tuple[str, str])
             yield recording, who, reason
@@ -214,13 +214,13 @@ class RecordingStore:
         guests = {name: size for name, size in held.items() if name not in KEPT}
         kept_here = {found.charged_to for found in self.recordings}
         if charged_to not in KEPT and held[charged_to] > self._disk // 4 and charged_to in kept_here:
-            return self._oldest({charged_to}), f"{charged_to} has its share of recorder.disk"
+            return self._oldest({charged_to}), f"{charged_to} used its quota of recorder.disk"
         if charged_to not in KEPT and sum(guests.values()) > self._disk * 3 // 4:
-            why = "hosts but the robot have their share of recorder.disk"
+            why = "hosts other than the robot used their quota of recorder.disk"
         elif sum(held.values()) > self._disk:
-            why = "recorder.disk is used up"
+            why = "recorder.disk is full"
         elif len(self.recordings) + len(making) >= MOST_KEPT:
-            why = f"there are {MOST_KEPT} recordings"
+            why = f"the limit is {MOST_KEPT} recordings"
         elif sum(self._described.values()) > _MOST_DESCRIBED:
             why = f"the descriptions of all recordings have more than {_MOST_DESCRIBED} bytes"
         else:

@@ -68,7 +68,7 @@ class Geometry(NamedTuple):
 def geometry(size: int) -> Geometry:
     """Return the layout of a ring of this size. Raises `ValueError` if it is too small."""
     if size < SMALLEST:
-        raise ValueError(f"a ring of {size} bytes is too small: {SMALLEST} at least")
+        raise ValueError(f"a ring of {size} bytes is too small: use at least {SMALLEST}")
     block = _SMALLEST_BLOCK
     while block < _LARGEST_BLOCK and block * _BLOCKS < size:
         block *= 2

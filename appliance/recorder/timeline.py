@@ -93,7 +93,7 @@ def timeline(
     start = recording.began if since is None else max(since, recording.began)
     end = recording.ended if until is None else min(until, recording.ended)
     if start >= end:
-        raise ValueError("that is not within the recording's time")
+        raise ValueError("that time is outside the recording")
     wanted = _Columns(start, end, columns)
     with BagReader.of(bag) as reader:
         flows, counts = _flows(reader, wanted), defaultdict[str, list[int]](lambda: [0] * columns)

@@ -182,11 +182,11 @@ class DataPlane:
             self._cut_clients("the service's node is gone", message.key)
             self._forget_services(message.key)
         elif isinstance(message, messages.PublicationWithdrawn):
-            self._remove_topic(message.key, message.topic, "the topic is published no longer")
+            self._remove_topic(message.key, message.topic, "the topic is no longer published")
         elif isinstance(message, messages.GrantRevoked):
             self._cut_by(("topic", message.key, message.topic, message.host, message.caller_id))
         elif isinstance(message, messages.ServiceWithdrawn):
-            self._cut_clients("the service is offered no longer", message.key, message.service)
+            self._cut_clients("the service is no longer offered", message.key, message.service)
             self._forget_services(message.key, message.service)
         elif isinstance(message, messages.ClientRevoked):
             self._cut_by(("service", message.key, message.service, message.host, message.caller_id))
@@ -386,7 +386,7 @@ class DataPlane:
             return False
         for member in self._served():
             if member.host == largest:
-                member.cut("its host has most connections, and there was no room for others")
+                member.cut("its host has the most connections, and the limit of connections was reached")
                 return True
         return False
 

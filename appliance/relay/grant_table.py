@@ -7,7 +7,7 @@ Invariants:
 - Nothing is served that is not in the table.
 - Between `StateBegan` and `StateEnded` everything stated before is valid, so a restart of control interrupts no
   connection; `StateEnded` withdraws what was not stated again. A `StateBegan` that is followed by another one (control
-  died before the end) withdraws nothing.
+  died before the end) is not a withdrawal.
 - Withdrawing an incarnation withdraws its publications, services and grants.
 """
 
@@ -200,7 +200,7 @@ def _fact(message: messages.Message) -> _Fact:
     """Return what a statement, or its withdrawal, is about."""
     kind = _KINDS.get(type(message))
     if kind is None:
-        raise TypeError(f"{type(message).__name__} withdraws nothing")
+        raise TypeError(f"{type(message).__name__} is not a withdrawal")
     return (kind, *(getattr(message, field) for field in _ABOUT[kind].fields))
 
 

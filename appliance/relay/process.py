@@ -94,7 +94,7 @@ class RelayProcess:
             self._earlier.append(memory)
 
     def _supervisor_gone(self, reason: str) -> None:
-        logging.getLogger(__name__).error("relay %s ends: its supervisor is gone (%s)", self._index, reason)
+        logging.getLogger(__name__).error("relay %s stops: its supervisor is gone (%s)", self._index, reason)
         self._loop.stop()
 
     def _open_control(self, sock: socket.socket) -> None:

@@ -107,7 +107,7 @@ class Reporter:
             self._refused[refusal] = int(self._link is None)
             self.send(ConnectionRefused(*refusal, 1))
         else:
-            folded = ("", "", "", "", "", "further refusals of other peers, not reported one by one")
+            folded = ("", "", "", "", "", "further rejections of other peers, not reported individually")
             self._refused[folded] = self._refused.get(folded, 0) + 1
 
     def limited(self, what: _Limited, messages: int, size: int) -> None:

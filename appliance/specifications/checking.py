@@ -94,14 +94,14 @@ def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
     try:
         return [_bounded(encoded_part(part_of(whole, names.monitors, names.shadows))) for names in wanted]
     except StepDiffersError as error:
-        text = f"the code of a step is not what its automaton says: {error}; {DEFECT}"
+        text = f"the code of a step differs from its automaton: {error}; {DEFECT}"
         raise SpecificationsRefusedError([text]) from error
 
 
 def _bounded(data: bytes) -> bytes:
     """Return the data if a channel can carry it. Raises `SpecificationsRefusedError`."""
     if len(data) > _LONGEST:
-        text = f"compiled, they take {len(data) >> 20} MiB; {_LONGEST >> 20} are allowed: load fewer of them"
+        text = f"the compiled specifications take {len(data) >> 20} MiB; the limit is {_LONGEST >> 20} MiB: load fewer"
         raise SpecificationsRefusedError([text])
     return data
 

@@ -26,10 +26,8 @@ from appliance.specifications.specification_files import (
 _START_SECONDS = 60.0  # on a machine that is busy starting
 _WORK_SECONDS = 180.0  # on a busy machine; the compiler bounds its processor time
 _LOOK_SECONDS = 1.0  # between two checks whether the client of the order still waits
-_ENDED = (
-    "the compiler ended while it read them, maybe of the memory or time that they take; the log says more"
-)
-_ENDED_BY_ORDER = "the dry run was ended, because an order needed the compiler: try again"
+_ENDED = "the compiler exited while it read them, possibly at its limit of memory or time; check the log"
+_ENDED_BY_ORDER = "the dry run was stopped, because a change needed the compiler: try again"
 _TRIES = 2  # an idle compiler may end just when it is asked
 
 
@@ -131,7 +129,7 @@ class SpecificationCompiler:
             except TimeoutError:
                 self._called = False
                 raise SpecificationsRefusedError(
-                    ["the compiler does not answer; try again, the log may say why"]
+                    ["the compiler does not answer; try again, or check the log"]
                 ) from None
             if isinstance(answer, messages.CompilationRefused):
                 raise SpecificationsRefusedError(answer.findings)

@@ -71,10 +71,10 @@ def judge_topics(
     return found
 
 
-_FORCE = "give the topic the publisher's type, or say --force (REST: force=1) if the publisher is wrong"
-_CUT = f"its messages would not be carried any more; {_FORCE}"
+_FORCE = "give the topic the publisher's type, or use --force (REST: force=1) if the publisher is wrong"
+_CUT = f"its messages would no longer be relayed; {_FORCE}"
 _MIXED = f"subscribers would get messages of two types; {_FORCE}"
-_UNREAD = "monitors in shadow mode are not given its messages"
+_UNREAD = "monitors in shadow mode do not see its messages"
 
 
 def _difference(theirs: LiveType, ours: LiveType) -> str:
@@ -86,7 +86,7 @@ def _difference(theirs: LiveType, ours: LiveType) -> str:
     return f"{ours.name} with md5sum {theirs.md5sum}, not {ours.md5sum} ({_DEFINITION})"
 
 
-_DEFINITION = "give the specifications the robot's definition: msg/ beside them"
+_DEFINITION = "add the robot's definition to the specifications: in msg/ beside them"
 
 
 def _heard(checked: CheckedSpecifications, names: Iterable[str]) -> set[str]:

@@ -50,7 +50,7 @@ class MonitorRecords:
             for tell in self.told:
                 tell(event)
         if lost:
-            text = f"{lost} reports of monitors were lost while the relay had no control"
+            text = f"{lost} reports of monitors were lost while control was not running"
             self.trail.happened("records lost", text, lost=lost)
 
     def _record(self, event: MonitorEvent) -> None:

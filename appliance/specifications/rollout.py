@@ -180,7 +180,7 @@ class Rollout:
             for relay in plan.losing - shadowed.losing:
                 self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
         self._restate()
-        raise SpecificationsRefusedError(["topics that would have to move come and go meanwhile; try again"])
+        raise SpecificationsRefusedError(["topics that must move changed during the rollout; try again"])
 
     async def all_taken(self) -> None:
         """Wait until the relays that gave something up have the new specifications, or one refuses them (`refused`)."""
@@ -267,10 +267,10 @@ class Rollout:
 
     def _say_moved(self, plan: AllocationPlan, monitors: list[str]) -> None:
         names = [move.name for move in plan.moves]
-        anew = f"; {', '.join(monitors)} began in the initial state there" if monitors else ""
+        anew = f"; {', '.join(monitors)} started in the initial state there" if monitors else ""
         self.trail.happened(
             "topics moved",
-            f"{', '.join(names[:20])} {'are' if len(names) > 1 else 'is'} carried by another relay process{anew}",
+            f"{', '.join(names[:20])} {'are' if len(names) > 1 else 'is'} handled by another relay process{anew}",
             severity=Severity.ALARM if monitors else Severity.NOTICE,
             category="monitor",
             resource="",
@@ -343,7 +343,7 @@ class Rollout:
     def lost(self, relay: int) -> None:
         """Refuse the specifications that a lost relay has not answered, since they may have killed it."""
         for at, statement in [entry for entry in self._waiting if entry[0] == relay]:
-            self._answer(at, statement, ["a relay process ended while it took them: try again"])
+            self._answer(at, statement, ["a relay process exited during the load: try again"])
 
     def _taken(self, relay: int, taken: messages.SpecificationsTaken) -> None:
         statement, began, held = taken.statement, taken.began, taken.held
@@ -353,7 +353,7 @@ class Rollout:
         if (relay, statement) in self._waiting:
             self._began |= set(began)
         if relay in self._fresh and (began or held):
-            parts = [f"{', '.join(began)} began in the initial state"] if began else []
+            parts = [f"{', '.join(began)} started in the initial state"] if began else []
             parts += [f"{', '.join(held)} hold their topics until resumed"] if held else []
             self.trail.happened(
                 "monitors restarted",
@@ -385,7 +385,7 @@ class Rollout:
             self._refusals[relay] = findings
         self.trail.happened(
             "specifications refused",
-            f"the relay does not take revision {number}: {findings[0] if findings else ''}",
+            f"the relay rejects revision {number}: {findings[0] if findings else ''}",
             severity=Severity.ALARM,
             findings=findings,
         )

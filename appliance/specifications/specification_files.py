@@ -132,7 +132,7 @@ def require_bounded(sources: Sources) -> None:
     """Raise `SpecificationsRefusedError` if there are too many sources, or too long ones."""
     if len(sources.files) > _MOST_FILES:
         raise SpecificationsRefusedError(
-            [f"{len(sources.files)} files of specifications; {_MOST_FILES} at most"]
+            [f"{len(sources.files)} specification files; the limit is {_MOST_FILES}"]
         )
     if sum(map(len, [*sources.files.values(), *sources.definitions.values()])) > _LONGEST:
         raise SpecificationsRefusedError(
@@ -158,7 +158,7 @@ def read_folder(folder: Path) -> Sources:
 
 def _read_folder(folder: Path) -> Sources:
     if not folder.is_dir():
-        raise SpecificationsRefusedError([f"{folder}: there is no such folder of specifications"])
+        raise SpecificationsRefusedError([f"{folder}: the folder of specifications does not exist"])
     paths = {path.name: path for path in sorted(folder.glob("*.rv"))}
     files = {name: _read(path) for name, path in paths.items()}
     definitions: dict[str, str] = {}

@@ -91,8 +91,8 @@ class MonitorsChangedError(Exception):
 
     def __init__(self, expected: str, tag: str) -> None:
         super().__init__(
-            f"the monitors were loaded, switched or resumed meanwhile (they are at {tag}, not at {expected}):"
-            " look at them first"
+            f"the monitors were loaded, switched or resumed in the meantime (they are at {tag}, not at {expected}):"
+            " list them first"
         )
         self.tag = tag
 
@@ -218,7 +218,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         """Return a revision with its texts. Raises `UnknownMonitorError`."""
         row = await self._find(request.revision)
         if row is None:
-            raise UnknownMonitorError(f"there is no revision {request.revision} of the specifications")
+            raise UnknownMonitorError(f"revision {request.revision} of the specifications does not exist")
         texts = msgspec.structs.asdict(sources_of(row))
         return msgspec.convert(self._described(row) | texts, answers.RevisionTexts)
 
@@ -248,7 +248,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
         """Return what a load would do. Raises as `load`, and `DryRunUnderWayError`."""
         if who in self._attempting:
-            raise DryRunUnderWayError("you have a dry run under way: wait for its answer, then try again")
+            raise DryRunUnderWayError(
+                "your previous dry run is still running: wait for its answer, then try again"
+            )
         if request.expected not in (None, self.tag):
             raise MonitorsChangedError(request.expected or "", self.tag)
         self._attempting.add(who)
@@ -320,7 +322,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 if file in files and not {monitor, file} & set(names)
             )
             if left:
-                text = f"{', '.join(left)} would go, too: they are in the same file; name the file, or load it without"
+                text = (
+                    f"{', '.join(left)} would also be removed: same file; name the file, or load it without"
+                )
                 raise SpecificationsRefusedError([text])
             sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
             return await self._change(sources, who, who, note, request.confirm_within)
@@ -400,7 +404,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         async with self._one_change:
             for to in (True, SHADOW):
                 names = [name for name in self._disabled() if back.get(name) == to]
-                await self._switch(names, to, "its time off is over")
+                await self._switch(names, to, "its disabled period is over")
 
     def _disabled(self) -> list[str]:
         return [name for name, state in self.switches.states.items() if state is False]
@@ -480,15 +484,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 self.rollout.resumed(name)
                 self._trail.happened(
                     "monitor resumed",
-                    f"the topics of {name} go on",
+                    f"the topics of {name} are released",
                     category="monitor",
                     resource=name,
                     who=who,
                 )
             if away:
-                text = (
-                    f"{', '.join(away)} not resumed: the relay process is away; resume when it is there again"
-                )
+                text = f"{', '.join(away)} not resumed: the relay process is not running; resume when it runs again"
                 raise SpecificationsRefusedError([text])
             await self.rollout.carried_out()
             return self._switched(held)

@@ -48,11 +48,11 @@ async def check_kept(
     try:
         return await check(sources_of(row), site_keys)
     except SpecificationsRefusedError as error:
-        way = (
-            f"this is revision {row.revision}, which {row.who} brought into force while the appliance ran."
-            " To give it up and start with the folder (--monitors): rosrv monitor reset --state DIR"
+        advice = (
+            f"this is revision {row.revision}, loaded by {row.who} while the appliance ran."
+            " To discard it and start with the folder (--monitors): rosrv monitor reset --state DIR"
         )
-        raise SpecificationsRefusedError([*error.findings, way]) from error
+        raise SpecificationsRefusedError([*error.findings, advice]) from error
 
 
 def forget_revision(store: StateStore, now: float) -> int | None:
@@ -63,6 +63,6 @@ def forget_revision(store: StateStore, now: float) -> int | None:
     last = next(iter(store.monitor_revisions(1)), NOTHING)
     if last.who == DISK:
         return None
-    note = f"revision {last.revision} was given up"
+    note = f"revision {last.revision} was discarded"
     store.save_monitor_revision(MonitorRevisionRow(last.revision + 1, "{}", now, DISK, note))
     return last.revision

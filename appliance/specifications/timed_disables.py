@@ -117,6 +117,6 @@ class TimedDisables:
             return
         except StoreError as error:
             _log.error(
-                "a monitor is enabled again, and this is not kept", monitors=list(due), reason=str(error)
+                "a monitor is enabled again, but this is not saved", monitors=list(due), reason=str(error)
             )
         self.end(due)

@@ -51,7 +51,7 @@ def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[Tok
     """
     if not _NAME.fullmatch(name) or name in _RESERVED:
         raise BadTokenNameError(
-            f"{name[:80]!r} is no name for a token: letters, digits and . _ @ -, beginning with a letter or digit, "
+            f"{name[:80]!r} is not a valid token name: letters, digits and . _ @ -, beginning with a letter or digit, "
             f"at most 63, and not {' or '.join(sorted(_RESERVED))}"
         )
     token_id, salt = secrets.token_hex(6), secrets.token_bytes(16)

@@ -52,7 +52,7 @@ class WriteAhead:
     def _descriptor(self) -> Iterator[int]:
         with self._lock:
             if self._open_descriptor < 0:
-                raise WriteAheadClosedError(errno.EBADF, "the state is closed already", str(self._path))
+                raise WriteAheadClosedError(errno.EBADF, "the state is already closed", str(self._path))
             yield self._open_descriptor
 
     def left(self) -> list[Statement]:

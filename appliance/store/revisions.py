@@ -180,9 +180,13 @@ class Revisions(ABC, Generic[R]):
                 await self._go_back(back_to)
             except (self.refusal, StoreError) as error:
                 if self.confirm_by is None:  # it was rolled back before the error
-                    _log.error("an unconfirmed change went back, and this is not kept", reason=str(error))
+                    _log.error(
+                        "an unconfirmed change was rolled back, but this is not saved", reason=str(error)
+                    )
                     return
-                _log.error("an unconfirmed change cannot go back yet", revision=back_to, error=str(error))
+                _log.error(
+                    "an unconfirmed change cannot be rolled back yet", revision=back_to, error=str(error)
+                )
                 await asyncio.sleep(_AGAIN_SECONDS)
             else:
                 return

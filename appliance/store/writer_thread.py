@@ -30,7 +30,7 @@ _CATCH_UP_SECONDS = 1.0
 _SETTLE_SECONDS = 5.0
 _ROOM = 4 << 20  # bytes: SQLite's log grows to this, and few texts are longer
 
-_LEFT = "changes that the file state.ahead took are made at the next start, others are lost"
+_LEFT = "changes in the file state.ahead are applied at the next start; other changes are lost"
 
 _log = structlog.get_logger()
 
@@ -65,7 +65,7 @@ class Database:
         # The file beside it is made once it has its tables. SQLite takes an empty one for new: nothing is revoked then.
         if path.exists() and not path.stat().st_size and path.with_suffix(".ahead").exists():
             raise StoreError(
-                f"{path}: is empty, and was not when the appliance ran before: restore a backup (rosrv restore), or"
+                f"{path}: is empty, but was not when the appliance last ran: restore a backup (rosrv restore), or"
                 " move the file away to start with an empty state"
             )
         try:
@@ -147,7 +147,7 @@ class Database:
     def _require_open(self) -> None:
         if self._closed:
             raise StoreError(
-                f"{self._path}: the appliance is stopping, and this change came too late to be kept"
+                f"{self._path}: the appliance is stopping, and this change came too late to be saved"
             )
 
     def put(self, table: str, *row: Parameter, ahead: bool = True) -> None:
@@ -166,7 +166,7 @@ class Database:
         free = disk.f_bavail * disk.f_frsize
         if self._failing or free < _ROOM:
             why = self._failing or f"{self._path}: {free} bytes are free on its disk, {_ROOM} are wanted"
-            raise StoreError(f"{why}; nothing was changed: make room and order it again")
+            raise StoreError(f"{why}; nothing was changed: free space and try again")
 
     async def settled(self) -> None:
         """Wait until everything queued so far is on the disk. Raises `StoreError` when it cannot be written."""
@@ -188,7 +188,7 @@ class Database:
         self._hurry.set()
         while not (await asyncio.wait([done], timeout=_SETTLE_SECONDS))[0]:
             if self._failing:
-                raise StoreError(f"{self._failing}; make room: until then a restart undoes what was ordered")
+                raise StoreError(f"{self._failing}; free space: until then a restart undoes recent changes")
 
     def close(self, seconds: float | None = None) -> None:
         """Write the queue within `seconds` (None: without a limit), and close the file.
@@ -286,4 +286,4 @@ def _advice(error: sqlite3.Error) -> str:
     # Subclasses report the environment (a full disk, a lock, rights); the class itself, wrong content.
     if type(error) is sqlite3.DatabaseError:
         return "move the file away to start with an empty state"
-    return "make room there and let it be written, or name another directory with --state DIR"
+    return "free space there and make it writable, or name another directory with --state DIR"

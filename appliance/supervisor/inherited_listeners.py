@@ -56,11 +56,9 @@ class InheritedListeners:
 
     def _check(self, name: str, descriptor: int) -> None:
         if not _NAME.fullmatch(name):
-            raise ListenerRejectedError(f"{name[:80]!r} is not a name for a kept socket")
+            raise ListenerRejectedError(f"{name[:80]!r} is not a valid name for a kept socket")
         if name not in self._sockets and len(self._sockets) >= self._limit:
-            raise ListenerRejectedError(
-                f"{self._limit} sockets are kept already; {name!r} would be one too many"
-            )
+            raise ListenerRejectedError(f"{self._limit} sockets are kept already; {name!r} exceeds the limit")
         try:
             with socket.socket(fileno=os.dup(descriptor)) as sock:
                 listens = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1

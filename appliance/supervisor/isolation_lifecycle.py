@@ -148,7 +148,7 @@ class ContainerIsolation(NoIsolation):
 
     def _require_standing(self) -> None:
         if self._ending:
-            raise NetworkError("the firewall is removed: the appliance ends")
+            raise NetworkError("the appliance stops: removing the firewall")
 
     @contextlib.contextmanager
     def _taking_away(self) -> Iterator[None]:
@@ -156,7 +156,7 @@ class ContainerIsolation(NoIsolation):
         self._ending = True
         held = self._changing.acquire(timeout=_PATIENCE_SECONDS)
         if not held:
-            log.error("a check of the firewall hangs; it is removed all the same")
+            log.error("a firewall check hangs; removing the firewall anyway")
         try:
             yield
         finally:
@@ -177,7 +177,7 @@ class ContainerIsolation(NoIsolation):
         log.info("firewall is in force", backend=chosen, isolation=self.kind)
         if self._namespace.lacks_syn_cookies():
             log.warning(
-                "no SYN cookies: first packets under forged addresses can keep every host out",
+                "no SYN cookies: SYN packets from forged addresses can lock every host out",
                 remedy="sysctl -w net.ipv4.tcp_syncookies=1",
             )
 
@@ -191,7 +191,7 @@ class ContainerIsolation(NoIsolation):
                     self._end_tunnels(self._own)
                 self.firewall.remove()
             except NetworkError as error:
-                log.error("rules of the firewall may be left", error=str(error))
+                log.error("firewall rules may remain", error=str(error))
 
     def _end_tunnels(self, own: str) -> None:
         """Remove the tunnels' address, and what a killed charon left in the kernel."""
@@ -199,7 +199,7 @@ class ContainerIsolation(NoIsolation):
             self._namespace.run(lambda: clear_leftovers(own.partition("/")[0]))
             interfaces.delete_address(self._namespace, "lo", own)
         except (NetworkError, LeftoversError) as error:
-            log.error("something of the tunnels may be left", error=str(error))
+            log.error("tunnel state may remain", error=str(error))
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
         """Close both ports to all users but those of rosmaster and rosout."""
@@ -236,7 +236,7 @@ class ContainerIsolation(NoIsolation):
         """Return the container's only address. With several, it is unknown which one outside hosts reach."""
         found = only_address(self._namespace, without=("lo", USER_SPACE_INTERFACE))
         if is_contained() and not lives_on_the_machines_network():
-            reason = f"{found.reason}, in a container: from outside its machine it may be another"
+            reason = f"{found.reason}, in a container: outside the machine the address may differ"
             return replace(found, reason=reason)
         return found
 
@@ -249,7 +249,7 @@ class ContainerIsolation(NoIsolation):
             if self._owed or not report.intact:
                 gone = [rule.purpose for rule in report.rules if not rule.in_force]
                 self._require_standing()
-                log.critical("rules of the firewall are missing and installed again", rules=gone)
+                log.critical("firewall rules were missing and are installed again", rules=gone)
                 self.firewall.install(self._settings())
                 self._owed = False
                 report = self.firewall.report()
@@ -259,7 +259,7 @@ class ContainerIsolation(NoIsolation):
         """Try to reach the hidden ports as another local user."""
         ports = {
             "ROSMaster": self._ports.rosmaster,
-            "the inner node face": self._ports.inner,
+            "the master-side proxy endpoint": self._ports.inner,
             "the own nodes' master": self._ports.own,
         }
         found = (self._probe(what, port) for what, port in ports.items() if port is not None)
@@ -269,7 +269,7 @@ class ContainerIsolation(NoIsolation):
         try:
             seen = probe_port(self._namespace, port)
         except NetworkError as error:
-            return f"whether {what} is hidden cannot be told: {error}"
+            return f"whether {what} is hidden is unknown: {error}"
         if not seen.closed:
             return f"{what} can be reached by another user of this machine ({seen.describe()})"
         if seen.listening_outside:
@@ -366,7 +366,7 @@ class NetnsIsolation(ContainerIsolation):
             try:
                 self._isolation.down()
             except NetworkError as error:
-                log.error("the namespace may be left; the next start clears it", error=str(error))
+                log.error("the namespace may remain; the next start removes it", error=str(error))
 
     def _api_networks(self) -> tuple[str, ...]:
         # Connections from the host's loopback arrive under the address of its end of the link.
@@ -394,7 +394,7 @@ class NetnsIsolation(ContainerIsolation):
             gone = [rule.purpose for rule in rules if not rule.in_force]
             if gone:
                 self._require_standing()
-                log.critical("rules on the host are missing and installed again", rules=gone)
+                log.critical("rules on the host were missing and are installed again", rules=gone)
                 self._isolation.put_rules_back()
                 rules = self._isolation.rules()
             return msgspec.structs.replace(super().report(), forwarding=list(rules), **self._look_at_others())
@@ -407,16 +407,16 @@ class NetnsIsolation(ContainerIsolation):
                 "obstacles": list(self._isolation.obstacles()),
             }
         except NetworkError as error:
-            found = {"translations": [], "obstacles": [f"the host's other rules cannot be read: {error}"]}
+            found = {"translations": [], "obstacles": [f"cannot read the host's other rules: {error}"]}
         if found != self._others:
             self._others = found
             if found["translations"]:
                 log.info(
-                    "others translate addresses on this host; the appliance sees their hosts as they are",
+                    "other rules translate addresses on this host; the appliance sees the translated addresses",
                     chains=found["translations"],
                 )
             for obstacle in found["obstacles"]:
-                log.warning("connections from the network may not reach the appliance", reason=obstacle)
+                log.warning("connections from the network may fail to reach the appliance", reason=obstacle)
         return found
 
 
@@ -435,7 +435,7 @@ def _require_own_network() -> None:
     if is_contained() and (shared or bridges()):
         raise StartError(
             "isolation container: this container shares the machine's network (network_mode: host, hostNetwork), so "
-            "the firewall would be everybody's there. Give it a network of its own, as compose.host.yaml does for a "
+            "the firewall would apply to the whole machine. Give it its own network, as compose.host.yaml does for a "
             "robot whose nodes run on the machine itself; or run rosrv without a container, with isolation netns"
         )
     if shared:

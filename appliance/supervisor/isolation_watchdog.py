@@ -121,14 +121,14 @@ class IsolationWatchdog:
             self._report = messages.FirewallReported(isolation=self.isolation.kind, report=report)
             return await in_thread(self.isolation.probe)
         except Exception as error:  # noqa: BLE001  see the invariant
-            return f"the state of the firewall cannot be told: {_words(error)}"
+            return f"the state of the firewall is unknown: {_words(error)}"
 
 
 def _words(error: Exception) -> str:
     """Return the text for an operator; log an unexpected exception with its traceback."""
     if isinstance(error, NetworkError | ValueError):
         return str(error)
-    log.error("fault while looking at the surroundings", exc_info=error)
+    log.error("fault while checking the environment", exc_info=error)
     return f"{type(error).__name__}: {error}"
 
 
@@ -152,7 +152,7 @@ async def in_thread(function: Callable[[], T]) -> T:
         try:
             loop.call_soon_threadsafe(settle, answer)
         except RuntimeError:
-            log.warning("finished after the appliance had ended", what=function.__qualname__)
+            log.warning("finished after the appliance stopped", what=function.__qualname__)
 
     threading.Thread(target=work, name="guard", daemon=True).start()
     return await outcome

@@ -64,7 +64,7 @@ class MonitorMemory:
             _sync(self._folder)
         except OSError as error:
             log.warning(
-                "monitors do not keep their state when the appliance ends: they hold their topics then",
+                "monitors do not keep their state when the appliance stops: they hold their topics after the restart",
                 reason=f"{self._folder}: {error}",
             )
             for index in range(len(self._own), relays):
@@ -87,7 +87,7 @@ class MonitorMemory:
                 os.fsync(descriptor)
             write_whole(self._folder / _ENDED, msgspec.json.encode(_Ended(self._boot, time.time_ns())), 0o600)
         except OSError as error:
-            log.warning("the state of monitors is not on the disk", reason=str(error))
+            log.warning("the state of monitors is not saved", reason=str(error))
         for descriptor in (*self._own, *self._earlier):
             os.close(descriptor)
         self._own, self._earlier = [], []

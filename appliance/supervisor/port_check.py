@@ -27,7 +27,7 @@ def first_free(ports: range) -> int:
             except OSError:
                 continue
             return port
-    raise OSError(errno.EADDRINUSE, f"none of the ports {ports.start} to {ports.stop - 1} is free")
+    raise OSError(errno.EADDRINUSE, f"no port from {ports.start} to {ports.stop - 1} is free")
 
 
 def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
@@ -62,7 +62,7 @@ def require_free(host: str, port: int) -> None:
             if error.errno != errno.EADDRINUSE:
                 raise StartError(f"cannot listen on {host}:{port}: {error.strerror}") from error
             raise StartError(
-                f"port {port} ({host}) is in use{_by_whom(port)}: stop that or choose another port"
+                f"port {port} ({host}) is in use{_by_whom(port)}: stop that program or choose another port"
             ) from error
 
 

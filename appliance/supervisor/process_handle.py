@@ -130,7 +130,7 @@ class ProcessHandle:
         except ChannelClosedError:
             pass
         except ChannelFullError as error:
-            self._reports.violated(self, f"does not read its lifeline: {error}")
+            self._reports.violated(self, f"does not read its liveness pipe: {error}")
 
     def ping(self) -> None:
         """Request an answer."""
@@ -170,7 +170,7 @@ class ProcessHandle:
 
     def _refused(self, reason: str) -> None:
         self._channel = None
-        self._reports.violated(self, f"sent what no process may send: {reason}")
+        self._reports.violated(self, f"sent an invalid message: {reason}")
 
     def _lifeline_closed(self) -> None:
         # An external program now runs, or a death will be reported soon. A role of the appliance that only closed its

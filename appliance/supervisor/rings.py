@@ -28,8 +28,8 @@ class RecorderRings:
     def __init__(self, rules: RecorderRules, relays: int) -> None:
         if rules.memory > (left := _left()):
             raise StartError(
-                f"recorder.memory: {ByteSize(rules.memory).human_readable()} is more than the machine has free "
-                f"({left.human_readable()}): set less, or end programs that use memory"
+                f"recorder.memory: {ByteSize(rules.memory).human_readable()} is more than the machine's free memory "
+                f"({left.human_readable()}): set a smaller value, or stop programs that use memory"
             )
         size = int(rules.memory) // relays // _PAGE * _PAGE
         since, sums = time.time_ns(), known_sums(rules.never)

@@ -48,7 +48,7 @@ def run_appliance(
     """
     if settings.isolation == "none":
         log.warning(
-            "isolation none: NO FIREWALL. Every user of this machine can reach the real ROSMaster; "
+            "isolation none: NO FIREWALL. Every user of this machine can reach the ROS master; "
             "for development only, use --isolation netns or container"
         )
     elif os.geteuid() != 0:
@@ -150,7 +150,7 @@ def _api_with_port(settings: Settings) -> str:
         try:
             require_free(host, port)
         except StartError as error:
-            log.warning("REST takes another port; choose one with --api HOST:PORT", reason=str(error))
+            log.warning("REST uses another port; choose one with --api HOST:PORT", reason=str(error))
             port = 0
     return _shown(host, port or free_port())
 

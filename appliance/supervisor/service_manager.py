@@ -43,7 +43,7 @@ class ServiceManager:
 
     def stopping(self) -> None:
         """Report the orderly end."""
-        self._say("STOPPING=1\nSTATUS=ending its processes, then removing its firewall")
+        self._say("STOPPING=1\nSTATUS=stopping its processes, then removing its firewall")
 
     @asynccontextmanager
     async def watched(self) -> AsyncIterator[None]:

@@ -49,7 +49,7 @@ async def _end(slots: Sequence[ProcessSlot], seconds: float, process_died: async
 def _signal(slots: Sequence[ProcessSlot], number: signal.Signals) -> None:
     for slot in slots:
         if slot.process is not None:
-            log.warning("process did not end", role=slot.role.name, pid=slot.process.pid, signal=number.name)
+            log.warning("process did not stop", role=slot.role.name, pid=slot.process.pid, signal=number.name)
             slot.process.kill(number)
 
 

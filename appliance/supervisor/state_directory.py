@@ -43,9 +43,7 @@ def foreign(path: Path) -> str | None:
     if not found or _has_lock(path) or (path / _RESTORED).is_file():
         return None
     more = " …" if len(found) > _SHOWN else ""
-    return (
-        f"{path} is not the state directory of an appliance: it has {', '.join(found[:_SHOWN])}{more} in it"
-    )
+    return f"{path} is not the state directory of an appliance: it contains {', '.join(found[:_SHOWN])}{more}"
 
 
 def _has_lock(path: Path) -> bool:
@@ -65,7 +63,7 @@ class StateDirectory:
         self.path = path.absolute()
         try:
             if (reason := foreign(self.path)) is not None:
-                raise StartError(f"{reason}; name another, empty or to be made, with --state DIR")
+                raise StartError(f"{reason}; name another directory, empty or new, with --state DIR")
             self.path.mkdir(mode=0o711, parents=True, exist_ok=True)
             self.path.chmod(0o711)
             flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -128,7 +126,7 @@ class StateDirectory:
         except OSError as error:
             listener.close()
             raise StartError(
-                f"{path} cannot be made: {error}; name a shorter path with --state DIR"
+                f"{path} cannot be created: {error}; name a shorter path with --state DIR"
             ) from error
         finally:
             os.umask(mask)
@@ -151,7 +149,7 @@ class StateDirectory:
             os.close(self._lock)
             self._lock = -1
             raise StartError(
-                f"an appliance uses the state directory {self.path} already (process {owner}): "
+                f"another appliance (process {owner}) already uses the state directory {self.path}: "
                 f"stop it, or name another directory with --state DIR"
             ) from error
         os.ftruncate(self._lock, 0)

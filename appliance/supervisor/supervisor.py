@@ -191,7 +191,7 @@ class Supervisor:
                 return
             with suppress(TimeoutError):
                 await asyncio.wait_for(self.stopping.wait(), 0.05)
-        self.stop(f"rosmaster does not answer on 127.0.0.1:{self._facts.rosmaster_port}; the log may say why")
+        self.stop(f"rosmaster does not answer on 127.0.0.1:{self._facts.rosmaster_port}; check the log")
 
     async def until_ready(self) -> None:
         """Log what the start waits for, and give up without progress."""
@@ -206,7 +206,7 @@ class Supervisor:
                 return
             if not self._gets_on(began, late):
                 self.stop(
-                    f"the appliance was not ready after {waited} seconds, it waited for {words}; the log says more"
+                    f"the appliance was not ready after {waited} seconds; still waiting for {words}; check the log"
                 )
             else:
                 log.info("still starting", waits_for=words, seconds=waited)
@@ -296,7 +296,7 @@ class Supervisor:
         process.sandbox = sandbox
         if sandbox.lacks:
             log.warning(
-                "process lacks a wall", role=process.role, lacks=[_printable(lack) for lack in sandbox.lacks]
+                "sandbox is incomplete", role=process.role, lacks=[_printable(lack) for lack in sandbox.lacks]
             )
         self._tell_processes()
 
@@ -332,7 +332,7 @@ class Supervisor:
             case messages.CompilerWanted():
                 self._demand("compiler")
             case messages.ApplianceStopRequested(reason):
-                log.warning("control asks to end the appliance", reason=reason)
+                log.warning("control requests the shutdown of the appliance", reason=reason)
                 self.stop()
 
     def _free_log(self, processes: list[int]) -> None:
@@ -346,7 +346,7 @@ class Supervisor:
                 continue
             if slot.process.pid in processes or not ours.issuperset(processes):
                 role, pid = slot.role.name, slot.process.pid
-                log.critical("process is ended: the audit log is kept locked", role=role, pid=pid)
+                log.critical("process is stopped: the audit log stays locked", role=role, pid=pid)
                 slot.process.kill()
 
     def _keep(self, process: ProcessHandle, name: str, descriptor: int) -> None:
@@ -357,7 +357,7 @@ class Supervisor:
         try:
             self.kept.keep(name, descriptor)
         except ListenerRejectedError as error:
-            log.error("socket is not kept, a restart of control would lose it", reason=str(error))
+            log.error("socket is not kept: a restart of control would close it", reason=str(error))
 
     def _child_ready(self, process: ProcessHandle, detail: dict[str, Any]) -> None:
         process.ready = True
@@ -370,7 +370,7 @@ class Supervisor:
         try:
             said = msgspec.convert(detail, ControlReady)
         except msgspec.ValidationError as error:
-            self._violated(process, f"said it is ready, but not where: {error}")
+            self._violated(process, f"reported ready without an address: {error}")
             return
         self._facts = replace(self._facts, rosout_master=said.rosout_master)
         self._spawn(self.control_ready(process, said))
@@ -398,7 +398,7 @@ class Supervisor:
         """Start work that ends with an answer to control, up to a limit."""
         if self._unanswered >= _MOST_UNANSWERED:
             work.close()
-            self._violated(process, f"asks for more than {_MOST_UNANSWERED} things at once")
+            self._violated(process, f"sent more than {_MOST_UNANSWERED} requests at once")
             return
         self._unanswered += 1
         self._spawn(work).add_done_callback(self._answered)
@@ -414,7 +414,9 @@ class Supervisor:
 
     async def _open_tunnels(self, process: ProcessHandle, pool: str, address: str) -> None:
         if not CHARON.exists():
-            reason = f"{CHARON} is not there: apt install charon-systemd strongswan-swanctl libcharon-extra-plugins"
+            reason = (
+                f"{CHARON} is missing: apt install charon-systemd strongswan-swanctl libcharon-extra-plugins"
+            )
             process.send(messages.TunnelsEnclosed(None, reason))
             return
         answer = await self._watchdog.open_tunnels(pool, address)
@@ -506,10 +508,10 @@ class Supervisor:
         self._tell_processes()
         if slot.is_failing:
             if not self.is_ready:
-                self.stop(f"{process.role} died {slot.short_runs} times ({_end_of(code)}); the log says why")
+                self.stop(f"{process.role} died {slot.short_runs} times ({_end_of(code)}); check the log")
                 return
             log.critical(
-                "process keeps dying", role=process.role, times=slot.short_runs, reason=slot.reason,
+                "process keeps crashing", role=process.role, times=slot.short_runs, reason=slot.reason,
                 again_in=slot.delay(),
             )  # fmt: skip
         self._start_later(slot)

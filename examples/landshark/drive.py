@@ -221,7 +221,7 @@ class Simulation:
 def record(drive: Drive, path: Path) -> None:
     """Write the published messages into a bag. Raises `FileExistsError`."""
     if path.exists():
-        raise FileExistsError(f"{path} is there already")
+        raise FileExistsError(f"{path} already exists")
     store = Messages().store
     with Writer(path) as writer:
         connections = {}

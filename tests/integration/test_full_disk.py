@@ -102,7 +102,7 @@ def test_a_change_that_cannot_be_stored_has_no_effect(small: SmallDisk) -> None:
         answer = small.ask(order)
         assert (answer.ok, answer.trouble) == (False, "failed"), order
         assert answer.error is not None
-        assert "nothing was changed: make room" in answer.error, order
+        assert "nothing was changed: free space" in answer.error, order
     assert small.all() == before
     small.filler.unlink()
     for order in (
@@ -121,7 +121,7 @@ def test_a_revocation_is_effective_even_if_it_cannot_be_stored(small: SmallDisk)
     small.fill()
     answer = small.ask(admin.TokenRevoke("guest"))
     assert answer.error is not None
-    assert "make room: until then a restart undoes what was ordered" in answer.error
+    assert "free space: until then a restart undoes recent changes" in answer.error
     assert small.revoked() == {"guest"}
     small.filler.unlink()
     eventually(lambda: small.ask(admin.TokenAdd("late", "viewer", 3600.0)).ok, small.appliance.story)

@@ -16,7 +16,7 @@ SECONDS = 60.0
 """Longer than control's slowest answers: enrolling a host through charon, compiling specifications."""
 _GRACE_SECONDS = 10.0
 UNKNOWN = (
-    "a change may have taken effect; if it has not by now, it never will. List what took effect:"
+    "the change may have taken effect; if it has not by now, it never will. List recent changes:"
     " rosrv audit search --since 5m"
 )
 
@@ -60,7 +60,7 @@ class AdminSocket:
             raise NotRunningError(f"{path}: only its owner and root have access; use sudo") from None
         except ConnectionRefusedError:
             raise NotRunningError(
-                f"{self.state}: the appliance that used this state directory has ended"
+                f"{self.state}: the appliance that used this state directory has stopped"
             ) from None
         except TimeoutError:
             text = f"{path}: the appliance did not answer within {self._seconds:g} s"
@@ -99,5 +99,5 @@ def _read_line(sock: socket.socket, line: bytearray) -> None:
     while not line.endswith(b"\n"):
         piece = sock.recv(65536)
         if not piece:
-            raise ConnectionResetError(f"the appliance closed the connection before it answered; {UNKNOWN}")
+            raise ConnectionResetError(f"the appliance closed the connection without an answer; {UNKNOWN}")
         line += piece

@@ -150,7 +150,7 @@ class RestLog:
             if isinstance(error, FilterError):
                 raise
             raise NotRunningError(
-                f"{self._client.url} is not the REST of an appliance: its answer is not as documented"
+                f"{self._client.url} is not an appliance's REST API: its answer is not as documented"
             ) from None
 
     def _records(self, lines: Iterator[str]) -> Iterator[LogEntry]:

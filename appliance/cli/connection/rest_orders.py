@@ -57,7 +57,9 @@ def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
     try:
         return msgspec.convert(body, admin.answer_to(type(request)))
     except msgspec.ValidationError as error:
-        raise NotRunningError(f"{rest.url}: this appliance's version answers otherwise: {error}") from None
+        raise NotRunningError(
+            f"{rest.url}: this appliance's version gives a different answer: {error}"
+        ) from None
 
 
 _KIT = (

@@ -52,7 +52,7 @@ class RestClient:
         self.url, secure = _place_of(url)
         self._token = _checked_token(token)
         if authority is not None and not secure:
-            raise ValueError(f"--api-ca is for https, and {self.url} is clear text")
+            raise ValueError(f"--api-ca is for https, but {self.url} is clear text")
         self._client = httpx.Client(
             base_url=self.url,
             headers={"Authorization": f"Bearer {reading_key(self._token)}", "User-Agent": "rosrv"},
@@ -92,7 +92,7 @@ class RestClient:
             found = None
         if not isinstance(found, dict):
             raise NotRunningError(
-                f"{self.url} is not the REST of an appliance: its answer is not a JSON object"
+                f"{self.url} is not an appliance's REST API: its answer is not a JSON object"
             )
         return found
 
@@ -130,7 +130,7 @@ class RestClient:
             raise NotRunningError(self._why_not_connected(error)) from None
         except httpx.TimeoutException:
             raise NotRunningError(
-                f"{self.url}: no answer in time; is the appliance there?{_unknown(method)}"
+                f"{self.url}: no answer in time; is the appliance running there?{_unknown(method)}"
             ) from None
         except httpx.HTTPError as error:
             raise NotRunningError(f"{self.url}: the connection broke: {error}{_unknown(method)}") from None
@@ -140,7 +140,7 @@ class RestClient:
         if "CERTIFICATE_VERIFY_FAILED" in text:
             if "mismatch" in text or "not valid for" in text:
                 return (
-                    f"{self.url}: its certificate is not for this name or address: call it by one that is (api_names "
+                    f"{self.url}: its certificate is not for this name or address: use one that it lists (api_names "
                     "in appliance.yaml adds names)"
                 )
             why = "has expired" if "expired" in text else "is not trusted"
@@ -149,7 +149,7 @@ class RestClient:
                 "it with --api-ca FILE"
             )
         if "SSL" in text:
-            return f"{self.url}: does not speak TLS as expected ({text}); is it http, and not https?"
+            return f"{self.url}: does not speak TLS as expected ({text}); is it http instead of https?"
         return (
             f"{self.url} cannot be reached: {text}; is the appliance running there, and may this machine connect "
             "(api, api_networks in appliance.yaml)?"
@@ -162,7 +162,7 @@ class RestClient:
             kind, detail = str(problem["type"]).removeprefix("urn:rosrv:problem:"), str(problem["detail"])
         except (ValueError, KeyError, TypeError, RecursionError):
             return NotRunningError(
-                f"{self.url} is not the REST of an appliance: it answers with status {answer.status_code}"
+                f"{self.url} is not an appliance's REST API: it answers with status {answer.status_code}"
             )
         wait = answer.headers.get("Retry-After")
         match answer.status_code:

@@ -99,7 +99,7 @@ def write_script(output: Output, made: EnrolmentToken, *, as_json: bool) -> None
         typer.echo(f"rosrv: {_chosen(made.endpoint, made.endpoint_reason)}", err=True)
     typer.echo(
         f"rosrv: {made.name} is awaited as {made.address} until {moment(made.expires)}; the token is"
-        f" valid once and not shown again.\nrosrv: on the host: sudo sh {output.name}   (it asks for the token)",
+        f" valid once and is not shown again.\nrosrv: on the host: sudo sh {output.name}   (it asks for the token)",
         err=True,
     )
 

@@ -65,7 +65,7 @@ def list_monitors(appliance: Appliance) -> None:
     _say_held(body.monitors)
     source = f" ({body.folder})" if body.folder else ""
     differs = (
-        "; differs from the folder (load the folder's, removing nothing: rosrv monitor reload)"
+        "; differs from the folder (load the folder's, removing no others: rosrv monitor reload)"
         if body.folder and body.differs_from_folder
         else ""
     )
@@ -241,7 +241,7 @@ def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str
             }
         )
         return
-    say(f"{word}: {', '.join(body.names) or 'no change, it was so already'}")
+    say(f"{word}: {', '.join(body.names) or 'no change'}")
     if body.began:
         say(f"{', '.join(body.began)} started in the initial state", "yellow")
 

@@ -104,7 +104,7 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
                 bags[row.id] = Path(f"/proc/self/fd/{file.fileno()}")
             pieces.append(Piece("memory" if row is lent else row.id, bags[row.id], part, row.why_not))
         if not pieces:
-            text = f"nothing is recorded of {span}: {_available(known.recordings)}"
+            text = f"there are no recordings of {span}: {_available(known.recordings)}"
             raise refused([f"rosrv monitor: {text}; the memory has the last {known.before:g} s"])
         yield pieces
 

@@ -30,9 +30,9 @@ def prove(backend: Backend, namespace: Namespace) -> None:
                 port = server.getsockname()[1]
                 _expect(namespace, server, "before any rule", reached=True)
                 backend.install(inner_port("proof", port, "another user", other))
-                _expect(namespace, server, f"while a rule of {backend.name} refuses it", reached=False)
+                _expect(namespace, server, f"while a rule of {backend.name} rejects it", reached=False)
                 backend.install(inner_port("proof", port, "this user", own))
-                _expect(namespace, server, f"while a rule of {backend.name} lets us pass", reached=True)
+                _expect(namespace, server, f"while a rule of {backend.name} accepts it", reached=True)
     finally:
         backend.remove()
 
@@ -43,7 +43,7 @@ def _listen(family: socket.AddressFamily, address: str) -> socket.socket | None:
     except OSError as error:
         if error.errno in (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT):
             return None
-        raise FirewallError(f"cannot listen on {address} to try the firewall: {error.strerror}") from error
+        raise FirewallError(f"cannot listen on {address} to test the firewall: {error.strerror}") from error
 
 
 def _expect(namespace: Namespace, server: socket.socket, when: str, *, reached: bool) -> None:
@@ -63,4 +63,4 @@ def _expect(namespace: Namespace, server: socket.socket, when: str, *, reached: 
     failure = namespace.run(connect)
     if (failure is None) is not reached:
         seen = "was reached" if failure is None else f"was not reached ({failure})"
-        raise FirewallError(f"a port of our own on {address[0]} {seen} {when}: it is not enforced here")
+        raise FirewallError(f"a test port on {address[0]} {seen} {when}: it is not enforced here")

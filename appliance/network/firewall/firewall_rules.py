@@ -157,7 +157,8 @@ class PacketRule:
             and self.chain is not Chain.OUT,
             f"where a packet came from is matched in {Chain.LEAVING} only": self.forwarded is not None
             and self.chain is not Chain.LEAVING,
-            "a limit counts who has answered; others may be named by anybody": self.above is not None
+            "a rate limit counts only sources that have answered; others can be forged": self.above
+            is not None
             and not self.answered,
             "DNAT and its address go together": (self.verdict is PacketVerdict.DNAT) != (self.to is not None),
         }
@@ -373,7 +374,7 @@ def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
         *_inner_ports("own node's messages", node.ports, "relay", node.relay_uid),
         answer("own node: control is answered", PacketVerdict.RETURN, source=node.address),
         answer("own node: the relay is answered", PacketVerdict.RETURN, from_ports=node.ports),
-        answer("own node: nobody else is answered", PacketVerdict.DROP),
+        answer("own node: no other user is answered", PacketVerdict.DROP),
         *inner_port("own node's master", node.master_port, "rosout", node.uid),
         *_ports_of_others(node.uid, settings),
         _sends_nothing_out("own node", node.uid),
@@ -427,7 +428,7 @@ def _forwarding(forwarder: ForwarderAccess | None) -> tuple[PacketRule, ...]:
             tcp_ports=None if forwarder.datagrams else ports,
             udp_ports=ports if forwarder.datagrams else None,
         ),
-        sending("audit log's forwarder: nobody else", PacketVerdict.DROP),
+        sending("audit log's forwarder: no other user", PacketVerdict.DROP),
     )
 
 

@@ -93,7 +93,7 @@ class NftBackend:
         except json.JSONDecodeError as error:
             raise FirewallError(f"nft {' '.join(arguments)}: the answer is not JSON: {error}") from error
         except (KeyError, TypeError) as error:
-            reason = f"the answer has an unknown form: {_first_lines(text)}"
+            reason = f"the answer has an unknown format: {_first_lines(text)}"
             raise FirewallError(f"nft {' '.join(arguments)}: {reason}") from error
 
     def _nft(self, arguments: list[str], text: str) -> str:

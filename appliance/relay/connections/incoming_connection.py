@@ -74,7 +74,7 @@ class IncomingConnection:
 
     def make_room(self) -> None:
         """End the connection for a peer that has a better claim to its place."""
-        self._failed(self, "it waited longest when there was no room for others")
+        self._failed(self, "it waited longest when the limit of connections was reached")
 
     def _received(self, data: bytes) -> None:
         if not data:

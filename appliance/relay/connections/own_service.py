@@ -22,7 +22,7 @@ HEADER: Final = {
     "request_type": "std_srvs/TriggerRequest",
     "response_type": "std_srvs/TriggerResponse",
 }
-_AWAY = "the appliance's control is away: nothing came of this call"
+_AWAY = "the appliance's control is not running: this call had no effect"
 _SECOND = 1.0
 
 

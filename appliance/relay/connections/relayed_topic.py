@@ -256,7 +256,7 @@ class RelayedTopic:
         self._listen()
         if before is not None and _identity(before) != _identity(header):
             for member in self._each():
-                member.cut("the publisher has come back with another type")
+                member.cut("the publisher returned with a different type")
         waiting, self._waiting = self._waiting, {}
         for member in waiting:
             self._serve(member, header)

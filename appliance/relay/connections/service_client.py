@@ -168,7 +168,7 @@ class ServiceClient:
         patience = SMALL if any(weight.share.exhausted for weight in self._weights) else _PATIENT
         if self._stall.seen(held if held > patience else 0, self._context.loop.clock()):
             seconds = self._context.limits.stall_seconds
-            self.cut(f"{held} bytes of a message wait, and nothing of it has come or gone for {seconds:g} s")
+            self.cut(f"{held} bytes of a message wait, without progress for {seconds:g} s")
 
     def cut(self, reason: str) -> None:
         """Close both connections; the reason is empty if the client ended."""
@@ -318,4 +318,4 @@ class ServiceClient:
 
 def _why(error: Exception) -> str:
     """Return the error without the address of the service's node, which the client must not learn."""
-    return errno.errorcode.get(getattr(error, "errno", None) or 0, "it has no address that can be called")
+    return errno.errorcode.get(getattr(error, "errno", None) or 0, "it has no usable address")

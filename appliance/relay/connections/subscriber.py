@@ -156,7 +156,7 @@ class Subscriber:
         """Cut a subscriber beyond its host's quota that takes nothing of a message; called once a second."""
         begun = self._queue.begun if self._queue.short else 0
         if self._stall.seen(begun, self._loop.clock()):
-            self.cut("its host has no memory left in the relay, and it does not take the rest of a message")
+            self.cut("its host has no memory left in the relay, and it does not accept the rest of a message")
 
     def cut(self, reason: str) -> None:
         """Close the connection; the reason is empty if the subscriber ended."""
@@ -211,9 +211,7 @@ class Subscriber:
         if not data:
             self.cut("")
             return
-        reason = (
-            "sent data after its header; a connection is for one topic, ask for another on another connection"
-        )
+        reason = "sent data after its header; a connection is for one topic; open another connection for another topic"
         asked = ("topic", self.topic.topic)
         self._reporter.refused(self.topic.key, asked, self.host, self.caller_id, reason)
         self.cut(reason)

@@ -163,7 +163,7 @@ class PublisherConnection(Upstream):
         held = self._receiver.unfinished if self._pause is None and not self._left else 0
         if self._stall.seen(held, self._clock()):
             self._lose(
-                f"{held} bytes of a message have come, and nothing for {self._limits.stall_seconds:g} s",
+                f"{held} bytes of a message arrived, then no data for {self._limits.stall_seconds:g} s",
                 "limit exceeded",
             )
 
@@ -404,7 +404,7 @@ def _refusal(header: dict[str, str]) -> tuple[str, Violation] | None:
         return f"the publisher says: {header['error']}", "connection refused"
     missing = [field for field in ("type", "md5sum") if field not in header]
     if missing:
-        return f"the publisher says nothing about its {missing[0]}", "malformed"
+        return f"the publisher's header lacks the field {missing[0]}", "malformed"
     return None
 
 

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from rosmop.run.outcomes import Outcome
 
 _AFTER_DEFECT = 1.0
-_NO_MEMORY = "the relay process before this one ended, and nothing keeps the state of monitors"
+_NO_MEMORY = "the previous relay process exited, and the state of monitors is not kept"
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ class Interceptor:
         for monitor in result.monitors:
             if monitor.name in message.moved and monitor.name in began and not monitor.held:
                 result.hold_lost(
-                    monitor, "it is on another relay process now, and its state was on the one before"
+                    monitor, "it moved to another relay process, and its state remained in the previous one"
                 )
             if monitor.why_held and monitor.name in began and not self._switches.get(monitor.name, True):
                 monitor.resume()  # a disabled monitor guarded nothing
@@ -198,7 +198,7 @@ class Interceptor:
     def _refuse(self, message: SpecificationsStated, findings: list[str]) -> None:
         self.invalidate_prepared()
         if self._stated is None:
-            reason = f"the specifications of revision {message.revision} could not be taken: {findings[0]}"
+            reason = f"the specifications of revision {message.revision} could not be loaded: {findings[0]}"
             self.blocked = reason
         self._changed(None if self._stated is None else frozenset())
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
@@ -460,6 +460,6 @@ def _other_definition(resource: str, name: str, md5sum: str, header: Mapping[str
         return ""
     theirs = header.get("type", "*")
     return (
-        f"the specifications understand {resource} as [{name}/{md5sum}], its messages are [{theirs}/{found}];"
-        " give the specifications the definition of the robot (msg/ beside them)"
+        f"the specifications define {resource} as [{name}/{md5sum}], but its messages are [{theirs}/{found}];"
+        " add the robot's definition to the specifications (in msg/ beside them)"
     )

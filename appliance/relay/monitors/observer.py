@@ -354,7 +354,7 @@ def refusal(outcome: Outcome, part: str) -> str:
     if outcome.reason:
         return outcome.reason
     said = f": {outcome.fatal.text}" if outcome.fatal is not None else _said(outcome)
-    return f"the {part} is refused by the monitor {outcome.dropped_by}{said}"
+    return f"the {part} is dropped by the monitor {outcome.dropped_by}{said}"
 
 
 def _why(outcome: Outcome) -> str:

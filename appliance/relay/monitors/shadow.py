@@ -36,10 +36,8 @@ _MOST_BYTES = 8 << 20
 _TOO_SLOW = (
     f"monitors in shadow mode take more than {SHARE:.0%} of a processor; this one did not see all messages"
 )
-_TOO_MANY = "more messages wait for monitors in shadow mode than can be kept; this one did not see all"
-_TOO_LONG = (
-    f"more than {SHADOW_BUDGET} instructions at once, the limit in shadow mode: it rests for this second"
-)
+_TOO_MANY = "the queue for monitors in shadow mode is full; this one did not see all messages"
+_TOO_LONG = f"more than {SHADOW_BUDGET} instructions at once, the limit in shadow mode: it pauses until the next second"
 
 
 class _Waiting(NamedTuple):

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from rosmop.run.state import GroupSnapshot
     from rosmop.run.state_of_slices import SliceParts
 
-_UNREADABLE = "the memory of its state cannot be read"
-_NO_ROOM = "the states of all monitors together are more than is kept"
+_UNREADABLE = "its saved state cannot be read"
+_NO_ROOM = "the states of all monitors together exceed the limit"
 _STEP = 1_000_000_000  # nanoseconds: a larger difference means that the clock was set
 
 
@@ -114,11 +114,13 @@ class StateKeeper:
         given = self._given
         if head.boot == given.boot:
             set_by = abs(head.offset - given.offset)
-            return "" if set_by <= _STEP else "the machine's clock was set while the appliance did not run"
+            return (
+                "" if set_by <= _STEP else "the machine's clock was changed while the appliance was stopped"
+            )
         if head.boot != given.ended_boot:
-            return "the machine stopped (a power cut, a reset) before the appliance had ended"
+            return "the machine stopped (a power cut, a reset) before the appliance did"
         if given.offset + time.monotonic_ns() < given.ended_at:
-            return "the machine's clock was set back while the appliance did not run"
+            return "the machine's clock was set back while the appliance was stopped"
         return ""
 
     # --- what is kept ---

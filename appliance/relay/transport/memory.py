@@ -47,8 +47,8 @@ class HostMemory:
         held, left = pool.held(self._host) + size, pool.bounds.whole - pool.total - size
         if held > left:
             return (
-                f"{self._host} would have {held} {pool.what}, and {max(left, 0)} would be left for all others;"
-                " a host may have as many as are left"
+                f"{self._host} would use {held} {pool.what}, leaving {max(left, 0)} for all others;"
+                " a host may use at most as many as it leaves"
             )
         return pool.refusal(self._host, size)
 

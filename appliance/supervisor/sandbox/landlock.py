@@ -41,7 +41,7 @@ def version() -> int:
 def lacking(abi: int) -> list[str]:
     """Return the limits that this version lacks, in words."""
     if abi < FILES:
-        return ["the kernel has no Landlock: only users' rights protect files"]
+        return ["the kernel has no Landlock: only file permissions protect files"]
     missing = [(PORTS, "TCP ports"), (SIGNALS, "signals to other processes of its user")]
     return [f"the kernel's Landlock ({abi}) does not limit {what}" for since, what in missing if abi < since]
 

@@ -89,7 +89,7 @@ class _Filter:
         try:
             self._library = ctypes.CDLL(LIBRARY, use_errno=True)
         except OSError as error:
-            raise SeccompError(f"{LIBRARY} is not there: apt install libseccomp2 ({error})") from error
+            raise SeccompError(f"{LIBRARY} is missing: apt install libseccomp2 ({error})") from error
         self._library.seccomp_init.restype = ctypes.c_void_p
         context = self._library.seccomp_init(ctypes.c_uint32(otherwise))
         if not context:

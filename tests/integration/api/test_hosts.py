@@ -88,7 +88,7 @@ def test_changes_that_are_rejected(rest: Rest) -> None:
 def test_wrong_enrolment_tokens_are_slowed_down(running: Appliance, nobody: Rest) -> None:
     """Each is recorded; after several of them the host has to wait, before the token is checked."""
     body = {"token": TOKEN, "request": signing_request(make_key(), "laptop").decode()}
-    assert "was used before" in problem(nobody.post("/v1/enrol", body), 403, "not-recognised")
+    assert "already used" in problem(nobody.post("/v1/enrol", body), 403, "not-recognised")
     assert running.recorded("--event", "enrolment refused")
     problem(nobody.post("/v1/enrol", body | {"token": "rosrv_0_0"}), 422, "bad-input")
     problem(nobody.post("/v1/enrol", body | {"request": "x" * 30_000}), 413, "too-large")

@@ -343,7 +343,7 @@ def test_a_load_ends_the_dry_run_of_an_operator(appliance: Appliance) -> None:
         assert (loaded.status, loaded.json["monitors"]) == (200, ["count"])
         tried = trying.result()
     assert tried.status == 422
-    assert "because an order needed the compiler" in tried.json["detail"]
+    assert "because a change needed the compiler" in tried.json["detail"]
     assert appliance.rest().get("/v1/monitors").json["revision"] == loaded.json["revision"]
 
 

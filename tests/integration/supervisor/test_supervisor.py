@@ -249,7 +249,7 @@ def test_a_clean_end_leaves_nothing(start: Any, state: Path) -> None:
     assert running.children() == []
     parts = {"compiler", "control", "ipsec", "monitors", "relay", "rosmaster", "rosout", "run", "signer"}
     assert {path.name for path in state.iterdir()} == {"lock", *parts}
-    assert running.process.seen(event="process did not end") == []
+    assert running.process.seen(event="process did not stop") == []
 
 
 def test_an_end_during_the_build_removes_the_surroundings(start: Any, state: Path) -> None:

@@ -194,7 +194,7 @@ def test_in_a_namespace_of_its_own_it_is_reached_through_the_host(directory: Pat
         (None, None, ["cannot read the policy: No such file or directory"]),
         ("[Nods]\na = b\n[Commands]\nnosuchcall = *\n", None, ["policy.ini:1:", "policy.ini:4:"]),
         ("\xff", None, ["not UTF-8"]),
-        (POLICY, "missing", ["there is no such folder of specifications"]),
+        (POLICY, "missing", ["the folder of specifications does not exist"]),
         (POLICY, "wrong", ["wrong.rv:2:"]),
     ],
     ids=["no policy", "wrong policy", "no text", "no folder", "wrong specification"],

@@ -98,5 +98,5 @@ def test_low_ports_need_the_capability(alone: Compose) -> None:
     without(alone, "NET_BIND_SERVICE")
     alone.wait_healthy()
     done = alone.exec("appliance", *ENROL, check=False)
-    assert "charon does not know it yet" in done.stderr
+    assert "charon has not loaded it yet" in done.stderr
     alone.wait_for_log("appliance", "charon cannot be started")

@@ -8,7 +8,7 @@ from appliance.network.public_address import PublicAddress, only_address, outwar
 from examples.landshark.lab import INTERFACE, Lab
 
 ROUTE = "this machine's address towards its default route"
-ONLY = "the only address here"
+ONLY = "the only address of this machine"
 LO = ("lo",)
 
 
@@ -41,5 +41,5 @@ def test_several_addresses_are_an_error(lab: Lab) -> None:
     host = lab.host("two", "10.78.0.5/24", "10.79.0.5/24", gateway="10.78.0.1").namespace
     with pytest.raises(NetworkError, match=r"10\.78\.0\.5, 10\.79\.0\.5"):
         only_address(host, without=LO)
-    with pytest.raises(NetworkError, match="no address here but loopback"):
+    with pytest.raises(NetworkError, match="has only loopback"):
         outward_address(host, without=("lo", INTERFACE))

@@ -356,7 +356,7 @@ def test_auto_selects_a_back_end_that_the_kernel_enforces(
     firewall = Firewall(protected.namespace)
     with listening(protected) as port:
         assert firewall.install(settings(port)) == "iptables"
-        assert "nft: a port of our own on 127.0.0.1 was reached" in firewall.report().not_used[0]
+        assert "nft: a test port on 127.0.0.1 was reached" in firewall.report().not_used[0]
         assert connect(protected, OTHER, ("127.0.0.1", port)) == ["refused"]
     with pytest.raises(FirewallError, match=r"no firewall works .* nft: a port of our own"):
         Firewall(protected.namespace, "nft").install(settings(11312))

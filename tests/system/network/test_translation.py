@@ -102,7 +102,7 @@ def test_an_earlier_chain_cannot_give_a_guest_the_machines_address(
         load(machine.namespace, "nft", early.format(guest.address))
         with guest.entered(), pytest.raises(TimeoutError):
             socket.create_connection((machine.address, MASTER), timeout=1)
-        (guard,) = (rule for rule in isolation.rules() if "under an address of the host" in rule.purpose)
+        (guard,) = (rule for rule in isolation.rules() if "with an address of the host" in rule.purpose)
         assert guard.packets > 0
         assert source_seen(server, machine, "127.0.0.1", MASTER) == isolation.ends[4].host
 

@@ -19,10 +19,12 @@ TICK = "b() { event t() every 500ms { } event asked(bool on) service /set std_sr
 
 def test_findings_without_a_position_stay_in_the_detail() -> None:
     """A finding without a position appears in the detail only."""
-    problem = refusal("refused", ["a would go, too: it is in the same file", "a.rv:1:2: error: odd: 1:2"])
+    problem = refusal(
+        "refused", ["a would also be removed: it is in the same file", "a.rv:1:2: error: odd: 1:2"]
+    )
     assert problem.findings is not None
     assert [(one.file, one.line, one.text) for one in problem.findings] == [("a.rv", 1, "odd: 1:2")]
-    assert "would go, too" in problem.detail
+    assert "would also be removed" in problem.detail
     assert findings_of(["nonsense", "a:b:c: error: x"]) == []
 
 

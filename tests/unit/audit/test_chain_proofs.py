@@ -192,4 +192,4 @@ def test_a_log_of_version_0_1_0(path: Path, tmp_path: Path) -> None:
     assert whole.proven > 0
     part = checked(exported(path, Filter(resource="/cmd_3")), tmp_path / "y.ndjson", old_key)
     assert part.findings
-    assert all("lead to no checkpoint; version 0.1.0 wrote what follows" in text for text in part.findings)
+    assert all("lead to no checkpoint; version 0.1.0 wrote later records" in text for text in part.findings)

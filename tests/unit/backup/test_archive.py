@@ -12,7 +12,7 @@ from appliance.backup.contents import BackupError
 from appliance.backup.restore import restore
 from tests.support.backups import LOG, archive, header
 
-NOTHING = "nothing is put back"
+NOTHING = "nothing is restored"
 
 
 def refused(file: Path, state: Path, words: str) -> None:
@@ -97,15 +97,15 @@ def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
     file = tmp_path / "flipped"
     for place in range(10, len(whole), len(whole) // 40):
         file.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        refused(file, tmp_path / "state", "flipped cannot be put back|flipped has")
+        refused(file, tmp_path / "state", "flipped cannot be restored|flipped has")
     file.write_bytes(whole[:-5])
-    refused(file, tmp_path / "state", "flipped cannot be put back")
+    refused(file, tmp_path / "state", "flipped cannot be restored")
 
 
 def test_an_unreadable_archive_is_an_error(tmp_path: Path) -> None:
     """Another file, a missing file, or an archive without an audit log: the error names it."""
     (tmp_path / "rubbish").write_bytes(b"\x1f\x8b rubbish")
-    refused(tmp_path / "rubbish", tmp_path / "state", "rubbish cannot be put back")
-    refused(tmp_path / "nowhere", tmp_path / "state", "nowhere cannot be put back")
+    refused(tmp_path / "rubbish", tmp_path / "state", "rubbish cannot be restored")
+    refused(tmp_path / "nowhere", tmp_path / "state", "nowhere cannot be restored")
     (tmp_path / "other").write_bytes(gzip.compress(header("api/x") + bytes(1024)))
     refused(tmp_path / "other", tmp_path / "state", "not a backup of an appliance")

@@ -114,7 +114,7 @@ def test_nothing_is_overwritten(state: Path, tmp_path: Path) -> None:
     """An existing file, and a state directory that is not empty, stay unchanged."""
     file = tmp_path / "backup.tar.gz"
     file.write_text("mine")
-    with pytest.raises(BackupError, match="is there already"):
+    with pytest.raises(BackupError, match="already exists"):
         back_up(state, file)
     assert file.read_text() == "mine"
     file.unlink()
@@ -132,7 +132,7 @@ def test_a_full_disk_is_reported(state: Path, tmp_path: Path, size: str) -> None
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "rosrv-backup-test", place], check=True)
     try:
         (state / "api" / "key.pem").write_bytes(os.urandom(200_000))
-        with pytest.raises(BackupError, match=f"{place}: the disk is full; make room") as caught:
+        with pytest.raises(BackupError, match=f"{place}: the disk is full; free space") as caught:
             back_up(state, place / "backup.tar.gz")
         assert "as root" not in str(caught.value)
         assert list(place.iterdir()) == []
@@ -234,7 +234,7 @@ def test_a_sparse_file_is_refused(state: Path, tmp_path: Path) -> None:
 def test_a_name_that_cannot_be_restored_is_refused(state: Path, tmp_path: Path, name: str) -> None:
     """The error names the file that would make the backup impossible to restore."""
     (state / "api" / name).touch()
-    with pytest.raises(BackupError, match="see who put it there"):
+    with pytest.raises(BackupError, match="find out its origin"):
         back_up(state, tmp_path / "backup.tar.gz")
     assert not (tmp_path / "backup.tar.gz").exists()
 
@@ -252,7 +252,7 @@ def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: 
         return descriptor
 
     monkeypatch.setattr(backup, "opened", grown)
-    with pytest.raises(BackupError, match=r"api/growing has more than 999 bytes: see who put it there"):
+    with pytest.raises(BackupError, match=r"api/growing has more than 999 bytes: find out its origin"):
         back_up(state, tmp_path / "backup.tar.gz")
     assert not (tmp_path / "backup.tar.gz").exists()
 
@@ -340,7 +340,7 @@ def test_a_database_replaced_by_a_link_reveals_nothing_of_root(
         return descriptor
 
     monkeypatch.setattr(backup, "opened", swapped)
-    with pytest.raises(BackupError, match=r"control/state\.db cannot be read by user id 61011"):
+    with pytest.raises(BackupError, match=r"control/state\.db cannot be read by its owner, user id 61011"):
         back_up(owned, tmp_path / "backup.tar.gz")
     assert not (tmp_path / "backup.tar.gz").exists()
     assert os.geteuid() == 0

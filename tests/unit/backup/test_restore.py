@@ -21,7 +21,7 @@ def test_a_backup_larger_than_the_disk_is_refused(tmp_path: Path, monkeypatch: p
     file = archive(tmp_path / "bomb", header("api/x", 1 << 24), bytes(1 << 24))
     assert file.stat().st_size < 1 << 16
     monkeypatch.setattr(backup_restore, "_room_in", lambda _state: 1 << 23)
-    with pytest.raises(BackupError, match="more than the 8 MiB that there is room for"):
+    with pytest.raises(BackupError, match="more than the 8 MiB of free space"):
         restore(file, tmp_path / "state")
     assert not (tmp_path / "state").exists()
 

@@ -78,7 +78,7 @@ def test_a_failed_sync_of_the_folder_is_reported_as_such(
         write_whole(path, b"first", 0o600)
     write_told(path, b"after")
     assert path.read_bytes() == b"after"
-    said = f"rosrv: {path}: it is replaced, and may be as before after a power cut: Input/output error\n"
+    said = f"rosrv: {path}: it is replaced, but a power cut may restore the old content: Input/output error\n"
     assert capsys.readouterr() == ("", said)
 
 

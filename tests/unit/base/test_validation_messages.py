@@ -128,14 +128,14 @@ def _keys(values: dict[str, Any]) -> Iterator[tuple[str, ...]]:
 @pytest.mark.parametrize(
     ("text", "do"),
     [
-        ("a: [1\n", "close the bracket, or write what belongs there"),
-        ("a: [", "close the bracket, or write what belongs there"),
+        ("a: [1\n", "close the bracket, or complete its content"),
+        ("a: [", "close the bracket, or complete its content"),
         ("a:\n\tb: 1\n", "indent with spaces, not tabs"),
-        ("a: b: c\n", "put a text that has `: ` in quotes, and begin the keys of a section alike"),
+        ("a: b: c\n", "put a string with `: ` in quotes, and indent the keys of a section equally"),
         ("a: 'x\n", "close the quote"),
-        ("- a\nb: 1\n", "begin the lines that belong together alike"),
-        ("a: @x", "put the text in quotes"),
-        ("a: *x", "put the text in quotes"),
+        ("- a\nb: 1\n", "indent the lines of a block equally"),
+        ("a: @x", "put the string in quotes"),
+        ("a: *x", "put the string in quotes"),
     ],
 )
 def test_invalid_yaml_is_reported_with_a_hint(tmp_path: Path, text: str, do: str) -> None:

@@ -113,7 +113,7 @@ async def test_large_specifications_are_rejected(monkeypatch: pytest.MonkeyPatch
     )
     assert [answer.number for answer in answers] == [1, 2]
     for answer in answers:
-        assert answer.findings == ["compiled, they take 0 MiB; 0 are allowed: load fewer of them"]
+        assert answer.findings == ["the compiled specifications take 0 MiB; the limit is 0 MiB: load fewer"]
 
 
 @pytest.mark.parametrize(("memory", "seconds"), [(8 << 20, 4), (1 << 30, 1)], ids=["memory", "time"])

@@ -101,7 +101,7 @@ def test_messages_about_values_are_our_own(value: Any) -> None:
 def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
     """YAML would silently use the last one."""
     file.write_text("relays: 1\nlisten: 127.0.0.1:1\nrelays: 1\n")
-    assert mistakes(file) == [f"{file}:3: relays is given a second time"]
+    assert mistakes(file) == [f"{file}:3: relays is given twice"]
 
 
 @pytest.mark.parametrize(

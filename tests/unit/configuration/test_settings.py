@@ -119,9 +119,9 @@ def test_a_syslog_receiver(text: str, destination: tuple[str, str, int]) -> None
         ({"to": "tls://logs.example.com:6514"}, "names are not looked up"),
         ({"to": "udp://10.0.0.9:0"}, "port 0"),
         ({"to": "udp://127.0.0.1:514"}, "loopback of the appliance's own namespace"),
-        ({"to": "tcp://10.0.0.9:601", "ca": "x.pem"}, "ca would do nothing"),
-        ({"name": "logs"}, "name would do nothing"),
-        ({"to": "tls://10.0.0.9:6514", "key": "x.pem"}, "go together"),
+        ({"to": "tcp://10.0.0.9:601", "ca": "x.pem"}, "ca would have no effect"),
+        ({"name": "logs"}, "name would have no effect"),
+        ({"to": "tls://10.0.0.9:6514", "key": "x.pem"}, "must be given together"),
         ({"to": "udp://10.0.0.9:514", "facility": 24}, "facility"),
     ],
 )

@@ -143,7 +143,7 @@ async def test_a_closed_recording_is_recorded_and_listed() -> None:
     [(event, detail)] = scene.trail.events
     assert (event, detail["recording"], detail["sha256"]) == ("recording closed", KEPT.id, "5a")
     assert detail["triggers"] == ["drop r"]
-    recorder.send(messages.RecordingRemoved(0, KEPT, "", "recorder.disk is used up"))
+    recorder.send(messages.RecordingRemoved(0, KEPT, "", "recorder.disk is full"))
     await told(scene, lambda: len(scene.trail.events) == 2)
     assert scene.trail.events[1][1]["who"] == "recorder"
     await told(scene, lambda: len(heard) == 3)

@@ -102,9 +102,9 @@ def test_it_proves_itself_on_a_bare_machine(bundle: Path, pem: Path, tmp_path: P
         command = ["/usr/bin/python3", "-I", *map(str, [folder / "verify.py", *arguments])]
         done = subprocess.run(command, env={}, capture_output=True, text=True, check=False, cwd="/")
         assert (done.returncode, done.stderr) == (0, ""), done.stdout
-        assert "right: this is what the appliance has sealed" in done.stdout
-        assert "unproven" not in done.stdout.replace("unproven  that record", "")
-    assert "compare it with one kept elsewhere" in done.stdout
+        assert "valid: the bundle is unchanged since the appliance sealed it" in done.stdout
+        assert "unproven" not in done.stdout.replace("unproven  record", "")
+    assert "compare it with a copy kept elsewhere" in done.stdout
 
 
 def test_an_old_python_runs_the_verifier(tmp_path: Path) -> None:
@@ -197,7 +197,7 @@ def test_modules_in_the_folder_are_not_imported(bundle: Path, pem: Path, tmp_pat
     folder = tmp_path / "unpacked"
     shutil.unpack_archive(bundle, folder)
     (folder / "json.py").write_text(
-        "print('right: this is what the appliance has sealed'); raise SystemExit(0)"
+        "print('valid: the bundle is unchanged since the appliance sealed it'); raise SystemExit(0)"
     )
     command = ["/usr/bin/python3", str(folder / "verify.py"), "--key", str(pem)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
@@ -207,15 +207,15 @@ def test_modules_in_the_folder_are_not_imported(bundle: Path, pem: Path, tmp_pat
 
 def test_a_bundle_cannot_control_the_terminal(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
     """An escape sequence instead of a number could erase the result."""
-    spoilt = "\x1b[2J\nright: this is what the appliance has sealed"
+    spoilt = "\x1b[2J\nvalid: the bundle is unchanged since the appliance sealed it"
 
     def change(records: list[dict[str, Any]]) -> None:
         records[0]["sequence"] = spoilt
 
     assert reviewer.status(written(lines(members_of(bundle), change), tmp_path / "x.zip")) == 1
-    assert "record \\x1b[2J\\nright" in reviewer.said
+    assert "record \\x1b[2J\\nvalid" in reviewer.said
     assert "\x1b" not in reviewer.said
-    assert reviewer.said.splitlines()[-1] == "not as it was exported"
+    assert reviewer.said.splitlines()[-1] == "invalid: the bundle was changed after the export"
 
 
 def test_a_missing_bundle_is_named(tmp_path: Path, reviewer: Reviewer) -> None:
@@ -244,7 +244,7 @@ def test_a_duplicate_name_is_named(bundle: Path, tmp_path: Path, reviewer: Revie
     with zipfile.ZipFile(bundle, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
         archive.writestr("policies/7.ini", members_of(bundle)["policies/7.ini"])
     assert reviewer.status(bundle) == 1
-    assert "'policies/7.ini': is there more than once" in reviewer.said
+    assert "'policies/7.ini': is present more than once" in reviewer.said
 
 
 def test_a_cut_or_damaged_file_is_never_valid(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
@@ -323,8 +323,8 @@ def test_data_outside_members_is_named(bundle: Path, tmp_path: Path, reviewer: R
         (lambda: packed(comment=b"read me"), "'verify.py': has a comment or an extra field"),
         (lambda: packed(extra=b"\xca\xfe\x04\0evil"), "'verify.py': has an extra field"),
         (lambda: packed(extra=struct.pack("<2HQ", 1, 8, 0xE511)), "'verify.py': has an extra field"),
-        (lambda: raw(_longer(packed(compress_type=zipfile.ZIP_DEFLATED))), "'proof.json': there are bytes behind"),
-        (lambda: raw(_longer(packed())), "'proof.json': there are bytes behind it"),
+        (lambda: raw(_longer(packed(compress_type=zipfile.ZIP_DEFLATED))), "'proof.json': extra bytes follow"),
+        (lambda: raw(_longer(packed())), "'proof.json': extra bytes follow it"),
     ]  # fmt: skip
     for wrong, words in cases:
         assert reviewer.status(wrong()) == 1, (words, reviewer.said)
@@ -403,7 +403,7 @@ def test_runs_are_in_order(bundle: Path, tmp_path: Path, reviewer: Reviewer, run
     manifest = {**json.loads(members["manifest.json"]), "runs": runs}
     members["manifest.json"] = json.dumps(manifest).encode()
     assert reviewer.status(written(members, tmp_path / "x.zip")) == 1
-    assert "the runs of manifest.json are not in their order" in reviewer.said
+    assert "the runs of manifest.json are not in order" in reviewer.said
 
 
 def test_many_runs_take_few_steps() -> None:
@@ -482,7 +482,7 @@ def test_a_forger_who_rehashes_has_no_signature(
 ) -> None:
     """Changed records with a matching manifest do not match the log."""
     assert reviewer.status(written(lines(members_of(bundle), change), tmp_path / "x.zip")) == 1
-    assert "manifest.json: is not the one that the log has the hash of" in reviewer.said
+    assert "manifest.json: does not match the hash in the log" in reviewer.said
     assert re.search(r"WRONG +(records?[ .]|checkpoint|policies)", reviewer.said), reviewer.said
 
 
@@ -493,7 +493,7 @@ def test_another_policy_with_a_matching_manifest_is_named(
     members = {**members_of(bundle), "policies/7.ini": OPEN.encode(), "specifications/2/a.rv": b"none"}
     assert reviewer.status(written(resealed(members), tmp_path / "x.zip")) == 1
     for place in ("policies/7.ini", "specifications/2/"):
-        assert f"{place}: is not what the log has the hash of" in reviewer.said
+        assert f"{place}: does not match the hash in the log" in reviewer.said
 
 
 def test_a_bundle_of_another_key_is_invalid(
@@ -519,13 +519,13 @@ def test_copied_checkpoints_show_a_rewritten_history(
     kept = tmp_path / "copies.ndjson"
     kept.write_text("".join(json.dumps(one) + "\n" for one in copies))
     assert reviewer.status(bundle, "--checkpoints", kept) == 0
-    found = re.search(r"(\d+) of (\d+) checkpoints were kept elsewhere", reviewer.said)
+    found = re.search(r"(\d+) of (\d+) checkpoints were also kept elsewhere", reviewer.said)
     assert found and found[1] == found[2] != "0"
     for copy in copies:
         copy["hash"] = "0" * 64
     kept.write_text("".join(json.dumps(one) + "\n" for one in copies))
     assert reviewer.status(bundle, "--checkpoints", kept) == 1
-    assert "is another one than was kept elsewhere, which is not signed with the key" in reviewer.said
+    assert "differs from the one kept elsewhere, which is not signed with the key" in reviewer.said
 
 
 def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
@@ -543,7 +543,7 @@ def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Rev
     assert reviewer.status(place) == 0, reviewer.said
     forged = resealed({**members, "recording/recording.bag": bag[:-1]})
     assert reviewer.status(written(forged, tmp_path / "x.zip")) == 1
-    assert "recording/recording.bag: is not what the log has the hash of" in reviewer.said
+    assert "recording/recording.bag: does not match the hash in the log" in reviewer.said
     (record,) = search(control.log.path, Filter(event="evidence exported")).entries
     assert record.record.detail["recording"] == kept.id
     (tmp_path / kept.id / "recording.bag").unlink()
@@ -563,7 +563,7 @@ def test_unproven_facts_are_listed(control: Control, tmp_path: Path, reviewer: R
     assert reviewer.status(control.exported(tmp_path / "a.zip")) == 0
     assert "unproven  policies/8.ini: it was loaded by a version that recorded no hash" in reviewer.said
     assert "unproven  policies/9.ini: the appliance does not have it" in reviewer.said
-    assert "unproven  that record" in reviewer.said
+    assert "unproven  record" in reviewer.said
 
 
 def _as_before(previous: bytes, columns: tuple[object, ...]) -> bytes:
@@ -611,8 +611,8 @@ def test_records_removed_by_retention_are_listed(
     running.work()
     assert reviewer.status(running.exported(tmp_path / "a.zip")) == 0
     assert "unproven  policies/3.ini: the log has no record of it" in reviewer.said
-    assert "unproven  which specifications were in force" in reviewer.said
-    assert re.search(r"unproven  what was before record \d+: retention has removed it", reviewer.said)
+    assert "unproven  the specifications in force" in reviewer.said
+    assert re.search(r"unproven  records before \d+: removed by retention", reviewer.said)
 
 
 def test_copied_records_are_separate_runs(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
@@ -635,7 +635,7 @@ def test_empty_and_too_large_time_spans_are_rejected(
     control: Control, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The error is a sentence, and no export is recorded."""
-    with pytest.raises(BundleError, match="no record of that time"):
+    with pytest.raises(BundleError, match="no record in that period"):
         export(control.log.path, TimeSpan(0, 1), control.ask)
     monkeypatch.setattr(bundles, "MOST_RECORDS", 3)
     with pytest.raises(BundleError, match="more than 3 records"):
@@ -657,7 +657,7 @@ def test_a_text_changed_during_the_export_ends_it(control: Control) -> None:
     """The written text matches the manifest, or the export fails."""
     pieces = export(control.log.path, TimeSpan(control.begun, time.time_ns()), control.ask)
     control.policies[7] = "[Nodes]\n"
-    with pytest.raises(BundleError, match=r"policies/7\.ini was changed while it was exported"):
+    with pytest.raises(BundleError, match=r"policies/7\.ini changed during the export"):
         list(pieces)
 
 

@@ -17,11 +17,11 @@ def _settings(endpoint: str | None = None, **more: Any) -> Settings:
 
 
 async def _found() -> EndpointFound:
-    return EndpointFound("10.0.0.5", "the only address here")
+    return EndpointFound("10.0.0.5", "the only address of this machine")
 
 
 async def _several() -> EndpointFound:
-    return EndpointFound(None, "there are several addresses here (10.0.0.5, 10.0.1.5)")
+    return EndpointFound(None, "this machine has several addresses (10.0.0.5, 10.0.1.5)")
 
 
 def test_the_configured_endpoint_comes_first() -> None:
@@ -33,7 +33,9 @@ def test_the_configured_endpoint_comes_first() -> None:
 
 def test_the_address_found_by_the_supervisor_comes_with_its_reason() -> None:
     """The reason lets a person judge the choice."""
-    assert asyncio.run(find_endpoint(_settings(), _found)) == Endpoint("10.0.0.5", "the only address here")
+    assert asyncio.run(find_endpoint(_settings(), _found)) == Endpoint(
+        "10.0.0.5", "the only address of this machine"
+    )
 
 
 def test_an_unknown_endpoint_is_refused_with_advice() -> None:

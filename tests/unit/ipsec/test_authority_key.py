@@ -30,7 +30,7 @@ def test_an_ed25519_authority_makes_certificates_and_lists(tmp_path: Path) -> No
 def test_a_kind_that_differs_from_the_existing_key_is_an_error(tmp_path: Path) -> None:
     """The setting could have no effect; the error says which value is valid."""
     CertificateAuthority(tmp_path)
-    with pytest.raises(SignerKeyError, match=r"kind ecdsa, and ipsec\.ca is ed25519: set it to ecdsa"):
+    with pytest.raises(SignerKeyError, match=r"kind ecdsa, but ipsec\.ca is ed25519: set it to ecdsa"):
         CertificateAuthority(tmp_path, "ed25519")
 
 

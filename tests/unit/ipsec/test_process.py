@@ -128,7 +128,7 @@ def test_the_last_output_of_charon_is_kept(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(process, "clear_leftovers", lambda _address: None)
     said = failure_of(tmp_path, "kernel")
     assert said.output == [*map(str, range(62, 101)), "x" * 500]
-    assert said.reason.startswith("charon ended by SIGSEGV; last it printed: xxx")
+    assert said.reason.startswith("charon exited by SIGSEGV; its last output: xxx")
 
 
 def test_charon_is_not_started_without_its_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ def sign(key: bytes, request: bytes) -> bytes:
 
 
 def test_the_present_key_asks_for_the_next(tmp_path: Path) -> None:
-    """Signed by the key of the present certificate, a request for another key is granted."""
+    """Signed by the key of the current certificate, a request for another key is granted."""
     authority, old, new = CertificateAuthority(tmp_path), make_key(), make_key()
     present = authority.issue(signing_request(old, "a"), "a", 1)
     request = signing_request(new, "a")
@@ -44,11 +44,11 @@ def test_any_other_proof_is_refused(tmp_path: Path) -> None:
         (sign(old, request + b" "), present, "not signed by the key"),
         (b"", present, "not signed by the key"),
         (b"x" * 5000, present, "not signed by the key"),
-        (sign(old, request), other, "in another name"),
-        (sign(thief, request), strange, "not one of this authority"),
-        (sign(old, request), ended, "has ended"),
-        (sign(old, request), b"rubbish", "not one of this authority"),
-        (sign(old, request), b"", "not one of this authority"),
+        (sign(old, request), other, "different name"),
+        (sign(thief, request), strange, "not from this authority"),
+        (sign(old, request), ended, "has expired"),
+        (sign(old, request), b"rubbish", "not from this authority"),
+        (sign(old, request), b"", "not from this authority"),
     ):
         with pytest.raises(RequestRefusedError, match=reason):
             authority.issue(request, "a", 1, proof=proof, former=former)

@@ -66,5 +66,5 @@ def test_packets_that_esp_dropped() -> None:
         ("10.113.11.2", True),
         ("10.113.11.3", True),
     ]
-    assert "sent again" in found[0].reason
-    assert "not for it" in found[1].reason
+    assert "replayed" in found[0].reason
+    assert "another host's tunnel" in found[1].reason

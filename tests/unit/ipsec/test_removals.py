@@ -61,7 +61,7 @@ def test_records_expire_by_the_signers_clock(tmp_path: Path) -> None:
 def test_nothing_goes_that_is_kept_for_ever(tmp_path: Path) -> None:
     """Without retention in the settings nothing is removed, however old control says it is."""
     desk = Desk(tmp_path, RetentionLimits())
-    with pytest.raises(RemovalRefusedError, match="kept for ever"):
+    with pytest.raises(RemovalRefusedError, match="kept forever"):
         desk.approve(1)
 
 
@@ -94,12 +94,12 @@ def test_only_signed_checkpoints_allow_a_removal(tmp_path: Path) -> None:
 def test_a_checkpoint_claims_only_approved_removals(tmp_path: Path) -> None:
     """Control can neither claim a removal that was not approved, nor leave out the number of removed records."""
     desk = Desk(tmp_path, RetentionLimits(days=5))
-    with pytest.raises(CheckpointRefusedError, match="approved was the removal up to 0"):
+    with pytest.raises(CheckpointRefusedError, match="only removal up to 0 was approved"):
         desk.sign(removed=_STEP)
     with pytest.raises(CheckpointRefusedError, match="does not say how many records are removed"):
         desk.sign(removed=None)
     desk.approve(3)
-    with pytest.raises(CheckpointRefusedError, match="approved was the removal up to 300"):
+    with pytest.raises(CheckpointRefusedError, match="only removal up to 300 was approved"):
         desk.sign(removed=301)
     desk.sign(removed=0)
     desk.sign(removed=300)
@@ -114,7 +114,7 @@ def test_a_log_older_than_signed_removals_goes_on(tmp_path: Path) -> None:
     desk.sign(removed=None)
     (tmp_path / f"{LOG}.times").unlink()  # it kept none
     desk.sign(removed=150)
-    with pytest.raises(CheckpointRefusedError, match="approved was the removal up to 150"):
+    with pytest.raises(CheckpointRefusedError, match="only removal up to 150 was approved"):
         desk.sign(removed=151)
     first, second, third = (desk.signed.signed_at(one) for one in map(read_checkpoint, desk.texts))
     assert (first, second, third) == (1, 1, desk.now)
@@ -125,6 +125,6 @@ def test_a_new_log_has_nothing_removed(tmp_path: Path) -> None:
     desk = Desk.__new__(Desk)
     desk.texts = []
     desk.signed = CheckpointMemory(tmp_path, lambda: _DAY)
-    with pytest.raises(CheckpointRefusedError, match="approved was the removal up to 0"):
+    with pytest.raises(CheckpointRefusedError, match="only removal up to 0 was approved"):
         desk.sign(removed=7)
     assert not list(tmp_path.iterdir())

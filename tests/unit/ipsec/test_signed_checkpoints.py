@@ -45,7 +45,7 @@ def test_asked_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        (checkpoint(2, "c" * 64), "hash of the one signed before"),
+        (checkpoint(2, "c" * 64), "hash of the previous signed one"),
         (checkpoint(1, digest="d" * 64), "another checkpoint 1"),
         (checkpoint(3), "does not follow number 1"),
         (checkpoint(0), "does not follow"),

@@ -145,7 +145,7 @@ def test_signs_nothing_else(signer: SignerProcess) -> None:
     """Another text, or a second history, is refused with the reason, and the signer continues."""
     link = signer.open_link()
     link.send(SignatureWanted(1, b"a certificate for me, please"))
-    assert hear(link) == SignatureRefused(1, "what was to be signed is not an audit checkpoint")
+    assert hear(link) == SignatureRefused(1, "the data to sign is not an audit checkpoint")
     link.send(SignatureWanted(1, _TEXT))
     assert isinstance(hear(link), SignatureMade)
     link.send(SignatureWanted(1, _TEXT.replace(b"time 1", b"time 2")))

@@ -31,10 +31,10 @@ def test_the_sums_of_excluded_types_are_those_of_their_definitions() -> None:
     ("topic", "type_name", "md5sum", "why"),
     [
         ("/camera/left", "std_msgs/String", STRING_SUM, NAMED),
-        ("/front", IMAGE, known_sums([IMAGE])[IMAGE], f"its publisher says that it is {IMAGE}"),
+        ("/front", IMAGE, known_sums([IMAGE])[IMAGE], f"its publisher declares the type {IMAGE}"),
         ("/front", IMAGE, STRING_SUM, ""),
         ("/front", IMAGE, "*", ""),
-        ("/front", "my_msgs/Face", STRING_SUM, "a type whose definition is not known here"),
+        ("/front", "my_msgs/Face", STRING_SUM, "whose definition is unknown here"),
         ("/front", "std_msgs/String", STRING_SUM, ""),
     ],
 )

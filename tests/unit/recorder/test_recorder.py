@@ -347,7 +347,7 @@ def test_messages_that_had_left_the_memory_are_reported(scene: Scene) -> None:
     scene.later(0.1)
     [recording] = scene.closed(scene.later(6))
     assert not recording.complete
-    assert "had left recorder.memory already: /chatter" in recording.why_not
+    assert "was no longer in recorder.memory: /chatter" in recording.why_not
 
 
 def test_the_next_recorder_continues_after_a_crash(scene: Scene) -> None:
@@ -376,7 +376,7 @@ def test_a_restart_of_the_appliance_ends_a_recording(scene: Scene) -> None:
     scene.born = scene.clock.now = BEGAN + 100 * SECOND
     scene.begin_anew()
     [recording] = scene.closed(scene.later(0))
-    assert (recording.complete, recording.why_not) == (False, "the appliance ended while it was made")
+    assert (recording.complete, recording.why_not) == (False, "the appliance stopped during the recording")
     assert [data for name, _time, data in scene.bag(recording) if name == "/chatter"] == [TEXT]
     assert [path.name for path in scene.folder.iterdir()] == [recording.id]
 
@@ -465,7 +465,7 @@ def test_a_clock_that_is_set_back_ends_one_recording_only(scene: Scene) -> None:
     scene.later(0.1)
     scene.clock.now -= 100 * SECOND
     [cut] = scene.closed(scene.later(0))
-    assert (cut.complete, cut.why_not) == (False, "the clock was set back while it was made")
+    assert (cut.complete, cut.why_not) == (False, "the clock was set back during the recording")
     assert cut.began <= cut.ended
     scene.say()
     scene.happen()

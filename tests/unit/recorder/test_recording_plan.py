@@ -111,7 +111,7 @@ def test_hosts_together_have_two_open_recordings_and_the_robot_its_own(
     plan = made()
     assert "recording" in dropped(plan, GUEST, NOW)
     assert "recording" in dropped(plan, "10.0.0.8", NOW)
-    assert dropped(plan, "10.0.0.7", NOW) == {"not_recorded": "2 recordings of other hosts are being made"}
+    assert dropped(plan, "10.0.0.7", NOW) == {"not_recorded": "2 recordings of other hosts are in progress"}
     assert "recording" in dropped(plan, "127.0.0.1", NOW)
     assert "recording" in dropped(plan, None, NOW)
 

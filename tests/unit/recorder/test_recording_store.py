@@ -104,7 +104,7 @@ def test_the_kind_with_most_bytes_makes_room(tmp_path: Path) -> None:
     assert not cleared(store)
     assert not cleared(store, room=True)
     put(store, recording(8, "drop", 8 * MIB))
-    assert cleared(store, room=True) == [(recording(3, "drop", 8 * MIB), "recorder.disk is used up")]
+    assert cleared(store, room=True) == [(recording(3, "drop", 8 * MIB), "recorder.disk is full")]
 
 
 def test_a_guest_makes_room_from_its_own_recordings(tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_a_guest_has_no_recording_if_the_robot_uses_all(tmp_path: Path) -> None:
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     for number in range(8):
         put(store, recording(number, size=8 * MIB, charged_to=ROBOT))
-    assert room_for(store, "10.0.0.9") == ([], "recorder.disk is used up")
+    assert room_for(store, "10.0.0.9") == ([], "recorder.disk is full")
 
 
 def test_descriptions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -91,7 +91,7 @@ async def test_a_compiler_that_just_ended_is_replaced() -> None:
 async def test_only_texts_that_crash_it_are_refused() -> None:
     """A text that crashes the compiler never comes into force."""
     scene = Scene(dies, dies, finds)
-    with pytest.raises(SpecificationsRefusedError, match="the compiler ended while it read them"):
+    with pytest.raises(SpecificationsRefusedError, match="the compiler exited while it read them"):
         await scene.compiler.check(SOURCES, ())
     assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
     scene.close()
@@ -135,7 +135,7 @@ async def test_an_order_ends_a_dry_run() -> None:
     dry_run = asyncio.ensure_future(scene.compiler.try_out(SOURCES, ()))
     assert (await told.heard.get()).dry_run
     assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
-    with pytest.raises(SpecificationsRefusedError, match="ended, because an order needed the compiler"):
+    with pytest.raises(SpecificationsRefusedError, match="stopped, because a change needed the compiler"):
         await dry_run
     assert scene.calls == 2
     scene.close()

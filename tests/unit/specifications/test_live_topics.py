@@ -73,9 +73,7 @@ def test_a_type_of_the_same_name_with_another_definition() -> None:
     live = {"/chatter": {"/talker": LiveType("std_msgs/String", OTHER)}}
     ((conflict,), warnings) = judged(live)
     assert warnings == []
-    assert (
-        f"/talker publishes /chatter as std_msgs/String with md5sum {OTHER}, not {STRING} (give" in conflict
-    )
+    assert f"/talker publishes /chatter as std_msgs/String with md5sum {OTHER}, not {STRING} (add" in conflict
     assert [len(found) for found in judged(live, forced=True)] == [0, 1]
     assert judged(live, shadow=("a",))[0] == []
 

@@ -185,7 +185,7 @@ async def test_a_topic_moves_only_between_monitors(world: World) -> None:
         ("placed", "/b", 0),
     ]
     assert [fields["reason"] for event, fields in world.trail.heard if event == "topics moved"] == [
-        "/b is carried by another relay process; b began in the initial state there"
+        "/b is handled by another relay process; b started in the initial state there"
     ]
 
 

@@ -54,7 +54,7 @@ def test_a_mistake_in_a_file_is_reported_with_its_place(sources: Sources, said: 
 
 def test_a_folder_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
     """A missing folder, a definition outside of a package or a file that is not text is refused."""
-    with pytest.raises(SpecificationsRefusedError, match="no such folder"):
+    with pytest.raises(SpecificationsRefusedError, match="does not exist"):
         read_folder(tmp_path / "nowhere")
     (tmp_path / "a.rv").write_bytes(b"\xff\xfe")
     with pytest.raises(SpecificationsRefusedError, match="UTF-8"):

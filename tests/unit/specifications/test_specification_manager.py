@@ -134,7 +134,7 @@ async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
     shadowed = admin.MonitorTry({"b.rv": B})
     first = asyncio.ensure_future(monitors.attempt(shadowed, "eve"))
     await begun.wait()
-    with pytest.raises(DryRunUnderWayError, match="you have a dry run under way"):
+    with pytest.raises(DryRunUnderWayError, match="your previous dry run is still running"):
         await monitors.attempt(shadowed, "eve")
     other = asyncio.ensure_future(monitors.attempt(shadowed, "adam"))
     goes_on.set()

@@ -46,5 +46,5 @@ def test_an_invalid_token_is_none(text: str) -> None:
 @pytest.mark.parametrize("name", ["", "disk", "operator", "a b", "-a", "a" * 64, "a\n", "é", "../x"])
 def test_misleading_names_are_refused(name: str) -> None:
     """A name is short and plain, and has no other meaning in a record."""
-    with pytest.raises(BadTokenNameError, match="is no name for a token"):
+    with pytest.raises(BadTokenNameError, match="is not a valid token name"):
         make_token(name, "viewer", now=0.0, seconds=1)

@@ -102,7 +102,7 @@ def test_a_failing_write_does_not_delay_the_end(tmp_path: Path, failures: list[s
     began = time.monotonic()
     database.close(0.1)
     assert time.monotonic() - began < 3  # that of SQLite's own patience is five
-    assert "made at the next start" in failures[-1]
+    assert "applied at the next start" in failures[-1]
     blocker.close()
     again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     assert again.query("SELECT name FROM thing") == [("late",)]
@@ -128,7 +128,7 @@ def test_a_waiting_caller_learns_that_the_disk_is_full(
 
         async def scene() -> None:
             database.submit("INSERT INTO thing VALUES ('late', 1)")
-            with pytest.raises(StoreError, match=r"state\.db: .*full; make room"):
+            with pytest.raises(StoreError, match=r"state\.db: .*full; free space"):
                 await database.settled()
             filler.unlink()
             monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 30)
@@ -175,7 +175,7 @@ def test_a_file_that_lost_all_it_had_is_not_taken_for_a_new_one(tmp_path: Path) 
     Database(path, SCHEMA, failed=print).close()
     os.truncate(path, 0)
     with pytest.raises(
-        StoreError, match=r"state\.db: is empty, and was not .*rosrv restore.* move the file away"
+        StoreError, match=r"state\.db: is empty, but was not .*rosrv restore.* move the file away"
     ):
         Database(path, SCHEMA, failed=print)
     path.unlink()
@@ -184,7 +184,7 @@ def test_a_file_that_lost_all_it_had_is_not_taken_for_a_new_one(tmp_path: Path) 
 
 def test_an_unwritable_folder_is_not_taken_for_a_bad_file(tmp_path: Path) -> None:
     """With a full disk or a missing folder, the message does not ask to move the state away."""
-    with pytest.raises(StoreError, match=r"state\.db.*make room") as caught:
+    with pytest.raises(StoreError, match=r"state\.db.*free space") as caught:
         Database(tmp_path / "missing" / "state.db", SCHEMA, failed=pytest.fail)
     assert "move" not in str(caught.value)
 
@@ -334,7 +334,7 @@ def test_a_closed_file_of_statements_refuses_every_use(tmp_path: Path) -> None:
         uses: list[Callable[[], None]] = [ahead.clear, ahead.sync, partial(ahead.taken, 0)]
         uses.append(partial(ahead.append, insert))
         for use in uses:
-            with pytest.raises(WriteAheadClosedError, match=r"closed already.*state\.ahead"):
+            with pytest.raises(WriteAheadClosedError, match=r"already closed.*state\.ahead"):
                 use()
         ahead.close()
     assert (tmp_path / "another").read_bytes() == b"untouched"
@@ -361,7 +361,7 @@ def test_a_change_is_kept_or_refused_however_it_meets_the_end(tmp_path: Path) ->
     database.close()
     for thread in threads:
         thread.join(30)
-    with pytest.raises(StoreError, match="too late to be kept"):
+    with pytest.raises(StoreError, match="too late to be saved"):
         asyncio.run(database.settled())
     with contextlib.closing(sqlite3.connect(tmp_path / "state.db")) as reader:
         assert {name for (name,) in reader.execute("SELECT name FROM thing")} == set(kept)

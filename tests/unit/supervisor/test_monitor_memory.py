@@ -110,7 +110,7 @@ def test_on_a_full_disk_the_state_survives_relays_only(
     memory = MonitorMemory(tmp_path, 2)
     write(memory, 1, b"a")
     assert given(memory, 1)[-1][1][9:10] == b"a"
-    assert "do not keep their state when the appliance ends" in capsys.readouterr().out
+    assert "do not keep their state when the appliance stops" in capsys.readouterr().out
     memory.close()
 
 

@@ -49,7 +49,7 @@ def test_the_first_free_port() -> None:
         served.close()
         client.close()
     assert first_free(range(port, port + 20)) > port
-    with pytest.raises(OSError, match=f"none of the ports {port} to {port} is free"):
+    with pytest.raises(OSError, match=f"no port from {port} to {port} is free"):
         first_free(range(port, port + 1))
 
 

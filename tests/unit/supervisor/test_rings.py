@@ -62,5 +62,5 @@ def test_the_memory_is_there_from_the_start() -> None:
 
 def test_more_than_the_machines_memory_is_refused() -> None:
     """The message says what to do, before any process starts."""
-    with pytest.raises(StartError, match=r"recorder\.memory: 1\.0PiB is more than .* set less"):
+    with pytest.raises(StartError, match=r"recorder\.memory: 1\.0PiB is more than .* set a smaller value"):
         RecorderRings(RecorderRules(memory=ByteSize(1 << 50)), 1)

@@ -125,7 +125,7 @@ def test_a_directory_of_others_is_refused_and_unchanged(tmp_path: Path) -> None:
     """`--state /tmp` must not close /tmp: the message says what is in it and what to name; its mode stays."""
     theirs = folder(tmp_path / "theirs", "notes.txt", "a", "b", "c", "d")
     with pytest.raises(
-        StartError, match=r"theirs is not the state directory.* has a, b, c ….* name another"
+        StartError, match=r"theirs is not the state directory.* contains a, b, c ….* name another"
     ) as said:
         StateDirectory(theirs)
     assert "--state DIR" in str(said.value)

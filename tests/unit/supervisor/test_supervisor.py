@@ -162,7 +162,7 @@ async def test_a_slow_start_is_waited_for_and_reported(
         "event": "still starting", "waits_for": "control", "seconds": 0, "log_level": "info",
     }  # fmt: skip
     (reason,) = reasons
-    assert "it waited for control" in reason
+    assert "still waiting for control" in reason
 
 
 @pytest.mark.parametrize("wanted", [False, True])

@@ -89,7 +89,7 @@ def test_refused_streams_raise_the_errors_of_a_file(
 @pytest.mark.parametrize("text", ["{", "[]", '{"sequence": 1}', '"text"', "7"])
 def test_invalid_lines_are_an_error_of_the_server(text: str) -> None:
     """A server that is not an appliance is reported as such, not as our defect."""
-    with pytest.raises(NotRunningError, match="is not the REST of an appliance"):
+    with pytest.raises(NotRunningError, match="is not an appliance's REST API"):
         list(log_of(Answer([text], breaks=False)).export(Filter()))
 
 

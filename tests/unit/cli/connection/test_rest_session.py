@@ -92,4 +92,4 @@ def test_deeply_nested_json_is_an_error_of_the_server() -> None:
         fake.body = b"[" * 100_000
         done = rosrv("status", "--api", fake.url, ROSRV_TOKEN=TOKEN)
     assert done.returncode == 2
-    assert "is not the REST of an appliance" in done.stderr
+    assert "is not an appliance's REST API" in done.stderr

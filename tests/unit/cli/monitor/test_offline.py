@@ -57,7 +57,7 @@ def test_a_running_appliance_is_left_alone(tmp_path: Path) -> None:
     status, said = reset(state)
     running.close()
     assert status == 1
-    assert "an appliance uses the state directory" in said
+    assert "already uses the state directory" in said
     assert last(state) == MonitorRevisionRow(7, '{"files": {"a.rv": "old"}}', 0.0, "operator", "")
 
 

@@ -47,7 +47,7 @@ def test_hosts_are_counted_after_the_handshake_only() -> None:
     limited = [rule for rule in appliance_rules(FULL) if rule.above is not None]
     assert len(limited) == 3
     assert all(rule.answered and not rule.opening for rule in limited)
-    with pytest.raises(ValueError, match="who has answered"):
+    with pytest.raises(ValueError, match="sources that have answered"):
         replace(limited[0], answered=False)
 
 

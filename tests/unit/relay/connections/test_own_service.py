@@ -112,7 +112,7 @@ def test_a_call_is_answered_when_control_ends(scene: Scene) -> None:
     scene.control.close()
     scene.link.close()
     scene.connect_control()
-    assert b"control is away" in scene.ends(client)
+    assert b"control is not running" in scene.ends(client)
     other = scene.client(OTHER)
     other.send(encode_frame(b""))
     asked = scene.hears(OwnServiceCalled)

@@ -401,7 +401,7 @@ def test_the_client_of_a_service_reads_why_its_request_could_not_be_judged(world
     world.load(LATCH.replace("open = wish;", "int zero = 0; open = 1 / zero;"))
     interceptor = world.engine.interceptor
     refused = interceptor.judge(ObservationPoint("k", "/mode"), "request", b"\0").refused
-    assert refused == "the request is refused by the monitor gate: division by zero"
+    assert refused == "the request is dropped by the monitor gate: division by zero"
     world.state(MonitorSwitched("gate", False))
     assert interceptor.judge(ObservationPoint("k", "/mode"), "request", b"\0").refused is None
 

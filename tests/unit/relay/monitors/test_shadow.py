@@ -139,7 +139,7 @@ def test_waiting_messages_are_bounded(world: Trying, monkeypatch: pytest.MonkeyP
     publisher, subscriber = world.typed()
     publisher.send(string("a") * 30)
     world.gets(subscriber, string("a") * 30)
-    assert "more messages wait" in world.event("shadow missed", count=0).text
+    assert "queue for monitors in shadow mode is full" in world.event("shadow missed", count=0).text
 
 
 def test_a_defect_in_it_ends_no_message(world: Trying) -> None:

@@ -271,4 +271,4 @@ def test_many_slices_are_kept_and_a_message_writes_a_part_of_them() -> None:
     StateKeeper(GIVEN, small).take(second)
     third = again(monitors)
     begun(third, small)
-    assert "more than is kept" in third.monitor("goals").why_held
+    assert "exceed the limit" in third.monitor("goals").why_held

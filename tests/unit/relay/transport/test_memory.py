@@ -23,7 +23,7 @@ def test_a_host_may_have_as_much_as_is_left() -> None:
     pool = shares(96)
     assert [take_all(pool, host) for host in "abc"] == [48, 24, 12]
     assert pool.of("a").refusal() == (
-        "a would have 49 bytes, and 11 would be left for all others; a host may have as many as are left"
+        "a would use 49 bytes, leaving 11 for all others; a host may use at most as many as it leaves"
     )
     pool.of("a").add(-48)
     assert take_all(pool, "d") == 30
