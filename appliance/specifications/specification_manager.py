@@ -322,9 +322,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 if file in files and not {monitor, file} & set(names)
             )
             if left:
-                text = (
-                    f"{', '.join(left)} would also be removed: same file; name the file, or load it without"
-                )
+                text = f"this would also remove {', '.join(left)} from the same file: name the file, or load it without"
                 raise SpecificationsRefusedError([text])
             sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
             return await self._change(sources, who, who, note, request.confirm_within)
