@@ -79,7 +79,7 @@ def test_over_the_command_line(appliance: Appliance, tmp_path: Path) -> None:
     assert "deny" in [record["decision"] for record in records_of(bundle)]
     [record] = appliance.recorded("--event", "evidence exported")
     assert record["detail"]["who"] == "operator"
-    assert appliance.rosrv("evidence", "verify", str(bundle), state=False).stdout.endswith("has sealed\n")
+    assert appliance.rosrv("evidence", "verify", str(bundle), state=False).stdout.endswith("sealed it\n")
     again = appliance.rosrv("evidence", "export", "--since", "1h", "-o", str(bundle), check=False)
     assert (again.returncode, again.stderr) == (2, f"rosrv: {bundle}: File exists\n")
 
@@ -136,7 +136,7 @@ def test_a_recording_exports_as_evidence(appliance: Appliance, tmp_path: Path) -
     fetched = appliance.recorded("--event", "recording fetched", "--oldest-first", count=2)
     assert [record["detail"]["who"] for record in fetched] == ["operator", "carol"]
     refused = appliance.rosrv("evidence", "export", "../x", "-o", str(tmp_path / "x.zip"), check=False)
-    assert (refused.returncode, refused.stderr) == (1, "rosrv: recording ../x does not exist\n")
+    assert (refused.returncode, refused.stderr) == (1, "rosrv: there is no recording ../x\n")
     both = ("evidence", "export", recording, "--since", "1h", "-o", str(tmp_path / "x.zip"))
     assert appliance.rosrv(*both, check=False).returncode == 2
 

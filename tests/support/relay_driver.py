@@ -9,6 +9,7 @@ Run as a program it serves until its standard input ends, for measurements:
 """
 
 import argparse
+import contextlib
 import itertools
 import os
 import re
@@ -361,7 +362,11 @@ class RelayDriver:
 
     def _received(self, message: Any) -> None:
         if isinstance(message, UpstreamWanted):
-            threading.Thread(target=self._find_upstream, args=(message,), daemon=True).start()
+            threading.Thread(target=self._answer_upstream, args=(message,), daemon=True).start()
+
+    def _answer_upstream(self, message: UpstreamWanted) -> None:
+        with contextlib.suppress(ChannelClosedError, OSError):  # the test may end first, and close the link
+            self._find_upstream(message)
 
     def _find_upstream(self, message: UpstreamWanted) -> None:
         face = next((face for face in self.faces.values() if face.key == message.key), None)

@@ -148,11 +148,11 @@ def test_a_check_does_not_restore_rules_after_the_end(
             end.result(0.2)
         go_on.set()
         end.result(30)
-        with pytest.raises(NetworkError, match="the appliance ends"):
+        with pytest.raises(NetworkError, match="the appliance stops"):
             look.result(30)
     assert reachable(host, hidden)
     for late in (isolation.report, lambda: isolation.control_ready(1, 2)):
-        with pytest.raises(NetworkError, match="the appliance ends"):
+        with pytest.raises(NetworkError, match="the appliance stops"):
             late()
     assert reachable(host, hidden)
 
@@ -179,7 +179,7 @@ def test_the_end_does_not_wait_for_a_hanging_check(
         assert looking.wait(LIMIT)
         isolation.remove()
         go_on.set()
-        with pytest.raises(NetworkError, match="the appliance ends"):
+        with pytest.raises(NetworkError, match="the appliance stops"):
             look.result(30)
     assert reachable(host, hidden)
 
