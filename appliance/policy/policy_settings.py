@@ -68,9 +68,7 @@ def read_monitor(section: SectionText | None, findings: Findings) -> MonitorSect
     for entry in _entries(section, tuple(names), findings):
         for word in entry.values:
             if not is_global_name(word.text):
-                text = (
-                    f"{quoted(word.text)} is not a resolved name, such as /landshark/gps (no patterns here)"
-                )
+                text = f"{quoted(word.text)} is not a resolved name (/landshark/gps) without patterns"
                 findings.error(word.line, word.column, text)
             elif word.text in names[entry.key.text]:
                 findings.warn(word.line, word.column, f"{word.text} is listed twice")
@@ -115,12 +113,8 @@ def _audit_only(entry: Entry, findings: Findings) -> frozenset[str]:
             known = "" if guess else f"; all, or some of {', '.join(by_fold.values())}"
             findings.error(word.line, word.column, f"{quoted(word.text)} decides nothing{guess}{known}")
     if chosen:
-        what = "nothing" if len(chosen) == len(by_fold) else f"nothing by [{'], ['.join(sorted(chosen))}]"
-        findings.warn(
-            entry.key.line,
-            entry.key.column,
-            f"audit-only: this policy denies {what}; denials are only recorded",
-        )
+        what = "are" if len(chosen) == len(by_fold) else f"by [{'], ['.join(sorted(chosen))}] are"
+        findings.warn(entry.key.line, entry.key.column, f"audit-only: denials {what} only recorded")
     return frozenset(chosen)
 
 

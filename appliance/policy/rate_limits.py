@@ -123,9 +123,7 @@ def read_limits(section: SectionText | None, file: str, groups: HostGroups, find
             break
         word = entry.key
         if len(first_lines) >= _LINES:
-            findings.error(
-                word.line, word.column, f"more than {_LINES} limits: use patterns, such as /camera/**"
-            )
+            findings.error(word.line, word.column, f"more than {_LINES} limits: use patterns (/camera/**)")
             break
         first = first_lines.setdefault(word.text, word.line)
         if first != word.line:
@@ -173,9 +171,7 @@ def _clauses(entry: Entry, groups: HostGroups, findings: Findings) -> Iterator[C
             findings.error(word.line, word.column, text)
             return
     if not parts:
-        findings.error(
-            entry.key.line, entry.key.column, "add whose limit it is, such as publisher 30 Hz 10 MB/s"
-        )
+        findings.error(entry.key.line, entry.key.column, "add whose limit it is: publisher 30 Hz 10 MB/s")
     for word, words in parts:
         clause = _clause(word, words, groups, findings)
         if clause is not None:
@@ -229,10 +225,7 @@ def _fault(number: float, known: str | None, unit: str, found: dict[str, float])
             + f" has no unit of a limit{guess or ': Hz, B/s, kB/s, MB/s or GB/s'}"
         )
     if not _LEAST <= number * _UNITS[known] <= _MOST:
-        return (
-            f"{number:g} {known} cannot be enforced as a limit;"
-            " to forbid sending, leave the host out of [Publishers]"
-        )
+        return f"{number:g} {known} cannot be enforced; to forbid sending, leave the host out of [Publishers]"
     if ("Hz" if known == "Hz" else "B/s") in found:
         return f"{number:g} {known}: this is already limited; give one number of messages and one of bytes"
     return ""

@@ -115,11 +115,7 @@ class ParameterCalls:
             self.rights.recorded(caller, _SEARCH, found, places[found])
         if answer[0] != 1 and hidden:
             why = self.rights.recorded(caller, _SEARCH, hidden[0], places[hidden[0]])
-            return [
-                -1,
-                f"Cannot find parameter [{key}] in an upwards search of the readable parameters: {why}",
-                "",
-            ]
+            return [-1, f"Cannot find parameter [{key}] in an upwards search of readable ones: {why}", ""]
         return answer
 
     def _next_readable(self, key: str, places: dict[str, Decision], hidden: str) -> str | None:
