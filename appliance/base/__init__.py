@@ -1,1 +1,1 @@
-"""Code that every package may use: files, clocks, input checks. It imports nothing of the appliance."""
+"""Files, clocks and input checks for every package. This package imports no other package of the appliance."""

@@ -1,16 +1,17 @@
 """A clock for the age of kept data, robust against wrong system time.
 
-After a start the system clock may be years off until a person or a time service corrects it. A retention limit that
-trusted it would delete everything at once.
+After a start, the system clock may be wrong by years until a person or a time service corrects it. A retention limit
+that trusted the system clock would then delete everything at once.
 
 Invariants:
 
 1. While the process runs, the age clock follows the monotonic clock. It ignores changes of the system clock and never
    goes back.
-2. Only the system clock shows how long the process was off. A gap of up to `_AT_ONCE` is added at once. A longer gap is
-   added after the system clock has been ahead for `_STANDS` of running time; the smallest gap seen in that time counts.
-   A system clock that is behind adds nothing until it is corrected.
-3. The clock continues after a restart. Its file is written every `_SAVE`; time since the last write counts as time off.
+2. Only the system clock shows how long the process was off. A gap of up to `_AT_ONCE` is added at once.
+3. A longer gap is added after the system clock has been ahead for `_STANDS` of running time. The smallest gap seen in
+   that time is added. A system clock that is behind adds nothing until someone corrects it.
+4. The age clock continues after a restart. It saves its state every `_SAVE`. Time since the last save counts as time
+   off.
 """
 
 import time
@@ -36,19 +37,20 @@ class _Kept(msgspec.Struct):
     lived: int  # running time of the machine while the process ran
     credited: int  # time since the epoch that counts in addition to `lived`
     believed: int  # the system clock minus `lived`, when last read
-    sets: int = 0  # changes of the system clock while the process ran, which were not counted
+    sets: int = 0  # the sum of ignored changes of the system clock while the process ran
     step: int = 0  # the gap at the start, until it is counted
     since: int = 0  # `lived` when the gap was first seen
 
 
 def _monotonic() -> int:
-    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)  # includes the time of a suspended machine
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)  # also counts while the machine is suspended
 
 
 class AgeClock:
-    """A callable clock: nanoseconds since the epoch as if the system clock had never been wrong, kept in `path`.
+    """A callable clock that returns nanoseconds since the epoch, as if the system clock had never been wrong.
 
-    Without the file, the clock starts at `begin()`, or now if that is None. Raises `OSError` if the file is unreadable.
+    The state is stored in the file `path`. Without this file, the clock starts at `begin()`, or at the system time if
+    `begin()` returns None. Raises `OSError` if the file exists but cannot be opened.
     """
 
     def __init__(
@@ -92,7 +94,7 @@ class AgeClock:
         return kept.lived + kept.credited
 
     def _was_off(self, ahead: int) -> None:
-        """Add the gap of the system clock as time off, once it is credible."""
+        """Add the gap of the system clock as time off, once the gap is credible."""
         kept, counts = self._kept, 0
         if abs(ahead) <= _AT_ONCE:
             kept.step, counts = 0, max(0, ahead)

@@ -9,11 +9,11 @@ import sys
 from pathlib import Path
 
 _UNFINISHED = re.compile(r".+\.[0-9a-f]{8}\.new(-journal)?")
-"""Matches the names that `name_to_make` returns, and the journal of a database with such a name."""
+"""Match the names that `name_to_make` returns, and the journals of databases with such names."""
 
 
 class NotLastingError(OSError):
-    """A replaced file may not be on the disk yet: after a power cut the old one may be back."""
+    """A file was replaced but may not be on the disk yet. After a power cut, the old file may be back."""
 
 
 def name_to_make(path: Path) -> Path:
@@ -36,8 +36,8 @@ def remove_unfinished(folder: str, place: int) -> None:
 def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | None = None) -> None:
     """Replace a file and sync it to the disk. Raises `OSError`, which leaves the old file unchanged.
 
-    `owner` (user and group; default: the writer) is set before the file gets its name. With concurrent writers, one
-    complete file remains. Raises `NotLastingError` if the file is replaced, but perhaps not on the disk.
+    `owner` (user and group; default: the writer) is set before the file gets its final name. With concurrent writers,
+    one complete file remains. Raises `NotLastingError` if the file is replaced but perhaps not on the disk.
     """
     making = name_to_make(path)
     try:
@@ -72,9 +72,9 @@ def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | Non
 def write_where_told(path: Path, data: bytes) -> None:
     """Write data to a path that a person chose. Raises `OSError`.
 
-    A regular file is replaced atomically and keeps its mode and owner, also behind a link. A pipe, a device, or a file
-    with an owner that this process cannot restore is written in place. The process's own output (/dev/stdout) gets the
-    data after its earlier output.
+    A regular file is replaced atomically and keeps its mode and owner, even if `path` is a symbolic link. A pipe, a
+    device, or a file with an owner that this process cannot set is written in place. If `path` is the process's own
+    output (/dev/stdout), the data is appended to its earlier output.
     """
     try:
         there = path.stat()

@@ -1,7 +1,7 @@
-"""Read files that a person names, or files in a folder they name: regular files only, with a size limit.
+"""Read files that a person names, or files in a folder that they name: regular files only, with a size limit.
 
-A named pipe may block its reader forever, a device may be endless, and a file may exceed the memory. Each raises an
-`OSError` that names the cause, so callers report it like a missing file.
+A named pipe may block its reader forever, a device may be endless, and a file may not fit in memory. Each case raises
+an `OSError` that names the cause, so callers report it like a missing file.
 """
 
 import errno

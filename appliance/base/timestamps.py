@@ -14,8 +14,8 @@ class TimestampError(ValueError):
 def parse_timestamp(text: str, now: int) -> int:
     """Return nanoseconds since the epoch. `1h` means one hour before `now`; a time without a zone is UTC.
 
-    `10:32` is the most recent 10:32; `today` and `yesterday` begin at midnight. A time outside the range of the log
-    is clamped to it. Raises `TimestampError`.
+    `10:32` is the most recent 10:32; `today` and `yesterday` begin at midnight. A time outside the log's range becomes
+    the nearest end of that range. Raises `TimestampError`.
     """
     ago = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)([smhdw])", text, re.ASCII)
     if ago is not None:
@@ -43,7 +43,7 @@ def _dated(text: str, now: int) -> str:
 
 def parse_date(text: str) -> int:
     """Return the nanoseconds since the epoch of a date or an RFC 3339 time. Raises `ValueError`."""
-    # datetime keeps microseconds only, but the log prints nanoseconds, and a printed time must be valid input.
+    # datetime keeps only microseconds. The log prints nanoseconds, and every printed time must be valid input.
     fraction = re.search(r"\.(\d{1,9})", text)
     whole = text if fraction is None else text.replace(fraction[0], "", 1)
     moment = datetime.fromisoformat(whole)

@@ -38,7 +38,7 @@ _MUST_BE = {
     "too_long": "{max_length} at most in number",
     "too_short": "{min_length} at least in number",
 }
-"""Descriptions of valid values, by pydantic's error type, the first word of it, or msgspec's type name."""
+"""Descriptions of valid values. The key is pydantic's error type, its first word, or msgspec's type name."""
 _BOUNDS = {">=": "at least", "<=": "at most", ">": "more than", "<": "less than"}
 _PARTS = {"str": "characters", "array": "entries", "object": "fields"}
 _BODY: dict[str, Callable[..., str]] = {
@@ -102,7 +102,7 @@ def refusal(error: Mapping[str, Any]) -> str:
     """Return the error message for a command line or query value, from one of pydantic's `errors()`."""
     if error["type"] == "missing":
         return "must be given"
-    if error["type"] == "value_error":  # our own validator wrote the sentence, which names the value
+    if error["type"] == "value_error":  # raised by the appliance's own validator, with a complete message
         return str(error["ctx"]["error"])
     return f"must be {must_be(error)}, not {_cut(repr(error['input']))}"
 

@@ -1,15 +1,16 @@
-"""Withdraw orders whose client no longer waits for the answer, before they take effect.
+"""Withdraw an order before it takes effect if its client no longer waits for the answer.
 
 Invariants:
 
-1. The code of an order calls `take_effect` before its first change. `take_effect` raises `WithdrawnError` if the client
-   gave up earlier (timeout, disconnection, kill). The order then changes nothing, now or later.
-2. After `take_effect` the order runs to its end, whatever its client does. A client that gave up therefore knows that
-   its order will not start later; the audit log has every order that started.
-3. Work outside an order (a start, a signal, an automatic rollback) is never withdrawn. Tasks that outlive their order
+1. Every order calls `take_effect` before its first change. `take_effect` raises `WithdrawnError` if the client gave up
+   earlier (timeout, disconnection, kill). A withdrawn order changes nothing, now or later.
+2. After `take_effect`, the order runs to its end even if its client gives up.
+3. A client that gave up therefore knows that its order does not start later. The audit log lists every order that
+   started.
+4. Work outside an order (a start, a signal, an automatic rollback) is never withdrawn. Tasks that outlive their order
    are not withdrawn either.
 
-The order is a context variable, shared by everything that is awaited for one request.
+The current order is a context variable, so all code that runs for one request sees the same order.
 """
 
 import contextlib
@@ -29,7 +30,7 @@ class WithdrawnError(Exception):
 
 
 class _Order:
-    """An order: `given_up()` returns whether the client stopped waiting, which is ignored once `begun` is true."""
+    """An order. `given_up()` returns whether the client stopped waiting; it no longer matters once `begun` is true."""
 
     def __init__(self, given_up: Callable[[], bool]) -> None:
         self.given_up = given_up
@@ -41,7 +42,7 @@ _PRESENT: ContextVar[_Order | None] = ContextVar("order", default=None)
 
 @contextlib.contextmanager
 def awaited(given_up: Callable[[], bool]) -> Iterator[None]:
-    """Surround the work for one request; `given_up()` returns whether its client stopped waiting."""
+    """Run the work for one request as an order; `given_up()` returns whether its client stopped waiting."""
     order = _Order(given_up)
     before = _PRESENT.set(order)
     try:
