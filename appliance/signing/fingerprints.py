@@ -1,7 +1,7 @@
 """Hash policies and specifications when they take effect, so that the audit log identifies them.
 
-The hash of several texts is the hash of the lines that `sha256sum` prints for their files, sorted by name, so
-`sha256sum` alone can compute it.
+The hash of several texts is the hash of the lines that `sha256sum` prints for their files, sorted by name. So anyone
+can compute this hash with `sha256sum` alone.
 """
 
 import hashlib
@@ -21,6 +21,6 @@ def fingerprint_of_all(texts: Mapping[str, str]) -> str:
 
 
 def file_name(name: str) -> str:
-    """Return any name as a relative file path, with unusual characters percent-encoded."""
+    """Convert a name to a relative file path, with unusual characters percent-encoded."""
     parts = name.split("/")
     return "/".join(quote(part) if part.strip(".") else part.replace(".", "%2E") or "%" for part in parts)

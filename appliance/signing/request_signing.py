@@ -1,18 +1,19 @@
 """Derive two keys from an access token, and sign orders with one of them. No I/O, no clock.
 
-The token itself need not be sent. The client derives two keys from it:
+A client need not send its token. It derives two keys from the token:
 
-- the *reading key* replaces the token in `Authorization: Bearer`. It permits all reads of the token and no changes.
-- the *signing key* (Ed25519) never leaves the client. It signs each order: the HTTP request as sent, with a challenge
-  that control issued and accepts once.
+- The *reading key* replaces the token in `Authorization: Bearer`. It permits all reads that the token permits, and no
+  changes.
+- The *signing key* (Ed25519) never leaves the client. It signs each order: the HTTP request as sent, with a challenge
+  from control. Control accepts each challenge once.
 
 Invariants:
 
 1. The appliance stores the SHA-256 of the reading key and the public half of the signing key (`TokenKeys`). Neither key
-   can be derived from them. Reading the state, a backup or the api's traffic is not enough to sign an order.
-2. The signed text has seven lines, each one part of the request. A part cannot contain control characters, so no two
-   requests have the same text.
-3. Any change here needs a new version in the first line, in the derivations and in `docs/reference/rest.md`.
+   can be derived from these values. Access to the state, a backup or the api's traffic is not enough to sign an order.
+2. The signed text has seven lines; each line is one part of the request. A part cannot contain control characters, so
+   no two requests have the same text.
+3. Any change of this format needs a new version in the first line, in the derivations and in `docs/reference/rest.md`.
 """
 
 import base64
@@ -54,7 +55,7 @@ def reading_key(token: str) -> str:
 
 
 def reading_id(shown: str) -> str | None:
-    """Return the id in a reading key, or None for any other text."""
+    """Return the id in a reading key, or None if the text is not a reading key."""
     found = _READING_FORM.fullmatch(shown)
     return None if found is None else found[1]
 
@@ -67,7 +68,7 @@ def reading_hash(key: str) -> bytes:
 def statement(
     challenge: str, *, method: str, target: str, if_match: str, content_type: str, body: bytes
 ) -> bytes:
-    """Return the text to sign. `target` is path and query as sent; pass a missing header as an empty string.
+    """Return the text to sign. `target` is the path and query as sent. Pass a missing header as an empty string.
 
     Raises `BadProofError` for a part with a control or non-ASCII character.
     """
@@ -79,12 +80,12 @@ def statement(
 
 
 def proof_of(token: str, challenge: str, stated: bytes) -> str:
-    """Return the header value for a statement with this challenge."""
+    """Sign a statement that contains this challenge; return the value of the `ROSRV-Proof` header."""
     return f"{challenge} {_text(_signing_key(token).sign(stated))}"
 
 
 def parse_proof(header: str) -> tuple[str, bytes]:
-    """Return the challenge and the signature in a header value. Raises `BadProofError`."""
+    """Return the challenge and the signature from the header's value. Raises `BadProofError`."""
     found = _PROOF_FORM.fullmatch(header)
     if found is None:
         raise BadProofError(f"{HEADER} is not `CHALLENGE SIGNATURE`")

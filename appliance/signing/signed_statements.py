@@ -1,10 +1,10 @@
 """Write and parse the statements about the audit log that the signer signs: checkpoints and removals. No I/O.
 
 Invariants:
-1. A checkpoint has the log, its own number, the sequence, the hash at that sequence, the time, the hash of the previous
-   checkpoint, and the last removed record. Checkpoints of version 1 do not have the last removed record.
-2. A removal has the checkpoint up to which records are removed, and the limit in the settings that required it.
-3. Each statement has exactly one text. Any other spelling, such as a leading zero, is invalid.
+1. A checkpoint contains the log's id, its own number, the sequence, the hash at that sequence, the time, and the hash
+   of the previous checkpoint. From version 2 on, it also contains the last removed record.
+2. A removal names the last checkpoint of the removed records, and the limit in the settings that required the removal.
+3. Each statement has exactly one valid text. Any other spelling, such as a leading zero, is invalid.
 """
 
 import hashlib
@@ -53,14 +53,15 @@ def parse_checkpoint(text: bytes) -> Checkpoint:
 
 
 def checkpoint_hash(text: bytes) -> str:
-    """Return the hash that the next checkpoint stores as `previous`."""
+    """Return the hash of a checkpoint, which the next checkpoint stores as `previous`."""
     return hashlib.sha256(text).hexdigest()
 
 
 class Removal(NamedTuple):
-    """A removal of all records up to a checkpoint: its number, sequence, the hash there, and its own hash (`sealed`).
+    """A removal of all records up to a checkpoint.
 
-    `limit` is the setting that required the removal, as the signer writes it.
+    The fields are the checkpoint's number, its sequence, the record's hash there, and the checkpoint's own hash
+    (`sealed`). `limit` is the setting that required the removal, as the signer writes it.
     """
 
     log: str

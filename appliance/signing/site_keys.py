@@ -1,12 +1,12 @@
-"""Sign texts, and verify signatures by the keys that the site's configuration names.
+"""Sign texts, and verify signatures with the keys in the site's configuration.
 
-A signature is a separate file in OpenSSH's format (SSHSIG, see its PROTOCOL.sshsig), as written to FILE.sig by
-`ssh-keygen -Y sign -n rosrv`. A key is an `ssh-ed25519` line, as `ssh-keygen -t ed25519` writes it to KEY.pub.
+A signature is a separate file, FILE.sig, in OpenSSH's format (SSHSIG; see OpenSSH's PROTOCOL.sshsig), as
+`ssh-keygen -Y sign -n rosrv` writes it. A key is an `ssh-ed25519` line, as in the KEY.pub of `ssh-keygen -t ed25519`.
 
 Invariants:
-1. A signature is valid only for the text it was made for, in the namespace `rosrv`, with a configured key. The key
-   inside the signature only selects one of the configured keys; it is not trusted otherwise.
-2. Without a configured key no signature is required or checked.
+1. A signature is valid only for its own text, in the namespace `rosrv`, with a configured key. The public key inside
+   the signature file only selects one of the configured keys; it is not trusted.
+2. Without a configured key, no signature is required or checked.
 """
 
 import base64
@@ -44,7 +44,7 @@ def checked_key(line: str) -> str:
 
 
 def name_of(line: str) -> str:
-    """Return the name of a key in records: its fingerprint as `ssh-keygen -l` shows it, and its comment."""
+    """Return the name that records use for a key: its fingerprint, as `ssh-keygen -l` prints it, and its comment."""
     digest = hashlib.sha256(_wire(_ED25519, _public(line))).digest()
     comment = " ".join(line.split()[2:])
     return f"SHA256:{base64.b64encode(digest).decode().rstrip('=')}" + (f" ({comment})" if comment else "")
