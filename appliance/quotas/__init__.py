@@ -1,1 +1,1 @@
-"""Quotas on finite resources: one way of counting (`pool`), one table of the counted resources (`table`)."""
+"""Quotas on finite resources: `pool` counts the holdings of hosts, `table` lists all counted resources."""

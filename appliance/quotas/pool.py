@@ -1,18 +1,18 @@
-"""Limit a finite resource by host, so that no host can exhaust it.
+"""Limit a finite resource by host, so that no host can exhaust the resource.
 
-`Pool` is arithmetic without I/O: it decides whether a host may have more, and counts its holdings. The owner of the
-resource asks the pool before each allocation.
+`Pool` is arithmetic without I/O. It counts the holdings of each host, and decides whether a host may have more. The
+owner of the resource asks the pool before each allocation.
 
 Invariants, for a pool with `Bounds(whole, host, unknown, kept)`:
 
-1. All hosts together hold at most `whole`; one host at most `host`.
+1. All hosts together hold at most `whole`; one host holds at most `host`.
 2. All unknown hosts together hold at most `unknown`, however many addresses they have.
-3. All hosts without a registration together hold at most `whole - kept`. The rest remains for the robot's own nodes,
-   however many other hosts came first.
+3. All hosts without a registration together hold at most `whole - kept`. The remaining `kept` is reserved for
+   registered hosts.
 4. A host without holdings takes no memory.
 
-A host's quota class may change while it holds something. Each call for a host reads its present class and moves its
-holdings to that class. No call checks other hosts.
+The quota class of a host may change while the host has holdings. Each call for a host reads its present class and
+counts its holdings under that class. Other hosts are not checked.
 """
 
 from collections.abc import Callable, Hashable, Iterator
@@ -27,13 +27,13 @@ class QuotaClass(IntEnum):
     """The rank of a host by policy and registry; a host of higher rank is evicted later."""
 
     UNKNOWN = 0
-    """No policy rule names its address."""
+    """No policy rule names the host's address."""
 
     NAMED = 1
-    """A rule names its address, and it has no registration now."""
+    """A policy rule names the host's address, but the host has no registration now."""
 
     REGISTERED = 2
-    """It has a registration, or a relay grant, which only registered nodes get."""
+    """The host has a registration, or a relay grant. Only registered nodes get relay grants."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,16 +41,16 @@ class Bounds:
     """The limits of a pool, in its unit. Raises ValueError if a part exceeds the whole."""
 
     whole: int
-    """All hosts together."""
+    """The limit of all hosts together."""
 
     host: int
-    """One host."""
+    """The limit of one host."""
 
     unknown: int
-    """All unknown hosts together."""
+    """The limit of all unknown hosts together."""
 
     kept: int
-    """The part of the whole for registered hosts only."""
+    """The part of `whole` that is reserved for registered hosts."""
 
     def __post_init__(self) -> None:
         if min(self.whole, self.host, self.unknown, self.kept) < 0:
@@ -61,10 +61,10 @@ class Bounds:
             )
 
     def sized(self, whole: int, host: int | None = None) -> "Bounds":
-        """Return bounds for the operator's whole and quota of a host (None: in proportion).
+        """Return bounds with the operator's `whole` and `host`. If `host` is None, it is scaled with `whole`.
 
-        The quota of unknown hosts and the kept part stay in proportion to the whole, rounded down. A nonzero quota of
-        unknown hosts stays at least one, so that a small pool still gives them a reason for a refusal.
+        `unknown` and `kept` are scaled with `whole` and rounded down. A nonzero `unknown` stays at least one, so that a
+        small pool can still answer an unknown host with the reason of a refusal.
         """
         host = self.host * whole // self.whole if host is None else host
         unknown = self.unknown * whole // self.whole
@@ -77,9 +77,9 @@ class Bounds:
 class Pool(Generic[Holder]):
     """The holdings of each host in one finite resource.
 
-    `what` is the noun of refusals, with its unit: "connections", "bytes of parameters". `unknown` is the noun for
-    unknown hosts. `quota_class` returns the present class of a host. For a machine with many addresses (IPv6), give
-    its network as the host.
+    In refusals, `what` is the name of the resource with its unit ("connections", "bytes of parameters"), and `unknown`
+    is the name of unknown hosts. `quota_class` returns the present class of a host. For a machine with many IPv6
+    addresses, pass its network as the host.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Pool(Generic[Holder]):
         self._by_class = [0 for _ in QuotaClass]
 
     def refusal(self, host: Holder, amount: int = 1) -> str:
-        """Return why `host` may not have `amount` more; empty if it may."""
+        """Return why `host` may not have `amount` more, or an empty string if it may."""
         return self._refusal(host, amount, *self._look_up(host))
 
     def _refusal(self, host: Holder, amount: int, quota_class: QuotaClass, mine: int) -> str:
@@ -118,7 +118,7 @@ class Pool(Generic[Holder]):
         return ""
 
     def take(self, host: Holder, amount: int = 1) -> str:
-        """Give `host` the whole amount or nothing. Return the reason as `refusal` does."""
+        """Give `host` the whole amount or nothing. Return the reason of a refusal, or an empty string."""
         quota_class, mine = self._look_up(host)
         reason = self._refusal(host, amount, quota_class, mine)
         if not reason:
@@ -126,12 +126,12 @@ class Pool(Generic[Holder]):
         return reason
 
     def charge(self, host: Holder, amount: int = 1) -> None:
-        """Count an amount without a check: `host` has it already, or it can no longer be refused."""
+        """Count an amount without a check, because `host` already has it or can no longer be refused."""
         quota_class, mine = self._look_up(host)
         self._set(host, quota_class, mine, mine + amount)
 
     def give_back(self, host: Holder, amount: int = 1) -> None:
-        """Take an amount from `host`. Raises ValueError if it has less."""
+        """Take an amount back from `host`. Raises `ValueError` if `host` has less."""
         quota_class, mine = self._look_up(host)
         if amount > mine:
             raise ValueError(f"{host} returns {amount} {self.what} and has {mine}")
@@ -142,7 +142,7 @@ class Pool(Generic[Holder]):
         return self._held.get(host, _NOTHING)[1]
 
     def held_by(self, quota_class: QuotaClass) -> int:
-        """Return the holdings of all hosts of this quota class, as last counted."""
+        """Return the holdings of all hosts that were of this quota class when they were last counted."""
         return self._by_class[quota_class]
 
     @property
@@ -151,7 +151,7 @@ class Pool(Generic[Holder]):
         return sum(self._by_class)
 
     def holders(self) -> Iterator[tuple[Holder, int]]:
-        """Yield every host with holdings, and their amount."""
+        """Yield every host that has holdings, and the amount."""
         return ((host, amount) for host, (_, amount) in self._held.items())
 
     def _look_up(self, host: Holder) -> tuple[QuotaClass, int]:

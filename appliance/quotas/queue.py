@@ -1,4 +1,4 @@
-"""Find the longest waiting member of each quota class, to evict it from a full pool."""
+"""Find the longest waiting member of each quota class, so that a full pool can evict that member."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
@@ -8,7 +8,7 @@ from appliance.quotas.pool import QuotaClass
 
 Holder = TypeVar("Holder", bound=Hashable)
 Member = TypeVar("Member")
-_MOST_MOVED = 64  # members that one search may move to the present quota class of their hosts
+_MOST_MOVED = 64  # the most members that one search moves to the present quota class of their hosts
 
 
 class Queue(Generic[Holder, Member]):
@@ -20,7 +20,7 @@ class Queue(Generic[Holder, Member]):
         self._line_of: dict[Member, OrderedDict[Member, tuple[Holder, float]]] = {}
 
     def put(self, member: Member, host: Holder, since: float) -> None:
-        """Append a member, which waits from `since`."""
+        """Append a member that has waited since `since`."""
         self._file(member, host, since, self._quota_class(host))
 
     def remove(self, member: Member) -> bool:
@@ -32,7 +32,10 @@ class Queue(Generic[Holder, Member]):
         return True
 
     def longest(self, quota_class: QuotaClass) -> tuple[Member, Holder, float] | None:
-        """Return the longest waiting member whose host now has this class, its host, and the start of its wait."""
+        """Return the longest waiting member of this class, with its host and the start of its wait.
+
+        The present class of the host counts. Return None if no member is found.
+        """
         for _ in range(_MOST_MOVED):
             found = next(iter(self._lines[quota_class].items()), None)
             if found is None:
