@@ -1,1 +1,1 @@
-"""XML-RPC over HTTP, bounded: the server, fair turns of hosts, and the client."""
+"""XML-RPC over HTTP with limits: the server, fair turns of hosts, and the client."""

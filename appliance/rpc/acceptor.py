@@ -1,9 +1,9 @@
-"""Accept the connections of a listening socket, several in a turn of the event loop.
+"""Accept the connections of a listening socket, several in one turn of the event loop.
 
-The kernel's queue is in order of arrival. The acceptor empties it quickly. Later code decides by host whether a
-connection may wait and when it is opened, so a host that connects without end fills no queue of other hosts.
+The kernel queues connections in order of arrival, and the acceptor empties this queue quickly. `accepted` then decides
+by host whether a connection may wait. So a host that connects without end does not fill the queues of other hosts.
 
-The queue of hosts that no rule names is paced: accepting from it waits for the turn of unknown hosts.
+A queue with `paced` is for hosts that no policy rule names: accepting from it waits for the turn of unknown hosts.
 """
 
 import asyncio
@@ -19,21 +19,21 @@ from appliance.rpc.front import plain_address
 from appliance.rpc.processor_time import ProcessorTime
 
 BACKLOG = 4096
-_CLOSING_SECONDS = 15e-6  # of processor time, to accept and close a connection
-_AT_ONCE = 256  # connections in one turn of the loop
-_AT_ONCE_PACED = 32  # in one piece of work
-_UNKNOWN = address_of("0.0.0.0")  # noqa: S104 - for all unknown hosts, which share processor time as one
+_CLOSING_SECONDS = 15e-6  # the processor time to accept and close a connection
+_AT_ONCE = 256  # the most connections in one turn of the event loop
+_AT_ONCE_PACED = 32  # the most connections in one paced turn
+_UNKNOWN = address_of("0.0.0.0")  # noqa: S104 - stands for all unknown hosts, which are charged as one host
 _GONE = frozenset({errno.ECONNABORTED, errno.EINTR, errno.EPROTO})
-_PAUSE_SECONDS = 0.2  # after the process ran out of descriptors
+_PAUSE_SECONDS = 0.2  # the pause after the process ran out of descriptors
 
 _log = structlog.get_logger()
 
 
 class Acceptor:
-    """The acceptor: passes each connection and its host to `accepted`, which owns the socket; charges the host.
+    """Pass each new connection and its host to `accepted`, which then owns the socket. Charge the host for the time.
 
-    If `accepted` returns False (too many), further connections of that host in the same turn are closed at once.
-    With `paced`, accepting is work of the unknown hosts, and waits for their turn.
+    If `accepted` returns False (too many connections), further connections of this host in the same turn are closed at
+    once. With `paced`, accepting waits for the turn of unknown hosts.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Acceptor:
             self._loop.remove_reader(self._sock)
 
     def _accept_paced(self) -> None:
-        if self._sock.fileno() >= 0:  # else it was closed before its turn
+        if self._sock.fileno() >= 0:  # False if the socket was closed before its turn
             self._loop.add_reader(self._sock, self._readable)
             self._accept()
 
@@ -100,7 +100,7 @@ class Acceptor:
                 self._time.end(host)
 
     def _wait(self, error: OSError) -> None:
-        """Pause accepting for a while."""
+        """Log the error, and stop accepting for `_PAUSE_SECONDS`."""
         _log.error("no connection can be accepted", reason=str(error))
         self._loop.remove_reader(self._sock)
         self._pause = self._loop.call_later(_PAUSE_SECONDS, self._loop.add_reader, self._sock, self._readable)

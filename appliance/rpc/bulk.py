@@ -1,7 +1,7 @@
-"""Limit the number of large bodies and answers in progress, by host, to save memory and the event loop.
+"""Limit the number of large bodies and answers in progress by host, to save memory and time of the event loop.
 
-A parameter tree takes ten times its size while it is read from the ROS master and written for a node. A request's
-*bulk* is its need for that. `AT_ONCE` requests may have their bulk, one of each host, and hosts take turns.
+A parameter tree needs ten times its size in memory while it is copied from the ROS master to a node. The *bulk* of a
+request is a reservation for this memory. At most `AT_ONCE` requests may hold a bulk, one per host; hosts take turns.
 """
 
 import asyncio
@@ -26,14 +26,14 @@ _VALUE, _TEXT, _MEMBER, _ARRAY, _STRUCT = 45, 35, 40, 50, 40  # approximate byte
 
 
 def bulk_turns(quota_class: Callable[[Address], QuotaClass]) -> Turns:
-    """Return the turns that all requests share."""
+    """Return the turns for the bulks of all requests."""
     return Turns(_BOUNDS, quota_class)
 
 
 class Bulk:
-    """The bulk of one request: reserved when it is needed, and released at the end.
+    """The bulk of one request: reserved on demand, and released when the request ends.
 
-    Work outside the request's own steps (in a thread, in another task) is charged to the host here.
+    `in_thread` charges the host for work in a thread, which is not part of the request's own steps.
     """
 
     def __init__(self, turns: Turns, host: Address, processor: ProcessorTime) -> None:
@@ -50,7 +50,7 @@ class Bulk:
         self.give_back()
 
     async def take(self) -> None:
-        """Wait for room, unless the request already has it."""
+        """Wait for the reservation, unless the request already has it."""
         if not self.taken:
             await self._turns.enter(self._host)
             self.taken = True
@@ -73,17 +73,17 @@ class Bulk:
             self._processor.charge_beside(self._host, used)
 
     def give_back(self) -> None:
-        """Release the room."""
+        """Release the reservation, if the request has it."""
         if self.taken:
             self.taken = False
             self._turns.leave(self._host)
 
 
 class LargeWrites:
-    """The limit of large values on their way to the ROS master: one of each host.
+    """Limit the large values that are on their way to the ROS master: one at a time for each host.
 
-    The ROS master is one Python process: many threads that read large values would block all others. A call with a
-    turn waits only for the ROS master.
+    The ROS master is one Python process. Many threads that read large values would block its other threads. A call that
+    has its turn waits only for the ROS master.
     """
 
     def __init__(self, enough: int, quota_class: Callable[[Address], QuotaClass]) -> None:
@@ -92,7 +92,7 @@ class LargeWrites:
 
     @contextlib.asynccontextmanager
     async def turn(self, host: Address, values: list[Value]) -> AsyncIterator[bool]:
-        """Surround a write of these values to the ROS master; yield whether they are large and so took a turn."""
+        """Take a turn for a write of these values to the ROS master, if they are large. Yield whether they are."""
         if weigh(values, self._enough) < self._enough:
             yield False
             return

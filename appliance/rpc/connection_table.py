@@ -1,14 +1,16 @@
-"""Count connections by host, with the bytes they hold, and choose connections that make room.
+"""Count the connections of each host and the bytes that they hold; evict connections to make room.
 
 Invariants:
 
-1. Connections, the bytes they hold (requests without an answer, answers not read yet) and connections that wait for
-   their refusal are pools of `appliance/quotas`: no number of addresses gets more than its class may have.
-2. If a host is within its share but its class or the whole is full, it gets the place of another connection. Candidates
-   have its own quota class or a lower one. The lowest class comes first, then idle, unfinished and served connections
-   in this order, then the longest wait. `patience` is the minimum wait: at RVMaster an idle connection makes room at
-   once (ROS clients reconnect), an unfinished one of the same quota class after a second, and a served one never.
-3. If bytes are short, the largest connection of a host that holds more makes room.
+1. Three pools (`appliance/quotas`) count connections, held bytes, and connections that wait for their refusal. Held
+   bytes are requests without an answer and answers that the peer has not read.
+2. A host within its own quota evicts another connection if the pool or the host's class is full. Only connections of
+   the same or a lower quota class are evicted.
+3. The lowest class is evicted first. In a class, idle connections are evicted before unfinished connections, and these
+   before served connections. In each stage, the longest wait is evicted first.
+4. `patience` is the minimum wait before an eviction. At RVMaster, an idle connection is evicted at once, because ROS
+   clients reconnect. An unfinished connection of the same class has one second. A served connection is never evicted.
+5. If bytes are short, the largest unfinished connection of a host with more bytes or a lower class is evicted.
 """
 
 import asyncio
@@ -30,30 +32,30 @@ class Stage(StrEnum):
     """All requests are answered."""
 
     UNFINISHED = "unfinished"
-    """It waits for the rest of a request, for its turn, or for the peer to read an answer."""
+    """The connection waits for the rest of a request, for its turn, or for the peer to read an answer."""
 
     SERVED = "served"
-    """A handler works on its request."""
+    """A handler works on a request of the connection."""
 
 
 class TrackedConnection(Protocol):
-    """A connection, as the table needs it; `deadline` is in monotonic seconds."""
+    """The interface of a connection in the table; `deadline` is in monotonic seconds."""
 
     deadline: float
 
     @property
     def holding(self) -> int:
-        """Return the bytes held for it, which its end releases."""
+        """Return the bytes that the connection holds, and releases when it ends."""
 
     def expire(self) -> None:
         """Handle a passed deadline."""
 
     def abort(self) -> None:
-        """End now, and `leave`."""
+        """End the connection now, and `leave` the table."""
 
 
 Patience = Callable[[QuotaClass, Stage, bool], float]
-"""Return the seconds that a connection keeps its place. True: against hosts of the same quota class."""
+"""Return the seconds before a connection may be evicted. True: for a host of the same quota class."""
 
 
 def _of_ros(_quota_class: QuotaClass, stage: Stage, own: bool) -> float:
@@ -63,9 +65,9 @@ def _of_ros(_quota_class: QuotaClass, stage: Stage, own: bool) -> float:
 
 
 class ConnectionTable(Generic[Holder]):
-    """Count the connections of all listeners that share it. `quota_class` returns the present quota class of a host.
+    """The connections of all listeners that share this table. `quota_class` returns the present class of a host.
 
-    `connection_class` does so for connections, open or not (None: `quota_class`).
+    `connection_class` returns the class that counts for connections (None: `quota_class`).
     """
 
     def __init__(
@@ -101,11 +103,11 @@ class ConnectionTable(Generic[Holder]):
 
     @property
     def connections(self) -> frozenset[TrackedConnection]:
-        """Return all connections, also those being turned away."""
+        """Return all connections, including those that wait for their refusal."""
         return frozenset(self._of)
 
     def enter(self, connection: TrackedConnection, host: Holder) -> str:
-        """Add a connection; return why not, if there is no room and no connection makes room (else empty)."""
+        """Add a connection; evict another connection if necessary. Return why there is no room, or an empty string."""
         why = self._take(self.connected, host, 1)
         if not why:
             self._of[connection] = host, self.connected
@@ -113,14 +115,14 @@ class ConnectionTable(Generic[Holder]):
         return why
 
     def turn_away(self, connection: TrackedConnection, host: Holder) -> bool:
-        """Count a connection beyond the limit that stays for its refusal; return False if it may not."""
+        """Count a connection that stays open for its refusal. Return False if too many stay already."""
         if self.farewells.take(host):
             return False
         self._of[connection] = host, self.farewells
         return True
 
     def leave(self, connection: TrackedConnection) -> None:
-        """Remove a connection; ignore an unknown one."""
+        """Remove a connection; ignore a connection that is not in the table."""
         if connection in self._stages:
             self._queues[self._stages.pop(connection)].remove(connection)
         host, pool = self._of.pop(connection, (None, self.connected))
@@ -128,7 +130,7 @@ class ConnectionTable(Generic[Holder]):
             pool.give_back(host)
 
     def file(self, connection: TrackedConnection, stage: Stage) -> None:
-        """Set the stage of a connection."""
+        """Set the stage of a connection, and restart its wait."""
         host, pool = self._of.get(connection, (None, self.farewells))
         if host is None or pool is not self.connected:
             return
@@ -139,11 +141,11 @@ class ConnectionTable(Generic[Holder]):
         self._queues[stage].put(connection, host, self._clock())
 
     def hold(self, host: Holder, size: int) -> str:
-        """Count bytes held for a host. If they are too many, return the reason and count nothing."""
+        """Count bytes held for a host, and return an empty string. If they are too many, return only the reason."""
         return self._take(self.held, host, size)
 
     def release(self, host: Holder, size: int) -> None:
-        """Release bytes."""
+        """Release bytes that were held for a host."""
         self.held.give_back(host, size)
 
     async def sweep(self) -> None:
@@ -165,7 +167,7 @@ class ConnectionTable(Generic[Holder]):
         return why
 
     def _to_make_room(self, host: Holder) -> TrackedConnection | None:
-        """Return the connection whose place this host may have."""
+        """Return the connection to evict for a new connection of this host, or None."""
         mine = self._connection_class(host)
         for quota_class in QuotaClass:
             if quota_class > mine:
@@ -178,7 +180,7 @@ class ConnectionTable(Generic[Holder]):
         return None
 
     def _to_free_bytes(self, host: Holder) -> TrackedConnection | None:
-        """Return the connection with the most bytes among those that may be ended for this host."""
+        """Return the connection with the most bytes among those that may be evicted for this host, or None."""
         mine, most = self._quota_class(host), self.held.held(host)
         able = [
             connection

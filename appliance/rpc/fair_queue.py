@@ -1,8 +1,10 @@
-"""Serve requests of hosts in turn, so that one host's flood costs the others little.
+"""Serve hosts in turn, so that a flood of requests from one host costs other hosts little.
 
-Slots are a pool of `appliance/quotas`. A host without a free slot waits. The next slot goes to the host with the
-longest wait since its last turn, whatever the number and duration of other hosts' requests. Hosts that are alike (the
-policy names them as one network) share one turn and half of the slots, so additional addresses are useless.
+The slots for requests are a pool of `appliance/quotas`. A request without a free slot waits. The next slot goes to the
+host with the longest wait since its last turn; the number and duration of requests do not matter.
+
+Hosts that the policy names as one network are a *group*. A group shares one turn and at most half of the slots, so
+additional addresses in its network are useless.
 """
 
 import asyncio
@@ -16,16 +18,16 @@ Queue = deque[asyncio.Future[None]]
 
 
 def itself(host: Address) -> Hashable:
-    """Return the host itself, for hosts without others alike."""
+    """Return the host itself as its group."""
     return host
 
 
 class Turns:
-    """The slots of requests within the shares of `bounds`; other requests wait in turn.
+    """The slots for requests within the quotas of `bounds`; other requests wait for their turn.
 
-    While a slot is free, requests wait only because of their host's share, or that of hosts alike. `alike(host)` is
-    equal for hosts that share turns. `pause(host)` returns the seconds until the next check of a host that owes for its
-    audit records; it waits without a slot.
+    While a slot is free, a request waits only because its host or its group has used up its quota. `alike(host)`
+    returns the group of a host. A host must pay for its audit records before it gets a slot: `pause(host)` returns the
+    seconds until the next check, or 0 if everything is paid.
     """
 
     def __init__(
@@ -39,12 +41,12 @@ class Turns:
         self._alike = alike
         self.pause = pause
         self._together = max(bounds.host, bounds.whole // 2)
-        self._taken: Counter[Hashable] = Counter()  # by group of hosts alike
+        self._taken: Counter[Hashable] = Counter()  # slots by group
         self._taken_as: dict[Address, Hashable] = {}
         self.waiting: OrderedDict[Hashable, OrderedDict[Address, Queue]] = OrderedDict()
 
     async def enter(self, host: Address) -> None:
-        """Wait until this host's records are paid, then take a slot or wait for a turn."""
+        """Wait until this host's audit records are paid, then take a slot or wait for a turn."""
         while seconds := self.pause(str(host)):
             await asyncio.sleep(seconds)
         kind = self._alike(host)
@@ -62,7 +64,7 @@ class Turns:
             raise
 
     def leave(self, host: Address) -> None:
-        """Release the slot to the longest waiting host that may have it."""
+        """Release a slot, and give free slots to the longest waiting hosts that may have them."""
         self._give_back(host)
         while (following := self._next()) is not None:
             kind, host = following
@@ -70,16 +72,16 @@ class Turns:
             queue = hosts.pop(host)
             turn = queue.popleft()
             if queue:
-                hosts[host] = queue  # at the end of the line: the next request waits a round
+                hosts[host] = queue  # the last in the queue: this host's next request waits for another round
             if hosts:
                 self.waiting[kind] = hosts
-            if turn.done():  # its task was cancelled, and has not yet run to give up its place
+            if turn.done():  # the waiting task was cancelled but has not removed its turn yet
                 self._give_back(host)
             else:
                 turn.set_result(None)
 
     def _next(self) -> tuple[Hashable, Address] | None:
-        """Take a slot for the next host, and return its group and the host."""
+        """Take a slot for the next host, and return the host with its group. Return None if no host may have a slot."""
         for kind, hosts in self.waiting.items():
             if self._taken[kind] < self._together:
                 for host in hosts:
@@ -88,7 +90,7 @@ class Turns:
         return None
 
     def _take(self, host: Address, kind: Hashable) -> bool:
-        kind = self._taken_as.get(host, kind)  # the group of its other slots
+        kind = self._taken_as.get(host, kind)  # the group that the host's other slots are counted for
         if self._taken[kind] >= self._together or self.slots.take(host):
             return False
         self._taken[kind] += 1

@@ -1,12 +1,11 @@
-"""Bound the connections of every HTTP server of the appliance: RVMaster, the proxy endpoints, and REST.
+"""Limit the connections of every HTTP server of the appliance: RVMaster, the proxy endpoints, and REST.
 
-The front reads with a parser of its own (httptools), within limits; the server behind it serves the requests.
-Invariants:
+The front parses requests with httptools, within limits. The server behind the front answers them. Invariants:
 
-1. A connection has a place among the `ConnectionTable` from the time it is accepted, TLS handshake included.
-2. A handshake and the head of a request take at most `head_seconds` each; a head has at most `head_bytes`.
-3. At most `most_waiting` requests of a connection wait behind one.
-4. The sweep closes a connection without progress in every state.
+1. A connection is in the `ConnectionTable` from its acceptance to its end, including the TLS handshake.
+2. The TLS handshake and the head of a request take at most `head_seconds` each; a head has at most `head_bytes`.
+3. At most `most_waiting` requests of a connection wait while another request is served.
+4. The sweep of the table closes a connection without progress, whatever its state.
 """
 
 import asyncio
@@ -23,13 +22,13 @@ import httptools
 from appliance.policy.model import Address, address_of
 from appliance.rpc.connection_table import ConnectionTable, Stage
 
-# Counts the bytes around each field, so that a head of many short fields has its full size.
+# The bytes around each header field; they count for the size of a head.
 _FIELD_FRAMING = len(": \r\n")
 
 
 @dataclass(frozen=True, slots=True)
 class HttpLimits:
-    """The bounds of the HTTP layer, in bytes and seconds."""
+    """The limits of the HTTP layer, in bytes and seconds."""
 
     head_bytes: int = 64 << 10
     head_seconds: float = 10.0
@@ -45,7 +44,7 @@ class HttpLimits:
 
 
 class Front(asyncio.BaseProtocol, ABC):
-    """The reading side of one connection. With `sock`, it has a place before it has a transport."""
+    """The reading side of one connection. With `sock`, it is counted before it has a transport."""
 
     transport: asyncio.Transport
     most_waiting: int
@@ -58,41 +57,41 @@ class Front(asyncio.BaseProtocol, ABC):
         self.closing = False
         self.in_request = False
         self.head_done = False
-        self.received = 0  # bytes of the present request, framing included
+        self.received = 0  # bytes of the present request, including framing
         self._socket = sock
         self._head_bytes = 0
         self.allow(limits.head_seconds)
 
     def allow(self, seconds: float) -> None:
-        """Set the deadline of the next progress."""
+        """Set the deadline: the connection must make progress within this time."""
         self.deadline = time.monotonic() + seconds
 
     @abstractmethod
     def reject(self, status: bytes, what: str) -> None:
-        """Answer with this status and close the connection. `what` describes the peer's act."""
+        """Answer with this status and close the connection. `what` describes the peer's action."""
 
     @property
     @abstractmethod
     def waiting(self) -> int:
-        """Return the number of requests behind the present one."""
+        """Return the number of requests that wait while another request is served."""
 
     @property
     @abstractmethod
     def is_quiet(self) -> bool:
-        """Whether no answer is under way, so that the next head has a deadline."""
+        """Whether no answer is in progress. Only then does the next head have a deadline."""
 
     @property
     def is_open(self) -> bool:
-        """Whether it has a transport."""
+        """Whether the connection has a transport."""
         return self._socket is None
 
     def open(self, transport: asyncio.Transport) -> bool:
-        """Begin with the transport. Return False and cut it if the connection has ended already."""
+        """Begin to use a transport. Abort it and return False if the connection has ended already."""
         self.transport, self._socket = transport, None
         if self.closing or not transport.get_extra_info("peername"):
             self.abort()
             return False
-        # asyncio sets it only for sockets with a protocol number; without it an answer's body waits 40 ms.
+        # asyncio sets TCP_NODELAY only for sockets with a protocol number. Without it, an answer's body waits 40 ms.
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.parser = httptools.HttpRequestParser(self)
         self.allow(self.limits.head_seconds)
@@ -105,7 +104,7 @@ class Front(asyncio.BaseProtocol, ABC):
         try:
             self.parser.feed_data(data)
         except httptools.HttpParserUpgrade:
-            pass  # the server refused it after its head, or goes on without an upgrade
+            pass  # the server refused the request after its head, or ignores the upgrade
         except httptools.HttpParserError as error:
             if not self.closing:
                 self.reject(b"400 Bad Request", f"sent something that is not HTTP: {error}")
@@ -128,13 +127,13 @@ class Front(asyncio.BaseProtocol, ABC):
             self.allow(self.limits.head_seconds)
 
     def on_url(self, url: bytes) -> None:
-        """Count a piece of the path."""
+        """Count the bytes of a piece of the path."""
         self._head_bytes += len(url)
         if self._head_bytes > self.limits.head_bytes and not self.closing:
             self._reject_head()
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Count one field."""
+        """Count the bytes of a header field."""
         self._head_bytes += len(name) + len(value) + _FIELD_FRAMING
         if self._head_bytes > self.limits.head_bytes and not self.closing:
             self._reject_head()
@@ -152,11 +151,11 @@ class Front(asyncio.BaseProtocol, ABC):
 
     @property
     def holding(self) -> int:
-        """Return the bytes held for it, which its end releases."""
+        """Return the bytes that the connection holds, and releases when it ends."""
         return 0
 
     def leave(self) -> None:
-        """Leave the counts; a second call is fine."""
+        """Leave the connection table; a second call has no effect."""
         self.closing = True
         self.connection_table.leave(self)
 
@@ -165,17 +164,17 @@ class Front(asyncio.BaseProtocol, ABC):
         self.abort()
 
     def abort(self) -> None:
-        """Cut the connection now, and leave the counts."""
+        """Cut the connection now, and leave the connection table."""
         self.leave()
         if self._socket is None:
             self.transport.abort()
         else:
-            with contextlib.suppress(OSError):  # readers and writers find the end
+            with contextlib.suppress(OSError):  # later reads and writes report the end
                 self._socket.shutdown(socket.SHUT_RDWR)
 
 
 def plain_address(text: str) -> Address:
-    """Return the address without scope; an IPv4-mapped IPv6 address as IPv4."""
+    """Parse an address without its scope id; return an IPv4-mapped IPv6 address as IPv4."""
     address = address_of(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
         return address_of(str(address.ipv4_mapped))

@@ -1,8 +1,8 @@
-"""Find the method name in the bytes of a request that cannot be parsed, for its record. No I/O."""
+"""Find the method name in a request that cannot be parsed, for the request's audit record. No I/O."""
 
 import re
 
-_BEGINNING = 4096  # searched bytes of a body
+_BEGINNING = 4096  # the number of bytes that are searched
 _METHOD = re.compile(rb"<methodName>\s*([^<>&\s]{1,128})\s*</methodName>")
 
 

@@ -3,14 +3,16 @@
 Work for a host (accept a connection, read a piece of a request, one step of a handler) is measured and charged.
 Invariants:
 
-1. In one turn of the loop, work runs for `TURN_SECONDS` and at most one piece longer; the rest waits for later turns.
-   Pieces are short: a long task is divided by `await asyncio.sleep(0)`.
-2. The waiting class of hosts with the least use runs next, and in it the host with the least use. All unknown hosts
-   are one class. This is deficit round robin without the round: a class that comes back waits for one piece, not for a
-   piece of each other class.
-3. No class saves time: after a break it starts with the use of the waiting classes. It keeps its debt while others
-   wait. When a turn ends and nothing waits, all use is forgotten: a class that works alone takes no time from others.
-4. While no work waits and the turn has time left, work runs at once.
+1. In one turn of the loop, work runs for `TURN_SECONDS`, and the last piece may finish later. Further work waits for
+   later turns. Pieces are short: `await asyncio.sleep(0)` divides a long task.
+2. Hosts are in classes; all unknown hosts are one class. The waiting class with the least use runs next, and in this
+   class the host with the least use.
+3. This is deficit round robin without the round: a class that comes back waits for one piece of work, not for one
+   piece of every other class.
+4. A class cannot save up time. After a break, it starts with the use of the waiting classes.
+5. A class keeps its debt while other classes wait. All use is forgotten when a turn ends and no work waits, because a
+   class that works alone takes no time from others.
+6. While no work waits and the turn has time left, work runs at once.
 """
 
 import asyncio
@@ -25,7 +27,7 @@ from appliance.policy.model import Address
 from appliance.quotas.table import RVMASTER_TIME
 
 TURN_SECONDS = RVMASTER_TIME.bounds.whole / 1e6
-_MOST_KEPT = 1024  # entries of use, before all but the largest debts are removed
+_MOST_KEPT = 1024  # keys with a stored use; beyond this, only the largest debts are kept
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
@@ -37,14 +39,14 @@ Steps = Generator[Any, Any, T]
 class Line(Generic[Key, Item]):
     """Waiting items by key. The key with the least use, in seconds, is next.
 
-    `start` is the use of the latest key that was next. A key that comes back starts there.
+    `start` is the use of the key that was served last. A key that comes back starts with this use.
     """
 
     def __init__(self) -> None:
         self.start = 0.0
         self._used: dict[Key, float] = {}
         self._items: dict[Key, deque[Item]] = {}
-        self._order: list[tuple[float, int, Key]] = []  # a heap; the use of a key may be higher by now
+        self._order: list[tuple[float, int, Key]] = []  # a heap; the stored use of a key may be too low
         self._count = 0
 
     def __len__(self) -> int:
@@ -54,23 +56,23 @@ class Line(Generic[Key, Item]):
         return bool(self._items)
 
     def used(self, key: Key) -> float:
-        """Return the use of a key; at least that of the waiting keys."""
+        """Return the use of a key, at least `start`."""
         return max(self._used.get(key, self.start), self.start)
 
     def charge(self, key: Key, seconds: float) -> None:
         """Add to the use of a key."""
         self._used[key] = self.used(key) + seconds
         if len(self._used) > _MOST_KEPT:
-            # Half, so that the next removal is far away.
+            # Keep only half of them, so that the next removal does not follow soon.
             largest = heapq.nlargest(_MOST_KEPT // 2, self._used.items(), key=itemgetter(1))
             self._used = {one: used for one, used in largest if used > self.start}
 
     def forget(self) -> None:
-        """Forget what all keys have used."""
+        """Forget the use of all keys."""
         self._used.clear()
 
     def put(self, key: Key, item: Item) -> None:
-        """Append an item to those of its key."""
+        """Append an item to the items of a key."""
         queue = self._items.get(key)
         if queue is None:
             self._items[key] = deque([item])
@@ -99,7 +101,7 @@ class Line(Generic[Key, Item]):
 
 
 class ProcessorTime:
-    """A runner of work. `kind(host)` is equal for hosts that share as one; `clock` returns processor seconds."""
+    """Run the work of hosts. `kind(host)` returns the class of a host; `clock` returns processor seconds."""
 
     def __init__(
         self,
@@ -108,12 +110,12 @@ class ProcessorTime:
     ) -> None:
         self._kind = kind
         self._clock = clock
-        self._classes: Line[Hashable, None] = Line()  # an item for each piece of work
-        self._hosts: dict[Hashable, Line[Address, Work]] = {}  # of classes that wait
+        self._classes: Line[Hashable, None] = Line()  # one item for each piece of work
+        self._hosts: dict[Hashable, Line[Address, Work]] = {}  # the hosts of each waiting class
         self._spent = 0.0  # seconds in this turn of the loop
         self._since: float | None = None  # the start of the running piece
         self._turn_ends = False  # whether the end of this turn is scheduled
-        self._granted = False  # whether a step may run and has not begun
+        self._granted = False  # whether a step may run but has not begun
 
     @property
     def waiting(self) -> int:
@@ -131,7 +133,10 @@ class ProcessorTime:
         return TURN_SECONDS - self._spent - running
 
     def run(self, host: Address, work: Work) -> bool:
-        """Run short work for a host now (True) or at its turn. Report exceptions to the loop."""
+        """Run short work for a host now and return True, or queue it for the host's turn and return False.
+
+        Exceptions of the work are reported to the event loop.
+        """
         if self.free:
             self._do(host, work)
             return True
@@ -147,33 +152,33 @@ class ProcessorTime:
         return await _InSteps(self, host, work)
 
     def charge(self, host: Address, seconds: float) -> None:
-        """Charge time of this turn to a host."""
+        """Charge a host for time that was used in this turn of the loop."""
         self._spent += seconds
         self.charge_beside(host, seconds)
         self._end_turn_later()
 
     def charge_beside(self, host: Address, seconds: float) -> None:
-        """Charge time of another thread to a host."""
+        """Charge a host for time that another thread used."""
         kind = self._kind(host)
         self._classes.charge(kind, seconds)
         if (hosts := self._hosts.get(kind)) is not None:
             hosts.charge(host, seconds)
 
     def begin(self) -> bool:
-        """Begin a piece of work. Return False inside another piece, which is charged for both."""
+        """Begin a piece of work. Return False if another piece is running; its host is charged for both."""
         if self._since is not None:
             return False
         self._since = self._clock()
         return True
 
     def end(self, host: Address) -> None:
-        """End the piece of work, and charge it to this host."""
+        """End the piece of work, and charge this host for it."""
         assert self._since is not None  # noqa: S101  by `begin`
         seconds, self._since = self._clock() - self._since, None
         self.charge(host, seconds)
 
     def turn_of(self, host: Address) -> "asyncio.Future[None]":
-        """Return a future that is done at the host's turn; call `taken` afterwards, also after a cancellation."""
+        """Return a future that is done at the host's turn. The caller must call `taken`, even after a cancellation."""
         turn = asyncio.get_running_loop().create_future()
 
         def grant() -> None:
@@ -185,7 +190,7 @@ class ProcessorTime:
         return turn
 
     def taken(self, turn: "asyncio.Future[None]") -> None:
-        """End a granted turn, after its step or instead of it."""
+        """End a turn of `turn_of` if it was granted, whether or not its step has run."""
         if turn.done() and not turn.cancelled():
             self._granted = False
             self._go_on()
@@ -223,7 +228,7 @@ class ProcessorTime:
             self._classes.forget()
 
     def _go_on(self) -> None:
-        """Run waiting work while this turn has time left; grant one step at a time."""
+        """Run waiting work while this turn has time left; grant coroutine steps one at a time."""
         while self._classes and not self._granted and self._left > 0:
             kind, _ = self._classes.pop()
             hosts = self._hosts[kind]
@@ -251,7 +256,7 @@ class _InSteps(Generic[T]):
                     turn = self._time.turn_of(self._host)
                     try:
                         yield from turn
-                    except BaseException as raised:  # noqa: BLE001 - it is the work's to handle
+                    except BaseException as raised:  # noqa: BLE001 - passed on to the coroutine
                         error = raised
                 try:
                     awaited = self._step(value, error)

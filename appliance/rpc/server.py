@@ -1,15 +1,16 @@
-"""Serve XML-RPC over HTTP on a listening socket: bounded, one request at a time for each connection.
+"""Serve XML-RPC over HTTP on a listening socket, one request at a time for each connection.
 
-`Front` parses and bounds heads. Further invariants:
+`Front` parses heads and limits their size. Further invariants:
 
-1. Buffers are bounded: the body by `Limits.body`, one request in progress for each connection (reading pauses after a
-   second one; the rest of the same 8 KiB waits), one response in the write buffer (the next request waits for it).
-2. A host that no rule names is answered before its body is read. Only the beginning is read, for the refusal's record.
-3. Accepting, reading, and each step of a handler are charged to the host and wait for its turn (`processor_time`).
-   Connections, the bytes they hold (`connection_table`) and requests being served (`fair_queue`) have quotas for each
-   host, for unknown hosts, and for hosts with a registration.
-4. A request waits for its turn only while its connection lives.
-5. A peer over a limit gets a fault that names the limit; only a few surplus connections get it at a time.
+1. The body is limited (`HttpLimits.body_bytes`). Each connection has at most one request in progress and one response
+   in the write buffer. Further requests wait, and reading pauses.
+2. A host that no policy rule names is refused before its body is complete. Only the beginning of the body is read, for
+   the audit record of the refusal.
+3. Accepting, reading, and each step of a handler wait for the host's turn and are charged to it (`processor_time`).
+4. Connections, the bytes that they hold (`connection_table`) and requests being served (`fair_queue`) have quotas: for
+   each host, for unknown hosts, and for hosts with a registration.
+5. A request no longer waits for its turn once its connection has ended.
+6. A peer that exceeds a limit gets a fault that names the limit. At most a few connections wait for such a fault.
 """
 
 import asyncio
@@ -37,21 +38,22 @@ _log = structlog.get_logger()
 
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: a close resets the connection
 
-# ROS clients send the next request after the answer. A few more are read, if they are quick to serve.
+# ROS clients wait for an answer before the next request. Other clients may send requests earlier, up to this number.
 _MOST_PIPELINED = 512
-# Bytes that a request counts beside body and path: ten times its memory, because thousands of small ones take time.
+# The bytes that count for a request in addition to body and path. They are ten times its memory, because thousands of
+# small requests take time.
 _REQUEST_BYTES = 4096
-_OPENING_SECONDS = 50e-6  # of processor time, to open and close a transport
-_READ_AT_ONCE = 8192  # bytes that are read and parsed in one piece
-_BEGINNING = 4096  # bytes of a body that are read for the record of a refusal
-_BEGINNING_SECONDS = 1.0  # of waiting for them
+_OPENING_SECONDS = 50e-6  # the processor time to open and close a transport
+_READ_AT_ONCE = 8192  # the bytes that are read and parsed in one piece
+_BEGINNING = 4096  # the bytes of a refused body that are read for its audit record
+_BEGINNING_SECONDS = 1.0  # the longest wait for these bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """The peer of a connection: `host` and `text` are its address, `local` is the address that it connected to.
+    """The peer of a connection. `host` and `text` are its address; `local` is the address that it connected to.
 
-    `here`: the peer is on this machine.
+    `here` is true if the peer is on this machine.
     """
 
     host: Address
@@ -64,7 +66,7 @@ class Peer:
 
 
 class HttpRequest(NamedTuple):
-    """A whole POST: path, body, and the arrival of its last byte (monotonic ns)."""
+    """A complete POST request; `arrived` is the arrival time of its last byte (monotonic ns)."""
 
     peer: Peer
     path: str
@@ -75,10 +77,10 @@ class HttpRequest(NamedTuple):
 Handler = Callable[[HttpRequest], Awaitable[bytes]]
 
 AtOnce = Callable[[HttpRequest], bytes | None]
-"""Answer a request that takes no time and waits for nothing; None leaves it to the handler."""
+"""Return the answer to a request that needs no waiting, or None to leave the request to the handler."""
 
 Refusal = Callable[[bytes], bytes]
-"""Make the answer to a refused request from the beginning of its body."""
+"""Return the answer to a refused request. The argument is the beginning of its body."""
 
 
 def not_at_once(_request: HttpRequest) -> bytes | None:
@@ -87,17 +89,17 @@ def not_at_once(_request: HttpRequest) -> bytes | None:
 
 
 class NoAnswerError(Exception):
-    """A handler raises this to reset the connection, as if the node were gone."""
+    """The handler wants the connection reset, as if the node were gone."""
 
 
 @dataclass(eq=False)
 class HttpServer:
     """Serve one listening socket: `handler` returns the response body of a request.
 
-    `refuse(peer)` is called after the head of a request. The `Refusal` that it returns gets the beginning of the body,
-    as far as it comes in time, and its answer ends the connection. Without `keep` every answer does. `troubled(peer,
-    reason)` is called for each exceeded limit. Connections that the program `first` sends to a second socket are
-    accepted in the turn of unknown hosts.
+    `refuse(peer)` is called after the head of a request. If it returns a `Refusal`, this function makes the answer from
+    the beginning of the body, as far as it arrives in time. Then the connection is closed. Without `keep`, every answer
+    closes the connection. `troubled(peer, reason)` is called for each exceeded limit. The program `first` sends some
+    connections to a second socket; they are accepted in the turn of unknown hosts.
     """
 
     sock: socket.socket
@@ -110,13 +112,13 @@ class HttpServer:
     time: ProcessorTime
     first: Program | None = None
     keep: bool = True
-    refuse: Callable[[Peer], Refusal | None] = lambda peer: None  # noqa: ARG005 - names the parameter
+    refuse: Callable[[Peer], Refusal | None] = lambda peer: None  # noqa: ARG005 - documents the parameter
     troubled: Callable[[Peer, str], None] = lambda peer, reason: None  # noqa: ARG005 - same
     connections: "set[_Connection]" = field(default_factory=set, init=False)
     _acceptors: list[Acceptor] = field(default_factory=list, init=False)
     _queues: SourceQueues | None = field(default=None, init=False)
     _opening: set[asyncio.Task[None]] = field(default_factory=set, init=False)
-    _complaining: set[Address] = field(default_factory=set, init=False)  # hosts with a waiting record
+    _complaining: set[Address] = field(default_factory=set, init=False)  # hosts with an unrecorded complaint
     _closed: bool = field(default=False, init=False)
 
     async def start(self) -> None:
@@ -140,7 +142,7 @@ class HttpServer:
             connection.abort()
 
     def _accepted(self, sock: socket.socket, host: Address) -> bool:
-        """Queue the connection for its host's turn. Close it and return False if there are too many."""
+        """Queue the connection for its host's turn. If there are too many, close the connection and return False."""
         if self._queues is not None:
             self._queues.update()
         too_many = self.connection_table.arriving.take(host)
@@ -155,7 +157,7 @@ class HttpServer:
         return False
 
     def _admit(self, sock: socket.socket, host: Address) -> None:
-        """Open the connection, unless it has ended already or is one too many."""
+        """Open the connection, unless it has ended already or exceeds a limit."""
         self.connection_table.arriving.give_back(host)
         if self._closed or _has_ended(sock):
             sock.close()
@@ -195,22 +197,22 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self.server = server
         self.peer = Peer(host, str(host), str(plain_address(sock.getsockname()[0])))
         self._counted = False
-        self._too_many = ""  # the reason of its refusal
+        self._too_many = ""  # the reason if the connection is refused
         self._unparsed = b""  # input that waits for the host's turn
         self._busy: asyncio.Task[None] | None = None
-        self._waiting = False  # for its turn
+        self._waiting = False  # whether the request waits for its turn
         self._pending: deque[tuple[HttpRequest, bool]] = deque()
         self._body = bytearray()
         self._held = 0  # bytes of the body that are counted
-        self._unsent = 0  # counted bytes of an answer that the peer does not read
+        self._unsent = 0  # counted bytes of an answer that the peer has not read
         self._refusal: Refusal | None = None
-        self._patience: asyncio.TimerHandle | None = None  # until the refusal stops waiting for the body
+        self._patience: asyncio.TimerHandle | None = None  # ends the wait of a refusal for the body
         self._writable = True
 
     # --- asyncio.Protocol ---
 
     def enter(self) -> bool:
-        """Take a place. Return False and close if there is none, and no room for a refusal."""
+        """Enter the connection table, at least for a refusal. If that is impossible too, return False."""
         self._too_many = self.connection_table.enter(self, self.peer.host)
         self._counted = not self._too_many
         if self._too_many and not self.connection_table.turn_away(self, self.peer.host):
@@ -244,7 +246,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def parse(self, data: bytes) -> None:
-        """Parse as `Front` does, and bound the body."""
+        """Parse a piece of input as `Front` does, and limit the body."""
         super().parse(data)
         if self.closing or not (self.in_request and self.head_done):
             return
@@ -257,12 +259,12 @@ class _Connection(Front, asyncio.BufferedProtocol):
 
     @property
     def is_quiet(self) -> bool:
-        """Whether no answer is under way. An answer is, until the peer has read it."""
+        """Whether no answer is in progress. An answer ends when the peer has read it."""
         return self._busy is None and self._writable
 
     @property
     def waiting(self) -> int:
-        """Return the number of requests behind the present one."""
+        """Return the number of requests that wait while another request is served."""
         return len(self._pending)
 
     def pause_writing(self) -> None:
@@ -360,7 +362,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.pause_reading()
 
     def _body_is_held(self) -> bool:
-        """Count the bytes of the body so far. Return False and refuse the request if they are too many."""
+        """Count the bytes of the body so far. If they are too many, refuse the request and return False."""
         unheld = len(self._body) - self._held
         too_much = self.connection_table.hold(self.peer.host, unheld) if unheld else ""
         if too_much:
@@ -370,18 +372,18 @@ class _Connection(Front, asyncio.BufferedProtocol):
         return True
 
     def _refuse_request(self, refusal: Refusal) -> None:
-        """Refuse the request after the beginning of its body."""
+        """Answer with a refusal, made from the beginning of the body."""
         if self._patience is not None:
             self._patience.cancel()
         self._write(b"200 OK", refusal(bytes(self._body[:_BEGINNING])), keep=False, unread=True)
 
     @property
     def holding(self) -> int:
-        """Return the bytes that its end releases: those held for it, without a request being served."""
+        """Return the bytes to release when the connection ends: all held bytes except a request being served."""
         return self._held + self._unsent + sum(_held_by(request) for request, _ in self._pending)
 
     def leave(self) -> None:
-        """Leave the counts, once. A request being served goes on, and its answer is dropped."""
+        """Leave the connection table, once. A request being served continues, but its answer is dropped."""
         if self._patience is not None:
             self._patience.cancel()
         self.server.connections.discard(self)
@@ -397,7 +399,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
     # --- serving ---
 
     def _go_on(self) -> None:
-        """Serve the next request, or wait for one, after an answer."""
+        """After an answer, serve the next request or wait for one."""
         self.allow(self.limits.idle_seconds)
         closing = self.transport.is_closing()
         finished = not (self._pending or self.in_request or closing)
@@ -408,7 +410,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def _answered_at_once(self, request: HttpRequest, *, keep: bool) -> bool:
-        """Answer without a task and a slot, in the host's time. Return whether that was possible."""
+        """Answer the request at once, without a task or a slot. Return False if that is not possible."""
         answer = self.server.at_once(request)
         if answer is None:
             return False
@@ -437,7 +439,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self._sent(status, body, keep=keep)
 
     def _sent(self, status: bytes, body: bytes, *, keep: bool) -> None:
-        """Send an answer, and go on once the peer has read it."""
+        """Send an answer. Continue with the next request once the peer has read the answer."""
         self._write(status, body, keep=keep)
         if keep and self._writable:
             self._go_on()
@@ -458,7 +460,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             return b"200 OK", await self.server.handler(request)
         except NoAnswerError:
             raise
-        except Exception:  # noqa: BLE001 - a defect of ours must not leave the peer without an answer
+        except Exception:  # noqa: BLE001 - the peer gets an answer even after a defect of the handler
             _log.exception("a request could not be served", host=request.peer.text, path=request.path[:200])
             return b"500 Internal Server Error", b""
         finally:
@@ -477,8 +479,10 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self.connection_table.release(self.peer.host, size)
 
     def _write(self, status: bytes, body: bytes, *, keep: bool, unread: bool = False) -> None:
-        """Send a response. `unread`: the request was not read to its end. The rest is read and dropped for a while,
-        because an immediate close resets the connection, and the peer loses the answer.
+        """Send a response; without `keep`, close the connection.
+
+        `unread`: the request was not read to its end. Its rest is read and dropped for a while, because an immediate
+        close would reset the connection and the peer would lose the answer.
         """
         connection = b"keep-alive" if keep else b"close"
         head = b"HTTP/1.1 %b\r\nContent-Type: text/xml\r\nContent-Length: %d\r\nConnection: %b\r\n\r\n"
@@ -507,11 +511,11 @@ class _Connection(Front, asyncio.BufferedProtocol):
 
     def expire(self) -> None:
         """Handle a passed deadline."""
-        if self._unparsed or not self.is_open:  # the delay is ours
+        if self._unparsed or not self.is_open:  # the appliance causes the delay, not the peer
             self.allow(self.limits.stall_seconds)
             return
         unsent = self.transport.get_write_buffer_size()
-        if unsent < self._unsent:  # slow progress
+        if unsent < self._unsent:  # the peer reads slowly
             self._release(self._unsent - unsent)
             self._unsent = unsent
             self.allow(self.limits.stall_seconds)
@@ -521,13 +525,13 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self.abort()
 
     def _reset(self) -> None:
-        """Reset the connection, so that the peer sees an error and not an end."""
+        """Reset the connection, so that the peer sees an error and not an orderly end."""
         self.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         self.abort()
 
 
 def _has_ended(sock: socket.socket) -> bool:
-    """Whether the peer closed the connection and sent nothing; opening it would take a hundred times as long."""
+    """Whether the peer closed the connection without data. Opening the transport would take a hundred times as long."""
     try:
         return not sock.recv(1, socket.MSG_PEEK)
     except BlockingIOError:
@@ -541,7 +545,7 @@ def _held_by(request: HttpRequest) -> int:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Return a TCP socket that listens at `host:port` (port 0: a free one); `::` takes IPv4 as well."""
+    """Return a TCP socket that listens at `host:port` (port 0: any free port); `::` also accepts IPv4."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     sock = socket.socket(family, socket.SOCK_STREAM)
     try:

@@ -1,10 +1,10 @@
-"""Sort new connections by their source address into two accept queues, in the kernel.
+"""Sort new connections into two accept queues of the kernel, by source address.
 
-The kernel has one queue of a listening socket, in order of arrival, so a flood delays every connection behind it. Two
-sockets of one port (`SO_REUSEPORT`) have a queue each, and a program picks the queue of a connection by its address.
+The kernel has one queue for each listening socket, in order of arrival, so a flood delays all later connections. Two
+sockets of one port (`SO_REUSEPORT`) have two queues. A BPF program picks the queue of a connection by its address.
 
-Only the order depends on the queue: every connection is decided by its address after it is accepted. While there is no
-second socket (control restarts), the first takes all connections.
+The queue affects only the order. After it is accepted, every connection is judged by its address. While the second
+socket does not exist (control restarts), the first socket gets all connections.
 """
 
 import array
@@ -19,10 +19,10 @@ from appliance.policy.policy import Policy
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 Program = Callable[[], bytes]
-"""Return the program for the policy in force: the same object until the policy changes."""
+"""Return the BPF program for the policy in force; the same object until the policy changes."""
 
 FIRST, SECOND = 0, 1  # the sockets of a port, as the kernel numbers them
-_MOST_INSTRUCTIONS = 1024  # in a program; each listener has a copy
+_MOST_INSTRUCTIONS = 1024  # the most instructions of a program; each listener has a copy
 
 _ATTACH = 51  # SO_ATTACH_REUSEPORT_CBPF
 # Classic BPF, as in linux/bpf_common.h and linux/filter.h.
@@ -37,7 +37,10 @@ _log = structlog.get_logger()
 
 
 class NamedFirst:
-    """The source of the program that sorts connections: this machine and hosts that the policy names come first."""
+    """Make the program that sends connections of this machine, and of hosts that the policy names, to the first socket.
+
+    Call the object to get the program.
+    """
 
     def __init__(self, policy: Callable[[], Policy]) -> None:
         self._policy = policy
@@ -53,9 +56,9 @@ class NamedFirst:
 
 
 class SourceQueues:
-    """The second listening socket of a port, for connections that `program` sends there.
+    """The second listening socket of a port, for the connections that `program` sends there.
 
-    Raises `OSError` if the kernel has no such queues.
+    Raises `OSError` if the kernel does not support such programs.
     """
 
     def __init__(self, first: socket.socket, program: Program, backlog: int) -> None:
@@ -78,7 +81,7 @@ class SourceQueues:
             raise
 
     def update(self) -> None:
-        """Attach the program of the policy in force, unless it is attached already."""
+        """Attach the program for the policy in force, unless it is attached already."""
         program = self._program()
         if program is self._attached:
             return
@@ -86,7 +89,7 @@ class SourceQueues:
             self._attach(program)
         except OSError as error:
             _log.error("connections are sorted by an earlier policy", reason=str(error))
-            self._attached = program  # so that it is not tried again
+            self._attached = program  # do not try this program again
 
     def _attach(self, program: bytes) -> None:
         code = array.array("B", program)

@@ -1,7 +1,7 @@
-"""Make the appliance's XML-RPC calls: to the ROS master on kept connections, to nodes on new ones.
+"""Make the appliance's XML-RPC calls. Connections to the ROS master are kept; each call to a node has its own.
 
-Each call has a time limit, each response a size limit. A slow, silent or lying peer costs its caller a
-`CallFailedError`, and other callers nothing.
+Each call has a time limit, and each response has a size limit. For a slow, silent or misbehaving peer, the caller gets
+a `CallFailedError`. Other callers are not affected.
 """
 
 import asyncio
@@ -19,29 +19,30 @@ from roswire.xmlrpc import FaultReceived, Value, XmlRpcLimits, build_call, parse
 
 
 class CallFailedError(Exception):
-    """A call without a usable answer; the text has the reason and the address."""
+    """A call has no usable answer; the message has the reason and the address."""
 
 
 class RefusedError(CallFailedError):
-    """The peer refuses connections or cannot be reached: no server is there."""
+    """The peer refuses connections or cannot be reached, so there is no server at the address."""
 
 
 class UnreachedError(CallFailedError):
-    """The time limit passed before a connection: the peer's machine or its packets are missing."""
+    """The time limit passed before a connection was made: the machine is off, or packets are lost."""
 
 
 class UnansweredError(CallFailedError):
-    """The time limit passed after a connection and before an answer: the peer hangs or is very slow."""
+    """The time limit passed between connection and answer: the peer hangs or is very slow."""
 
 
 class BrokenOffError(CallFailedError):
-    """The connection broke before the answer. The call may have been carried out."""
+    """The connection broke before the answer. The peer may have carried out the call."""
 
 
 class XmlRpcClient:
-    """A client of one XML-RPC server at `uri`, which reuses up to `pool` connections (0: a new one for each call).
+    """A client of the XML-RPC server at `uri`. It keeps up to `pool` connections (0: a new connection for each call).
 
-    `timeout` is in seconds, for one whole call. `disconnected` is called when the server closes a kept connection.
+    `timeout` is in seconds and applies to a whole call. `disconnected` is called when the server closes a kept
+    connection.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class XmlRpcClient:
         self._limits = limits or XmlRpcLimits()
         self._idle: deque[_Connection] = deque()
         host = f"[{uri.host}]" if ":" in uri.host else uri.host
-        # The ROS master, to which connections are kept, needs no other fields; each costs it 10 µs.
+        # The ROS master (the only server with a pool) needs no further fields. Each field would cost it 10 µs.
         more = "" if pool else "User-Agent: rosrv\r\nContent-Type: text/xml\r\nConnection: close\r\n"
         head = f"POST {uri.path} HTTP/1.1\r\nHost: {host}:{uri.port}\r\n{more}Content-Length: %d\r\n\r\n"
         self._head = head.encode("ascii")
@@ -95,7 +96,11 @@ class XmlRpcClient:
         return node_uri(self.uri.host, self.uri.port, self.uri.path)
 
     async def _exchange(self, request: bytes, seconds: float) -> bytes:
-        """Return the response. Raises `UnreachedError`, and `TimeoutError` or another `OSError` after a connection."""
+        """Return the response.
+
+        Raises `UnreachedError` if the time limit passes before a connection, `TimeoutError` if it passes later, and
+        another `OSError` if the connection fails.
+        """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + seconds
         while self._idle:
@@ -106,7 +111,7 @@ class XmlRpcClient:
                 except ConnectionResetError:
                     if connection.answering:
                         raise
-                    continue  # the server may close a kept connection at any time: use another
+                    continue  # the server may close a kept connection at any time: use another connection
         try:
             async with asyncio.timeout_at(deadline):
                 _transport, connection = await loop.create_connection(
@@ -162,7 +167,7 @@ class _Connection(asyncio.Protocol):
         return self._answer
 
     def give_up(self) -> None:
-        """Fail the answer: its time limit passed."""
+        """Fail the answer, because its time limit passed."""
         self._fail(TimeoutError())
 
     def close(self) -> None:
@@ -227,6 +232,6 @@ def _kind(error: OSError) -> type[CallFailedError]:
 
 
 _HEAD_LIMIT = 64 << 10
-_READ_IN_A_SECOND = 1 << 20  # bytes, by Python's reader on a slow machine: large values get more time
-_OFFLOAD = 256 << 10  # bytes of a call or answer that the event loop writes or reads itself
+_READ_IN_A_SECOND = 1 << 20  # bytes that a slow machine parses in a second; larger values get more time
+_OFFLOAD = 256 << 10  # the most bytes of a call or answer that the event loop encodes or parses itself
 _UNREACHABLE = frozenset({101, 111, 113})  # ENETUNREACH, ECONNREFUSED, EHOSTUNREACH
