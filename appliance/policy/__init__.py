@@ -1,4 +1,4 @@
-"""The access policy: INI text in, `Policy` out; `Policy.decide(request)` is a pure function.
+"""The access policy. A `Policy` is compiled from INI text; `Policy.decide(request)` is a pure function.
 
-Without I/O and without a clock, decisions can be tested, explained and proved.
+Decisions use no I/O and no clock, so they can be tested, explained and proved.
 """

@@ -1,4 +1,4 @@
-"""The words for actions: `publish /scan`, `call /reset`; in tests and on the CLI."""
+"""Parse the actions and hosts of test cases and commands, such as `publish /scan` or `host:ocu-1`."""
 
 import ipaddress
 
@@ -16,11 +16,11 @@ VERBS = {"use-node" if category is Category.NODE else category.value: category f
 
 
 class BadWordError(ValueError):
-    """An invalid host or action; the message says why and what to write."""
+    """A host or action is invalid; the message has the reason and the remedy."""
 
 
 def parse_action(text: str) -> tuple[Category, str]:
-    """Return the category and resource of `VERB NAME`; raises `BadWordError`."""
+    """Parse `VERB NAME`; return the category and the resource. Raises `BadWordError`."""
     verb, _, name = text.strip().partition(" ")
     category = VERBS.get(verb)
     if category is None:
@@ -30,7 +30,7 @@ def parse_action(text: str) -> tuple[Category, str]:
 
 
 def check_resource(category: Category, name: str) -> str:
-    """Return the resource unchanged; raises `BadWordError` unless a request of the category can have it."""
+    """Return a resource unchanged. Raises `BadWordError` if a request of this category cannot have such a resource."""
     if category is Category.COMMAND:
         if ALIASES.get(name, name) not in COMMANDS:
             elsewhere = DECIDED_ELSEWHERE.get(name)
@@ -42,7 +42,7 @@ def check_resource(category: Category, name: str) -> str:
 
 
 def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
-    """Return the addresses of an address, `robot` or `host:NAME` under this policy; raises `BadWordError`."""
+    """Return the addresses that an address, `robot` or `host:NAME` means in this policy. Raises `BadWordError`."""
     if text == "robot":
         if not policy.robot:
             raise BadWordError("the address of robot is not known")
@@ -60,5 +60,5 @@ def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
 
 
 def _first(network: Network) -> Address:
-    """Return the first address of the network that a machine can have."""
+    """Return the first address of a network that a machine can have."""
     return network[1] if network.num_addresses > 2 else network[0]

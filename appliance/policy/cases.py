@@ -1,4 +1,4 @@
-"""The test cases beside a policy, `FILE.tests.yaml`: hosts, actions, and whether they are allowed or denied.
+"""Run the test cases of a policy. `FILE.tests.yaml` lists actions of hosts, and whether they are allowed or denied.
 
     given:
       robot: 192.168.1.10
@@ -9,7 +9,7 @@
         allow: [publish /landshark_control/trigger]
         deny: [command shutdown]
 
-The policy is compiled with the `given` addresses, so that the cases hold wherever it is deployed (docs/policy.md).
+The policy is compiled with the `given` addresses, so its cases pass wherever it is deployed (docs/policy.md).
 """
 
 import ipaddress
@@ -37,7 +37,7 @@ _Pairs = dict[str, tuple[_Node, _Node]]
 
 @dataclass(frozen=True, slots=True)
 class CaseResult:
-    """One check: `request` was to be allowed (`expected`) or denied; `line` and `column` count from 1."""
+    """The result of one check. `expected`: the case wants `request` to be allowed. `line` and `column` count from 1."""
 
     file: str
     line: int
@@ -48,7 +48,7 @@ class CaseResult:
 
     @property
     def passed(self) -> bool:
-        """Whether the rules decide as the case expects; a request that only audit-only mode passes counts as denied."""
+        """Whether the rules decide as expected. A request that passes only because of audit-only mode is denied."""
         return (self.decision.allowed and not self.decision.would_deny) == self.expected
 
     def __str__(self) -> str:
@@ -57,16 +57,16 @@ class CaseResult:
 
     @property
     def finding(self) -> PolicyFinding:
-        """Return the failure of a check that did not pass."""
+        """Return the finding for a check that failed."""
         expected = "allow" if self.expected else "deny"
         text = f"expected {expected}: {self.decision.reason}"
         return PolicyFinding(self.file, self.line, self.column, FindingSeverity.ERROR, text)
 
 
 def run_cases(policy: Policy, text: str, file: str) -> list[CaseResult]:
-    """Judge every case in `text` (named `file` in results). Raises `PolicyError` with all mistakes in it.
+    """Run every case in `text`; `file` is its name in the results. Raises `PolicyError` with all mistakes in the text.
 
-    A file without any case is a mistake: it would pass under every policy.
+    A file without cases is a mistake, because it would pass with every policy.
     """
     findings = Findings(file)
     reader = _CaseReader(policy, findings)
@@ -95,7 +95,7 @@ def _compose(text: str, findings: Findings) -> _Node | None:
 
 
 class _CaseReader:
-    """A reader of the composed YAML, in which every node has its place."""
+    """Read the cases from YAML nodes, which know their line and column."""
 
     def __init__(self, policy: Policy, findings: Findings) -> None:
         self._policy = policy
@@ -183,7 +183,7 @@ class _CaseReader:
     # --- YAML with places ---
 
     def _mapping(self, node: _Node, what: str, keys: tuple[str, ...] | None) -> _Pairs:
-        """Return the pairs of a mapping by key; unknown and repeated keys are errors. `keys` None: any."""
+        """Return the pairs of a mapping by key. Unknown and repeated keys are errors; `keys` None permits any key."""
         pairs: _Pairs = {}
         if not isinstance(node, yaml.MappingNode):
             expected = f" with {', '.join(keys)}" if keys else ""

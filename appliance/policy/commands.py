@@ -1,6 +1,6 @@
-"""The policy's table of calls: one row each, from which `[Commands]`, rights and dry runs are derived.
+"""The policy's table of calls. `[Commands]`, rights and dry runs are derived from its rows.
 
-A call without a row is unknown and denied, `default` or not.
+A call without a row is unknown and always denied; `default` does not grant it.
 """
 
 from typing import NamedTuple
@@ -13,17 +13,17 @@ _PUBLISHERS, _SUBSCRIBERS, _SERVICES = (
 
 
 class PolicyCall(NamedTuple):
-    """One call, by its name in the policy.
+    """One call; its key in the table is its name in the policy.
 
-    category      what it is decided and recorded as
-    elsewhere     the sections that decide it, if `[Commands]` does not
-    touches       how it touches the parameter that it is about
-    node          it makes a node part of the graph, or takes it out, so that `[Nodes]` decides as well
-    gives         the thing that the caller has from it, until that is taken back
-    silent        the answer says nothing about the parameter's value
-    named_only    granted by its own key only, never by `default`: it ends the appliance or reveals hidden data
-    at_start      why an unmodified rospy or roscpp node makes it while it starts
-    wire          the longer name that it has on the wire
+    category      the category of the call's decisions and audit records
+    elsewhere     the sections that decide the call, if `[Commands]` does not
+    touches       how the call accesses its parameter: read or write
+    node          the call adds a node to the graph or removes it, so `[Nodes]` also decides
+    gives         the thing that the call gives the caller, such as a publication, until it is revoked
+    silent        the answer reveals nothing about the parameter's value
+    named_only    only its own key grants the call, never `default`: it ends the appliance or reveals hidden data
+    at_start      why an unmodified rospy or roscpp node makes the call while it starts
+    wire          the longer name of the call on the wire
     """
 
     category: Category = Category.COMMAND
@@ -66,7 +66,7 @@ CALLS: dict[str, PolicyCall] = {
     "getParamNames": _COMMAND,
     "subscribeParam": PolicyCall(touches=Category.READ, node=True, gives="parameter"),
     "unsubscribeParam": PolicyCall(touches=Category.READ, node=True, silent=True),
-    # node API; a node that asks for a topic has subscribed to it
+    # node API; a node that calls requestTopic has subscribed to the topic
     "requestTopic": PolicyCall(Category.SUBSCRIBE, _SUBSCRIBERS, node=True, gives="subscription"),
     "getBusInfo": _COMMAND,
     "getBusStats": _COMMAND,
@@ -95,9 +95,9 @@ COMMANDS = frozenset(name for name, call in CALLS.items() if not call.elsewhere)
 NAMED_ONLY = frozenset(name for name, call in CALLS.items() if call.named_only)
 DECIDED_ELSEWHERE = {name: call.elsewhere for name, call in CALLS.items() if call.elsewhere}
 ALIASES = {call.wire: name for name, call in CALLS.items() if call.wire}
-"""The policy's names of calls by their longer names on the wire."""
+"""The names of calls in the policy, by their longer names on the wire."""
 
 
 def policy_call(name: str) -> PolicyCall:
-    """Return the row of a call; an unknown call is a command."""
+    """Return the row of a call; for an unknown call, the row of a command."""
     return CALLS.get(name, _COMMAND)

@@ -1,4 +1,4 @@
-"""Explain a decision: the rule that decides, how it includes the host, and the overruled rules."""
+"""Explain a decision: the deciding rule, the words by which it includes the host, and the overruled rules."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from appliance.policy.sections import PARAMETERS
 
 @dataclass(frozen=True, slots=True)
 class OverruledRule:
-    """A rule that matches the resource and does not decide, with the reason; `grants`: it grants the request."""
+    """A rule that matches the resource but does not decide, with the reason. `grants`: it would grant the request."""
 
     rule: Rule
     grants: bool
@@ -24,10 +24,10 @@ class OverruledRule:
 class DecisionExplanation:
     """The decision on one category of a request.
 
-    `through` are the words of the deciding rule's value that include the host (empty for a denial). `also` explains the
-    other rights that the request needs (`policy/rights`); `allowed` is the answer to the whole call. `namespace` is the
-    denial of an allowed parameter in case it holds others, which is only known when the call comes. `told` is the text
-    of a denial for the host, by `[Options] tell`.
+    `through` lists the words of the deciding rule that include the host (empty for a denial). `lost` lists the
+    overruled rules. `also` explains the other rights that the request needs (`policy/rights`); `allowed` covers all of
+    them. `namespace` is the denial that an allowed parameter gets if it contains other parameters at the time of the
+    call. `told` is the text of a denial for the host, as `[Options] tell` requires.
     """
 
     request: Request
@@ -38,21 +38,21 @@ class DecisionExplanation:
     namespace: Decision | None = None
     told: str | None = None
     limit: str = ""
-    """The limit on what is allowed, and its line of `[Limits]`."""
+    """The rate limit of an allowed request, and its line in `[Limits]`."""
 
     @property
     def allowed(self) -> bool:
-        """Whether the whole call passes."""
+        """Whether the request has all rights that it needs."""
         return self.decision.allowed and all(other.allowed for other in self.also)
 
     @property
     def node(self) -> "DecisionExplanation | None":
-        """Return the `[Nodes]` right, where the request needs that too."""
+        """Return the explanation of the `[Nodes]` right, or None if the request does not need it."""
         return self._also(Category.NODE)
 
     @property
     def command(self) -> "DecisionExplanation | None":
-        """Return the `[Commands]` right, where the request needs that too."""
+        """Return the explanation of the `[Commands]` right, or None if the request does not need it."""
         return self._also(Category.COMMAND)
 
     def _also(self, category: Category) -> "DecisionExplanation | None":
@@ -60,7 +60,7 @@ class DecisionExplanation:
 
 
 def explain(policy: Policy, request: Request) -> DecisionExplanation:
-    """Explain each right that the request needs; the name must be resolved, as for `decide`."""
+    """Explain each right that the request needs. The resource must be a resolved name, as for `decide`."""
     first, *others = (_explain(policy, right) for right in rights_of(request))
     return replace(first, also=tuple(others))
 
@@ -87,7 +87,7 @@ def _explain(policy: Policy, right: Right) -> DecisionExplanation:
 
 
 def render(explanation: DecisionExplanation) -> Iterator[str]:
-    """Yield the explanation as lines of text for a person."""
+    """Yield the explanation as lines of text."""
     yield from _render_one(explanation)
     for other in explanation.also:
         if other.request.category is Category.NODE:
@@ -127,7 +127,7 @@ def _limit(policy: Policy, request: Request) -> str:
 
 
 def _matching(policy: Policy, request: Request) -> list[CompiledRule]:
-    """Return every rule that matches the resource, the most specific first, `default` last."""
+    """Return all rules that match the resource: the most specific rule first, `default` last."""
     command = request.category is Category.COMMAND
     name = commands.ALIASES.get(request.resource, request.resource) if command else request.resource
     rules = policy.rules(request.category)

@@ -10,18 +10,18 @@ from appliance.policy.rights import decide, rights_of
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One request that the two policies decide or limit differently; `count` is how often it was given."""
+    """A request that the two policies decide or limit differently; `count` is its number of occurrences."""
 
     request: Request
     old: Decision
     new: Decision
     count: int
     limited: int = 0
-    """Below 0 if both policies allow it and the new one lets less of it pass, above 0 if it lets more pass."""
+    """If both policies allow the request: -1 for a stricter limit, 1 for a weaker one. Otherwise 0."""
 
     @property
     def granted(self) -> bool:
-        """Whether the new policy grants what the old one denied, or lets more of it pass."""
+        """Whether the new policy grants a request that the old policy denied, or limits it less."""
         return _answer(self.new) > _answer(self.old) or self.limited > 0
 
     @property
@@ -33,9 +33,9 @@ class Difference:
 
 
 def diff(old: Policy, new: Policy, requests: Iterable[Request]) -> list[Difference]:
-    """Return each request that `new` decides or limits differently, in the order they were first seen.
+    """Return each request that `new` decides or limits differently, in order of first occurrence.
 
-    A request that passes only because of audit-only mode differs from one that a rule grants.
+    Audit-only counts: a request that passes only because of this mode is not the same as a granted request.
     """
     counts: dict[Request, int] = {}
     for request in requests:

@@ -1,8 +1,8 @@
-"""The smallest change of a policy's text that grants a denied request. Pure.
+"""Find the smallest change of a policy's text that grants a denied request. No I/O.
 
-Each missing right changes one line. If the section has the exact key, the host is added to it. Otherwise a line for
-that key is added, with all hosts of the deciding rule, so that only this host's rights change. Comments, order and
-blanks of the text stay.
+Each missing right changes one line. If the section has a line with the exact key, the host is added to it. Otherwise, a
+new line is added for this key. It lists the host and all hosts of the deciding rule, so the rights of other hosts do
+not change. Comments, order and blanks of the text stay.
 """
 
 import difflib
@@ -21,16 +21,16 @@ from appliance.policy.policy_settings import TAKEOVERS
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
 from appliance.policy.sections import BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
 
-_MOST_LINES = 8  # that one grant may change
+_MOST_LINES = 8  # the most lines that one grant may change
 
 
 class UngrantableError(Exception):
-    """No line of a policy can grant the request; the text says why."""
+    """No line of a policy can grant the request; the message has the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class DecidedRequest:
-    """A decided request and its rights; with `takeover`, it also needs a name that another host has."""
+    """A decided request and the rights that it needs. `takeover`: it needs a node name that another host has."""
 
     request: Request
     rights: list[Right]
@@ -39,15 +39,15 @@ class DecidedRequest:
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """A policy text that grants the request, and the rule for each right that it adds (none: the text is unchanged)."""
+    """A policy text that grants the request, and the lines that were changed or added (none: it was granted before)."""
 
     text: str
     added: tuple[str, ...]
 
     def findings(self, file: str, known: PolicyContext) -> list[str]:
-        """Return the failed test cases, because of which the text would be rejected."""
+        """Return the findings that would reject the text, such as failed test cases."""
         try:
-            unsigned = replace(known, site_keys=())  # a text that is being written cannot be signed yet
+            unsigned = replace(known, site_keys=())  # the new text cannot be signed yet
             judge(self.text, file, unsigned).accepted()
         except PolicyError as error:
             return [str(finding) for finding in error.findings]
@@ -60,7 +60,7 @@ class Grant:
 
 
 def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> Grant:
-    """Return the smallest change of a policy that grants the host everything that it asked for.
+    """Return the smallest change of a policy that grants the host all rights of the request.
 
     Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy.
     """
@@ -77,7 +77,7 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> 
         added.append(line)
         try:
             policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
-        except PolicyError:  # the line would be invalid: there is no such call, or no key for it
+        except PolicyError:  # the line is invalid: the call is unknown, or no key can name the resource
             raise UngrantableError(f"no line of a policy grants it: {reason}") from None
     if asked.takeover and policy.takeover != TAKEOVERS[-1]:
         text, line = _with_takeover(text)
@@ -93,7 +93,7 @@ def _granted(policy: Policy, right: Right) -> bool:
 
 
 def _word(text: str, known: PolicyContext, host: Address) -> str:
-    """Return the word for the host: its own name if it has one, else its address."""
+    """Return the policy's word for the host: `host:NAME`, a group of this host alone, `robot`, or its address."""
     enrolled = next((name for name, address in known.hosts.items() if address == host), None)
     if enrolled is not None:
         return f"host:{enrolled}"
@@ -112,21 +112,21 @@ def _sections(text: str) -> list[SectionText]:
 
 
 def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, str]:
-    """Return the text with one more line or word, and that line."""
+    """Add a line, or a word to a line. Return the new text and the line."""
     request = right.request
     rule, key = decide_right(policy, right).rule, request.resource
     name = BY_CATEGORY[request.category].name
     section = next((section for section in _sections(text) if section.name.text == name), None)
     itself = policy.decide(request)
     if itself.allowed and not itself.would_deny:
-        key = _below(request.resource, rule)  # the denial is below
+        key = _below(request.resource, rule)  # a rule for something below the parameter denies the request
         if section is not None and word in _holders(section, f"{request.category} {key}"):
-            # A pattern that also matches other names (/*/max) denies it until everything below has a rule.
+            # A pattern that also matches other names (/*/max) denies the request until all keys below have a rule.
             table = policy.tables[request.category]
             above = table.tree.inherited(request.resource) or table.default
             rule, key = above.rule if above is not None else None, _below(request.resource, None)
         if key == _below(request.resource, None) and itself.rule not in (None, rule):
-            # The key /arm/** also matches /arm, which keeps its hosts by its own key.
+            # The new key /arm/** also matches /arm. A key /arm of its own keeps the hosts of /arm.
             own = f"{request.category} {request.resource}"
             if section is not None and _entry(section, own) is None:
                 rule, key = itself.rule, request.resource
@@ -141,7 +141,7 @@ def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, s
 
 
 def _below(name: str, rule: Rule | None) -> str:
-    """Return the key for what is below a parameter: by the rule's own key (`write /*/max`), or `/**` without one."""
+    """Return the key for everything below a parameter: the key of the rule (`write /*/max`), or `NAME/**`."""
     of_rule = rule.key.split(" ", 1)[-1] if rule is not None else DEFAULT
     own = of_rule[1:].split("/")[len(levels(name)) :] if of_rule != DEFAULT else []
     return "/".join([name.rstrip("/"), *(own or ["**"])])
@@ -186,7 +186,7 @@ def _with_line(text: str, section: SectionText | None, name: str, line: str) -> 
             lines.pop()
         return "\n".join([*lines, end, f"[{name}]{end}", f"{line}{end}", ""]), f"[{name}] {line}"
     last = section.entries[-1].key.line if section.entries else section.name.line
-    # `default` is usually the last line: add the line before it.
+    # `default` is usually the last line. Insert the new line before it.
     if section.entries and section.entries[-1].key.text.endswith(DEFAULT):
         last -= 1
     return "\n".join([*lines[:last], f"{line}{end}", *lines[last:]]), line
@@ -205,7 +205,7 @@ def asked(
         return DecidedRequest(request, rights_of(request))
     rights = rights_of_call(request, call, str(key) if key is not None else None)
     category, _, needed = str(detail.get("needs", "")).partition(" ")
-    # The other parameters that the call contained, or that blocked it: only the record has them.
+    # The call may also have needed a right on another parameter. Only the record names that parameter.
     if category in PARAMETERS:
         right = replace(request, category=Category(category), resource=needed.removesuffix("/**") or "/")
         namespace = needed.endswith("/**")

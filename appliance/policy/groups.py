@@ -1,4 +1,4 @@
-"""The right side of a rule: groups, addresses, networks, `host:NAME` and `*`, as atoms of a host table."""
+"""Read the right side of a rule: groups, addresses, networks, `host:NAME` and `*`, as atoms of `HostSets`."""
 
 import ipaddress
 import re
@@ -20,7 +20,7 @@ _SHOWN_LIMIT = 80
 
 @dataclass(slots=True)
 class HostGroup:
-    """One line of `[Groups]`; `used`: a rule or another group names it."""
+    """One line of `[Groups]`. `used`: a rule or another group names this group."""
 
     atom: Atom
     word: Word | None
@@ -29,7 +29,7 @@ class HostGroup:
 
 
 class HostGroups:
-    """The groups of one file; `read(words)` returns the hosts of a value and notes every mistake in it."""
+    """The groups of one file. `read(words)` returns the hosts of a value, and adds its mistakes to the findings."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class HostGroups:
         table.put((table.network(network) for network in self.robot), self.groups[ROBOT].atom)
 
     def define(self, section: SectionText | None) -> None:
-        """Read `[Groups]`: groups may name groups that are defined below them."""
+        """Read `[Groups]`. A group may name groups that are defined later."""
         if section is None:
             return
         for entry in section.entries:
@@ -128,7 +128,7 @@ class HostGroups:
         return network
 
     def _robot_instead(self) -> str:
-        """Return the hint to write `robot` for the robot's own nodes where loopback is the appliance."""
+        """Return the hint to write `robot` for the robot's nodes, where loopback is the appliance itself."""
         if not self.robot:
             return "(unless isolation is none): write robot if you mean the nodes of its machine"
         robot = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)
@@ -150,7 +150,7 @@ class HostGroups:
         return None
 
     def _find_cycles(self) -> None:
-        """Note an error for each group that contains itself, once per cycle."""
+        """Report one error for each cycle of groups that contain each other."""
         done: set[str] = {ROBOT}
         for start in self.groups:
             path: list[str] = []
@@ -178,7 +178,7 @@ class HostGroups:
             self._findings.error(word.line, word.column, text)
 
     def shown(self, words: Iterable[Word]) -> str:
-        """Return a value for a person: groups with few addresses are spelled out."""
+        """Return a value as text for messages; groups with few addresses are spelled out."""
         parts: list[str] = []
         length = 0
         for word in words:
@@ -216,7 +216,7 @@ def _as_network(member: Address | Network) -> Network:
 
 
 def _address_fault(text: str) -> str:
-    """Return why a text that looks like an address or a network is not one."""
+    """Return why a text that looks like an address or network is invalid."""
     address, slash, _ = text.partition("/")
     if "%" in text:
         return f"{quoted(text)} has a zone: write the address alone"

@@ -1,12 +1,12 @@
-"""The hosts of a rule: networks, groups, and a prefix tree that finds those which contain an address.
+"""Store networks and groups as numbers, and find the numbers for an address with a prefix table.
 
-Every network and every group is a number (an *atom*). A rule has the atoms of its value; a host has the atoms of all
-networks that contain it and of all groups that contain those. A rule includes a host if they share an atom, so memory
-and time do not grow with rules times group sizes.
+Every network and every group has a number (an *atom*). A rule has the atoms of its value. A host has the atoms of all
+networks that contain its address, and of all groups that contain these networks. A rule includes a host if they share
+an atom. So memory and time do not grow with the number of rules times the size of groups.
 
 Invariants:
-1. An IPv4 address that is mapped into IPv6 (::ffff:a.b.c.d) equals the IPv4 address.
-2. Atoms of a host are computed once and kept for at most `_KEPT_HOSTS` hosts.
+1. An IPv4-mapped IPv6 address (::ffff:a.b.c.d) equals the IPv4 address.
+2. The atoms of a host are computed once, and kept for at most `_KEPT_HOSTS` hosts.
 """
 
 import ipaddress
@@ -19,7 +19,7 @@ Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 Atom = int
 
 EVERYONE: Final[Atom] = 0
-"""The atom of `*`: every host has it."""
+"""The atom of `*`, which every host has."""
 
 _KEPT_HOSTS = 1024
 _BITS = {4: 32, 6: 128}
@@ -42,12 +42,12 @@ def canonical_network(network: Network) -> Network:
 
 
 class HostSets:
-    """The networks and groups of one policy; built once, then only queried."""
+    """The networks and groups of one policy. They do not change after the policy is compiled."""
 
     __slots__ = ("_lengths", "_named", "_networks", "_parents", "_tables", "kept")
 
     def __init__(self) -> None:
-        self._parents: list[list[Atom]] = [[]]  # of each atom; atom 0 is EVERYONE
+        self._parents: list[list[Atom]] = [[]]  # the groups of each atom; atom 0 is EVERYONE
         self._networks: dict[Network, Atom] = {}
         # version -> prefix length -> leading bits -> atom of the network
         self._tables: dict[int, dict[int, dict[int, Atom]]] = {4: {}, 6: {}}
@@ -56,7 +56,7 @@ class HostSets:
         self._named: dict[Address, tuple[Network, str, bool]] = {}
 
     def network(self, network: Network) -> Atom:
-        """Return the atom of a network; a new network gets one."""
+        """Return the atom of a network; add the network if it is new."""
         network = canonical_network(network)
         atom = self._networks.get(network)
         if atom is None:
@@ -77,7 +77,7 @@ class HostSets:
         return len(self._parents) - 1
 
     def put(self, members: Iterable[Atom], group: Atom) -> None:
-        """Make atoms members of a group."""
+        """Add atoms to a group."""
         for member in members:
             self._parents[member].append(group)
 
@@ -105,11 +105,11 @@ class HostSets:
         return self.above(waiting)
 
     def narrowest(self, address: Address) -> Network:
-        """Return the smallest network of the policy that contains the address; the address alone if none does."""
+        """Return the smallest network of the policy that contains the address, or the address itself as a network."""
         return self._named_as(address)[0]
 
     def alike(self, address: Address) -> str:
-        """Return `narrowest` as text, the same for all addresses that the policy names as one network."""
+        """Return `narrowest` as text. It is the same for all addresses that the policy names as one network."""
         return self._named_as(address)[1]
 
     def names(self, address: Address) -> bool:

@@ -1,8 +1,9 @@
-"""Read INI text and keep the place of every word.
+"""Read INI text, with the line and column of every word.
 
-The text has sections `[Name]`, entries `key = value`, and comments from `#` or `;` to the end of the line: no
-continuation lines, no interpolation, no quotes. The reader does not know what a section or key means. (Other readers,
-such as configparser, do not report columns, which every error of a policy has.)
+The text has sections `[Name]`, entries `key = value`, and comments from `#` or `;` to the end of the line. It has no
+continuation lines, no interpolation and no quotes. The reader does not know the meaning of sections and keys.
+
+configparser cannot be used, because it does not report columns. Every error of a policy has a column.
 """
 
 import re
@@ -11,7 +12,7 @@ from dataclasses import dataclass, field
 from appliance.policy.policy_findings import Findings, quoted
 
 MAXIMUM_CHARACTERS = 2 * 1024 * 1024
-"""Characters of the longest policy; one with 10,000 rules has about 600,000."""
+"""The most characters of a policy. A policy with 10,000 rules has about 600,000."""
 
 _WORD = re.compile(r"[^\s,]+", re.ASCII)
 _COMMENT = re.compile(r"[#;]")
@@ -20,7 +21,7 @@ _FOREIGN = re.compile(r"[^\t\x20-\x7e]")
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """A piece of text and where it begins (line and column count from 1)."""
+    """A piece of text and its position; line and column count from 1."""
 
     text: str
     line: int
@@ -44,7 +45,7 @@ class SectionText:
 
 
 def read(text: str, findings: Findings) -> list[SectionText]:
-    """Return the sections in the order of the file; unreadable lines are noted in `findings` and left out."""
+    """Return the sections in the order of the file. Unreadable lines are skipped and reported in `findings`."""
     if len(text) > MAXIMUM_CHARACTERS:
         findings.error(1, 1, f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
         return []
@@ -81,7 +82,7 @@ def _begin_section(line: str, number: int, sections: list[SectionText], findings
     elif rest.strip():
         column = start + 1 + len(inside) + 1 + len(rest) - len(rest.lstrip()) + 1
         findings.error(number, column, f"unexpected text after the section: {quoted(rest.strip())}")
-    # The section still counts, so that its entries are judged in the right place.
+    # Keep the section in spite of the error, so that its entries are not added to the section before.
     sections.append(SectionText(Word(name, number, start + 1)))
 
 

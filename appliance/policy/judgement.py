@@ -1,4 +1,4 @@
-"""Judge whether a policy is valid: its text, signature and test cases, for a load, a dry run and the command line."""
+"""Check the text, signature and test cases of a policy, for a load, a dry run or the command line."""
 
 import ipaddress
 from collections.abc import Collection, Mapping, Sequence
@@ -18,8 +18,8 @@ from appliance.signing.site_keys import UnsignedError, signer
 class PolicyContext:
     """The context of a policy: the addresses of `host:NAME` and `robot`, and the text of its test cases.
 
-    `cases` is None if it has no cases; `cases_error` is why they could not be read, which rejects the policy. With
-    `site_keys`, one of them must have signed the policy.
+    `cases` is None if the policy has no test cases. `cases_error` is the reason if they could not be read; it rejects
+    the policy. If `site_keys` is not empty, one of these keys must have signed the policy.
     """
 
     hosts: Mapping[str, Address] = field(default_factory=dict)
@@ -31,7 +31,7 @@ class PolicyContext:
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Self:
-        """Make a context from `fields`; other fields are ignored."""
+        """Make a context from the mapping of `fields()`; unknown fields are ignored."""
         return cls(
             {name: ipaddress.ip_address(address) for name, address in fields["hosts"].items()},
             [ipaddress.ip_network(place) for place in fields["robot"]],
@@ -39,7 +39,7 @@ class PolicyContext:
         )
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields, for another process."""
+        """Return the fields as a mapping, to send them to another process."""
         return {
             "hosts": {name: str(address) for name, address in self.hosts.items()},
             "robot": [str(place) for place in self.robot],
@@ -51,14 +51,14 @@ class PolicyContext:
 
 
 class PolicyJudgement(NamedTuple):
-    """A policy that compiles, the results of its test cases, and the site's key that signed it."""
+    """A policy without errors in its text, the results of its test cases, and the name of the key that signed it."""
 
     policy: Policy
     results: list[CaseResult]
     signed_by: str
 
     def accepted(self) -> Policy:
-        """Return the policy; raises `PolicyError` with every failed case."""
+        """Return the policy. Raises `PolicyError` with every failed test case."""
         failed = [result.finding for result in self.results if not result.passed]
         if failed:
             raise PolicyError(failed)
@@ -66,9 +66,10 @@ class PolicyJudgement(NamedTuple):
 
 
 def judge(text: str, file: str, known: PolicyContext, signature: str = "") -> PolicyJudgement:
-    """Compile a policy (`file` names it in findings and rules), verify its signature and run its cases.
+    """Compile a policy, verify its signature and run its test cases. `file` is its name in findings and rules.
 
-    Raises `PolicyError` with all errors of the text, or else of the signature or the cases.
+    Raises `PolicyError` with all errors in the text. If there are none, the errors of the signature or the test cases
+    are raised.
     """
     policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
     try:

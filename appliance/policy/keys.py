@@ -5,9 +5,9 @@
     /arm*         names of one level that begin with /arm: /arm, /arm2, but not /arm/joint
     /*/state      a star at the end of any level stands for the rest of that level
 
-The most specific key that matches decides, alone: an exact name beats a pattern, a longer literal beginning
-(the text up to the first star) beats a shorter one, then a pattern without `**` beats one with it. Two keys
-that are equally specific and can match the same name are a tie, which is an error at load.
+Only the most specific matching key decides. An exact name beats a pattern. A longer literal beginning (the text up to
+the first star) beats a shorter beginning. If these are equally long, a pattern without `**` beats a pattern with `**`.
+Two keys tie if they are equally specific and match the same name. A tie is an error when the policy is loaded.
 """
 
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ Step = tuple[str, bool]
 
 
 class BadKeyError(ValueError):
-    """A text that is not a key, with the reason and the correct form."""
+    """A text is not a valid key; the message has the reason and the correct form."""
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A parsed key: its text, its levels, and whether it includes everything below them (`/**`)."""
+    """A parsed key: its text, its levels, and whether it includes everything below the last level (`/**`)."""
 
     text: str
     steps: tuple[Step, ...]
@@ -43,12 +43,12 @@ class Key:
 
     @property
     def specificity(self) -> tuple[bool, int, bool]:
-        """Return the rank of the key: if two keys match a name, the one with the greater specificity decides."""
+        """Return the rank of the key. If two keys match a name, the key with the greater specificity decides."""
         return (self.exact, len(self.literal), not self.subtree)
 
     @property
     def inner_star(self) -> bool:
-        """Whether there is a star before the end (`/*/state`, `/arm*/**`); only such keys can tie."""
+        """Whether the key has a star before its end (`/*/state`, `/arm*/**`). Only such keys can tie."""
         return any(star for _, star in (self.steps if self.subtree else self.steps[:-1]))
 
     def matches(self, name: str) -> bool:
@@ -73,7 +73,7 @@ class Key:
 
 
 def _compatible(one: Step, other: Step) -> bool:
-    """Whether some level of a name matches both."""
+    """Whether one level of a name can match both steps."""
     (text, star), (other_text, other_star) = one, other
     fits = star and other_text.startswith(text)
     return fits or (other_star and text.startswith(other_text)) or text == other_text
@@ -85,7 +85,7 @@ def levels(name: str) -> list[str]:
 
 
 def parse_key(text: str, *, parameter: bool = False) -> Key:
-    """Parse a key; raises `BadKeyError`. Parameters have a wider grammar than topics."""
+    """Parse a key. The names of parameters have a wider grammar than those of topics. Raises `BadKeyError`."""
     if not text.startswith("/"):
         raise BadKeyError(f"names here are resolved and begin with a slash: /{text.lstrip('~')}")
     if "//" in text:
@@ -98,7 +98,7 @@ def parse_key(text: str, *, parameter: bool = False) -> Key:
     steps = tuple((part.removesuffix("*"), part.endswith("*")) for part in parts[: -1 if subtree else None])
     if any("*" in step for step, _ in steps):
         raise BadKeyError("a star may only be at the end of a level, and ** only as the whole last level")
-    # A level that is only a star matches any name, also x.
+    # Check the key as a name. A level that is only a star matches any name, so replace it by x.
     name = "".join(f"/{step or 'x'}" for step, _ in steps) or "/x"
     if not (is_parameter_key(name) if parameter else is_global_name(name)):
         raise BadKeyError("is not a ROS name: letters, digits and _ between single slashes")
@@ -111,7 +111,7 @@ def command_key(name: str) -> Key:
 
 
 def is_parameter_key(text: str) -> bool:
-    """Whether `text` is the key of a parameter, or `/`, in its one canonical spelling."""
+    """Whether `text` is a parameter's name, or `/`, in canonical spelling."""
     try:
         return text.startswith("/") and resolve_parameter(text, "") == text
     except InvalidNameError:

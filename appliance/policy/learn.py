@@ -1,14 +1,14 @@
 """Learn a least-privilege policy from the recorded decisions of a robot.
 
-Run the robot with `audit-only = all`, then learn from the recorded decisions: each right that was used is granted to
-the hosts that used it, and nothing else. Two things are made wider than observed, because the next run needs them:
+Run the robot with `audit-only = all`, then learn from the recorded decisions. Each used right is granted to the hosts
+that used it; nothing else is granted. Two keys are wider than observed, because the next run needs them:
 
 1. An anonymous node name (`/rostopic_4711_1700000000000`) becomes a pattern (`/rostopic_*`).
-2. A parameter's key includes what is below it (`/arm` becomes `/arm/**`), because a call on a namespace needs the right
-   on everything in it. So a host that may touch a namespace may also touch the narrower keys in it.
+2. The key of a parameter becomes the key of its namespace (`/arm` becomes `/arm/**`). A call on a namespace needs the
+   right on every parameter in it. So a host that may access a namespace may also access narrower keys in it.
 
-The result is for an engineer to read: every line names the nodes that used the right, and how often. Hosts that occur
-together on several lines become a group. A parameter's key with the hosts of the key above it is left out.
+The result is written for engineers: every line names the nodes that used the right, and how often. Hosts that occur
+together on several lines become a group. A parameter's key is left out if the key above it has the same hosts.
 """
 
 import re
@@ -31,7 +31,7 @@ _SHOWN_NODES = 3
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """A request that passed, as recorded: `call` is its name on the wire, `key` the parameter it was about."""
+    """A recorded request that passed. `call` is the name of the call on the wire, `key` its parameter."""
 
     request: Request
     call: str = ""
@@ -47,7 +47,7 @@ class _Right:
 
 @dataclass(frozen=True, slots=True)
 class LearnedPolicy:
-    """The policy as text; the number of requests that it is based on, and of those that no rule can grant."""
+    """The text of the policy, the number of requests that it grants, and the number that no rule can grant."""
 
     text: str
     requests: int
@@ -55,7 +55,7 @@ class LearnedPolicy:
 
 
 def learn(observations: Iterable[Observation], robot: Collection[Address | Network] = ()) -> LearnedPolicy:
-    """Return the policy that grants what was observed; `robot` has the addresses of the group of that name."""
+    """Return the policy that grants the observed requests. `robot` lists the addresses of the group `robot`."""
     rights: dict[tuple[Category, str], _Right] = {}
     requests = left_out = 0
     for observation in observations:
@@ -76,7 +76,7 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
 
 
 def _needed(observation: Observation) -> Iterator[Request]:
-    """Yield everything that must be granted for this request to pass. Raises `BadWordError` if no rule can grant it."""
+    """Yield every right that this request needs. Raises `BadWordError` if no rule can grant the request."""
     for right in rights_of_call(observation.request, observation.call, observation.key or None):
         check_resource(right.request.category, right.request.resource)
         yield right.request
@@ -95,7 +95,7 @@ def _without_numbers(name: str) -> str:
 
 
 def _hand_down(rights: dict[tuple[Category, str], _Right]) -> None:
-    """Give the hosts of a namespace the narrower keys in it, because the most specific key decides alone."""
+    """Add the hosts of a namespace to all narrower keys in it, because only the most specific key decides."""
     for (category, key), right in rights.items():
         if category in PARAMETERS:
             levels = key.removesuffix("/**").split("/")
@@ -106,7 +106,7 @@ def _hand_down(rights: dict[tuple[Category, str], _Right]) -> None:
 
 
 def _needful(rights: dict[tuple[Category, str], _Right]) -> dict[tuple[Category, str], _Right]:
-    """Return the rights without the keys of parameters that have the same hosts as the nearest key above them."""
+    """Drop each parameter key that has the same hosts as the nearest key above it; return the other rights."""
     left = dict(rights)
     for (category, key), right in rights.items():
         levels = key.removesuffix("/**").split("/") if category in PARAMETERS else []
@@ -143,7 +143,7 @@ def _text(rights: dict[tuple[Category, str], _Right], robot: Collection[Address 
 
 
 def _hosts(hosts: set[Address], robot: Collection[Address | Network]) -> tuple[str, str]:
-    """Return the group of the robot, if it is among them, and the addresses of the others."""
+    """Return the group `robot`, if it covers one of the hosts, and the addresses of the other hosts."""
     known = {host for host in hosts if any(_within(host, network) for network in robot)}
     rest = sorted(hosts - known, key=lambda host: (host.version, int(host)))
     return "robot" if known else "", " ".join(map(str, rest))

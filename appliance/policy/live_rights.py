@@ -1,7 +1,7 @@
-"""Things that a call gave a host, and those among them that a policy would end.
+"""Find the live rights of hosts, such as publications, that a policy would end.
 
-A reload (`master/graph/revocation`) and a dry run ask the same question: may the host make the call that gave it, now
-and under this policy? `policy/rights` has the rights that this needs.
+A call gave each live right. A reload (`master/graph/revocation`) and a dry run ask the same question: may the host make
+this call now, under this policy? `policy/rights` lists the rights that the call needs.
 """
 
 import ipaddress
@@ -17,9 +17,9 @@ from roswire.parameter_tree import Tree, holds_others, standing_at
 
 
 class LiveRight(NamedTuple):
-    """Something that a host has: `call` gave it, about `resource`.
+    """A live right of a host, such as a publication: `call` gave it for `resource`.
 
-    `namespace`: it is a parameter that holds others now.
+    `namespace`: the resource is a parameter that now contains other parameters.
     """
 
     host: Address
@@ -34,11 +34,11 @@ class LiveRight(NamedTuple):
         return cls(**{**fields, "host": ipaddress.ip_address(fields["host"])})
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields, for another process."""
+        """Return the fields as a mapping, to send them to another process."""
         return {**self._asdict(), "host": str(self.host)}
 
     def requests(self) -> list[Request]:
-        """Return the requests that a person would ask about: the parameter that it is about, if any, and the deed."""
+        """Return the requests to explain to a person: access to the parameter, if there is one, and the call."""
         asked = [request_of(self.call, self.host, self.caller_id, self.resource)]
         touch = policy_call(self.call).touches
         return asked if touch is None else [Request(self.host, self.caller_id, touch, self.resource), *asked]
@@ -46,7 +46,7 @@ class LiveRight(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """Something live that a policy would end: `what` the caller has, about `resource`."""
+    """A live right that a policy would end: `what`, such as "publication", for `resource`."""
 
     host: str
     caller_id: str
@@ -56,19 +56,19 @@ class Ending:
 
 
 def live_by(call: str, host: Address, caller_id: str, resource: str, tree: Tree) -> LiveRight:
-    """Return the right that this call gave; `tree` has the present parameters."""
+    """Return the live right that this call gave; `tree` is the present parameter tree."""
     namespace = policy_call(call).touches is not None and holds_others(standing_at(tree, resource)[0])
     return LiveRight(host, caller_id, call, resource, namespace)
 
 
 def may_keep(policy: Policy, live: LiveRight) -> Decision:
-    """Return the decision whether the host may keep it under a policy."""
+    """Decide whether the host may keep a live right under a policy."""
     request = request_of(live.call, live.host, live.caller_id, live.resource)
     return decide(policy, rights_to_keep(request, live.call, live.resource, namespace=live.namespace))
 
 
 def endings(policy: Policy, things: Iterable[LiveRight]) -> list[Ending]:
-    """Return the things that the policy would end, each once."""
+    """Return the live rights that the policy would end, without repetitions."""
     decided = ((live, may_keep(policy, live)) for live in things)
     found = (
         Ending(str(live.host), live.caller_id, policy_call(live.call).gives, live.resource, decision.reason)

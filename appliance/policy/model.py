@@ -1,7 +1,6 @@
-"""The nouns of the access policy: questions and answers.
+"""Define the policy's questions (`Request`) and answers (`Decision`).
 
-`Request` and `Decision` are the contract between the policy and its users: RVMaster, the `rosrv policy` verbs, REST and
-the console show the same text.
+RVMaster, the `rosrv policy` commands, REST and the console all use these two classes, so all show the same text.
 """
 
 import enum
@@ -14,7 +13,7 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class _IPv4(ipaddress.IPv4Address):
-    """An address that keeps its hash and its text; the standard library computes both each time."""
+    """An address that stores its hash and its text. The standard library computes both at each use."""
 
     __slots__ = ("_hash", "_text")
 
@@ -47,15 +46,15 @@ class _IPv6(ipaddress.IPv6Address):
 
 @lru_cache(4096)
 def address_of(text: str) -> Address:
-    """Return the address of a host: the same object for the same text, because every call looks up the host's holdings.
+    """Parse the address of a host. Return the same object for the same text, to speed up the look-ups of every call.
 
-    It is equal to the address that `ipaddress` makes of the text, with the same hash. Raises `ValueError`.
+    The result equals the address that `ipaddress` makes, and has the same hash. Raises `ValueError`.
     """
     return _IPv6(text) if ":" in text else _IPv4(text)
 
 
 class Category(enum.StrEnum):
-    """The kind of thing that a request touches; one section of the policy each (parameters share one)."""
+    """The kind of access in a request. Each category has its own section, but both for parameters share one."""
 
     NODE = "node"  # use a node name                [Nodes]
     PUBLISH = "publish"  # publish a topic          [Publishers]
@@ -69,10 +68,10 @@ class Category(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One question to the policy.
+    """One question to the policy: may `host` access `resource`?
 
-    `resource` is a resolved, canonical ROS name (topics, services, parameters, nodes) or, for
-    `Category.COMMAND`, the exact name of a call. `caller_id` is a claim; the policy decides by `host`.
+    `resource` is a resolved, canonical ROS name (topic, service, parameter, node). For `Category.COMMAND`, it is the
+    exact name of a call. `caller_id` is not verified, so the policy decides by `host`.
     """
 
     host: Address
@@ -92,7 +91,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """The place of a rule in the policy."""
+    """The position of a rule in the policy."""
 
     section: str  # as written in the documentation: "Publishers"
     key: str  # as written in the file: "/arm/**", "default", "read /ns/**"
@@ -108,11 +107,11 @@ class Rule:
 class Decision:
     """The answer to a `Request`.
 
-    `rule` is the rule that decided, or None if no rule matches the request. `reason` is a sentence for a person, in the
-    audit record, `rosrv policy explain` and the console. `told` is the same without other hosts' names and addresses,
-    for the answer to the caller; None if the reason has none (`text_for_caller`). `would_deny` is set in audit-only
-    mode if the rules deny the request; `allowed` is then True. `needs` is the further right that decided, if it was not
-    the request itself (`write /arm/**`).
+    `rule` is the rule that decided, or None if no rule matches the request. `reason` is a sentence for audit records,
+    `rosrv policy explain` and the console. `told` is the reason without names and addresses of other hosts, for the
+    answer to the caller; it is None if `reason` contains none (`text_for_caller`). In audit-only mode, `would_deny` is
+    true if the rules deny the request, and `allowed` is true. `needs` names the further right that decided, such as
+    `write /arm/**`; it is empty if the request itself decided.
     """
 
     allowed: bool
@@ -129,11 +128,11 @@ class Decision:
 
 
 TELLS = ("rule", "full", "id")
-"""The values of `[Options] tell`, which limits the text for a denied caller; the first is the default."""
+"""The values of `[Options] tell`, which limits the text for a denied caller. The first value is the default."""
 
 
 def text_for_caller(decision: Decision, tell: str) -> str:
-    """Return the text for a denied caller: all (`full`), without allowed hosts (`rule`), or only the fact (`id`)."""
+    """Return the text for a denied caller: the reason (`full`), no other hosts (`rule`), or only the denial (`id`)."""
     if tell == "full":
         return decision.reason
     return "denied" if tell == "id" else decision.told or decision.reason

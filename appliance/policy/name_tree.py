@@ -1,10 +1,12 @@
-"""Find the most specific key of a name: exact names by hash, patterns in a tree of levels.
+"""Find the most specific key that matches a name. Exact names are found by hash, patterns in a tree of levels.
 
-If stars are only at the end of keys, a look-up takes one step per level of the name, whatever the number of keys. Keys
-with an earlier star make the search branch; the compiler bounds their number.
+If stars are only at the end of keys, a look-up takes one step per level of the name, whatever the number of keys. A key
+with an earlier star makes the search branch; the compiler limits the number of such keys.
 
-Invariants: `find` returns the value of the key with the greatest `specificity` among those that match (the tests
-compare the two); the caller adds no key twice, and none that ties with another.
+Invariants:
+
+1. `find` returns the value of the matching key with the greatest `specificity`. The tests compare both.
+2. The caller does not add a key twice, and does not add a key that ties with another key.
 """
 
 from collections.abc import Iterator
@@ -18,16 +20,16 @@ Value = TypeVar("Value")
 
 @dataclass(slots=True)
 class _Node(Generic[Value]):
-    """A node of the tree: `value` for a key that ends here; `subtree` for one that ends with `/**`."""
+    """A node of the tree. `value` belongs to a key that ends here, `subtree` to a key that ends here with `/**`."""
 
     names: dict[str, "_Node[Value]"] = field(default_factory=dict)
-    # Beginnings of a level, longest first; one table per length.
+    # The literal beginnings of levels with a star: one table for each length, longest first.
     stars: list[tuple[int, dict[str, "_Node[Value]"]]] = field(default_factory=list)
     value: tuple[Key, Value] | None = None
     subtree: tuple[Key, Value] | None = None
 
     def starred(self, level: str) -> Iterator["_Node[Value]"]:
-        """Yield the nodes behind the stars that match a level, longest beginning first."""
+        """Yield the nodes behind stars that match a level; the longest literal beginning comes first."""
         for length, table in self.stars:
             node = table.get(level[:length])
             if node is not None:
@@ -61,7 +63,7 @@ class KeyTree(Generic[Value]):
             node.value = (key, value)
 
     def find(self, name: str) -> Value | None:
-        """Return the value of the most specific key for a resolved name (`/` is matched by `/**` only)."""
+        """Return the value of the most specific key that matches a resolved name. Only `/**` matches `/`."""
         found = self._exact.get(name)
         if found is not None:
             return found
@@ -76,7 +78,7 @@ class KeyTree(Generic[Value]):
         return pattern[1] if pattern is not None else None
 
     def below(self, name: str) -> list[Value]:
-        """Return the values of the specific keys that decide some names below `name`."""
+        """Return the values of all keys that decide only some of the names below `name`."""
         inherited, ends = self._walk(name)
         prefix = "/" if name == "/" else name + "/"
         found = [pair for end in ends for child in end.children() for pair in _everything(child)]
@@ -87,12 +89,12 @@ class KeyTree(Generic[Value]):
         return [value for _, value in found]
 
     def inherited(self, name: str) -> Value | None:
-        """Return the value for the names below `name` that have no more specific key."""
+        """Return the value of the key that decides a name below `name` if no more specific key matches it."""
         inherited, _ = self._walk(name)
         return inherited[1] if inherited is not None else None
 
     def _walk(self, name: str) -> tuple[tuple[Key, Value] | None, list[_Node[Value]]]:
-        """Return the most specific `/**` key that includes all of `/name/**`, and the nodes that `name` leads to."""
+        """Return the most specific `/**` key that covers everything below `name`, and the nodes at `name`."""
         reached = [self._root]
         subtrees = [self._root.subtree]
         for level in levels(name):
@@ -133,9 +135,8 @@ def _everything(node: _Node[Value]) -> Iterator[tuple[Key, Value]]:
 def _find(path: list[_Node[Value]], parts: list[str]) -> tuple[Key, Value] | None:
     """Return the best pattern for a name whose first levels lead through `path` without a star.
 
-    Literal beginnings grow along the path, so its end is tried first. In one node the stars come before
-    `subtree`: a longer beginning of a level beats a shorter one, and of /x/* and /x/**, equally long, the
-    first wins.
+    Literal beginnings grow along the path, so the end of the path is tried first. In each node, stars are tried before
+    `subtree`, because a longer literal beginning beats a shorter one, and /x/* beats /x/**.
     """
     for depth in range(len(path) - 1, -1, -1):
         node = path[depth]
@@ -150,7 +151,11 @@ def _find(path: list[_Node[Value]], parts: list[str]) -> tuple[Key, Value] | Non
 
 
 def _find_behind_star(node: _Node[Value], parts: list[str], depth: int) -> tuple[Key, Value] | None:
-    """Return the best pattern behind a star: all have the same literal beginning, so at most one of a kind fits."""
+    """Return the best pattern behind a star, or None.
+
+    All patterns here have the same literal beginning. So at most one pattern with `/**` matches, and at most one
+    without.
+    """
     waiting = [(node, depth)]
     subtree: tuple[Key, Value] | None = None
     while waiting:

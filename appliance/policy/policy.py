@@ -1,10 +1,10 @@
 """A compiled policy, and the one function that decides: `Policy.decide(request)`.
 
-It is pure: the same request always gets the same answer, without I/O and without a clock.
+The function is pure: the same request always gets the same answer, without I/O and without a clock.
 
 Invariants:
-1. A request that no rule grants is denied, except that a missing extension section leaves its category free.
-2. Exactly one rule decides a request: the most specific key of its section, or `default`.
+1. A request that no rule grants is denied. Exception: if an extension section is missing, its requests are allowed.
+2. Exactly one rule decides a request: the rule with the most specific matching key of its section, or `default`.
 3. `Decision.reason` is a sentence shorter than 300 characters.
 4. Memory does not grow with requests: answers are kept for at most `_KEPT_DECISIONS` short resource names.
 """
@@ -34,8 +34,8 @@ _LONGEST_REASON = 299
 class CompiledRule:
     """One line of a deciding section.
 
-    `key` is None for `default`; `atoms` and `words` are the value, the words as written; `shown` lists its hosts for a
-    person, `place` is its place in the file; `column` is where the key begins.
+    `key` is None for `default`. `atoms` is the value as atoms, `words` the value as written, and `shown` the value as
+    text for messages. `place` is the rule's position as text; `column` is the column of its key.
     """
 
     rule: Rule
@@ -57,7 +57,7 @@ class CompiledRule:
 
 @dataclass(slots=True)
 class RuleTable:
-    """The rules of one category; `audit_only`: requests that they deny still pass."""
+    """The rules of one category. `audit_only`: requests that these rules deny still pass."""
 
     tree: KeyTree[CompiledRule] = field(default_factory=KeyTree)
     default: CompiledRule | None = None
@@ -67,12 +67,12 @@ class RuleTable:
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Policy:
-    """A policy in force (or about to be); only `compile_policy` makes it.
+    """A compiled policy; only `compile_policy` makes it.
 
-    `text` and `file` are its source; `warnings` the lint; `named` all hosts that a rule names; `present` the categories
-    that have a section; `ports` the ports for proxy endpoints and relay; `monitored_topics` and `monitored_services`
-    the names in `[Monitor]`; `takeover` is `same-host` or `granted`; `enrolled` and `robot` are the given addresses of
-    `host:NAME` and `robot`.
+    `text` and `file` are its source. `warnings` are the findings of the lint. `named` has the atoms of all hosts that a
+    rule names. `present` lists the categories that have a section. `ports` are the ports for proxy endpoints and relay.
+    `monitored_topics` and `monitored_services` are the names in `[Monitor]`. `takeover` is `same-host` or `granted`.
+    `enrolled` and `robot` are the given addresses of `host:NAME` and `robot`.
     """
 
     text: str
@@ -99,9 +99,9 @@ class Policy:
         self._any_audit_only = any(table.audit_only for table in self.tables.values())
 
     def decide(self, request: Request) -> Decision:
-        """Return the decision of the request's own category: whether its rules let the host touch the resource.
+        """Decide by the rules of the request's own category whether the host may access the resource.
 
-        `policy/rights` lists the further rights that a call needs, and decides on all of them.
+        A call may need further rights: `policy/rights` lists them and decides on all of them.
         """
         host = request.host
         key = (host.version, int(host), request.category, request.resource)
@@ -115,10 +115,10 @@ class Policy:
         return decision
 
     def decide_parameter(self, request: Request, *, namespace: bool = False) -> Decision:
-        """Return the decision on a parameter and what is below it: a rule below that denies the host denies the call.
+        """Decide on a parameter and everything below it. If a rule for a name below denies the host, deny the call.
 
-        `namespace`: the parameter is known to hold others. Then the rule for those without their own key must also
-        grant the host (an exact key `/arm` does not match `/arm/speed`).
+        `namespace`: the parameter contains other parameters. Then the rule for contained parameters without their own
+        key must also grant the host, because an exact key `/arm` does not match `/arm/speed`.
         """
         decision = self.decide(request)
         if not decision.allowed or decision.would_deny or request.category not in self.present:
@@ -135,7 +135,7 @@ class Policy:
         return kept
 
     def _decide_below(self, request: Request, namespace: bool) -> Decision | None:
-        """Return the denial of the call on `request.resource` because of a key below it, if there is one."""
+        """Return the denial because of a key below the resource, or None if no such key denies the host."""
         table = self.tables[request.category]
         atoms = self.hosts.atoms_of(request.host)
         deciding = table.tree.below(request.resource)
@@ -152,7 +152,7 @@ class Policy:
         return None
 
     def limit_rule(self, topic: str) -> LimitRule | None:
-        """Return the line of `[Limits]` for a topic."""
+        """Return the line of `[Limits]` for a topic, or None."""
         return self.limits.find(topic)
 
     def limit(self, part: LimitScope, topic: str, host: Address | None = None) -> Rate:
@@ -163,31 +163,31 @@ class Policy:
         return rule.rate(part, self.hosts.atoms_of(host) if host is not None else frozenset())
 
     def limit_on(self, request: Request) -> Rate:
-        """Return the limit on a request."""
+        """Return the rate limit of a request to publish or subscribe; other requests have no limit."""
         part = _LIMITED.get(request.category)
         return NO_LIMIT if part is None else self.limit(part, request.resource, request.host)
 
     def knows(self, address: Address) -> bool:
-        """Whether any rule includes this address: if not, its requests need not even be read.
+        """Whether any rule includes this address. Requests from other addresses need not even be read.
 
-        With a section in audit-only mode every address is known, because its requests pass.
+        If a section is in audit-only mode, every address is known, because its requests pass.
         """
         return self._any_audit_only or not self.named.isdisjoint(self.hosts.atoms_of(address))
 
     def named_as(self, address: Address) -> Network:
-        """Return the policy's name of an address: itself, or the smallest network that it names as a whole."""
+        """Return the smallest network of the policy that contains the address, or the address itself as a network."""
         return self.hosts.narrowest(address)
 
     def alike(self, address: Address) -> str:
-        """Return `named_as` as text, which every call uses for look-ups."""
+        """Return `named_as` as text, a key for fast look-ups."""
         return self.hosts.alike(address)
 
     def counted_as(self, address: Address) -> str:
-        """Return the name under which a host is counted: `alike`, and "" for all unknown hosts together."""
+        """Return the key for counting a host: `alike`, or one empty string for all unknown hosts."""
         return self.alike(address) if self.knows(address) else ""
 
     def names(self, address: Address) -> bool:
-        """Whether a rule names this address or its network, and not only all hosts (`*`)."""
+        """Whether the policy names this address or a network that contains it; `*` does not count."""
         return self.hosts.names(address)
 
     def has_section(self, category: Category) -> bool:
@@ -228,7 +228,7 @@ class Policy:
             reason = f"{_what(request, 'may not')}: only its own key in [Commands] grants it, never default"
             return Decision(False, None, reason)
         decision = self._apply(request, table, found)
-        # audit-only is for learning what a robot does. No robot needs these calls, so they stay denied.
+        # audit-only is for learning the needs of a robot. No robot needs these calls, so they stay denied.
         return replace(decision, allowed=False, would_deny=False) if decision.would_deny else decision
 
     def _apply(self, request: Request, table: RuleTable, found: CompiledRule | None) -> Decision:
@@ -269,7 +269,7 @@ def _what(request: Request, may: str) -> str:
 
 
 def _by_rule(what: str, rule: CompiledRule, audit_only: bool) -> Decision:
-    """Return a denial by a rule; the reason lists the allowed hosts unless that makes it too long."""
+    """Return a denial by a rule. The reason lists the allowed hosts, unless it would be too long."""
     told = f"{what}, by {rule.place}"
     reason = f"{what}: {rule.shown}, by {rule.place}"
     decision = _decided(False, rule.rule, reason if len(reason) <= _LONGEST_REASON else told, audit_only)
@@ -282,6 +282,6 @@ def _shortened(text: str, limit: int = 60) -> str:
 
 
 def place_of(rule: Rule) -> str:
-    """Return the place of a rule, short enough for a sentence."""
+    """Return the position of a rule as text, short enough for a sentence."""
     file = rule.file.rpartition("/")[2]
     return f"[{rule.section}] {_shortened(rule.key, 50)} ({_shortened(file, 30)}:{rule.line})"

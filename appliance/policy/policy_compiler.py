@@ -1,7 +1,6 @@
 """Compile a policy: read the text, check every word, compile the rules.
 
-All errors are reported at once. A wrong section or value is left out and the rest is still checked, as if the error
-were fixed.
+All errors are reported at once. An invalid section or value is left out, and the rest of the text is still checked.
 """
 
 from collections.abc import Collection, Mapping
@@ -27,10 +26,10 @@ def compile_policy(
     hosts: Mapping[str, Address] | None = None,
     robot: Collection[Address | Network] = (),
 ) -> Policy:
-    """Return the policy of a text. Raises `PolicyError` with every error in it.
+    """Compile a text to a policy. Raises `PolicyError` with every error in the text.
 
-    `file` names the text in findings and rules. `hosts` maps the names of enrolled hosts to their addresses
-    (`host:NAME`); a name without an address includes no host, and is a warning. `robot` has the addresses of the
+    `file` is the name of the text in findings and rules. `hosts` maps the names of enrolled hosts (`host:NAME`) to
+    their addresses. A name without an address matches no host and causes a warning. `robot` lists the addresses of the
     predefined group `robot`.
     """
     findings = Findings(file)
@@ -74,7 +73,7 @@ def compile_policy(
 
 
 def _by_name(found: list[SectionText], findings: Findings) -> dict[str, SectionText]:
-    """Return sections by their documented names; unknown and repeated ones are errors."""
+    """Return the sections by their documented names. Unknown and repeated sections are errors."""
     by_fold = {name.casefold(): name for name in sections.NAMES}
     there = {section.name.text.casefold() for section in found}
     by_name: dict[str, SectionText] = {}
@@ -87,7 +86,7 @@ def _by_name(found: list[SectionText], findings: Findings) -> dict[str, SectionT
             findings.error(place.line, place.column, f"unknown section {quoted(place.text)}{guess}{known}")
             name = nearest(place.text, sections.NAMES)
             if name is not None and name.casefold() not in there:
-                by_name.setdefault(name, section)  # read as intended, so that one slip is one error
+                by_name.setdefault(name, section)  # use the intended name: one mistake causes one error
         elif name in by_name:
             first = by_name[name]
             text = f"the section [{name}] is already defined at line {first.name.line}: move its lines there"

@@ -1,6 +1,7 @@
-"""Errors and warnings in an operator's text, with their place: `file:line:column: error: text`.
+"""Collect errors and warnings about an operator's file, with their position: `file:line:column: error: text`.
 
-Errors reject the file, warnings (the lint) never do. All are found in one go, so that a file can be fixed in one go.
+Errors reject the file; warnings (the lint) never do. All findings are reported together, so that a file can be fixed in
+one step.
 """
 
 import enum
@@ -18,7 +19,7 @@ class FindingSeverity(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class PolicyFinding:
-    """One mistake; `line` and `column` count from 1, and `text` says what was meant or what to write."""
+    """One mistake. `line` and `column` count from 1; `text` describes the mistake and the remedy."""
 
     file: str
     line: int
@@ -40,7 +41,7 @@ class PolicyError(Exception):
 
 
 class Findings:
-    """The findings of one file; beyond `MAXIMUM_FINDINGS` errors they are only counted."""
+    """The findings of one file. Beyond `MAXIMUM_FINDINGS`, further errors are only counted."""
 
     def __init__(self, file: str) -> None:
         self.file = file
@@ -66,7 +67,7 @@ class Findings:
         return len(self._errors) >= MAXIMUM_FINDINGS
 
     def raise_errors(self) -> None:
-        """Raise `PolicyError` with all findings, in the order of the file, if there is an error."""
+        """If there is an error, raise `PolicyError` with all findings in the order of the file."""
         if not self._errors:
             return
         findings = sorted([*self._errors, *self.warnings])
@@ -78,7 +79,7 @@ class Findings:
 
 
 def quoted(text: str, limit: int = 60) -> str:
-    """Return untrusted text for a person: in quotes, shortened, control characters escaped."""
+    """Return untrusted text in a form that is safe to print: quoted, shortened, with control characters escaped."""
     shown = text if len(text) <= limit else text[: limit - 1] + "…"
     return '"' + "".join(c if c.isprintable() and c != '"' else _escaped(c) for c in shown) + '"'
 

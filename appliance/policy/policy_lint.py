@@ -1,4 +1,4 @@
-"""Warn about valid rules that a policy most likely does not mean. Warnings never reject a policy."""
+"""Warn about valid rules that the author most likely did not intend. Warnings never reject a policy."""
 
 import bisect
 import ipaddress
@@ -26,7 +26,7 @@ def lint(
     hosts: HostSets,
     findings: Findings,
 ) -> None:
-    """Note every warning about a policy without errors."""
+    """Add all warnings about a policy without errors to `findings`."""
     _shadowed_defaults(tables, findings)
     _dead_rules(tables, hosts, findings)
     _nodes_that_cannot_start(tables, present, written, findings)
@@ -44,7 +44,7 @@ def _shadowed_defaults(tables: Tables, findings: Findings) -> None:
 
 
 def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
-    """Warn of rules that let a host publish, subscribe or offer although it may not use any node name."""
+    """Warn about rules that let a host publish, subscribe or offer although it may not use any node name."""
     named = {atom for rule in tables[Category.NODE].rules for atom in rule.atoms}
     if EVERYONE in named:
         return
@@ -62,7 +62,7 @@ def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
 
 
 def _nameless(named: set[Atom], table: HostSets) -> dict[Atom, Network]:
-    """Return, for each atom with a network that does not overlap `[Nodes]`, one such network."""
+    """For each atom, return a network in it that does not overlap the hosts of `[Nodes]`; omit atoms without one."""
     networks = table.networks()
     nodes = [network for network, atom in networks.items() if not named.isdisjoint(table.above([atom]))]
     overlap = _Overlap(nodes)
@@ -79,7 +79,7 @@ def _nameless(named: set[Atom], table: HostSets) -> dict[Atom, Network]:
 
 
 class _Overlap:
-    """A set of networks that answers whether a network overlaps any of them."""
+    """A set of networks; `any` checks whether a network overlaps one of them."""
 
     def __init__(self, networks: list[Network]) -> None:
         self._starts: dict[int, list[int]] = {}
@@ -92,7 +92,7 @@ class _Overlap:
             self._ends.setdefault(network.version, []).append(int(network.broadcast_address))
 
     def any(self, network: Network) -> bool:
-        """Whether an address of the network is in the set."""
+        """Whether any address of the network is in the set."""
         starts = self._starts.get(network.version, [])
         before = bisect.bisect_right(starts, int(network.broadcast_address)) - 1
         return before >= 0 and self._ends[network.version][before] >= int(network.network_address)
@@ -101,7 +101,7 @@ class _Overlap:
 def _nodes_that_cannot_start(
     tables: Tables, present: set[Category], written: Mapping[str, SectionText], findings: Findings
 ) -> None:
-    """Warn of commands that every node needs and no host is granted."""
+    """Warn about commands that every node needs but that are granted to no host."""
     if Category.COMMAND not in present:
         return
     table = tables[Category.COMMAND]
@@ -121,7 +121,7 @@ def _unused_groups(groups: HostGroups, findings: Findings) -> None:
 
 
 def _missing_sections(present: set[Category], findings: Findings) -> None:
-    """Warn of missing sections without which the policy grants nothing that a node can use."""
+    """Warn about missing sections whose requests are therefore denied for all hosts."""
     for decider in sections.DECIDERS:
         if not decider.extension and decider.categories[0] not in present:
             findings.warn(

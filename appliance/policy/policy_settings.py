@@ -1,4 +1,4 @@
-"""The sections that decide nothing: `[Ports]`, `[Monitor]` and `[Options]`."""
+"""Read the sections that do not decide requests: `[Ports]`, `[Monitor]` and `[Options]`."""
 
 import re
 from collections.abc import Collection, Iterator, Sequence
@@ -14,7 +14,7 @@ from roswire.names import is_global_name
 
 TAKEOVERS = ("same-host", "granted")
 AT_ONCE = "[Options] takeover = granted"
-"""The option that lets another host take a name; a denial that it would have prevented names it."""
+"""The option that lets another host take over a node name. A denial that it would prevent names this option."""
 _MASTER_PORT = 11311
 _RANGE = re.compile(r"([0-9]{1,5})-([0-9]{1,5})", re.ASCII)
 
@@ -30,14 +30,14 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class MonitorSection:
-    """`[Monitor]`: topics and services that are relayed even without a specification."""
+    """`[Monitor]`: the topics and services that are relayed even without a specification."""
 
     topics: frozenset[str] = frozenset()
     services: frozenset[str] = frozenset()
 
 
 def read_ports(section: SectionText | None, findings: Findings) -> range:
-    """Return the ports for proxy endpoints and relay, first to last."""
+    """Return the range of ports for proxy endpoints and relay."""
     ports = DEFAULT_PORTS
     for entry in _entries(section, ("range",), findings):
         ports = _range(entry, findings) or DEFAULT_PORTS
@@ -77,7 +77,7 @@ def read_monitor(section: SectionText | None, findings: Findings) -> MonitorSect
 
 
 def read_options(section: SectionText | None, findings: Findings) -> Options:
-    """Return the options; what the file does not set keeps its default."""
+    """Return the options; an option that the file does not set has its default."""
     options = Options()
     for entry in _entries(section, ("takeover", "audit-only", "tell"), findings):
         match entry.key.text:
@@ -119,7 +119,7 @@ def _audit_only(entry: Entry, findings: Findings) -> frozenset[str]:
 
 
 def _entries(section: SectionText | None, keys: Collection[str], findings: Findings) -> Iterator[Entry]:
-    """Yield the entries of a section whose keys are known and not repeated; the others are errors."""
+    """Yield the entries of a section. Entries with an unknown or repeated key are left out and reported as errors."""
     first_lines: dict[str, int] = {}
     for entry in section.entries if section else ():
         word = entry.key

@@ -1,12 +1,14 @@
-"""`[Limits]`: how many messages, and how many bytes, may pass in a second.
+"""`[Limits]`: the number of messages and bytes that may pass in a second.
 
     /camera/** = publisher 30 Hz 10 MB/s, subscriber tablet 5 Hz
     /scan      = publisher guests 20 Hz, topic 100 Hz 2 MB/s
 
-`publisher` limits the publishers of the topic on each host together, `subscriber` each subscriber, `topic` all
-publishers together, which share it fairly by host. Hosts may follow the first two words: then only nodes on them are
-limited. As in every section, only the most specific key counts; among its clauses for a host, the strictest does. A
-limit bounds how much of the allowed traffic may pass; it decides no request.
+`publisher` limits all publishers of the topic on one host together. `subscriber` limits each subscriber. `topic` limits
+all publishers of the topic; the hosts share this limit fairly. Hosts may follow `publisher` and `subscriber`: then the
+limit applies only to nodes on these hosts.
+
+As in every section, only the most specific key counts. If several of its clauses match a host, the strictest one
+counts. A limit restricts allowed traffic; it never allows or denies a request.
 """
 
 import re
@@ -26,7 +28,7 @@ from appliance.policy.sections import DEFAULT, LIMITS
 
 
 class LimitScope(StrEnum):
-    """The messages that a limit counts together."""
+    """The scope of a limit, which counts the messages in its scope together."""
 
     PUBLISHER = "publisher"
     SUBSCRIBER = "subscriber"
@@ -35,7 +37,7 @@ class LimitScope(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """Messages and bytes in a second; 0 is unlimited."""
+    """Messages and bytes per second; 0 means unlimited."""
 
     messages: float = 0.0
     bytes: float = 0.0
@@ -52,7 +54,7 @@ class Rate:
         return ", ".join(parts) or "no limit"
 
     def strictest(self, other: "Rate") -> "Rate":
-        """Return the lower limit of each unit."""
+        """Return the lower limit of messages and the lower limit of bytes."""
         return Rate(_lower(self.messages, other.messages), _lower(self.bytes, other.bytes))
 
 
@@ -68,7 +70,7 @@ _LINES = 1000
 
 @dataclass(frozen=True, slots=True)
 class Clause:
-    """One limit of a line: of the nodes on hosts with one of these atoms (None: on every host)."""
+    """One limit of a line. It applies to nodes on hosts with one of `atoms` (None: on all hosts)."""
 
     part: LimitScope
     atoms: frozenset[Atom] | None
@@ -84,7 +86,7 @@ class LimitRule:
     clauses: tuple[Clause, ...]
 
     def rate(self, part: LimitScope, atoms: frozenset[Atom]) -> Rate:
-        """Return the strictest limit among the clauses for this part of a host with these atoms."""
+        """Return the strictest limit among the clauses for this scope that apply to a host with these atoms."""
         rate = NO_LIMIT
         for clause in self.clauses:
             if clause.part is part and (clause.atoms is None or not clause.atoms.isdisjoint(atoms)):
@@ -109,12 +111,12 @@ class LimitTable:
             self._tree.add(rule.key, rule)
 
     def find(self, topic: str) -> LimitRule | None:
-        """Return the line for a topic, if there is one."""
+        """Return the line for a topic, or None."""
         return (self._tree.find(topic) or self._default) if self.rules else None
 
 
 def read_limits(section: SectionText | None, file: str, groups: HostGroups, findings: Findings) -> LimitTable:
-    """Return the lines of the section; wrong parts are noted in `findings` and left out."""
+    """Return the lines of the section. Invalid parts are left out and reported in `findings`."""
     table = LimitTable()
     first_lines: dict[str, int] = {}
     patterns: list[tuple[Key, int]] = []
@@ -139,7 +141,7 @@ def read_limits(section: SectionText | None, file: str, groups: HostGroups, find
 
 
 def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key | None:
-    """Return the parsed key; None for `default` and (with an error noted) for a bad one."""
+    """Return the parsed key. Return None for `default`, and for an invalid key, which is reported as an error."""
     if word.text == DEFAULT:
         return None
     try:
@@ -158,7 +160,7 @@ def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key
 
 
 def _clauses(entry: Entry, groups: HostGroups, findings: Findings) -> Iterator[Clause]:
-    """Yield the clauses of a line; each begins with the word for its part."""
+    """Yield the clauses of a line; each begins with the word for its scope."""
     parts: list[tuple[Word, list[Word]]] = []
     for word in entry.values:
         if word.text in _PARTS:
@@ -194,7 +196,7 @@ def _clause(part: Word, words: list[Word], groups: HostGroups, findings: Finding
 
 
 def _rate(part: Word, words: list[Word], findings: Findings) -> Rate | None:
-    """Parse numbers with their units, in one word or two; return None with an error noted."""
+    """Parse numbers with units, such as `5Hz` or `5 Hz`. Report an error and return None if they are invalid."""
     found: dict[str, float] = {}
     words = list(words)
     while words:

@@ -1,14 +1,15 @@
-"""The rights that a call needs; only this module knows which rules must grant it.
+"""List the rights that a call needs. Only this module knows which rules must grant a call.
 
-RVMaster's gate, the revocation of live rights, `explain`, the cases beside a policy, `diff` and `learn` all use it, so
-that none of them can allow what another denies. `rights_of_call` returns the rights of a whole call, `rights_of` those
-of a deed that a person names (`publish /cmd_vel`), `decide` makes one decision of them.
+RVMaster's gate, the revocation of live rights, `explain`, test cases, `diff` and `learn` all use this module, so they
+cannot contradict each other. `rights_of_call` returns the rights of a whole call. `rights_of` returns the rights of an
+action that a person names (`publish /cmd_vel`). `decide` makes one decision on several rights.
 
-A right is a question to one section. A call needs all of these:
+A right is a question to one section of the policy. A call needs all of these rights:
 
-1. the deed itself: a topic, a service, or the call as a command;
-2. the command that carries it out, if commands for such deeds have rules (`COMMAND_FOR`);
-3. for a call about a parameter: reading or writing it, what is below it, and what it replaces;
+1. the action itself: access to a topic or service, or the call as a command;
+2. the command that carries out the action, if `COMMAND_FOR` has one;
+3. for a call about a parameter: read or write access to the parameter, to everything below it, and to the parameter
+   that it replaces;
 4. for a call that makes a node part of the graph: the node's name.
 """
 
@@ -25,13 +26,13 @@ from roswire.xmlrpc import Value
 
 _NODE_CATEGORIES = {call.category for call in CALLS.values() if call.node} - {Category.COMMAND}
 COMMAND_FOR = {Category.CALL: "lookupService", Category.READ: "getParam", Category.WRITE: "setParam"}
-"""The command with which a node calls a service, reads and writes a parameter."""
+"""The commands by which a node calls a service, reads a parameter and writes a parameter."""
 
 
 class Right(NamedTuple):
     """One question to the policy.
 
-    `namespace`: the parameter is known to hold others; `alone`: the question leaves out what is below it.
+    `namespace`: the parameter contains other parameters. `alone`: the question excludes everything below the parameter.
     """
 
     request: Request
@@ -45,7 +46,7 @@ class Right(NamedTuple):
 
 
 def request_of(call: str, host: Address, caller_id: str, resource: str) -> Request:
-    """Return the request as which a call is decided: about this topic or service, or else a command."""
+    """Return the request that decides a call: about its topic or service, or otherwise about the command."""
     category = policy_call(call).category
     return Request(host, caller_id, category, call if category is Category.COMMAND else resource)
 
@@ -53,9 +54,10 @@ def request_of(call: str, host: Address, caller_id: str, resource: str) -> Reque
 def rights_of_call(
     request: Request, call: str, key: str | None = None, *, value: Value = None, tree: Tree | None = None
 ) -> list[Right]:
-    """Return all rights that this call needs; `tree` has the present parameters.
+    """Return all rights that this call needs.
 
-    The call is decided as `request`; `key` and `value` are a parameter's.
+    `request` is the request that decides the call (`request_of`). `key` and `value` are the key and the new value of
+    its parameter. `tree` is the present parameter tree.
     """
     row = policy_call(call)
     if key is None or row.touches is None:
@@ -69,13 +71,16 @@ def rights_of_call(
 
 
 def rights_to_keep(request: Request, call: str, resource: str, *, namespace: bool) -> list[Right]:
-    """Return all rights needed to keep what this call gave; `namespace`: a parameter that holds others."""
+    """Return all rights that a host needs to keep the live right that this call gave.
+
+    `namespace`: the resource is a parameter that contains other parameters.
+    """
     touch = policy_call(call).touches
     return rights_of(request, [] if touch is None else [Right(_of(request, touch, resource), namespace)])
 
 
 def rights_of(request: Request, touched: Iterable[Right] = ()) -> list[Right]:
-    """Return all rights that a deed needs, with those on what it touches."""
+    """Return all rights that an action needs, including `touched`, the rights on its parameters."""
     rights = [Right(request)]
     if (command := COMMAND_FOR.get(request.category)) is not None:
         rights.append(Right(_of(request, Category.COMMAND, command)))
@@ -86,24 +91,24 @@ def rights_of(request: Request, touched: Iterable[Right] = ()) -> list[Right]:
 
 
 def right_to_read(request: Request, value: Value) -> Right:
-    """Return the right to learn that a parameter has this value."""
+    """Return the right to learn the value of a parameter."""
     return Right(request, namespace=holds_others(value))
 
 
 def right_to_find(request: Request) -> Right:
-    """Return the right to learn that a parameter of this name exists, and nothing of those below it."""
+    """Return the right to learn that a parameter exists, without the right on anything below it."""
     return Right(request, alone=True)
 
 
 def needs_node(request: Request) -> bool:
-    """Whether the deed makes a node part of the graph, so that `[Nodes]` decides as well."""
+    """Whether the action makes a node part of the graph, so that `[Nodes]` also decides."""
     if request.category is Category.COMMAND:
         return policy_call(request.resource).node
     return request.category in _NODE_CATEGORIES
 
 
 def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
-    """Return one decision on all rights: the first denial, else the first audit-only pass, else that of the deed."""
+    """Return one decision on all rights: the first denial, otherwise the first audit-only pass, otherwise the first."""
     first, *others = rights
     verdict = decide_right(policy, first)
     for right in others:
@@ -111,7 +116,7 @@ def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
             break
         category = right.request.category
         if category in PARAMETERS and not policy.has_section(category):
-            continue  # without the section, parameters are free
+            continue  # without the section, all access to parameters is allowed
         decision = decide_right(policy, right)
         if not decision.allowed or (decision.would_deny and not verdict.would_deny):
             verdict = replace(decision, needs=str(right))
@@ -119,7 +124,7 @@ def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
 
 
 def decide_right(policy: Policy, right: Right) -> Decision:
-    """Return the answer to one question."""
+    """Return the decision on one right."""
     if right.request.category in PARAMETERS and not right.alone:
         return policy.decide_parameter(right.request, namespace=right.namespace)
     return policy.decide(right.request)

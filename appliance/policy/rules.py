@@ -1,4 +1,4 @@
-"""Compile the lines of the deciding sections into rule tables, and note their mistakes."""
+"""Compile the lines of the deciding sections into rule tables, and report their mistakes."""
 
 from appliance.base.validation_messages import meant
 from appliance.policy import commands
@@ -11,7 +11,7 @@ from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import DEFAULT, PARAMETERS, Decider
 
 MAXIMUM_INNER_STARS = 1000
-"""Most keys with a star before the end, in all sections: they make the look-up of a name branch."""
+"""The most keys with a star before the end, in all sections together. Such keys make the search for a name branch."""
 
 
 class RuleCompiler:
@@ -56,7 +56,7 @@ class RuleCompiler:
             )
 
     def _fits(self, category: Category, key: Key, name: Word) -> bool:
-        """Whether a pattern ties with none before it, within the number of patterns."""
+        """Whether a pattern can be added: it ties with no earlier pattern, and there are not too many patterns."""
         self._inner_stars += key.inner_star
         if self._inner_stars > MAXIMUM_INNER_STARS:
             text = f"more than {MAXIMUM_INNER_STARS} keys have a star before the end, such as /*/state: use fewer"
@@ -93,7 +93,7 @@ class RuleCompiler:
         return category, Word(name, entry.key.line, entry.key.column + len(verb) + 1)
 
     def _key(self, category: Category, name: Word) -> Key | None:
-        """Return the parsed key; None for `default` and (with an error noted) for a bad one."""
+        """Return the parsed key. Return None for `default`, and for an invalid key, which is reported as an error."""
         if name.text == DEFAULT:
             return None
         if category is Category.COMMAND:

@@ -1,4 +1,4 @@
-"""The sections of a policy file, one row each; to add one, add its row."""
+"""The table of sections of a policy file. To add a section, add a row."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,10 +8,10 @@ from appliance.policy.model import Category
 
 @dataclass(frozen=True, slots=True)
 class Decider:
-    """A section that decides requests. `phrases` has its categories, with the words before the name of the resource.
+    """A section that decides requests. `phrases` maps its categories to the words before a resource in messages.
 
-    A missing `extension` section grants everything to all hosts (the thesis does not have these sections); any other
-    missing section grants nothing.
+    The sections with `extension` are not in the thesis: if one is missing, its requests are allowed for all hosts. If
+    another section is missing, its requests are denied.
     """
 
     name: str
@@ -20,7 +20,7 @@ class Decider:
 
     @property
     def categories(self) -> tuple[Category, ...]:
-        """Return the categories that it decides."""
+        """Return the categories that the section decides."""
         return tuple(self.phrases)
 
 
@@ -41,10 +41,10 @@ DECIDERS = (
 BY_CATEGORY = {category: decider for decider in DECIDERS for category in decider.categories}
 
 PARAMETERS = frozenset({Category.READ, Category.WRITE})
-"""The categories whose resources are keys of parameters."""
+"""The categories of access to parameters."""
 
 DEFAULT = "default"
-"""The key for names that no other key of a section matches."""
+"""The key that applies to names without another matching key in the section."""
 
 GROUPS, PORTS, MONITOR, LIMITS, OPTIONS = "Groups", "Ports", "Monitor", "Limits", "Options"
 
