@@ -1,1 +1,1 @@
-"""The control process: it decides requests, holds the state, and answers operators."""
+"""The control process. It decides requests, stores the state, and answers operators."""

@@ -1,4 +1,4 @@
-"""Answer operators' tools on the admin socket."""
+"""Answer the requests of operators' tools on the admin socket."""
 
 import asyncio
 import contextlib
@@ -26,7 +26,7 @@ class AdminServer:
         self._decoder = msgspec.json.Decoder(admin.AnyRequest)
 
     async def start(self, sock: socket.socket) -> asyncio.Server:
-        """Serve the listening socket; the caller must keep a reference to the returned server."""
+        """Serve the listening socket. The caller must keep a reference to the returned server."""
         return await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -54,7 +54,7 @@ class AdminServer:
 
 
 def _given_up(writer: asyncio.StreamWriter) -> bool:
-    """Whether the client closed the connection or its sending side, which withdraws its request."""
+    """Whether the client closed the connection or its sending side. If so, its request is withdrawn."""
     if writer.is_closing():
         return True
     found = select.poll()

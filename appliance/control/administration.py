@@ -1,7 +1,7 @@
 """Carry out operators' orders and queries, from the admin socket and from REST.
 
-Both send a request of `appliance.channel.admin` and get its answer from the method that is marked with `answers` for
-this request. To add a request, define it with its row of the table of operations, and write such a method.
+Each request is a class in `appliance.channel.admin`. The method that is marked with `answers` for this class answers
+the request. To add a request, define its class with a row in the table of operations, and write such a method.
 """
 
 from collections.abc import Awaitable, Callable
@@ -37,7 +37,7 @@ from appliance.specifications.specification_manager import (
 )
 from appliance.store.writer_thread import StoreError
 
-# The first matching class is used.
+# The first matching exception class is used.
 _TROUBLES: dict[type[Exception], admin.Trouble] = {
     RevisionChangedError: "conflict",
     HostsChangedError: "conflict",
@@ -55,8 +55,8 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     NotSealedError: "failed",
     StoreError: "failed",
 }
-# Requests that are rejected if their effect cannot be stored. A revocation takes effect at once, and its answer reports
-# if it is not stored. The recorder checks its own disk space.
+# Requests that are rejected if the store cannot be written. A revocation is not in the list: it takes effect at once,
+# and its answer reports if it was not stored. The recorder checks its own disk space.
 KEPT = (admin.CHANGES | {admin.TokenAdd, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed}) - {
     admin.HostRevoke, admin.TokenRevoke, admin.RecordNow, admin.RecordingOfMemory, admin.RecordingRemove
 }  # fmt: skip
@@ -68,7 +68,7 @@ _Method = Callable[..., Awaitable[Any]]
 
 
 class _Taken(NamedTuple):
-    """The method that answers a request; `who`: it takes the author, `orders`: it is not only a query."""
+    """The method that answers a request. `who`: the method takes the author. `orders`: the request is not a query."""
 
     method: _Method
     who: bool
@@ -76,9 +76,9 @@ class _Taken(NamedTuple):
 
 
 class Administration:
-    """The executor of requests; `durable` waits until all records are on disk, or cannot be.
+    """Carry out requests. `durable()` waits until all audit records are on disk, or cannot be written.
 
-    `require_room()` raises `StoreError` if the store cannot be written; requests in `KEPT` are then rejected.
+    `require_room()` raises `StoreError` if the store cannot be written. Requests in `KEPT` are then rejected.
     """
 
     def __init__(
@@ -97,9 +97,10 @@ class Administration:
                 self._methods[mark.request] = _Taken(partial(method, part), mark.who, part is not queries)
 
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
-        """Carry out a request of `who` (the name of a token, or `operator` for the admin socket). An order is in the
-        audit log before it is answered, so that a later search finds it. It is withdrawn if its client gives up before
-        it takes effect (`appliance/base/withdrawal.py`).
+        """Carry out a request of `who`: the name of a token, or `operator` for the admin socket.
+
+        The records of an order are in the audit log before the order is answered, so that a later search finds them. If
+        the client gives up before the order takes effect, the order is withdrawn (`appliance/base/withdrawal.py`).
         """
         answer = await self._answer(request, who)
         if self._methods[type(request)].orders:

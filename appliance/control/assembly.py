@@ -1,4 +1,4 @@
-"""Assemble RVMaster: the core, the endpoints, and on top of both the specifications and the calls."""
+"""Assemble RVMaster from its core, its endpoints, the specifications and the calls."""
 
 from dataclasses import dataclass
 
@@ -44,7 +44,7 @@ class Parts:
 
 
 def assemble(base: Foundation) -> Parts:
-    """Make RVMaster, without serving or running anything yet."""
+    """Make the parts of RVMaster. No part serves or runs yet."""
     core = make_core(base)
     ends = make_endpoints(base, core)
     settings = base.settings

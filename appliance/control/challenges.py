@@ -1,12 +1,12 @@
 """Issue challenges for signed REST orders, so that each proof is valid once and only for a short time. No I/O.
 
-A challenge is `ENDS.RANDOM.MAC` with a MAC by a key of this process. Invariants:
+A challenge is `ENDS.RANDOM.MAC`; the MAC uses a key of this process. Invariants:
 
 1. Issued challenges are not stored, so requests for challenges cannot exhaust memory.
-2. A challenge is accepted once. Accepted ones are stored until they expire. While `_MOST_TAKEN` are stored, no others
-   are accepted.
-3. A new process has a new key, so an order signed before a restart is rejected after it.
-4. Expiry uses this process's monotonic clock, independent of the client's clock and the machine's date.
+2. A challenge is accepted once. Accepted challenges are stored until they expire. While `_MOST_TAKEN` challenges are
+   stored, no further challenge is accepted.
+3. A new process has a new key, so an order that was signed before a restart is rejected after the restart.
+4. Challenges expire by this process's monotonic clock. The client's clock and the machine's date do not matter.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ class Challenges:
 
     def __init__(self) -> None:
         self._key = secrets.token_bytes(32)
-        self._taken: dict[str, float] = {}  # with their ends
+        self._taken: dict[str, float] = {}  # accepted challenges, with the time at which they expire
 
     def give(self, now: float) -> str:
         """Return a new challenge, valid for `SECONDS`."""

@@ -1,8 +1,11 @@
-"""Check whether the times of records are credible, for status, metrics and the log. Nothing is blocked.
+"""Check whether the times of audit records are credible, for status, metrics and the log. Nothing is blocked.
 
-Four conditions are checked: no time service keeps the machine's clock (the supervisor reports that); the clock is
-before the log's last record, because it was set back, perhaps while the appliance was off; the clock advanced more than
-the elapsed time; the clock is before the date of this program.
+Four conditions are reported:
+
+1. No time service synchronises the machine's clock. The supervisor checks this condition.
+2. The clock is before the last record of the log, because it was set back, perhaps while the appliance was off.
+3. The clock advanced by more than the elapsed time.
+4. The clock is before the date of this program's files.
 """
 
 import asyncio
@@ -18,7 +21,10 @@ _STEP_SECONDS = 2.0  # smaller steps are normal corrections of a time service
 
 
 class ClockCheck:
-    """The check of the clock, which records each change once. `behind()`: seconds before the last record, or 0."""
+    """Check the clock, and record each change once.
+
+    `behind()` returns how many seconds the clock is behind the last record, or 0.
+    """
 
     def __init__(
         self,
@@ -26,7 +32,7 @@ class ClockCheck:
         behind: Callable[[], float],
         started: Callable[[], float] = lambda: time.time() - time.clock_gettime(time.CLOCK_BOOTTIME),
     ) -> None:
-        """Begin; `started()` is the start of the machine by its present clock (seconds since the epoch)."""
+        """Begin the check. `started()` returns the machine's start by its present clock, in seconds since the epoch."""
         self._trail = trail
         self._behind = behind
         self._synchronised: bool | None = None
@@ -35,7 +41,7 @@ class ClockCheck:
         self._seen = started()
 
     def synchronisation_reported(self, synchronised: bool | None) -> None:
-        """Record a change in the supervisor's report of the time service; None if that is unknown."""
+        """Record whether the supervisor found a time service that synchronises the clock (None: unknown)."""
         before, self._synchronised = self._synchronised, synchronised
         if synchronised is False and before is not False:
             self._trail.happened(

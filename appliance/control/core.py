@@ -1,4 +1,4 @@
-"""Make the core of RVMaster, which decides calls and changes the graph, but sends nothing."""
+"""Make the core of RVMaster. The core decides calls and changes the graph, but sends no messages."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from appliance.specifications.specification_manager import SpecificationManager
 
 @dataclass(frozen=True, slots=True)
 class Core:
-    """The core of RVMaster. `policy()` is the policy in force; `monitors` is set once the specifications are made."""
+    """The core of RVMaster. `policy()` returns the policy in force; `monitors` is set once specifications load."""
 
     policy: Callable[[], Policy]
     registry: Registry

@@ -28,7 +28,7 @@ from appliance.specifications.specification_manager import ALLOCATION
 
 @dataclass(frozen=True, slots=True)
 class Endpoints:
-    """The endpoints. `handler` is set once calls can be served, and returns the handler of a node's proxy endpoint."""
+    """The endpoints. `handler()` returns the handler of a node's proxy endpoint; it is set once calls can be served."""
 
     places: NodePorts
     addresses: AdvertisedAddresses
@@ -44,7 +44,7 @@ class Endpoints:
 
 
 def make_endpoints(base: Foundation, core: Core) -> Endpoints:
-    """Make the endpoints, without serving or running anything yet."""
+    """Make the endpoints. They do not serve yet."""
     settings, policies, handler = base.settings, base.policies, Current[Callable[[Incarnation], Handler]]()
     places = NodePorts(
         settings.listen_address[0],

@@ -29,7 +29,7 @@ class EvidenceOrders:
 
     @admin.answers(admin.EvidenceExported, who=True)
     async def exported(self, request: admin.EvidenceExported, who: str) -> Sealed:
-        """Record an exported bundle; return the id of the record once a signed checkpoint seals it."""
+        """Record an exported bundle. Once a signed checkpoint seals the record, return its id."""
         record = self._trail.happened(
             "evidence exported",
             f"{request.records} records were exported as evidence",

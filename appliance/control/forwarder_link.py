@@ -1,4 +1,4 @@
-"""Handle the reports of the log's forwarder, for status, metrics, and the audit log."""
+"""Handle the reports of the audit log's forwarder, for status, metrics and audit records."""
 
 import asyncio
 
@@ -10,11 +10,11 @@ from appliance.channel.link import Link
 from appliance.configuration.settings import Syslog
 from appliance.telemetry.audit_trail import AuditTrail
 
-_PATIENCE_SECONDS = 10.0  # the restart of a receiver is not recorded
+_PATIENCE_SECONDS = 10.0  # a shorter failure, such as the restart of a receiver, is not recorded
 
 
 class ForwarderLink:
-    """The link to the forwarder, with its last report; `wanted` is its configuration."""
+    """The link to the forwarder, and its last report. `wanted` is the configuration of the forwarder."""
 
     def __init__(self, wanted: Syslog, trail: AuditTrail) -> None:
         self._wanted = wanted
@@ -25,7 +25,7 @@ class ForwarderLink:
         self._failure_recorded = False
 
     def status(self) -> ForwardingState | None:
-        """Return the state for `rosrv status` and the metrics; None if the log is not to be forwarded."""
+        """Return the state for `rosrv status` and the metrics, or None if no forwarding is configured."""
         if self._wanted.to is None:
             return None
         report = self._report or messages.ForwardingReported()

@@ -44,7 +44,7 @@ _HOSTS_IN_RESERVE = AUDIT_RESERVE.bounds.whole // AUDIT_RESERVE.bounds.host
 
 
 class Current(Generic[T]):
-    """A value that is set after its readers are made; calling this object returns the current value."""
+    """A value that is set after its readers are made. Call this object to get the value."""
 
     def __init__(self) -> None:
         self._values: list[T] = []
@@ -67,7 +67,7 @@ class Current(Generic[T]):
 class Foundation:
     """The durable state, the policy and the listeners.
 
-    `enforcement` gets its value later; `parameters_dirty` is set when the mirror of the parameters has changed.
+    `enforcement` gets its value later. `parameters_dirty` is set whenever the mirror of the parameters changes.
     """
 
     settings: Settings
@@ -102,7 +102,9 @@ async def make_foundation(
     *,
     restarted: bool,
 ) -> Foundation:
-    """Open the log and the store, read the policy and listen. Set `tunnels` before the supervisor reports about them.
+    """Open the log and the store, read the policy and open the listeners.
+
+    `tunnels` is set here, before the supervisor can report about tunnels.
 
     Raises `PolicyRefusedError`, `StoreError`, and `OSError` if an address is in use.
     """
@@ -120,7 +122,8 @@ async def make_foundation(
     store = StateStore(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
-    # Start tunnels before the policy, which names hosts: their addresses are valid once clear text is blocked.
+    # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
+    # start the tunnels before the policy.
     table = HostTable(store, settings.ipsec.pool, DeclaredHosts(settings.hosts))
     tunnels.set(Tunnels(table, trail, authority, listen=settings.listen_address, say=lifeline.say))
     await tunnels().start()
@@ -160,7 +163,7 @@ async def make_foundation(
 
 
 def _open_listeners(settings: Settings, lifeline: ControlLifeline) -> dict[str, socket.socket]:
-    """Return the listeners by name; those that the supervisor did not keep are opened."""
+    """Return the listeners by name. Listeners that the supervisor did not keep are opened."""
     host, port = settings.listen_address
     sockets = lifeline.sockets
     for name, address in ((RVMASTER, (host, port)), (INNER, ("127.0.0.1", 0)), (OWN, ("127.0.0.1", 0))):
@@ -177,7 +180,7 @@ def _open_listeners(settings: Settings, lifeline: ControlLifeline) -> dict[str, 
 
 
 def _log_held(lifeline: ControlLifeline) -> Callable[[list[int]], None]:
-    """Return a thread-safe function that reports the processes that lock the log to the supervisor."""
+    """Return a thread-safe function that tells the supervisor which processes lock the log."""
     loop = asyncio.get_running_loop()
 
     def report(processes: list[int]) -> None:
@@ -199,7 +202,7 @@ def _open_audit(
     )
 
     def class_of_text(host: str) -> QuotaClass:
-        # Until the policy is read, all hosts count as named.
+        # Before the policy is read, all hosts count as named.
         return quota_class().of_text(host) if quota_class else QuotaClass.NAMED
 
     return AuditLog(

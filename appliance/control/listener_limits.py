@@ -1,7 +1,7 @@
-"""The limits of control's listeners, and the hosts that they serve: RVMaster's, peer-side and master-side endpoints.
+"""Limit the listeners of control: RVMaster, and the peer-side and master-side proxy endpoints.
 
-An unknown host (an address that no rule of the policy names) is refused after the beginning of its body, which names
-the call. While the ROS master is not hidden, every host is refused.
+An unknown host (an address that no rule of the policy names) is refused. The beginning of its body is read first, to
+record the name of the call. While the ROS master is not hidden, every host is refused.
 """
 
 import asyncio
@@ -29,7 +29,10 @@ from roswire.xmlrpc import XmlRpcLimits, build_fault
 
 
 class ListenerLimits:
-    """The limits and connections of all listeners; `policy()` is in force, `quota_class` classifies hosts."""
+    """The limits and connections of all listeners.
+
+    `policy()` returns the policy in force; `quota_class(host)` returns the quota class of a host.
+    """
 
     def __init__(
         self,
@@ -73,7 +76,7 @@ class ListenerLimits:
         at_once: AtOnce = not_at_once,
         keep: bool = True,
     ) -> None:
-        """Serve a listener. Without `guarded`, only the appliance's own processes can reach it."""
+        """Serve a listener. `guarded` is false for a listener that only the appliance's own processes can reach."""
         server = self.server(sock.dup(), handler, guarded=guarded, at_once=at_once, keep=keep)
         self._servers.append(server)
         await server.start()
@@ -87,7 +90,7 @@ class ListenerLimits:
         at_once: AtOnce = not_at_once,
         keep: bool = True,
     ) -> HttpServer:
-        """Return a server that shares the limits of all listeners; the caller starts and closes it."""
+        """Return a server that shares the limits of all listeners. The caller must start and close the server."""
         return HttpServer(
             sock,
             handler,
@@ -112,11 +115,11 @@ class ListenerLimits:
             server.close()
 
     def refuse(self, peer: Peer) -> Refusal | None:
-        """Return the refusal for a peer that is not served, or None."""
+        """Return the refusal for a peer, or None if the peer is served."""
         if self._unhidden:
             fault = build_fault(1, f"the appliance does not serve nodes: {self._unhidden}")
             return lambda _beginning: fault
-        # The rosout aggregator calls from this machine, which the policy need not name.
+        # The rosout aggregator calls from this machine. The policy need not name this machine.
         if peer.here or self._policy().knows(peer.host):
             return None
         return partial(self._refuse_unknown, peer)
@@ -142,7 +145,7 @@ class ListenerLimits:
         self._trail.happened("limit exceeded", reason, decision="deny", host=peer.text)
 
     def probed(self, reason: str) -> None:
-        """Handle the supervisor's probe of whether the ROS master is hidden; `reason` is empty if it is."""
+        """Handle the result of the supervisor's probe. `reason` is empty if the ROS master is hidden."""
         if bool(reason) != bool(self._unhidden):
             event = "probe failed" if reason else "probe passed"
             self._trail.happened(event, reason or "the ROS master is hidden")
@@ -166,9 +169,10 @@ _UNKNOWN, _ANYBODY = "unknown hosts", "hosts with a registration, by *"
 
 
 def class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) -> str:
-    """Return the class that is charged for a host's processor time: the address or network that the policy names.
+    """Return the class that is charged for a host's processor time.
 
-    Hosts can have many addresses: all that only `*` names are one class, and those with a registration another.
+    The class is the address or network that the policy names. A host can have many addresses, so all hosts that only
+    `*` names share one class, or a second one if they have a registration.
     """
     if host.is_loopback or policy().names(host):
         return policy().alike(host)
@@ -178,9 +182,9 @@ def class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) 
 def connection_class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) -> QuotaClass:
     """Return a host's quota class for connections.
 
-    Hosts that only `*` names share processor time as one host, so their connections must not use the quotas of hosts
-    that the policy names. Without a registration they count as unknown, and with one as named: any host that `*` names
-    can register a node, so the part for registered hosts is kept for those that the policy names.
+    Hosts that only `*` names share processor time as one host. So their connections must not use up the quotas of hosts
+    that the policy names. Without a registration, they count as unknown; with a registration, as named. Any of these
+    hosts can register a node, so they do not get the part for registered hosts.
     """
     found = class_of(policy, quota_class, host)
     if found == _UNKNOWN:
@@ -188,7 +192,8 @@ def connection_class_of(policy: Callable[[], Policy], quota_class: ClassOf, host
     return QuotaClass.NAMED if found == _ANYBODY else quota_class(host)
 
 
-# The appliance's own nodes and the ROS master share one address, and other hosts cannot reach their listeners.
+# The bounds for the appliance's own nodes and the ROS master: they share one address, and no other host can reach their
+# listeners.
 _FOR_ONE, _BYTES_FOR_ONE, _SLOTS_FOR_ONE = (
     Bounds(whole=bounds.whole, host=bounds.whole, unknown=0, kept=0)
     for bounds in (RVMASTER_CONNECTIONS.bounds, RVMASTER_BYTES.bounds, RVMASTER_REQUESTS.bounds)

@@ -1,4 +1,4 @@
-"""Collect the measurements of control, which the api formats for Prometheus."""
+"""Collect the measurements of control. The api formats them for Prometheus."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -14,7 +14,7 @@ from appliance.policy.model import Category
 from appliance.specifications.records import KINDS
 from appliance.telemetry.metrics import Meter
 
-MOST_DELAYED = 200  # topics with a histogram of their own
+MOST_DELAYED = 200  # the most topics that have their own histogram
 
 _Labels = tuple[str, str]
 _Number = TypeVar("_Number", int, float)
@@ -28,8 +28,8 @@ def measures_of(
 ) -> Measures:
     """Return the status, the counters of requests, and the present state of registry and relay.
 
-    At most `MOST_RESOURCES` topics and services are named (histograms: `MOST_DELAYED`); the rest are summed in
-    `OTHERS`.
+    At most `MOST_RESOURCES` topics and services have their own values (histograms: `MOST_DELAYED`). All others are
+    summed in `OTHERS`.
     """
     lives = Counter(incarnation.life for incarnation in parts.core.registry.all() if not incarnation.own)
     kinds = Counter(
@@ -74,7 +74,7 @@ def _at(counts: Mapping[_Labels, int], kind: str) -> dict[str, int]:
 
 
 def carried_of(carried: RelayTraffic) -> tuple[dict[str, list[int]], dict[str, list[float]]]:
-    """Return traffic and delays of each topic and service since control started, summed over all incarnations."""
+    """Return the traffic and delays of topics and services since control started, summed over all incarnations."""
     rows: list[tuple[str, Traffic]] = [*carried.past.items()]
     rows += [(resource, traffic) for (_key, resource), traffic in carried.traffic.items()]
     return by_resource((name, (row.messages, row.bytes, row.dropped)) for name, row in rows), by_resource(
@@ -83,14 +83,14 @@ def carried_of(carried: RelayTraffic) -> tuple[dict[str, list[int]], dict[str, l
 
 
 def from_zero(counts: Mapping[_Labels, int], expected: Iterable[_Labels]) -> dict[_Labels, int]:
-    """Return the counts, with 0 for events that did not happen yet: a Prometheus counter must start at 0."""
+    """Add 0 for events that have not happened yet, because a Prometheus counter must start at 0."""
     return dict.fromkeys(expected, 0) | dict(counts)
 
 
 def by_resource(
     rows: Iterable[tuple[str, tuple[_Number, ...]]], most: int = MOST_RESOURCES
 ) -> dict[str, list[_Number]]:
-    """Return the sums of each resource's rows: the first `most` resources by name, the rest as `OTHERS`."""
+    """Return the sum of the rows of each resource; all but the first `most` by name are summed in `OTHERS`."""
     sums: dict[str, list[_Number]] = {}
     for resource, values in rows:
         name = resource if resource in sums or len(sums) < most else OTHERS

@@ -14,7 +14,7 @@ from appliance.specifications.specification_manager import SpecificationManager
 
 
 def monitors_of(monitors: SpecificationManager, rv_state: list[object], *, texts: bool) -> answers.Monitors:
-    """Return all monitors with state and counters; with `texts`, also the specifications."""
+    """Return all monitors with state and counters. With `texts`, also return the specifications."""
     return answers.Monitors(
         revision=monitors.revision,
         tag=monitors.tag,
@@ -87,7 +87,7 @@ def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
 
 
 def published_now(registry: Registry, traffic: Mapping[tuple[str, str], Traffic]) -> Published:
-    """Return the nodes that publish each topic, with their types, except the appliance's own nodes."""
+    """Return the nodes that publish each topic, with their types; omit the appliance's own nodes."""
     found: dict[str, dict[str, LiveType]] = {}
     for kind, topic, nodes in registry.resources():
         if kind is Kind.PUBLICATION:

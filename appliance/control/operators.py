@@ -1,4 +1,4 @@
-"""Make the parts for operators: hosts and tunnels, tokens, queries and orders, on the admin socket and over REST."""
+"""Make the parts that serve operators on the admin socket and over REST: tunnels, tokens, queries and orders."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -34,7 +34,7 @@ class Operators:
 
 
 def make_operators(base: Foundation, parts: Parts) -> Operators:
-    """Make the parts that serve operators. The specifications must be loaded before."""
+    """Make the parts that serve operators. The specifications must already be loaded."""
     settings, trail, ends = base.settings, base.trail, parts.endpoints
     certification = Certification(
         base.store,

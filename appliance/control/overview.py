@@ -1,6 +1,6 @@
 """Describe the graph for operators: nodes, topics, services, connections, traffic.
 
-All values are a snapshot of the registry and the relay's reports, without the appliance's own nodes.
+All values are a snapshot of the registry and the relay's reports. The appliance's own nodes are left out.
 """
 
 from msgspec.structs import asdict

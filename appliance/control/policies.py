@@ -1,10 +1,10 @@
-"""Keep the policy in force: load it, store revisions, roll back, and limit the time of an unconfirmed change.
+"""Manage the policy in force: load it, store revisions, roll back, and limit the time of an unconfirmed change.
 
-A new policy is checked, run against its own tests and compiled before it takes effect; an invalid one changes nothing,
-and all findings are reported. Every policy that came into force is a revision in the store.
+A new policy is compiled and tested before it takes effect. An invalid policy changes nothing, and all findings are
+reported. The store keeps every policy that came into force as a revision.
 
-Operators' changes are made one at a time; a change for another revision than the one in force is rejected. A change is
-answered when it is on disk and the relays have carried it out: revoked traffic no longer passes.
+Operators' changes are made one at a time. A change that expects a revision other than the one in force is rejected. A
+change is answered once it is on disk and the relays have carried it out: revoked traffic no longer passes.
 """
 
 import asyncio
@@ -58,14 +58,14 @@ def _error_text(error: OSError | UnicodeDecodeError) -> str:
 
 
 class RevisionChangedError(Exception):
-    """The revision in force is not the one that the change is for; the message has both numbers."""
+    """The revision in force is not the revision that the change expects; the message has both numbers."""
 
     def __init__(self, expected: int, found: int) -> None:
         super().__init__(f"revision {found} is in force, not {expected}: read it before you change it")
 
 
 class Policies(Revisions[RevisionRow]):
-    """The policy in force with its revisions; it answers the requests about them."""
+    """The policy in force and its revisions. The marked methods answer requests about them."""
 
     refusal = PolicyRefusedError
     outdated = RevisionChangedError
@@ -82,10 +82,11 @@ class Policies(Revisions[RevisionRow]):
         carried_out: Callable[[], Awaitable[None]],
         site_keys: Sequence[str],
     ) -> None:
-        """Prepare; `hosts()` returns the addresses for `host:NAME`; call `hosts_changed` when they change.
+        """Prepare; `start` brings a policy into force.
 
+        `hosts()` returns the addresses for `host:NAME`; the owner calls `hosts_changed` when they change.
         `changed(before, policy)` decides all live rights again, and returns the number of revocations. `carried_out()`
-        waits until the relays have carried out all orders. With `site_keys`, one of them must sign every policy.
+        waits until the relays have carried out all orders. With `site_keys`, one of these keys must sign every policy.
         """
         nothing = RevisionRow(0, "", "", 0.0, "", "")
         super().__init__(store, store.revisions, store.save_revision, nothing, "confirm")
@@ -114,10 +115,11 @@ class Policies(Revisions[RevisionRow]):
             return True
 
     def start(self, *, restarted: bool) -> None:
-        """Bring a policy into force at start. Raises `PolicyRefusedError`.
+        """Bring a policy into force at the start of control. Raises `PolicyRefusedError`.
 
-        After a crash of control (`restarted`) it is the policy that was in force. At the appliance's start it is the
-        file, unless an operator's own revision (a rollback, REST) was in force when the appliance stopped.
+        After a crash of control (`restarted`), this is the policy that was in force. At the start of the appliance, it
+        is the file. Exception: if an operator's own revision (from a rollback or REST) was in force when the appliance
+        stopped, this revision is used.
         """
         if self._find_last(restarted=restarted):
             last = self.in_force
@@ -137,7 +139,7 @@ class Policies(Revisions[RevisionRow]):
 
     @contextlib.asynccontextmanager
     async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
-        """Surround an operator's change; at the end wait until it is on disk and carried out."""
+        """Run an operator's change exclusively, then wait until it is on disk and carried out."""
         async with super()._changing(expected):
             yield
             await self.store.settled()
@@ -147,8 +149,8 @@ class Policies(Revisions[RevisionRow]):
     async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
         """Read the file again: check, test and load it, and decide all live rights again.
 
-        The author of the revision is always `disk`; `who` is only recorded. Raises `PolicyRefusedError`, and
-        `RevisionChangedError` if another revision came into force in between.
+        The author of the revision is always `disk`; `who` is only recorded. Raises `PolicyRefusedError`. Raises
+        `RevisionChangedError` if another revision came into force in the meantime.
         """
         by, within = DISK if who == "operator" else who, request.confirm_within
         async with self._changing(request.expected):
@@ -157,10 +159,10 @@ class Policies(Revisions[RevisionRow]):
 
     @admin.answers(admin.PolicyLoad, who=True)
     async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
-        """Bring a given text into force instead of the file, like `reload`.
+        """Bring a given text into force, as `reload` does with the file.
 
-        Loading the same text again makes no new revision. Rules are cited as `revision N:line`, because the file
-        differs. Raises `PolicyRefusedError` and `RevisionChangedError`.
+        Loading the same text again makes no new revision. Messages cite its rules as `revision N:line`, because the
+        file has a different text. Raises `PolicyRefusedError` and `RevisionChangedError`.
         """
         given, within = (request.text, request.signature), request.confirm_within
         async with self._changing(request.expected):
@@ -171,7 +173,7 @@ class Policies(Revisions[RevisionRow]):
             return self._keep(policy, signature, who=who, note=request.note or "posted", within=within)
 
     def hosts_changed(self) -> int:
-        """Compile the policy in force again, because hosts changed; return the number of revocations."""
+        """Compile the policy in force again, because hosts changed. Return the number of revocations."""
         before = self.current
         try:
             self._current = self._judged(before.text, self.in_force.signature, before.file, self.known)
@@ -187,9 +189,9 @@ class Policies(Revisions[RevisionRow]):
             return await self.rollback(request.revision, who=who)
 
     async def rollback(self, revision: int | None, *, who: str) -> Loaded:
-        """Bring a kept revision into force (None: the previous one).
+        """Bring a kept revision into force (None: the previous revision).
 
-        Raises `PolicyRefusedError`, and `RevisionChangedError` if another one came into force while it was read.
+        Raises `PolicyRefusedError`. Raises `RevisionChangedError` if another revision came into force in the meantime.
         """
         row = await self._wanted(revision)
         policy = self._judged(row.text, row.signature, row.file, self.known)
@@ -213,7 +215,7 @@ class Policies(Revisions[RevisionRow]):
 
     @admin.answers(admin.PolicyWanted)
     async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
-        """Return a revision and the context in which its text is checked. Raises `UnknownThingError`."""
+        """Return a revision and the context for checks of its text. Raises `UnknownThingError`."""
         row = await self._kept_revision(self.revision if request.revision is None else request.revision)
         return await asyncio.to_thread(self._text, row, self.known)
 
@@ -241,11 +243,11 @@ class Policies(Revisions[RevisionRow]):
 
     @property
     def known(self) -> PolicyContext:
-        """Return the context of a policy: hosts, robot and site keys."""
+        """Return the present context of policies: hosts, robot and site keys."""
         return PolicyContext(dict(self._hosts()), self._robot, site_keys=self._site_keys)
 
     def with_cases(self, known: PolicyContext) -> PolicyContext:
-        """Return this context with the test cases from the file beside the policy."""
+        """Add the test cases from the file beside the policy to a context."""
         cases = self.file.with_name(f"{self.file.name}.tests.yaml")
         text = error = None
         try:
@@ -259,7 +261,7 @@ class Policies(Revisions[RevisionRow]):
     # --- inside ---
 
     async def _prepared(self, read: Callable[[], tuple[str, str]], file: str, who: str) -> tuple[Policy, str]:
-        """Read, compile and test a policy in a thread, so that it does not delay nodes; return it and its signature."""
+        """Read, compile and test a policy in a thread, without delay for nodes. Return it with its signature."""
         before = self.revision
         try:
             while True:

@@ -1,8 +1,13 @@
-"""Run the control process: start its parts, serve until the supervisor stops it, end them.
+"""Run the control process: start its parts, serve until the supervisor stops the process, end the parts.
 
-The start has this order: receive the listening sockets of an earlier control process; open the log, the store and the
-policy; restore the registry; serve the listeners; register all nodes with the ROS master in the first reconcile round;
-send `Ready`.
+The order of the start:
+
+1. Receive the listening sockets of an earlier control process.
+2. Open the log and the store, and bring the policy into force.
+3. Restore the registry.
+4. Serve the listeners.
+5. Register all nodes with the ROS master, in the first reconcile round.
+6. Send `Ready`.
 """
 
 import asyncio
@@ -38,17 +43,17 @@ from roswire.uris import node_uri
 _log = structlog.get_logger()
 _ADMIN = "admin"
 _SWITCH_SECONDS = 0.0002
-_GARBAGE = 10_000  # objects between two garbage collections: records that wait for the log are not garbage
+_GARBAGE = 10_000  # new objects between two garbage collections; many are waiting records, not garbage
 _SAVE_SECONDS = 1.0
 _TASKS_SECONDS = 0.4
-_CLOSE_SECONDS = 1.2  # for the state and for the log each; the supervisor kills control after three seconds
-_WARNINGS = 100  # of the policy, in `Ready`
+_CLOSE_SECONDS = 1.2  # the limit for the state, and for the log; the supervisor kills control after 3 s
+_WARNINGS = 100  # the most warnings of the policy in `Ready`
 
 
 def main(lifeline_fd: int, config_path: Path) -> None:
     """Run control until the supervisor stops it."""
     settings = load_resolved(config_path)
-    # The longest time that the loop waits for a thread (audit log, store, large values) that runs Python code.
+    # Limit how long the event loop waits for a thread (audit log, store, large values) that runs Python code.
     sys.setswitchinterval(_SWITCH_SECONDS)
     gc.set_threshold(_GARBAGE)
     uvloop.run(_run(settings, lifeline_fd))
@@ -77,7 +82,7 @@ async def _start(
 ) -> "_Control":
     await lifeline.restored.wait()
     if settings.monitors is not None:
-        compiler.call()  # it starts while the policy is read
+        compiler.call()  # the compiler starts while the policy is read
     restarted = RVMASTER in lifeline.sockets
     base = await make_foundation(settings, lifeline, compiler, tunnels, restarted=restarted)
     parts = assemble(base)
@@ -107,14 +112,14 @@ class _Control:
         listener_limits, sockets, inner = base.listener_limits, base.sockets, parts.endpoints.inner
         await listener_limits.open(sockets[RVMASTER], parts.pipeline.handler(parts.table), guarded=True)
         await listener_limits.open(sockets[OWN], parts.pipeline.handler(parts.table, own=True), guarded=False)
-        # Not kept alive: with each call, the ROS master queries the kernel about every connection that it keeps.
+        # Do not keep connections alive: at each call, the ROS master queries the kernel about every open connection.
         await listener_limits.open(
             sockets[INNER], inner.handle, guarded=False, at_once=inner.acknowledge, keep=False
         )
         if base.lifeline.announced:
             operators.tokens.first_token_shown()
         if _ADMIN in sockets:
-            # Keep a reference, otherwise the garbage collector closes it.
+            # Keep a reference, otherwise the garbage collector closes the server.
             self._admin = await AdminServer(operators.administration).start(sockets[_ADMIN].dup())
         base.lifeline.hear(self._messages.heard)
         work: list[Coroutine[Any, Any, None]] = [
@@ -131,7 +136,7 @@ class _Control:
         self._tasks += map(asyncio.get_running_loop().create_task, work)
 
     async def announce(self, *, restarted: bool) -> None:
-        """Send `Ready`, with the first token if it was not shown to an operator yet."""
+        """Send `Ready`. Include the first access token if it was not shown to an operator yet."""
         base, settings = self._base, self._base.settings
         token = await self._operators.tokens.first() if settings.api_address is not None else None
         host = settings.listen_address[0]
@@ -152,7 +157,7 @@ class _Control:
         base.lifeline.say(messages.Ready(detail))
 
     async def end(self) -> None:
-        """Stop serving, and write the state."""
+        """Stop serving, and save the state."""
         base, parts, ends = self._base, self._parts, self._parts.endpoints
         base.listener_limits.close()
         ends.faces.close_all()
@@ -186,7 +191,7 @@ async def _end_others(seconds: float) -> None:
 
 
 async def _restore(base: Foundation, parts: Parts) -> None:
-    """Restore the nodes from before a restart, with their ports and grants, as far as the policy allows."""
+    """Restore the nodes of the earlier control process, with their ports and grants, as far as the policy allows."""
     core, ends = parts.core, parts.endpoints
     for name, sock in base.sockets.items():
         if name.startswith("port:"):
@@ -205,5 +210,5 @@ async def _restore(base: Foundation, parts: Parts) -> None:
             continue
         claimed |= set(incarnation.ports)
     ends.places.close_unclaimed(claimed)
-    # The file may have changed while the appliance was down, or control may have died during a change.
+    # The policy's file may have changed while the appliance was down, or control may have died during a change.
     ends.enforcement.policy_changed(base.policies.current, base.policies.current)

@@ -1,4 +1,4 @@
-"""Answer queries about the appliance: status, graph, live registrations, measurements. They change nothing."""
+"""Answer queries about the appliance: status, graph, live registrations, measurements. Queries change nothing."""
 
 import asyncio
 import time
@@ -45,7 +45,7 @@ LONGEST_LOOK = 10.0
 """The longest time in seconds that a query waits for messages."""
 
 ONE_LOOK = 60.0
-"""The seconds in which all queries of one token for one topic are one record."""
+"""The seconds in which all queries of one token for one topic make only one audit record."""
 
 _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 
@@ -55,7 +55,8 @@ class Queries:
     """The answers to queries.
 
     `audit()`, `clock()` and `recorder()` return the states of the audit log, the machine's clock and the flight
-    recorder; `live()` the rights that a change of the policy may end; `switched_off()` the disabled protection.
+    recorder. `live()` returns the rights that a change of the policy may end. `switched_off()` returns the protection
+    that is switched off.
     """
 
     parts: Parts
@@ -135,7 +136,7 @@ class Queries:
         )
 
     def _record_look(self, topic: str, who: str) -> None:
-        """Record only the first of equal queries within `ONE_LOOK`: a plot in the console polls."""
+        """Record only the first of equal queries within `ONE_LOOK`, because a plot in the console polls."""
         now = time.monotonic()
         for key in [key for key, since in self._shown.items() if now - since >= ONE_LOOK]:
             del self._shown[key]
@@ -165,7 +166,7 @@ class Queries:
 
     def _status(self) -> Status:
         parts, registry, relay = self.parts, self.parts.core.registry, self.parts.endpoints.relay
-        # As in the graph, the appliance's own nodes are not counted.
+        # The appliance's own nodes are not counted; the graph leaves them out also.
         lives = [incarnation.life for incarnation in registry.all() if not incarnation.own]
         named = {
             (registration.kind, registration.resource)

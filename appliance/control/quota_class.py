@@ -11,7 +11,7 @@ from appliance.quotas.pool import QuotaClass
 class HostQuotaClass:
     """The quota class of hosts, by the policy in force and by their registrations.
 
-    `policy()` is the policy in force; `registrations(host)` is the number of a host's registrations.
+    `policy()` returns the policy in force; `registrations(host)` returns the number of a host's registrations.
     """
 
     def __init__(self, policy: Callable[[], Policy], registrations: Callable[[Address], int]) -> None:
@@ -28,7 +28,7 @@ class HostQuotaClass:
         return QuotaClass.UNKNOWN
 
     def of_text(self, host: str) -> QuotaClass:
-        """Return the quota class of a host in a record; a text that is not an address counts as named."""
+        """Return the quota class of a host in an audit record. A text that is not an address counts as named."""
         try:
             return self(address_of(host))
         except ValueError:
@@ -36,7 +36,7 @@ class HostQuotaClass:
 
 
 def charged_to(policy: Policy, host: str) -> str:
-    """Return the name that recordings of a host's acts are charged to (see `recorder.plan`)."""
+    """Return the name to which recordings about a host are charged (see `recorder.recording_plan`)."""
     try:
         address = address_of(host)
     except ValueError:

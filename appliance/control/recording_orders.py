@@ -1,4 +1,4 @@
-"""Pass operators' orders to the flight recorder, and record them and the recorder's reports."""
+"""Pass operators' orders to the flight recorder. Record these orders and the recorder's reports in the audit log."""
 
 import asyncio
 import time
@@ -32,13 +32,14 @@ _M = TypeVar("_M", messages.RecordingStarted, messages.RecordingRemoved, message
 
 
 class RecorderAwayError(Exception):
-    """The recorder does not run, or cannot carry out the order."""
+    """The recorder is not running, or cannot carry out the order."""
 
 
 class RecordingOrders:
     """The link to the recorder. Its methods raise `RecorderAwayError`, `UnknownThingError` and `SenselessError`.
 
-    `in_force()` returns the revisions of policy and specifications. `plan` finds the recording that covers an event.
+    `in_force()` returns the revisions of policy and specifications in force. `plan` finds the recording that covers an
+    event.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class RecordingOrders:
         self._in_force = in_force
         self.link = Link(self._heard)
         self._kept: dict[str, Recording] = {}
-        self._lent: dict[str, Recording] = {}  # temporary recordings of the memory
+        self._lent: dict[str, Recording] = {}  # temporary recordings of the data in memory
         self._begun: str | None = None  # the id of the recording in progress, if it was returned to a client
         self._notes: set[asyncio.Future[None]] = set()
 
@@ -95,7 +96,7 @@ class RecordingOrders:
         return RecordingBegun(begun.id, begun.ends)
 
     async def called(self, call: messages.OwnServiceCalled) -> messages.OwnServiceAnswered:
-        """Begin a recording for a node's service call; the answer has the recording's id, or the reason for none."""
+        """Begin a recording for a node's service call. Answer with its id, or the reason if none was begun."""
         try:
             self._require()
             text = f"{call.caller_id} of {call.host} called {call.service}"
@@ -115,7 +116,7 @@ class RecordingOrders:
     async def _begin(
         self, what: TriggerKind, reason: str, text: str, who: str, span: tuple[float, float], **caller: Any
     ) -> messages.RecordingStarted:
-        """Record who ordered a recording, then begin it; `span` has the seconds before and after now."""
+        """Record who ordered a recording, then begin it. `span` is the number of seconds before and after now."""
         before, after = span
         record = self._trail.happened(
             "recording ordered", reason, who=who, before=before, after=after, **caller
@@ -131,12 +132,12 @@ class RecordingOrders:
 
     @admin.answers(admin.RecordingFetch, who=True)
     async def fetch(self, request: admin.RecordingFetch, who: str) -> Recording:
-        """Record who fetches a recording, whose messages the api reads from the disk."""
+        """Record who fetches a recording. The api reads its messages from the disk."""
         return await self._given_out(request.id, "recording fetched", f"by {who}", who)
 
     @admin.answers(admin.RecordingRead, who=True)
     async def read(self, request: admin.RecordingRead, who: str) -> Recording:
-        """Record who reads messages of a recording; repetitions within seconds are counted."""
+        """Record who reads messages of a recording. Repetitions within a few seconds are only counted."""
         topics = request.topics
         if len(topics) > _MOST_TOPICS or any(len(topic) > _LONGEST_NAME for topic in topics):
             raise SenselessError(f"at most {_MOST_TOPICS} topics at once, of {_LONGEST_NAME} characters each")
@@ -146,7 +147,7 @@ class RecordingOrders:
     async def _given_out(
         self, recording_id: str, event: str, reason: str, who: str, *, reads: bool = False, **detail: Any
     ) -> Recording:
-        """Record who gets the messages of a recording, wait until that is on disk, and return the recording."""
+        """Record who gets the messages of a recording, wait until the record is on disk, and return the recording."""
         self._require()
         recording = self._find(recording_id)
         self._trail.happened(
@@ -166,7 +167,7 @@ class RecordingOrders:
 
     @admin.answers(admin.RecordingOfMemory, who=True)
     async def of_memory(self, request: admin.RecordingOfMemory, who: str) -> Recording:
-        """Return the messages in memory, as a temporary recording."""
+        """Make a temporary recording of the messages in memory."""
         self._require()
         now = time.time_ns()
         since, until = request.since or 0, now if request.until is None else request.until
@@ -212,7 +213,7 @@ class RecordingOrders:
         return known[recording_id]
 
     async def _ask(self, order: Callable[[int], messages.Message], kind: type[_M]) -> _M:
-        """Send an order with a new number; return the recorder's answer, which must be of this kind."""
+        """Send an order with a new number, and return the recorder's answer. The answer must be of this kind."""
         try:
             answer: _M | messages.RecordingRefused = await self.link.ask(order, _PATIENCE_SECONDS)
         except ChannelClosedError:
@@ -263,7 +264,7 @@ class RecordingOrders:
                 self.link.answered(number, message)
 
     def _note(self, recording_id: str) -> None:
-        """Notify the recorder once the record of its report is on disk."""
+        """Once the audit record of the recorder's report is on disk, notify the recorder."""
 
         async def note() -> None:
             if await self._trail.durable() is None:

@@ -1,14 +1,15 @@
 """Carry out the REST requests that the api passes on, one by one, and record REST calls.
 
-Invariants, so that a flooded or compromised api cannot block RVMaster:
+These invariants ensure that a flooded or compromised api cannot block RVMaster:
 
-1. At most `_MOST_WAITING` requests wait; further ones are answered `busy` at once. Between two requests the loop serves
-   nodes. Requests that wait for another process (`WaitingRequest`, at most `_MOST_SLOW`) do not delay others.
-2. An invalid message ends the link, and so does an api that does not read its answers.
-3. REST requests cannot make access tokens, and RVMaster's decisions do not depend on the api.
-4. A request is withdrawn if its client is gone before it takes effect (`appliance/base/withdrawal.py`).
-5. Every request needs a token whose role allows it, and every change needs the client's own request, with its proof if
-   required (`rest_proof.py`). Control itself denies and records all others.
+1. At most `_MOST_WAITING` requests wait; further requests are answered `busy` at once. Between two requests, the event
+   loop serves nodes.
+2. Requests that wait for another process (`WaitingRequest`, at most `_MOST_SLOW`) do not delay other requests.
+3. The link ends if the api sends an invalid message or does not read its answers.
+4. REST requests cannot make access tokens, and RVMaster's decisions do not depend on the api.
+5. A request is withdrawn if its client is gone before the request takes effect (`appliance/base/withdrawal.py`).
+6. Every request needs a token whose role allows it. Every change also needs the client's own HTTP request, with a proof
+   if the settings require it (`rest_proof.py`). Control denies and records all other requests.
 """
 
 import asyncio
@@ -49,15 +50,15 @@ _log = structlog.get_logger()
 _MOST_WAITING = 64
 _TEXT = 300
 _DENIED = (401, 403, 421, 429)
-_METHODS = ("POST", "PUT", "PATCH", "DELETE")  # if rejected, they changed nothing
+_METHODS = ("POST", "PUT", "PATCH", "DELETE")  # a rejected request with one of these methods changed nothing
 _MOST_SLOW = 16
 
 
 class RestLink:
     """The link to the api.
 
-    `served(pin)` is called with the pin by which hosts recognise the api. `require_proof`: a change needs a signed
-    request; a bare token is not enough.
+    `served(pin)` is called with the pin by which hosts recognise the api. `require_proof`: every change needs a signed
+    request, because a bare token is not enough.
     """
 
     def __init__(
@@ -75,14 +76,14 @@ class RestLink:
         self._trail = trail
         self._link = Link(self._received, self._lost)
         self._waiting: deque[RequestMade] = deque()
-        self._withdrawn: dict[int, bool] = {}  # by number, until answered (present link)
-        self._worker: asyncio.Task[None] | None = None  # of the present link
+        self._withdrawn: dict[int, bool] = {}  # unanswered requests of the present link, by number
+        self._worker: asyncio.Task[None] | None = None  # the worker of the present link
         self._slow: set[asyncio.Task[None]] = set()
-        self._workers: set[asyncio.Task[None]] = set()  # also those of ended links
+        self._workers: set[asyncio.Task[None]] = set()  # the workers of present and ended links
         self._served = served
 
     def attach(self, channel: Channel) -> None:
-        """Serve a new api process, and send it the tokens."""
+        """Serve a new api process, and send the usable tokens to it."""
         self._link.attach(channel)
         self._worker = None
         self._waiting.clear()
@@ -123,7 +124,7 @@ class RestLink:
             await asyncio.sleep(0)
 
     def _begin(self, channel: Channel | None, made: RequestMade) -> None:
-        """Serve concurrently a request that waits for charon, the signer, the recorder or a topic's messages."""
+        """Serve a request that waits for charon, the signer, the recorder or a topic's messages in its own task."""
         if len(self._slow) >= _MOST_SLOW:
             text = "too many long requests are running: try again"
             self._send_answer(made.number, AdminAnswer(False, error=text, trouble="busy"))
@@ -155,7 +156,7 @@ class RestLink:
         except UnprovenError as error:
             self._refused(made, error)
             return AdminAnswer(False, error=str(error), trouble="forbidden")
-        except Exception as error:  # noqa: BLE001  a defect fails only this request
+        except Exception as error:  # noqa: BLE001  a defect affects only this request
             _log.exception("a request of the api failed", request=type(made.request).__name__)
             return AdminAnswer(False, error=f"a defect of rosrv: {type(error).__name__}", trouble="failed")
 
@@ -207,7 +208,7 @@ class RestLink:
             _log.error("the api does not read its answers: its link is closed")
 
     def _lost(self, wrong: str) -> None:
-        """Forget the requests of the api; `wrong` is its protocol error, empty if the process ended."""
+        """Forget the requests of the api. `wrong` is the api's protocol error, or empty if its process ended."""
         self._waiting.clear()
         if wrong:
             _log.error("the api's link is closed; another one is started", reason=wrong)

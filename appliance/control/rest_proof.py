@@ -1,14 +1,16 @@
-"""Authenticate REST requests in control by the client's credentials, never by the api's claim.
+"""Authenticate REST requests in control by the client's credentials, never by a claim of the api.
 
-The api is the process that browsers and scripts talk to, and may be compromised. Invariants:
+Browsers and scripts connect to the api, so the api may be compromised. Invariants:
 
-1. Every request must contain its token, or the token's reading key. A compromised api can use only tokens that it has
-   received since.
-2. A change comes with the client's HTTP request, and must equal the order derived from it (`channel/rest_meaning.py`).
-3. A change by a reading key needs a proof: the request signed with the token's signing key, with a challenge of this
-   process that is valid once. A compromised api can drop such an order; it cannot change, repeat or make one.
-4. A bare token authorises all requests of anyone who has seen it, but no changes with the setting `api_require_proof`.
-5. A request denied here has no effect; the caller records it.
+1. Every request must contain its token, or the token's reading key. A compromised api can use only the tokens that it
+   has received since it was compromised.
+2. A change comes with the client's HTTP request. Control derives an order from this HTTP request
+   (`channel/rest_meaning.py`). The change must equal the derived order.
+3. A change by a reading key needs a proof: a signature of the HTTP request by the token's signing key, with a challenge
+   of this process that is valid once. A compromised api can drop such an order, but cannot change, repeat or forge it.
+4. A bare token authorises requests of anyone who has seen it. With the setting `api_require_proof`, a bare token does
+   not authorise changes.
+5. A request that is denied here has no effect. The caller records the denial.
 """
 
 import asyncio
@@ -40,7 +42,7 @@ _ITSELF = "the host itself"
 
 
 class UnprovenError(Exception):
-    """The request is denied; the message has the reason. `who` is the name of the shown token, if any."""
+    """The request is denied; the message has the reason. `who` is the name of the presented token, if there is one."""
 
     def __init__(self, text: str, who: str = "", severity: Severity = Severity.WARNING) -> None:
         super().__init__(text)
@@ -49,22 +51,26 @@ class UnprovenError(Exception):
 
 
 class RequestAuthenticator:
-    """The authentication of requests by their tokens; `require_proof`: a bare token is not enough for changes."""
+    """Authenticate requests by their tokens. `require_proof`: a bare token is not enough for changes."""
 
     def __init__(self, tokens: TokenOrders, *, require_proof: bool) -> None:
         self._tokens = tokens
         self._require_proof = require_proof
         self._challenges = Challenges()
-        # For tokens without keys: SHA-256 of the texts that scrypt has accepted, by id; scrypt runs once at a time.
+        # Tokens without keys are checked with slow scrypt, one at a time. This cache has the SHA-256 of accepted
+        # tokens, by token id.
         self._checked: dict[str, bytes] = {}
         self._checking = asyncio.Lock()
 
     def challenge(self) -> Challenge:
-        """Return a challenge for an order, and its lifetime."""
+        """Return a new challenge for an order, with its lifetime in seconds."""
         return Challenge(self._challenges.give(time.monotonic()), SECONDS)
 
     async def asker(self, made: RequestMade) -> str:
-        """Return the name of the request's token, or another author if none is needed. Raises `UnprovenError`."""
+        """Return the author of a request: the name of its token, or a fixed name if it needs no token.
+
+        Raises `UnprovenError` if the request is denied.
+        """
         role = _role_for(made.request)
         if role is None:
             return "" if isinstance(made.request, admin.MetricsWanted) else _ITSELF
@@ -78,7 +84,7 @@ class RequestAuthenticator:
         return row.name
 
     async def _holder(self, shown: str) -> TokenRow:
-        """Return the usable token that was shown, or whose reading key was. Raises `UnprovenError`."""
+        """Return the usable token for a presented token or reading key. Raises `UnprovenError`."""
         parsed = parse_token(shown)
         token_id = parsed[0] if parsed is not None else reading_id(shown)
         row = self._tokens.usable_row(token_id) if token_id is not None else None
@@ -87,7 +93,7 @@ class RequestAuthenticator:
                 good = row.keys is not None and reading_hash(shown) == row.keys.reading
             else:
                 good = await self._is_token(shown, parsed[1], row)
-            if good and self._tokens.usable_row(row.id) is not None:  # it may have ended since
+            if good and self._tokens.usable_row(row.id) is not None:  # the token may have ended meanwhile
                 return row
         raise UnprovenError("no valid token was presented")
 
@@ -145,7 +151,7 @@ class RequestAuthenticator:
 
 
 def _role_for(request: admin.RestRequest) -> TokenRole | None:
-    """Return the least role whose token authorises this request; None if no token is needed."""
+    """Return the least role that a token needs for this request, or None if the request needs no token."""
     operation = admin.operation_of(request)
     if operation is None or operation.role is None:
         return None if operation is not None else "admin"

@@ -1,4 +1,4 @@
-"""Find the addresses of the group `robot`: the machine beside the appliance, as seen from inside its isolation."""
+"""Find the addresses of the group `robot`: the robot's machine, as seen from inside the appliance's isolation."""
 
 import ipaddress
 import socket
@@ -12,7 +12,7 @@ _ROUTES = Path("/proc/net/route")
 
 
 def robot_addresses(settings: Settings) -> list[Address]:
-    """Return loopback with `isolation: none`, else the gateway of the default route."""
+    """Return loopback with `isolation: none`, otherwise the gateway of the default route."""
     if settings.isolation == "none":
         return [ipaddress.ip_address("127.0.0.1"), ipaddress.ip_address("::1")]
     gateway = _default_gateway()
@@ -26,7 +26,7 @@ def own_address(settings: Settings) -> str:
 
 
 def master_address(settings: Settings) -> str:
-    """Return `own_address`; without a default route, the address in the first attached network, if any."""
+    """Return `own_address`. Without a default route, return the address in the first attached network, if any."""
     if settings.isolation != "none" and not robot_addresses(settings):
         for network, gateway in _routes():
             if int(network) and not int(gateway) and network not in settings.ipsec.pool:
@@ -46,7 +46,7 @@ def _default_gateway() -> Address | None:
 
 
 def _routes() -> list[tuple[ipaddress.IPv4Address, ipaddress.IPv4Address]]:
-    """Return network and gateway of each route in the kernel."""
+    """Return the network and gateway of each IPv4 route of the kernel."""
 
     def address(field: str) -> ipaddress.IPv4Address:
         return ipaddress.IPv4Address(struct.pack("<I", int(field, 16)))

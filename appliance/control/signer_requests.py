@@ -1,6 +1,6 @@
-"""Send the signer's requests: sign checkpoints of the audit log and removals from it, and make certificates.
+"""Send requests to the signer: sign checkpoints of the audit log, approve removals from the log, make certificates.
 
-Missing signatures are requested again whenever a signer starts.
+Missing signatures are requested again whenever a signer process starts.
 """
 
 import asyncio
@@ -21,11 +21,11 @@ class SignerRequests:
         self._loop = asyncio.get_running_loop()
 
     def want(self, number: int, text: bytes) -> None:
-        """Request the signature of a checkpoint. Called on the log's thread."""
+        """Request the signature of a checkpoint. The log calls this method on its own thread."""
         self._ask(messages.SignatureWanted(number, text))
 
     def want_removal(self, number: int, checkpoint: bytes, newest: bytes) -> None:
-        """Request the signature of a removal of the records up to a checkpoint. Called on the log's thread."""
+        """Request approval to remove the records up to a checkpoint. The log calls this method on its own thread."""
         self._ask(messages.RemovalWanted(number, checkpoint, newest))
 
     def _ask(self, message: messages.Message) -> None:

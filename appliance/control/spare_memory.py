@@ -1,8 +1,8 @@
 """Return unused memory of control to the system.
 
-Large values are read and written in threads, and glibc keeps up to 64 MiB of freed memory per thread. Mapping every
-large block separately would return the memory at once, but takes twice as long, because the pages are allocated again
-for each copy. So the memory is returned a little later.
+Large values are read and written in threads, and glibc keeps up to 64 MiB of freed memory per thread. If every large
+block had its own mapping, its memory would be returned at once. But this takes twice as long, because the kernel
+allocates the pages again for each copy. So control returns the memory a little later.
 """
 
 import asyncio
@@ -21,16 +21,16 @@ def resident() -> int:
 
 
 def give_back() -> None:
-    """Return the allocator's free memory to the system; other Python threads run meanwhile."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # only glibc has it; other C libraries keep less
+    """Return the allocator's free memory to the system. Other Python threads run in the meantime."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only; other C libraries keep less memory
     if trim is not None:
         trim(0)
 
 
 class SpareMemory:
-    """A watcher that returns memory while the process has over `MUCH` bytes more than its minimum.
+    """Return free memory while the process has over `MUCH` bytes more than its minimum.
 
-    It repeats even if that memory is in use, because the allocator keeps memory that is freed later.
+    This repeats even if the memory is in use, because the allocator keeps memory that is freed later.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class SpareMemory:
             await self.look()
 
     async def look(self) -> None:
-        """Return free memory if there may be more than `MUCH` bytes of it."""
+        """Return free memory if there may be more than `MUCH` bytes of free memory."""
         size = self._size()
         self._least = min(self._least, size)
         if size > self._least + MUCH:

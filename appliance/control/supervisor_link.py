@@ -11,18 +11,19 @@ from appliance.channel import messages
 from appliance.channel.answers.status import FirewallState, ProcessInfo
 from appliance.channel.channel import Channel, ChannelClosedError
 
-ROUTES_AT_ONCE = 32  # unknown hosts cause these queries, and the supervisor accepts a limited number
+ROUTES_AT_ONCE = 32  # the most open route queries; unknown hosts cause them, and the supervisor limits them
 
 Heard = Callable[[Any, tuple[int, ...]], None]
-"""Handles a message of the supervisor and the descriptors that came with it."""
+"""Handle a message of the supervisor and its descriptors."""
 
 _log = structlog.get_logger()
 
 
 class Surroundings:
-    """The last reports of the supervisor; `probe` is empty before the first one, then `passed` or the reason.
+    """The last reports of the supervisor.
 
-    `master` is the URI at which nodes find their master; empty before control is ready.
+    `probe` is empty before the first probe; then it is `passed` or the reason of the failure. `master` is the URI at
+    which nodes find their ROS master; it is empty before control is ready.
     """
 
     def __init__(self) -> None:
@@ -33,9 +34,11 @@ class Surroundings:
 
 
 class ControlLifeline:
-    """The lifeline. `stopping` is set when the supervisor stops control or is gone. `enclosed(answer)` is called when
-    the supervisor has opened or closed tunnels, and `compiler(channel)` at once for each link to the compiler, because
-    the start may wait for it. Other messages are passed on, in order, after `hear` was called.
+    """Control's end of the lifeline.
+
+    `stopping` is set when the supervisor stops control or is gone. `enclosed(answer)` is called when the supervisor has
+    opened or closed tunnels. `compiler(channel)` is called at once for each new link to the compiler, because the start
+    of control may wait for this link. Other messages are queued until `hear` is called, and passed on in order.
     """
 
     def __init__(
@@ -52,7 +55,7 @@ class ControlLifeline:
         self.surroundings = Surroundings()
         self.sockets: dict[str, socket.socket] = {}
         self.restored = asyncio.Event()
-        # Whether the caller that started the appliance already received `Ready` from an earlier control
+        # Whether the caller that started the appliance has received `Ready` from an earlier control process.
         self.announced = False
         self._routes: dict[str, list[asyncio.Future[str | None]]] = {}  # unanswered queries
         self._free_questions = asyncio.Semaphore(ROUTES_AT_ONCE)
@@ -61,7 +64,7 @@ class ControlLifeline:
         self._heard: Heard = lambda *said: self._early.append(said)
 
     def attach(self) -> None:
-        """Begin to receive messages; `restored` is set when all kept sockets have arrived."""
+        """Begin to receive messages. `restored` is set when all kept sockets have arrived."""
         self.channel.attach(asyncio.get_running_loop(), self._received, self._closed)
 
     def hear(self, heard: Heard) -> None:
@@ -83,13 +86,13 @@ class ControlLifeline:
         self.say(messages.SocketDropped(name))
 
     async def route_to(self, host: str) -> str | None:
-        """Return the machine's address at which `host` reaches the appliance; None: the address that it used.
+        """Return the machine's address at which `host` reaches the appliance (None: the address that `host` used).
 
         Concurrent calls for a host share one query. At most `ROUTES_AT_ONCE` queries are open; other calls wait.
         """
         if host not in self._routes:
             await self._free_questions.acquire()
-            if host in self._routes:  # another call has sent the query meanwhile
+            if host in self._routes:  # another call has sent the query in the meantime
                 self._free_questions.release()
             else:
                 self._routes[host] = []
@@ -99,7 +102,7 @@ class ControlLifeline:
         return await future
 
     async def endpoint(self) -> messages.EndpointFound:
-        """Return the address, found by the supervisor, at which hosts of other networks reach the appliance."""
+        """Ask the supervisor for the address at which hosts of other networks reach the appliance."""
         future: asyncio.Future[messages.EndpointFound] = asyncio.get_running_loop().create_future()
         self._endpoints.append(future)
         self.say(messages.EndpointWanted())

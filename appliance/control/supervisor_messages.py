@@ -23,7 +23,7 @@ _log = structlog.get_logger()
 
 
 class SupervisorMessages:
-    """The dispatcher of the supervisor's links and reports to the parts of control."""
+    """Pass the supervisor's links and reports to the parts of control."""
 
     def __init__(self, base: Foundation, parts: Parts, operators: Operators) -> None:
         self._base = base
@@ -34,7 +34,7 @@ class SupervisorMessages:
         self._failing: frozenset[str] = frozenset()  # the roles of processes that keep ending
 
     def heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
-        """Handle a message and the descriptors that came with it."""
+        """Handle a message and its descriptors."""
         match message:
             case messages.LinkOpened(role, index):
                 self._link(role, index, socket.socket(fileno=descriptors[0]))
@@ -43,7 +43,7 @@ class SupervisorMessages:
                 self._parts.reconciler.wake()
             case messages.PolicyReloadRequested():
                 task = asyncio.get_running_loop().create_task(self._reload())
-                self._reloading.add(task)  # referenced until it is done
+                self._reloading.add(task)  # keep a reference until the task is done
                 task.add_done_callback(self._reloading.discard)
             case messages.Announced():
                 self._operators.tokens.first_token_shown()
@@ -119,6 +119,6 @@ class SupervisorMessages:
         while True:
             try:
                 await self._base.policies.reload(PolicyReload(), "disk")
-            except RevisionChangedError:  # another revision came into force meanwhile
+            except RevisionChangedError:  # another revision came into force in the meantime
                 continue
             return

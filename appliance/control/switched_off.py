@@ -1,8 +1,8 @@
-"""List switched-off protection: monitors that are disabled or in shadow mode, audit-only sections of the policy.
+"""List switched-off protection: monitors that are disabled or in shadow mode, and audit-only sections of the policy.
 
-Switched-off protection is easily forgotten. It is listed with its age, and after `forgotten_after` it is recorded once,
-as an alarm. The age of a monitor that comes back automatically grows only if it is still off after that time. Ages
-count the time for which the appliance runs, so they do not depend on the system clock.
+Switched-off protection is easily forgotten, so it is listed with its age. After `forgotten_after`, it is recorded once,
+as an alarm. If a monitor is to come back automatically, its age grows only if it is still off after that time. Ages
+count the running time of the appliance, so they do not depend on the system clock.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ _LOOK_SECONDS = 60.0
 
 
 class _Age(msgspec.Struct):
-    """An age: its begin in seconds since the epoch, the running time since then, and whether it was recorded."""
+    """An age: its start (seconds since the epoch), the running time since then, and whether an alarm was recorded."""
 
     since: float
     seconds: float = 0.0
@@ -31,7 +31,7 @@ class _Age(msgspec.Struct):
 
 
 def off_now(monitors: SpecificationManager, policies: Policies) -> Iterator[SwitchedOff]:
-    """Yield all switched-off protection, with the present time as its begin."""
+    """Yield all switched-off protection, with the present time as its start."""
     now = time.time()
     for name, to in monitors.switches.switched_off().items():
         if to is False:
@@ -81,7 +81,7 @@ class SwitchedOffWatch:
             self.look(time.monotonic() - before)
 
     def look(self, seconds: float) -> None:
-        """Add `seconds` to the ages, and record protection that was forgotten."""
+        """Add `seconds` to the ages, and record an alarm for each forgotten protection."""
         self._look(seconds)
         if self._ages:
             self._save()
@@ -100,7 +100,7 @@ class SwitchedOffWatch:
             )
 
     def _look(self, seconds: float) -> None:
-        """Begin new ages, end those of restored protection, and add `seconds` to all ages that grow."""
+        """Begin new ages, end the ages of restored protection, and add `seconds` to all ages that grow."""
         off = {one.what: one for one in off_now(self._monitors, self._policies)}
         if off.keys() != self._ages.keys():
             self._ages = {what: self._ages.get(what) or _Age(one.since) for what, one in off.items()}

@@ -1,6 +1,6 @@
 """Make, list and revoke the access tokens of REST.
 
-The api gets data to recognise a token, but never the secret. Every creation and revocation of a token is recorded.
+The api gets data to recognise tokens, but never their secrets. Every creation and revocation of a token is recorded.
 """
 
 import time
@@ -16,7 +16,7 @@ from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
 
 FIRST_NAME = "first"
-_UNTOLD = "first token untold"  # the setting while the first token was not shown yet
+_UNTOLD = "first token untold"  # this setting exists while the first token has not been shown
 DEFAULT_SECONDS = 90 * 86_400.0
 LONGEST_SECONDS = 3650 * 86_400.0
 _MOST = 1000
@@ -38,11 +38,11 @@ class TokenOrders:
 
     @admin.answers(admin.TokenList)
     async def listed(self, _request: admin.TokenList) -> answers.Tokens:
-        """Return all tokens, also ended ones, oldest first."""
+        """Return all tokens, including ended ones, oldest first."""
         return answers.Tokens([answers.Token(*_fields(row)) for row in self._rows.values()])
 
     def usable(self) -> list[TokenKept]:
-        """Return the data by which the api recognises tokens; it checks `expires` itself."""
+        """Return the data by which the api recognises tokens. The api checks `expires`."""
         now = time.time()
         return [
             TokenKept(
@@ -64,7 +64,7 @@ class TokenOrders:
         return row if row is not None and row.usable(time.time()) else None
 
     async def first(self) -> str | None:
-        """Return the text of a new first token if no token exists, or if the first one was never shown (`told`)."""
+        """Make a first token, if no token exists or if the first token was never shown. Return its text, or None."""
         if self._rows and not self._untold:
             return None
         self._untold = True
@@ -74,14 +74,14 @@ class TokenOrders:
         return (await self.add(admin.TokenAdd(FIRST_NAME, "admin", DEFAULT_SECONDS))).token
 
     def first_token_shown(self) -> None:
-        """Note that the first token was shown to the person who started the appliance."""
+        """Store that the first token was shown to the person who started the appliance."""
         if self._untold:
             self._untold = False
             self._store.save_setting(_UNTOLD, "")
 
     @admin.answers(admin.TokenAdd)
     async def add(self, request: admin.TokenAdd) -> answers.NewToken:
-        """Make a token; only the answer has its text. Raises `TokenRefusedError` and `StoreError`."""
+        """Make a token. Only this answer contains its text. Raises `TokenRefusedError` and `StoreError`."""
         name, seconds, now = request.name, request.seconds, time.time()
         if not 0 < seconds <= LONGEST_SECONDS:
             raise TokenRefusedError(f"a token ends after at most {LONGEST_SECONDS / 86_400:.0f} days")
@@ -105,7 +105,7 @@ class TokenOrders:
         )
         try:
             await self._store.settled()
-        except StoreError:  # the text was not shown: the token must not block its name
+        except StoreError:  # the token's text was not shown, so end the token to free its name
             self._end(row)
             raise
         return answers.NewToken(*_fields(row), token=text)
