@@ -1,8 +1,8 @@
 """Typed messages between the processes of the appliance, over Unix sockets.
 
-The supervisor starts every process with one end of a socket pair (its *lifeline*) and brokers the links between them: a
-link is a socket pair whose ends the supervisor hands out (SCM_RIGHTS). So both ends are known by construction, and
-there is no path to find or guess.
+The supervisor starts every process with one end of a socket pair, its *lifeline*. A *link* connects two processes: it
+is also a socket pair, and the supervisor sends one end to each process (SCM_RIGHTS). So the supervisor determines both
+ends of a link, and no other process can find or guess a path to it.
 
-`messages` defines the messages, `channel` carries them.
+`messages` defines the messages; `channel` sends and receives them.
 """

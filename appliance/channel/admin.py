@@ -1,13 +1,15 @@
-"""The requests of operators' tools to the running appliance, each with the struct that answers it.
+"""The requests of operators' tools to the running appliance. Each request names the struct of its answer.
 
-Over the admin socket: one JSON document per line in each direction, one request per connection at a time. The
-socket is in the state directory, for its owner and root only, and takes `AnyRequest`: all but `ChallengeWanted`. Over
-REST the api process passes on `RestRequest`, all that has `@rest`, and gets the same document back.
+The admin socket carries one JSON document per line in each direction, and one request per connection at a time. It is
+in the state directory; only its owner and root may use it. It accepts `AnyRequest`: all requests except
+`ChallengeWanted`.
 
-`@rest` is a request's row in the table of operations (`channel/rest_operation.py`): method, path, roles, ETag. The
-docstring of a request is its description in the contract, unless the row has `words`.
+Over REST, the api process passes on `RestRequest`: all requests with `@rest`. It gets the same JSON document back.
 
-`expected` is the revision that the client has seen: a change is rejected when another one is in force by now.
+`@rest` defines a request's row in the table of operations (`channel/rest_operation.py`): method, path, role, ETag. The
+docstring of a request is its description in the REST contract, unless the row has `words`.
+
+`expected` is the revision that the client has seen. If another revision is now in force, a change is rejected.
 """
 
 import functools
@@ -52,7 +54,7 @@ MONITORS = Versioned(
     "monitors",
     "/v1/monitors",
     "The monitors were changed, switched or resumed since the ETag in If-Match was read.",
-    seconds=40.0,  # RVMaster compiles, and then the relay
+    seconds=40.0,  # RVMaster compiles first, then the relay
 )
 HOSTS = Versioned("table of hosts", "/v1/hosts", "The table of hosts is not the one that If-Match names.")
 
@@ -106,7 +108,7 @@ class WaitingRequest(AdminRequest[A], Generic[A], frozen=True):
 def answers(
     request: type[AdminRequest[A]], *, who: bool = False
 ) -> Callable[[Callable[P, Coroutine[Any, Any, A]]], Callable[P, Coroutine[Any, Any, A]]]:
-    """Mark a method of control as the answer to a request; `who`: it also takes the client's name."""
+    """Mark a method of control as the answer to a request. `who`: the method also takes the client's name."""
 
     def mark(method: Callable[P, Coroutine[Any, Any, A]]) -> Callable[P, Coroutine[Any, Any, A]]:
         method.answers = Answers(request, who)  # type: ignore[attr-defined]  # read by `methods_of`
@@ -130,7 +132,7 @@ def methods_of(kind: type) -> Iterator[tuple[Answers, Callable[..., Coroutine[An
 
 
 def verb_of(request: AdminRequest[Any]) -> str:
-    """Return the name of a request, as `verb` has it."""
+    """Return the name of a request, which is its `verb` in JSON."""
     return str(type(request).__struct_config__.tag)
 
 
@@ -669,10 +671,10 @@ class ChallengeWanted(AdminRequest[token_answers.Challenge], frozen=True, tag="c
 
 OPERATIONS = tuple(operation for operations in rows().values() for operation in operations)
 CHANGES = frozenset(operation.request for operation in OPERATIONS if operation.is_change)
-"""Requests that change something in the name of a token: control requires the HTTP request that asked for them."""
+"""Requests that change something in the name of a token. Control requires the client's HTTP request for each."""
 
 ORDERS = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
-"""The requests that change something over REST, also in the name of a host itself."""
+"""All requests that change something over REST, in the name of a token or of a host."""
 
 if TYPE_CHECKING:
     RestRequest = AdminRequest[Any]
@@ -683,7 +685,7 @@ else:
 
 
 def operation_of(request: AdminRequest[Any]) -> Operation | None:
-    """Return the row of a request; None: not over REST."""
+    """Return the row of a request, or None if REST does not have the request."""
     for operation in rows().get(type(request), ()):
         if all(getattr(request, name) == operation.fixed[name] for name in operation.fixed):
             return operation
@@ -709,7 +711,7 @@ class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
     tag: str = ""
 
     def given(self) -> A:
-        """Return the body of an answer that is `ok`."""
+        """Return the body of a successful answer (`ok`)."""
         assert self.body is not None  # noqa: S101  it has one
         return self.body
 

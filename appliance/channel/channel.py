@@ -1,12 +1,14 @@
-"""One end of a link: typed messages and file descriptors over a Unix stream socket, never blocking.
+"""Send and receive typed messages and file descriptors over a Unix stream socket, without blocking.
 
-A frame is a 4-byte big-endian length and that many bytes of MessagePack. Descriptors travel as SCM_RIGHTS with
-the first byte of their frame; the kernel never merges two sends that carry descriptors, so a queue in order of
-arrival pairs them again.
+A frame is a 4-byte big-endian length, followed by a MessagePack document of this length. Descriptors are sent as
+SCM_RIGHTS with the first byte of their frame. The kernel never merges two sends with descriptors, so received
+descriptors are queued in order and assigned to frames in this order.
 
-The channel owns no loop: it has a `fileno()`, `receive()` to call when readable and `flush()` when writable, so the
-same class serves an asyncio process (`attach`) and the relay's epoll loop. If the peer does not read, `send` raises
-`ChannelFullError` beyond `limit` bytes of backlog (both ends are ours: that is a defect, not load).
+The channel has no event loop. Its owner waits on `fileno()`, calls `receive()` when it is readable, and `flush()` when
+it is writable. So the same class works with asyncio (`attach`) and with the relay's epoll loop.
+
+If the peer does not read, `send` raises `ChannelFullError` beyond `limit` bytes of backlog. Both ends belong to the
+appliance, so this is a defect and not high load.
 """
 
 import os
@@ -21,15 +23,15 @@ import msgspec
 from appliance.channel.messages import Message
 
 if TYPE_CHECKING:
-    import asyncio  # not loaded by a process without asyncio (a launcher, the relay)
+    import asyncio  # processes without asyncio (a launcher, the relay) do not load it
 
 _LENGTH = struct.Struct(">I")
 _RECEIVE_SIZE = 262_144
 _MAX_DESCRIPTORS = 64
-_TOGETHER = 65_536  # bytes of frames to write at once
+_TOGETHER = 65_536  # the bytes of frames that are joined for one write
 _MAX_UNCLAIMED = 65_536
-SOON_SECONDS = 0.005  # `soon` frames wait to be joined: a wakeup costs more than reading them
-_MAX_READS = 64  # in one go, so that an endless writer leaves time for others
+SOON_SECONDS = 0.005  # `soon` frames wait for this time to be joined, because each wakeup is expensive
+_MAX_READS = 64  # the most reads in one `receive()`, so that an endless writer does not block other work
 
 
 class ChannelClosedError(Exception):
@@ -37,16 +39,16 @@ class ChannelClosedError(Exception):
 
 
 class ChannelFullError(Exception):
-    """The other end has not read for so long that the backlog reached its limit."""
+    """The backlog has reached its limit, because the other end does not read."""
 
 
 class Channel:
-    """One end of a link for the messages of `union` (a union of `Message` structs)."""
+    """One end of a link. It accepts the messages of `union`, a union of `Message` structs."""
 
     def __init__(
         self, sock: socket.socket, union: Any, *, limit: int = 64 << 20, longest: int = 64 << 20
     ) -> None:
-        """Wrap a socket; `limit` bounds the unsent backlog, `longest` one received message, both in bytes."""
+        """Wrap a socket. `limit` bounds the unsent backlog, and `longest` each received message, in bytes."""
         sock.setblocking(False)
         self._socket = sock
         self._encoder = msgspec.msgpack.Encoder()
@@ -66,13 +68,14 @@ class Channel:
 
     @property
     def pending(self) -> bool:
-        """Whether `flush` has something left to write."""
+        """Whether `flush` has more data to write."""
         return bool(self._outgoing)
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
-        """Queue a message and write what the socket takes; descriptors are duplicated, the caller keeps its own.
+        """Queue a message, and write as much as the socket accepts. Raises `ChannelFullError`.
 
-        `soon`: an attached channel writes it within `SOON_SECONDS`, together with other messages.
+        Descriptors are duplicated; the caller keeps its own. `soon`: an attached channel writes the message within
+        `SOON_SECONDS`, together with other messages.
         """
         if len(descriptors) != message.descriptors:
             raise ValueError(f"{type(message).__name__} travels with {message.descriptors} descriptors")
@@ -91,7 +94,7 @@ class Channel:
             self._loop.call_later(SOON_SECONDS, self._flush_attached)
 
     def flush(self) -> None:
-        """Write what the socket takes now. Raises `ChannelClosedError` when the other end is gone."""
+        """Write as much as the socket accepts now. Raises `ChannelClosedError` if the other end is gone."""
         while self._outgoing:
             data, descriptors = self._next()
             try:
@@ -114,7 +117,7 @@ class Channel:
         self._watch_writable()
 
     def _next(self) -> tuple[bytes, list[int]]:
-        """Return the next bytes to write, with their descriptors; frames without descriptors are joined."""
+        """Return the next bytes to write, with their descriptors. Join frames without descriptors."""
         frames, size = [], 0
         while self._outgoing and not self._outgoing[0][1] and size < _TOGETHER:
             frames.append(self._outgoing.popleft()[0])
@@ -124,10 +127,10 @@ class Channel:
         return self._outgoing[0]
 
     def receive(self) -> list[tuple[Any, tuple[int, ...]]]:
-        """Read what has arrived: whole messages with their descriptors, which the caller now owns.
+        """Return all messages that have arrived completely, with their descriptors. The caller owns the descriptors.
 
-        Raises `ChannelClosedError` if the other end is gone, and `msgspec.DecodeError` for a message that is not of
-        this link, is too long, or came without its descriptors: the link is unusable after that.
+        Raises `ChannelClosedError` if the other end is gone. Raises `msgspec.DecodeError` if a message does not belong
+        to this link, is too long, or lacks its descriptors. The link is unusable after this error.
         """
         closed = False
         for _turn in range(_MAX_READS):
@@ -178,10 +181,11 @@ class Channel:
         closed: Callable[[], None],
         refused: Callable[[str], None] | None = None,
     ) -> None:
-        """Serve this end from an asyncio loop: `received(message, descriptors)` for each, `closed()` once.
+        """Serve this end from an asyncio loop: call `received(message, descriptors)` for each message.
 
-        From now on `send` never raises because the other end is gone: `closed()` reports it, in order. A message of
-        another link closes this one: `refused(reason)` is called, or `closed()` if `refused` is None.
+        When the other end is gone, `closed()` is called once, after the last message. `send` no longer raises
+        `ChannelClosedError`. An invalid message closes the channel: `refused(reason)` is called, or `closed()` if
+        `refused` is None.
         """
         self._loop = loop
 
@@ -220,7 +224,7 @@ class Channel:
         try:
             self.flush()
         except ChannelClosedError:
-            # The reader reports the end of the stream too, after the rest of the data.
+            # The reader reports the end of the stream after it has received the rest of the data.
             self._discard_outgoing()
             if self._socket.fileno() >= 0:
                 self._watch_writable()
@@ -233,7 +237,7 @@ class Channel:
         self._backlog = 0
 
     def close(self) -> None:
-        """Close this end, and all received descriptors that were not taken."""
+        """Close this end, and all received descriptors that no message has claimed."""
         if self._socket.fileno() < 0:
             return
         if self._loop is not None:

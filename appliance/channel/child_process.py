@@ -1,7 +1,7 @@
-"""The common part of the supervisor's children that serve control: lifeline, and link to control.
+"""The lifeline and the link to control, for all children of the supervisor that serve control.
 
-A child answers the supervisor's pings, replaces its link by each new one, closes unexpected descriptors, and ends when
-the supervisor sends `Stop` or is gone.
+A child answers the supervisor's pings, uses each new link instead of the previous one, and closes unexpected
+descriptors. It ends when the supervisor sends `Stop` or is gone.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from appliance.channel.messages import Failed, LinkOpened, Message, Ping, Pong, 
 
 
 class Child:
-    """The two channels of a child; `said(message)` is called with control's messages, `linked()` after a new link."""
+    """The two channels of a child. `said(message)` gets control's messages; `linked()` is called for each new link."""
 
     def __init__(
         self,
@@ -28,9 +28,9 @@ class Child:
         lost: Callable[[str], None] = lambda _reason: None,
         ring_given: Callable[[RingGiven, int], None] = lambda _given, descriptor: os.close(descriptor),
     ) -> None:
-        """`link` is the union of the messages of the link to control; `ring_given` takes over the descriptor.
+        """Make the channels. `link` is the union of the messages on the link to control.
 
-        `lost(reason)` is called when control closes the link, or ends.
+        `lost(reason)` is called when control closes the link or ends. `ring_given` takes over the descriptor.
         """
         self._lifeline = lifeline
         self._link = link
@@ -45,7 +45,10 @@ class Child:
         self._answer(ready)
 
     def tell(self, message: Message) -> bool:
-        """Send a message to control; return False without one, or if it does not read: its next link asks again."""
+        """Send a message to control. Return False if there is no link.
+
+        If control does not read, close the link and return False: control asks again over its next link.
+        """
         try:
             return self._control.send(message)
         except ChannelFullError:

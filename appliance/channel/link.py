@@ -1,4 +1,4 @@
-"""One end of a link to a process that may be restarted: one channel after the other, and questions over them."""
+"""One end of a link to a process that may be restarted. Each life of the process has its own channel."""
 
 import asyncio
 import itertools
@@ -10,9 +10,10 @@ from appliance.channel.messages import Message
 
 
 class Link:
-    """The link to the present process: `heard(message)` gets its messages, and none of an earlier process.
+    """The link to the present process. `heard(message)` gets its messages, but no messages of an earlier process.
 
-    `lost(reason)` is called when the process is gone without a successor, with the reason if it sent a wrong message.
+    `lost(reason)` is called when the process is gone and has no successor yet. The reason is empty unless the process
+    sent an invalid message.
     """
 
     def __init__(
@@ -30,7 +31,7 @@ class Link:
         return len(self._asked)
 
     def attach(self, channel: Channel) -> None:
-        """Use a new channel instead of the present one."""
+        """Use a new channel, and close the present one."""
         self.close()
         self.channel = channel
 
@@ -46,16 +47,16 @@ class Link:
         channel.attach(asyncio.get_running_loop(), received, ended, ended)
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> bool:
-        """Send a message, as `Channel.send`; return False if there is no other end. Raises `ChannelFullError`."""
+        """Send a message like `Channel.send`. Return False if the link is not connected. Raises `ChannelFullError`."""
         if self.channel is None:
             return False
         self.channel.send(message, descriptors, soon=soon)
         return True
 
     async def ask(self, question: Callable[[int], Message], seconds: float) -> Any:
-        """Send a question with a number, and return its answer.
+        """Send a question with a new number, and return the answer. Wait at most `seconds`.
 
-        Raises `TimeoutError`, `ChannelFullError`, and `ChannelClosedError` when the process is gone.
+        Raises `TimeoutError`, `ChannelFullError`, and `ChannelClosedError` if the process is gone.
         """
         number = next(self._numbers)
         answer = self._asked[number] = asyncio.get_running_loop().create_future()
@@ -68,13 +69,13 @@ class Link:
             del self._asked[number]
 
     def answered(self, number: int, answer: Any) -> None:
-        """Take the answer to the question with this number, if it is still awaited."""
+        """Pass on the answer to the question with this number, unless the question has ended."""
         future = self._asked.get(number)
         if future is not None and not future.done():
             future.set_result(answer)
 
     def close(self) -> None:
-        """Close the channel; open questions fail."""
+        """Close the channel. Open questions fail."""
         if self.channel is None:
             return
         self.channel.close()

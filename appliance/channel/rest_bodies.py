@@ -1,4 +1,4 @@
-"""Bodies that REST takes, by the rows of `channel/admin.py` that name them. An unknown field is an error."""
+"""The bodies of REST requests; the rows in `channel/admin.py` refer to them. An unknown field is an error."""
 
 from typing import Annotated, Literal
 
@@ -11,7 +11,7 @@ HOST_NAME = r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?$"
 ENDPOINT = r"^[A-Za-z0-9][A-Za-z0-9.:-]{0,252}$"
 PORTS = r"^[0-9]{1,5}(?:-[0-9]{1,5})?$"
 SERVICE = r"^(?:tcp|udp)/[0-9]{1,5}(?:-[0-9]{1,5})?$"
-WHOLE = r"(?!\n)"  # after `$`, which in Python also matches before a last newline
+WHOLE = r"(?!\n)"  # follows `$`, because Python's `$` also matches before a final newline
 LONGEST_REQUEST = 16 << 10
 LONGEST_DAYS = 398
 LONGEST_TOKEN_SECONDS = 7 * 86_400

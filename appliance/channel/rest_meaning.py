@@ -1,10 +1,10 @@
 """Convert HTTP requests to orders, and orders to HTTP requests, by the table of operations.
 
-The api makes an order from each request. Control derives the order again from the request that the client has signed,
-and carries it out only if both are equal: a compromised api cannot use a proof for another order.
+The api makes an order from each HTTP request. Control derives the order again from the client's HTTP request, and
+carries it out only if both orders are equal. So a compromised api cannot use a proof for another order.
 
-The api may only fill in the fields in `Operation.filled`. All other fields that a request leaves out have the defaults
-in `docs/reference/rest.md`.
+The api may only fill in the fields in `Operation.filled`. Other fields that a request omits have the defaults in
+`docs/reference/rest.md`.
 """
 
 import json
@@ -27,15 +27,15 @@ _SECOND = 1_000_000_000
 
 
 class NoOrderError(ValueError):
-    """The request means no order; the text says why."""
+    """The HTTP request does not define an order; the message has the reason."""
 
 
 class BadTagError(NoOrderError):
-    """`If-Match` has no ETag of what the request changes."""
+    """`If-Match` does not contain an ETag of the resource that the request changes."""
 
 
 class RestCall(NamedTuple):
-    """A request over REST; `match`: it changes whatever is in force (`If-Match: *`)."""
+    """An HTTP request to REST. `match`: it is sent with `If-Match: *`, so it changes any revision in force."""
 
     method: str
     target: str
@@ -49,7 +49,10 @@ def is_dry_run(query: str) -> bool:
 
 
 def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
-    """Return the order that a request means, or, for a `dry_run`, would mean. Raises `NoOrderError`."""
+    """Return the order that an HTTP request defines. With `dry_run`, the request must be a dry run.
+
+    Raises `NoOrderError`.
+    """
     path, _mark, text = asked.target.partition("?")
     if is_dry_run(text) is not dry_run:
         raise NoOrderError("a dry run changes nothing")
@@ -70,7 +73,7 @@ def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
 
 
 def filled_in(order: AdminRequest[Any], given: AdminRequest[Any]) -> AdminRequest[Any]:
-    """Return an order with the fields that the request left to the appliance, as `given` has them."""
+    """Return the order; copy unset fields that the appliance may fill in (`Operation.filled`) from `given`."""
     operation = operation_of(order)
     if operation is None or type(order) is not type(given):
         return order
@@ -79,7 +82,7 @@ def filled_in(order: AdminRequest[Any], given: AdminRequest[Any]) -> AdminReques
 
 
 def call_of(order: AdminRequest[Any], operation: Operation) -> RestCall:
-    """Return the request for an order by a row of the table, whatever is in force: the inverse of `meant`."""
+    """Return the HTTP request for an order, by a row of the table: the inverse of `meant`."""
     values = msgspec.structs.asdict(order)
     path, query = operation.path, []
     for name, field in operation.fields().items():
@@ -99,7 +102,7 @@ def _written(value: Any) -> str:
 
 
 def _named(template: list[str], parts: list[str]) -> dict[str, str] | None:
-    """Return the parameters of the path; None if the path is another operation's."""
+    """Return the parameters in the path, or None if the path belongs to another operation."""
     if len(template) != len(parts):
         return None
     both = list(zip(template, parts, strict=True))
@@ -116,7 +119,7 @@ def _order(
     *,
     dry_run: bool,
 ) -> AdminRequest[Any] | None:
-    """Return the order; None if the body is another operation's."""
+    """Return the order, or None if the body belongs to another operation."""
     fields: dict[str, Any] = dict(operation.fixed)
     for name, field in operation.fields().items():
         if name in named:
@@ -140,7 +143,7 @@ def _order(
 
 
 def _read(kind: Any, given: list[str]) -> Any:
-    """Return the value of a parameter; if it is given several times, the last counts."""
+    """Return the value of a parameter. If the parameter is repeated, the last value counts."""
     kind = plain(kind)
     if get_origin(kind) is list:
         return given
@@ -150,7 +153,7 @@ def _read(kind: Any, given: list[str]) -> Any:
 
 
 def _moment(field: msgspec.structs.FieldInfo, value: Any) -> Any:
-    """Return a value of the body; a date for a number is that many seconds, or nanoseconds, since the epoch."""
+    """Convert a value of the body. A date in a numeric field becomes seconds or nanoseconds since the epoch."""
     kind = plain(field.type)
     if not isinstance(value, str) or kind not in (int, float):
         return value
@@ -174,7 +177,7 @@ def _body(asked: ClientRequest) -> dict[str, Any]:
 
 
 def _tag(operation: Operation, if_match: str) -> str | None:
-    """Return the tag in `If-Match`; None for `*`. Raises `BadTagError`."""
+    """Return the tag in `If-Match`, or None for `*`. Raises `BadTagError`."""
     assert operation.of is not None  # noqa: S101  a request with `expected` changes something that has an ETag
     given = if_match.strip()
     if given == "*":

@@ -1,7 +1,7 @@
-"""A row of the table of operations: how clients send one request of `channel/admin.py` over REST.
+"""Define a row of the table of operations: how clients send a request of `channel/admin.py` over REST.
 
 The api's routes (`api/operation_routes.py`), the command line's calls and control's check (`channel/rest_meaning.py`)
-are all derived from the rows.
+are derived from the rows.
 """
 
 import functools
@@ -19,19 +19,19 @@ R = TypeVar("R", bound=msgspec.Struct)
 
 
 class RequestParameter(NamedTuple):
-    """The description, bounds and name of a field in the path or the query, as FastAPI takes them."""
+    """The description, bounds and name of a field in the path or the query, for FastAPI."""
 
     name: str
     rules: Mapping[str, Any]
 
 
 def parameter(description: str = "", *, name: str = "", **rules: Any) -> RequestParameter:
-    """Annotate a field that is in the path or the query; `name` is its name there, if that differs."""
+    """Annotate a field that is sent in the path or the query. `name` is its name there, if it differs."""
     return RequestParameter(name, {**({"description": description} if description else {}), **rules})
 
 
 def parameter_of(kind: Any) -> RequestParameter:
-    """Return the parameter that a field is annotated with; for a list without one, that of its elements."""
+    """Return the `RequestParameter` in a field's annotation, or an empty one if the annotation has none."""
     if get_origin(kind) is Annotated:
         return next(
             (one for one in kind.__metadata__ if isinstance(one, RequestParameter)), RequestParameter("", {})
@@ -40,7 +40,7 @@ def parameter_of(kind: Any) -> RequestParameter:
 
 
 def plain(kind: Any) -> Any:
-    """Return a type without its annotation, and without None."""
+    """Return a type without its annotation and without `| None`."""
     while True:
         if get_origin(kind) is Annotated:
             kind = get_args(kind)[0]
@@ -51,9 +51,10 @@ def plain(kind: Any) -> Any:
 
 
 class Versioned(NamedTuple):
-    """Something with an ETag, which a change must name in `If-Match`.
+    """A resource with an ETag. A change of the resource must name the ETag in `If-Match`.
 
-    `where` is the path that has the ETag, `changed` describes 412 in the contract; a change takes at most `seconds`.
+    `where` is the path that returns the ETag. `changed` describes status 412 in the contract. A change takes at most
+    `seconds`.
     """
 
     what: str
@@ -64,33 +65,35 @@ class Versioned(NamedTuple):
 
 @dataclass(frozen=True)
 class Operation:
-    """One way to send a request over REST. Without a `role` it needs no token; without a path it serves other routes.
+    """One way to send a request over REST. Without `role`, it needs no token; without `path`, it serves other routes.
 
-    A field of the request is in the path, in the query, in `If-Match` (`expected`), or else in the body. As a decorator
-    this adds the row for a request, before the rows of the decorators below it.
+    A field of the request is sent in the path, in the query, in `If-Match` (`expected`), or otherwise in the body.
+
+    An object is used as a decorator of a request class, and adds a row for this request. If a class has several
+    decorators, the top row is first.
     """
 
     role: TokenRole | None
     method: str = ""
     path: str = ""
     query: tuple[str, ...] = ()
-    # In the contract. If several operations have one path, the one with a name describes it.
+    # The name in the contract. If several operations have one path, the operation with a name describes the path.
     name: str = ""
     words: str = ""
     tag: str = ""
     status: int = 200
     good: str = "OK"
     problems: Mapping[int, str] = field(default_factory=dict)
-    # The kind of the body, which may also be sent as `text` (text/plain).
+    # The class of the body. The body may also be sent as `text` (text/plain).
     body: type[msgspec.Struct] | None = None
     text: str = ""
-    # Further fields of the body, and fields that the operation implies. Both distinguish the operations of one path:
-    # the first match is used.
+    # Further fields of the body, and fields that the operation implies. Operations with the same path differ in these
+    # fields; the first matching operation is used.
     says: Mapping[str, Any] = field(default_factory=dict)
     fixed: Mapping[str, Any] = field(default_factory=dict)
     # The resource that the request changes or reads.
     of: Versioned | None = None
-    # The action that operators may try in a dry run; and the action of each field that only admins may set.
+    # The action that operators may only try in a dry run, and the action of each field that only admins may set.
     dry_run: str = ""
     admin_with: Mapping[str, str] = field(default_factory=dict)
     # Fields that the appliance fills in when the client leaves them out.
@@ -113,11 +116,11 @@ class Operation:
         return bool(self.path) and self.method != "GET"
 
     def fields(self) -> Mapping[str, msgspec.structs.FieldInfo]:
-        """Return the request's fields, by their names in the path and the query."""
+        """Return the fields of the request by their names in the path and the query."""
         return _fields(self.request)
 
     def in_body(self) -> list[msgspec.structs.FieldInfo]:
-        """Return the fields in the body."""
+        """Return the fields that are sent in the body."""
         return [
             one
             for name, one in self.fields().items()
@@ -125,7 +128,7 @@ class Operation:
         ]
 
     def least(self, given: Mapping[str, Any], *, dry_run: bool = False) -> tuple[TokenRole, str]:
-        """Return the least role that may send these fields, and the reason if that is not the row's role."""
+        """Return the least role that may send these fields, and the reason if it is not the row's role."""
         for name, doing in self.admin_with.items():
             if given.get(name):
                 return "admin", f"{doing} is for admins"

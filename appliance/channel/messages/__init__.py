@@ -1,13 +1,13 @@
 """Every message that crosses a process boundary of the appliance, by link.
 
-A message is a frozen struct with a tag of its own name; a link accepts only the messages of its union, so a process
-cannot receive any other kind of message. A struct that travels with file descriptors has `descriptors`; they are sent
-as SCM_RIGHTS with the message and delivered with it.
+A message is a frozen struct that is tagged with its class name. A link accepts only the messages of its union, so a
+process cannot receive any other kind of message. `descriptors` is the number of file descriptors of a message; they are
+sent as SCM_RIGHTS and delivered with the message.
 
-Strings from unknown hosts (names, header values) are carried as values and never interpreted on the way.
+Strings from unknown hosts (names, header values) are carried as values, and never interpreted on the way.
 
-Every message that is defined in these files is in `messages`, without another list. The exception is `messages.api`,
-which imports every request of operators: only the two ends of its link import it.
+Every message of these files is automatically in `messages`. The exception is `messages.api`, which imports all requests
+of operators: only the two ends of its link import that module.
 """
 
 # ruff: noqa: F403  so that a new message need not be listed

@@ -1,5 +1,6 @@
-"""The link control <-> api. The api passes on the client's request with its credentials, which control verifies. The
-api's requests are the union `RestRequest`, which cannot make a token.
+"""The link control <-> api. The api passes on each client's request and credentials; control verifies them.
+
+The api's requests are the union `RestRequest`. No request in it can make a token.
 """
 
 import math
@@ -12,7 +13,7 @@ from appliance.channel.messages.message import Message
 
 
 class ClientRequest(msgspec.Struct, frozen=True):
-    """The HTTP request of a change as it came, from the peer `host`; missing headers are empty."""
+    """The unmodified HTTP request of a change, from the peer `host`; missing headers are empty."""
 
     host: str
     method: str
@@ -24,9 +25,9 @@ class ClientRequest(msgspec.Struct, frozen=True):
 
 
 class RequestMade(Message):
-    """Pass on a client's request; `number` pairs it with its answer.
+    """The api passes on a client's request. The answer has the same `number`.
 
-    `shown` is the token or reading key that came with it, empty if none is needed. A change also has `asked`. A request
+    `shown` is the token or reading key of the request, empty if none is needed. A change also has `asked`. A request
     that has not taken effect by `until` (seconds of the monotonic clock, which all processes share) is withdrawn.
     """
 
@@ -38,13 +39,13 @@ class RequestMade(Message):
 
 
 class RequestWithdrawn(Message):
-    """The client of the request with this number is gone: its order is withdrawn if it has not taken effect."""
+    """The client of the request with this number is gone. Its order is withdrawn if it has not taken effect."""
 
     number: int
 
 
 class RequestAnswered(Message):
-    """Control's answer to `RequestMade` with the same number: the document that the admin socket would carry."""
+    """Control answers the `RequestMade` with the same number. The admin socket would send the same document."""
 
     number: int
     answer: bytes
@@ -53,7 +54,7 @@ class RequestAnswered(Message):
 class TokenKept(msgspec.Struct, frozen=True):
     """A usable token, without its secret; `expires` is seconds since the epoch.
 
-    `reading` is the hash of its reading key, empty for a token of a version that had none.
+    `reading` is the hash of the token's reading key, empty for tokens of an early version without reading keys.
     """
 
     id: str
@@ -66,15 +67,16 @@ class TokenKept(msgspec.Struct, frozen=True):
 
 
 class TokensStated(Message):
-    """Control lists for the api every usable token, at the start of a link and after every change."""
+    """Control sends the api all usable tokens, at the start of a link and after every change."""
 
     tokens: list[TokenKept]
 
 
 class RestCalled(Message):
-    """A REST call to be recorded. `who` is the token's name, empty for an invalid token.
+    """The api reports REST calls for the audit log. `who` is the token's name, empty for an invalid token.
 
-    `count` equal calls (of one second at least) are one message; `duration_us` is of the first. `dry`: a dry run.
+    `count` equal calls, collected for at least a second, are one message. `duration_us` is the duration of the first.
+    `dry`: the call was a dry run.
     """
 
     host: str

@@ -1,4 +1,4 @@
-"""The link control <-> compiler: texts of specifications, and their contents."""
+"""The link control <-> compiler, which carries the texts of specifications and their contents."""
 
 import msgspec
 
@@ -6,13 +6,13 @@ from appliance.channel.messages.message import Message
 
 
 class Contents(msgspec.Struct, frozen=True):
-    """The contents of specifications without errors: monitors (name to file), topics that they subscribe to and
-    publish.
+    """The contents of valid specifications: the monitors (name to file), and the topics that they use.
 
-    `uses` has the other monitors whose variables a monitor uses, `published_by` the topics that each file publishes.
-    `types` has the message type of each topic, `texts` the full text of each such type. `certificates` has for each
-    property of a monitor whether its automaton was proved equal to its formula. `places` has where each topic is first
-    named (`file:line:column`). Each relay runs its part of `compiled` (`PartsWanted`).
+    `uses` maps a monitor to the other monitors whose variables it uses. `published_by` maps a file to the topics that
+    it publishes. `types` maps a topic to its message type, and `texts` maps such a type to its full definition.
+    `certificates` has each property of a monitor, and whether its automaton was proved equal to its formula. `places`
+    maps a topic to its first position in the files (`file:line:column`). Each relay runs its part of `compiled`
+    (`PartsWanted`).
     """
 
     monitors: dict[str, str] = {}
@@ -30,9 +30,9 @@ class Contents(msgspec.Struct, frozen=True):
 
 
 class ContentsWanted(Message):
-    """Control asks for the contents of these specifications (name to text), with these definitions of messages.
+    """Control asks for the contents of specifications (name to text), given these message definitions.
 
-    A `dry_run` has a smaller budget of processor time than an order.
+    A `dry_run` gets less processor time than an order.
     """
 
     number: int
@@ -49,21 +49,21 @@ class ContentsFound(Message):
 
 
 class CompilationRefused(Message):
-    """All errors of the specifications, as `file:line:column: error: text`, or why there are no parts."""
+    """The compiler rejects an order. `findings` has all errors (`file:line:column: error: text`), or the reason."""
 
     number: int
     findings: list[str]
 
 
 class PartNames(msgspec.Struct, frozen=True, array_like=True):
-    """The monitors of one relay, in their order, and which of them are in shadow mode."""
+    """The monitors of one relay in order, and the subset in shadow mode."""
 
     monitors: tuple[str, ...] = ()
     shadows: tuple[str, ...] = ()
 
 
 class PartsWanted(Message):
-    """Control asks for the parts of a compiled set (`Contents.compiled`) that several relays run."""
+    """Control asks for the parts of compiled specifications (`Contents.compiled`) that several relays run."""
 
     number: int
     compiled: bytes
@@ -71,7 +71,7 @@ class PartsWanted(Message):
 
 
 class PartsMade(Message):
-    """The parts (`rosmop/fast/serialization.py`), in the order of the question."""
+    """The compiler returns the parts (`rosmop/fast/serialization.py`) in the order of `PartsWanted`."""
 
     number: int
     parts: list[bytes]

@@ -1,13 +1,14 @@
-"""The link control <-> the forwarder of the audit log, which only reports."""
+"""The link control <-> forwarder of the audit log. The forwarder only sends reports."""
 
 from appliance.channel.messages.message import Message
 
 
 class ForwardingReported(Message):
-    """How far the audit log was forwarded; once a second at most, when something has changed.
+    """The forwarder reports its progress after a change, at most once a second.
 
-    `sent` messages in this life of the process, up to record `sequence` and checkpoint `checkpoint`; `behind` records
-    wait, the oldest for `seconds`; `missed` were removed before they could be sent; `trouble` is why nothing goes on.
+    The process has sent `sent` messages since its start, up to record `sequence` and checkpoint `checkpoint`. `behind`
+    records wait, the oldest for `seconds`. `missed` records were removed before they could be sent. `trouble` is the
+    reason if forwarding is interrupted.
     """
 
     sent: int = 0

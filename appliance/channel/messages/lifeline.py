@@ -1,4 +1,4 @@
-"""The lifeline: supervisor <-> any child."""
+"""The lifeline: the link between the supervisor and each child process."""
 
 from typing import Any, ClassVar
 
@@ -12,36 +12,40 @@ from appliance.channel.messages.tunnels import TunnelsEnclosed, TunnelsWanted
 
 
 class Ping(Message):
-    """Supervisor asks a child whether it is alive; unanswered for 5 s, the child is killed and restarted."""
+    """The supervisor asks a child whether it is alive. Without an answer in 5 s, the child is killed and restarted."""
 
     number: int
 
 
 class Pong(Message):
-    """A child's answer to `Ping`, sent from its main loop."""
+    """A child answers `Ping` from its main loop."""
 
     number: int
 
 
 class Stop(Message):
-    """Supervisor asks a child to end cleanly; it has 3 s."""
+    """The supervisor asks a child to end within 3 s."""
 
 
 class Ready(Message):
-    """A child is in service. For control: nodes may connect. `detail` is for status (addresses, ports).
+    """A child is in service. If the child is control, nodes may connect. `detail` is for the status: addresses, ports.
 
-    Control's `detail` has `master` (the URI for nodes), `revision` (of the policy), `rosout_master` (the URI of the
-    loopback listener for the appliance's own nodes), `inner_port` (of the master-side endpoints) and `token` (the
-    first access token of REST, if it was made at this start).
+    Control's `detail` has these keys:
+
+    - `master`: the URI for nodes
+    - `revision`: the revision of the policy
+    - `rosout_master`: the URI of the loopback listener for the appliance's own nodes
+    - `inner_port`: the port of the master-side endpoints
+    - `token`: the first access token of REST, if it was made at this start
     """
 
     detail: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
 class Failed(Message):
-    """A child cannot serve, with the reason; the supervisor shows it, and stops the appliance or restarts the child.
+    """A child cannot serve. The supervisor shows the reason, and stops the appliance or restarts the child.
 
-    `output` is the last lines of a program that it ran.
+    `output` has the last lines of output of the program that the child ran.
     """
 
     reason: str
@@ -49,12 +53,11 @@ class Failed(Message):
 
 
 class Walled(Message):
-    """The first message of a child: the sandbox it is in (docs/dev/architecture.md), and what this kernel lacks for
-    it.
+    """The first message of a child describes its sandbox (docs/dev/architecture.md) and missing kernel features.
 
-    `calls` is how its system calls are limited: "listed" (only those on a list), "usual" (all but those that no
-    process of the appliance makes) or empty. `landlock` is the ABI of the kernel's Landlock that limits its files and
-    ports; 0 for none.
+    `calls` is the limit on its system calls: "listed" (only calls on a list are allowed), "usual" (calls that no
+    process of the appliance makes are forbidden) or empty. `landlock` is the ABI version of the kernel's Landlock that
+    limits its files and ports; 0 means none.
     """
 
     calls: str
@@ -63,7 +66,7 @@ class Walled(Message):
 
 
 class LinkOpened(Message):
-    """Supervisor hands a child its end of a new link to another process (replaces an earlier one)."""
+    """The supervisor gives a child its end of a new link to another process. It replaces an earlier link."""
 
     descriptors: ClassVar[int] = 1
     role: str
@@ -71,29 +74,29 @@ class LinkOpened(Message):
 
 
 class SocketKept(Message):
-    """Control gives the supervisor a listening socket, under a unique name, to keep when control dies."""
+    """Control gives the supervisor a listening socket with a unique name. The supervisor keeps it if control dies."""
 
     descriptors: ClassVar[int] = 1
     name: str
 
 
 class SocketDropped(Message):
-    """Control no longer needs a kept socket."""
+    """Control no longer needs the kept socket with this name."""
 
     name: str
 
 
 class SocketRestored(Message):
-    """Supervisor returns a kept socket to a restarted control, or gives the api the one it serves (`api`)."""
+    """The supervisor returns a kept socket to a restarted control, or gives the api its listening socket (`api`)."""
 
     descriptors: ClassVar[int] = 1
     name: str
 
 
 class SocketsRestored(Message):
-    """All kept sockets have been returned; sent at every start of control, even if there are none.
+    """The supervisor has returned all kept sockets. It sends this at every start of control, even if there are none.
 
-    `announced`: the caller that started the appliance has received the `Ready` of an earlier control.
+    `announced`: the caller that started the appliance has received the `Ready` of an earlier control process.
     """
 
     count: int
@@ -105,46 +108,46 @@ class Announced(Message):
 
 
 class ProcessesChanged(Message):
-    """Supervisor tells control which processes run; sent at start and after every start or death."""
+    """The supervisor lists the running processes for control: at the start, and after each start or death of one."""
 
     processes: list[ProcessInfo]
 
 
 class ClockRead(Message):
-    """Supervisor tells control whether a time service keeps the machine's clock: at start, and when it changes."""
+    """The supervisor reports whether a time service synchronises the machine's clock: at the start, and on changes."""
 
     synchronised: bool | None
 
 
 class FirewallReported(Message):
-    """Supervisor tells control the state of isolation and firewall for `rosrv status`."""
+    """The supervisor reports the state of isolation and firewall, for `rosrv status`."""
 
     isolation: str
     report: FirewallState
 
 
 class ProbeFailed(Message):
-    """Another user could reach the port of the ROS master: control stops serving nodes and reports why."""
+    """Another user could reach the port of the ROS master. Control stops serving nodes and reports the reason."""
 
     reason: str
 
 
 class ProbePassed(Message):
-    """The port of the ROS master is hidden (again)."""
+    """The probe found that the port of the ROS master is hidden."""
 
 
 class PolicyReloadRequested(Message):
-    """Supervisor got SIGHUP: control reads the policy file again, as `rosrv policy reload` would."""
+    """The supervisor received SIGHUP. Control reads the policy file again, as for `rosrv policy reload`."""
 
 
 class RouteWanted(Message):
-    """Control asks which address of the machine a host uses to reach the appliance (netns isolation)."""
+    """Control asks for the machine's address that a host uses to reach the appliance (isolation by a namespace)."""
 
     host: str
 
 
 class RouteFound(Message):
-    """Supervisor's answer to `RouteWanted`; `address` is None if the peer's own route is the right one."""
+    """The supervisor answers `RouteWanted`. `address` is None if the address that the peer used is correct."""
 
     host: str
     address: str | None
@@ -155,7 +158,7 @@ class EndpointWanted(Message):
 
 
 class EndpointFound(Message):
-    """Supervisor's answer to `EndpointWanted`: the address (None: there is none), and the reason."""
+    """The supervisor answers `EndpointWanted` with the address, or None, and the reason."""
 
     address: str | None
     reason: str
@@ -168,21 +171,21 @@ class LogHeld(Message):
 
 
 class CompilerWanted(Message):
-    """Control has specifications to compile: the supervisor starts the compiler if it is not running."""
+    """Control has specifications to compile. The supervisor starts the compiler if it is not running."""
 
 
 class ApplianceStopRequested(Message):
-    """Control asks the supervisor to end the appliance (the `shutdown` call of the Master API, granted)."""
+    """Control asks the supervisor to end the appliance, after a granted `shutdown` call of the Master API."""
 
     reason: str
 
 
 class StateGiven(Message):
-    """Supervisor gives a relay a memory for the state of its monitors: first those of earlier lives of the appliance,
-    which it only reads, then its `own`.
+    """The supervisor gives a relay shared memory with the state of monitors.
 
-    `boot` names this start of the machine; `offset` and the machine's monotonic clock are the time of monitors (ns).
-    `ended_boot` names the start of the machine in which the appliance last ended in order, at `ended_at` (ns since the
+    It sends the memory of earlier lives of the appliance first, which the relay only reads, and then the relay's `own`.
+    `boot` identifies the present boot of the machine. The monitors' time (ns) is the machine's monotonic clock plus
+    `offset`. `ended_boot` identifies the boot in which the appliance last ended in order, at `ended_at` (ns since the
     epoch).
     """
 

@@ -1,4 +1,4 @@
-"""The recorder's links: the memory that the supervisor gives to relays and recorder, and control <-> the recorder."""
+"""The recorder's links: the supervisor gives relays and recorder shared memory, and control <-> recorder."""
 
 from typing import ClassVar
 
@@ -9,11 +9,11 @@ from appliance.channel.messages.message import Message
 
 
 class RingGiven(Message):
-    """The supervisor gives relay `index`, and the recorder, the memory in which that relay leaves what it receives.
+    """The supervisor gives relay `index` and the recorder shared memory. The relay stores received messages there.
 
-    It was made at `since` (nanoseconds since the epoch). The relay keeps `seconds` of the topics whose name matches a
-    glob of `topics`, except those whose name or type matches one of `never`. `sums` has the known md5sums of types that
-    match a glob of `never`: a topic that claims such a type must have its sum.
+    The memory was made at `since` (nanoseconds since the epoch). The relay keeps the last `seconds` of each topic whose
+    name matches a glob of `topics`, unless its name or type matches a glob of `never`. `sums` lists the known md5sums
+    of types that match a glob of `never`. A topic that claims such a type must have its md5sum.
     """
 
     descriptors: ClassVar[int] = 1
@@ -26,11 +26,11 @@ class RingGiven(Message):
 
 
 class RecordingsAsked(Message):
-    """Control asks for the list of recordings, and for another report of those that it has not noted."""
+    """Control asks for the list of recordings, and for a new report of each recording that it has not noted."""
 
 
 class RecordingsStated(Message):
-    """All recordings that are kept, the oldest first."""
+    """The recorder lists all kept recordings, oldest first."""
 
     recordings: list[Recording]
 
@@ -40,14 +40,14 @@ class RevisionsWanted(Message):
 
 
 class RevisionsStated(Message):
-    """The revisions of policy and specifications in force."""
+    """Control states the revisions of policy and specifications in force."""
 
     policy: int
     monitors: int
 
 
 class RecordingClosed(Message):
-    """A recording is complete; repeated until control has noted it."""
+    """A recording is complete. The recorder repeats this report until control has noted it."""
 
     recording: Recording
 
@@ -59,7 +59,7 @@ class RecordingNoted(Message):
 
 
 class RecordingRequested(Message):
-    """Control asks for a recording from `before` seconds before now (`trigger`) to `after` seconds after."""
+    """Control asks for a recording from `before` seconds before the trigger to `after` seconds after it."""
 
     number: int
     trigger: Trigger
@@ -68,7 +68,7 @@ class RecordingRequested(Message):
 
 
 class RecordingStarted(Message):
-    """The recording of request `number` is `id`, from `began` to `ends` (ns) or later."""
+    """The recorder began the recording `id` for request `number`. It covers `began` to `ends` (ns) or later."""
 
     number: int
     id: str
@@ -85,9 +85,9 @@ class RecordingRemovalWanted(Message):
 
 
 class RecordingRemoved(Message):
-    """A recording was removed: for `who` (then `number` is that of the order), or because of `reason`.
+    """A recording was removed by order `number` of `who`, or because of `reason`.
 
-    Repeated until control has noted it.
+    The recorder repeats this report until control has noted it.
     """
 
     number: int
@@ -97,7 +97,7 @@ class RecordingRemoved(Message):
 
 
 class MemoryWanted(Message):
-    """Control asks for the data in memory from `since` to `until` (ns), to be read but not kept."""
+    """Control asks for a temporary recording of the data in memory from `since` to `until` (ns)."""
 
     number: int
     trigger: Trigger
@@ -106,7 +106,7 @@ class MemoryWanted(Message):
 
 
 class MemoryLent(Message):
-    """The data of request `number` can be read as `recording`, which expires or makes room for later ones."""
+    """The data of request `number` can be read as `recording`. It expires, or is removed for later ones."""
 
     number: int
     recording: Recording
@@ -121,9 +121,9 @@ class RecordingRefused(Message):
 
 
 class RecordingMissed(Message):
-    """A trigger made no recording, with the reason; sent only now and then.
+    """A trigger made no recording, for this reason. The recorder sends only some of these reports.
 
-    `planned` is the recording that the trigger's record promised, if it did.
+    `planned` is the recording that the trigger's audit record promised, if any.
     """
 
     trigger: Trigger

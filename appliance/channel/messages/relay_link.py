@@ -1,6 +1,7 @@
-"""The link control <-> relay. Control states what is wanted; the relay reports what it sees.
+"""The link control <-> relay. Control sends the wanted state; the relay reports connections, traffic and events.
 
-`key` is the key of an incarnation. Each link has one file, so that related messages are changed together.
+`key` is the key of an incarnation. All messages of the link are in this file, so that related messages are changed
+together.
 """
 
 from typing import Any, ClassVar, Literal
@@ -11,30 +12,30 @@ from appliance.channel.messages.message import Message
 
 
 class StateBegan(Message):
-    """Control restates everything: facts that it does not restate before `StateEnded` are withdrawn."""
+    """Control begins to send its whole state. Facts that it does not send again before `StateEnded` are withdrawn."""
 
     epoch: int
 
 
 class StateEnded(Message):
-    """End of the restatement that began with the same epoch."""
+    """Control has sent its whole state since the `StateBegan` with the same epoch."""
 
     epoch: int
 
 
 class OrdersAsked(Message):
-    """Control asks for `OrdersCarriedOut` when all its earlier orders are carried out."""
+    """Control asks the relay to send `OrdersCarriedOut` once all earlier orders are carried out."""
 
 
 class OrdersCarriedOut(Message):
-    """The relay's answer to `OrdersAsked`; several are answered in order."""
+    """The relay answers `OrdersAsked`. Several are answered in order."""
 
 
 class NodePlaced(Message):
-    """An incarnation, and the listening socket that replaces its TCPROS port.
+    """Control places an incarnation, with the listening socket that replaces its TCPROS port.
 
-    `host` is the address at which the node is called, `name` the node's name (its `callerid`). `monitors`: it is the
-    appliance's own publisher, whose port sends the messages that monitors publish.
+    `host` is the address for calls to the node; `name` is the node's name (its `callerid`). `monitors`: the incarnation
+    is the appliance's own publisher, whose port sends the messages that monitors publish.
     """
 
     descriptors: ClassVar[int] = 1
@@ -45,13 +46,13 @@ class NodePlaced(Message):
 
 
 class NodeWithdrawn(Message):
-    """An incarnation is gone: its port is closed, its connections are cut."""
+    """An incarnation is gone. The relay closes its port and cuts its connections."""
 
     key: str
 
 
 class FlowLimit(msgspec.Struct, frozen=True, array_like=True):
-    """The traffic that may pass in a second: messages, bytes; 0 is unlimited."""
+    """The messages and bytes that may pass in a second; 0 means unlimited."""
 
     messages: float = 0.0
     bytes: float = 0.0
@@ -61,11 +62,11 @@ UNLIMITED = FlowLimit()
 
 
 class PublicationPlaced(Message):
-    """The incarnation publishes this topic (type as registered, `*` when unknown).
+    """The incarnation publishes this topic. The type is as registered, `*` if unknown.
 
-    `limit` is for all publications of the topic on this host, `together` for all of the topic, which hosts (by
-    `counted_as`) share equally. A second statement changes the limits. `named`: the policy names the node's host, not
-    only all hosts (`*`).
+    `limit` applies to all publications of the topic on this host. `together` applies to all publications of the topic;
+    hosts, by `counted_as`, share it equally. Sending this message again changes the limits. `named`: the policy names
+    the node's host, not only all hosts (`*`).
     """
 
     key: str
@@ -78,7 +79,7 @@ class PublicationPlaced(Message):
 
 
 class PublicationWithdrawn(Message):
-    """The incarnation no longer publishes this topic: its connections are cut."""
+    """The incarnation no longer publishes this topic. The relay cuts its connections."""
 
     key: str
     topic: str
@@ -94,16 +95,16 @@ class ServicePlaced(Message):
 
 
 class ServiceWithdrawn(Message):
-    """The incarnation no longer offers this service: its connections are cut."""
+    """The incarnation no longer offers this service. The relay cuts its connections."""
 
     key: str
     service: str
 
 
 class GrantInstalled(Message):
-    """This subscriber (host, caller_id) may subscribe to this topic of that incarnation, up to a limit.
+    """A subscriber (host, caller_id) may subscribe to this topic of the incarnation, up to a limit.
 
-    A second statement changes the limit. `named`: the policy names the host, not only all hosts (`*`).
+    Sending this message again changes the limit. `named`: the policy names the host, not only all hosts (`*`).
     """
 
     key: str
@@ -115,7 +116,7 @@ class GrantInstalled(Message):
 
 
 class GrantRevoked(Message):
-    """The grant is gone; a connection that uses it is cut."""
+    """The grant is gone. The relay cuts a connection that uses it."""
 
     key: str
     topic: str
@@ -124,7 +125,7 @@ class GrantRevoked(Message):
 
 
 class ClientGranted(Message):
-    """This client (host, caller_id) may call this service of that incarnation.
+    """A client (host, caller_id) may call this service of the incarnation.
 
     `named`: the policy names the host, not only all hosts (`*`).
     """
@@ -137,7 +138,7 @@ class ClientGranted(Message):
 
 
 class ClientRevoked(Message):
-    """The client may no longer call the service; connections that use it are cut."""
+    """The client may no longer call the service. The relay cuts the client's connections to it."""
 
     key: str
     service: str
@@ -146,14 +147,14 @@ class ClientRevoked(Message):
 
 
 class UpstreamWanted(Message):
-    """The relay needs the publisher's TCPROS address for a topic: control calls `requestTopic` there."""
+    """The relay needs the publisher's TCPROS address for a topic. Control calls `requestTopic` of the publisher."""
 
     key: str
     topic: str
 
 
 class UpstreamFound(Message):
-    """Answer to `UpstreamWanted`: connect here."""
+    """Control answers `UpstreamWanted`: the relay may connect to this address."""
 
     key: str
     topic: str
@@ -162,7 +163,7 @@ class UpstreamFound(Message):
 
 
 class UpstreamRefused(Message):
-    """Answer to `UpstreamWanted`: the publisher cannot be asked or refused; the relay asks again later."""
+    """Control answers `UpstreamWanted`: the publisher did not answer, or refused. The relay asks again later."""
 
     key: str
     topic: str
@@ -173,9 +174,9 @@ Violation = Literal["", "limit exceeded", "malformed", "connection refused"]
 
 
 class UpstreamLost(Message):
-    """A connection to a publisher broke or could not be made: control checks the node at once.
+    """A connection to a publisher broke or could not be made. Control checks the node at once.
 
-    `violation` is the event to record if the relay cut it because of the publisher's data; otherwise empty.
+    `violation` is the event to record if the relay cut the connection because of the publisher's data; otherwise empty.
     """
 
     key: str
@@ -185,7 +186,7 @@ class UpstreamLost(Message):
 
 
 class LatchRefused(Message):
-    """A latched message of a publisher is passed on and not kept: its host has no memory left for latched messages."""
+    """A publisher's latched message was passed on but not kept, because its host's memory for them is used up."""
 
     key: str
     topic: str
@@ -193,7 +194,7 @@ class LatchRefused(Message):
 
 
 NO_GRANT = "no grant for"
-"""The beginning of the reason of a `ConnectionRefused` without a grant, and of no other."""
+"""The beginning of the reason of each `ConnectionRefused` for lack of a grant. No other reason begins like this."""
 
 
 class ConnectionOpened(Message):
@@ -215,9 +216,9 @@ class ConnectionClosed(Message):
 
 
 class ConnectionRefused(Message):
-    """A connection to a relay port was refused; `resource` is the topic or service that the header asked for.
+    """A connection to a relay port was refused. `resource` is the topic or service in its header.
 
-    `kind` is "topic" or "service"; both are empty for a header that names neither.
+    `kind` is "topic" or "service". Both fields are empty if the header names neither.
     """
 
     key: str
@@ -226,26 +227,26 @@ class ConnectionRefused(Message):
     host: str
     caller_id: str
     reason: str
-    count: int  # identical refusals are counted together
+    count: int  # the number of identical refusals
 
 
 DELAY_BOUNDS = (0.00005, 0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.1)
-"""Bounds (seconds) of the delays that `TopicTraffic` counts."""
+"""The upper bounds (seconds) of the histogram of delays in `TopicTraffic`."""
 
 
 class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
     """The traffic of one relayed topic since the last report.
 
-    `delays` counts messages by the time from their receipt to the write to the subscribers' sockets: up to each of
-    `DELAY_BOUNDS`, and beyond; empty if none was delivered. `delay_seconds` is their sum. `md5sum` is from the
-    publisher's header; empty while it is not known, and for services.
+    `delays` counts messages by the time from their receipt to the write to the subscribers' sockets. It has a count for
+    each of `DELAY_BOUNDS` and one for longer delays, or is empty if no message was delivered. `delay_seconds` is the
+    sum of all delays. `md5sum` is from the publisher's header; it is empty while unknown, and for services.
     """
 
     key: str
     resource: str
     messages: int
     bytes: int
-    dropped: int  # at slow subscribers
+    dropped: int  # messages that were dropped for slow subscribers
     subscribers: int
     delays: list[int] = msgspec.field(default_factory=list)
     delay_seconds: float = 0.0
@@ -255,7 +256,8 @@ class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
 class LimitedRow(msgspec.Struct, frozen=True, array_like=True):
     """Messages of a publication that a limit dropped since the last report.
 
-    `part` is the scope of the limit. `host` and `caller_id` are the publisher's, or for a subscriber's limit its own.
+    `part` is the scope of the limit. `host` and `caller_id` identify the publisher, or, for a subscriber's limit, the
+    subscriber.
     """
 
     key: str
@@ -268,16 +270,16 @@ class LimitedRow(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MessagesLimited(Message):
-    """The messages that limits of the policy dropped; at most once a second."""
+    """The relay reports the messages that limits of the policy dropped, at most once a second."""
 
     rows: list[LimitedRow]
 
 
 class TrafficReported(Message):
-    """Counters of all relayed topics and services that changed; once a second at most.
+    """The relay reports the changed counters of topics and services, at most once a second.
 
-    `over` is the seconds that they cover. `unrecorded` counts connections that came and went without a control and are
-    not reported one by one. `memory` has the bytes that all hosts hold now, by kind.
+    The counters cover `over` seconds. `unrecorded` counts connections that began and ended while there was no control
+    process; they are not reported one by one. `memory` has the bytes that all hosts hold now, by kind.
     """
 
     rows: list[TopicTraffic]
@@ -287,15 +289,17 @@ class TrafficReported(Message):
 
 
 class SpecificationsStated(Message):
-    """Control states the specifications in force: before anything is placed, and at every change.
+    """Control sends the specifications in force: before it places any topic, and at every change.
 
-    `part` is this relay's part of the compiled specifications (`rosmop/fast/serialization.py`; empty: it has none).
-    `enabled` has for each monitor of this relay whether its events happen. With `restarted`, a relay without
-    specifications replaces one that died, so monitors with the modifier `hold` block their topics. So do the monitors
-    in `moved`, which come from another relay and begin here. `statement` numbers the statements and is repeated in the
-    answer, because the same revision may be stated again. With `ahead`, later statements are carried out once this one
-    is in force (or refused), so that nothing is placed before its monitors. The monitors in `shadows` are in shadow
-    mode: they get copies of messages. `slices` is the largest number of slices of a parametric specification.
+    `part` is this relay's part of the compiled specifications (`rosmop/fast/serialization.py`; empty if it has none).
+    `enabled` maps each monitor of this relay to whether its events happen. `restarted`: this relay replaces one that
+    died, so its monitors with the modifier `hold` block their topics. The monitors in `moved` come from another relay
+    and start here; with `hold`, they also block their topics.
+
+    `statement` is the number of this message. The answer repeats it, because the same revision may be sent again.
+    `ahead`: the relay carries out later messages only after these specifications are in force or rejected, so no topic
+    is placed before its monitors. The monitors in `shadows` are in shadow mode: they get copies of messages. `slices`
+    is the largest number of slices of a parametric specification.
     """
 
     revision: int
@@ -311,21 +315,23 @@ class SpecificationsStated(Message):
 
 
 class MonitorSwitched(Message):
-    """From now on the events of this monitor happen, or do not."""
+    """Control enables or disables the events of a monitor from now on."""
 
     name: str
     enabled: bool
 
 
 class MonitorResumed(Message):
-    """A monitor that holds its topics lets them go on."""
+    """Control lets the topics continue that a monitor holds."""
 
     name: str
 
 
 class SpecificationsTaken(Message):
-    """The relay has these specifications in force. `began` are the monitors that started in their initial state, `held`
-    those that hold their topics, `because` the reasons of those that do so because their state is lost.
+    """The relay has brought the specifications into force.
+
+    `began` lists the monitors that started in their initial state. `held` lists the monitors that hold their topics.
+    `because` has the reason for each monitor that holds its topics because its state was lost.
     """
 
     revision: int
@@ -336,7 +342,7 @@ class SpecificationsTaken(Message):
 
 
 class SpecificationsRefused(Message):
-    """The relay could not take the specifications: its present ones stay; without any, everything is blocked."""
+    """The relay rejects the specifications and keeps its present ones. If it has none, it blocks everything."""
 
     revision: int
     findings: list[str]
@@ -344,7 +350,7 @@ class SpecificationsRefused(Message):
 
 
 class OwnHeaderStated(Message):
-    """The connection header, without names, of a topic on which control itself publishes (`OwnPublished`)."""
+    """Control sends the connection header, without names, of a topic on which control publishes (`OwnPublished`)."""
 
     topic: str
     type: str
@@ -353,14 +359,14 @@ class OwnHeaderStated(Message):
 
 
 class OwnPublished(Message):
-    """Control publishes a message as the appliance's own publisher; `data` is without its length."""
+    """Control publishes a message as the appliance's own publisher. `data` does not include the length field."""
 
     topic: str
     data: bytes
 
 
 class OwnServiceCalled(Message):
-    """A client called the service that the appliance itself offers; it waits for `OwnServiceAnswered`."""
+    """A client called the appliance's own service, and waits for `OwnServiceAnswered`."""
 
     number: int
     service: str
@@ -369,7 +375,7 @@ class OwnServiceCalled(Message):
 
 
 class OwnServiceAnswered(Message):
-    """The result of a call of the appliance's own service, in words."""
+    """Control answers a call of the appliance's own service, with a text."""
 
     number: int
     success: bool
@@ -377,7 +383,7 @@ class OwnServiceAnswered(Message):
 
 
 class PublicationRefused(Message):
-    """A publisher (or service) is not carried, because its definition differs from that of the specifications."""
+    """The relay does not carry a publisher or service, because its definition differs from the specifications'."""
 
     key: str
     resource: str
@@ -385,15 +391,17 @@ class PublicationRefused(Message):
 
 
 class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
-    """An action of a monitor: the first of its kind and second in full, the others as a count.
+    """An action of a monitor. The first action of each kind in a second is complete; the others are only counted.
 
-    `kind` is verdict, drop, change, fault, log or publish. With the prefix "shadow " it is what a monitor in shadow
-    mode would have done ("shadow missed": a message that it did not get); `time` is nanoseconds since the epoch;
-    `before` and `after` are the first bytes of the message (`size` is its whole length). `count` is 0 for an event in
-    full, else the number of further ones. `monitor` is the one that acted, for a change the last one; `changed_by` in
-    the detail names the events of all (in a count: if it was more than one monitor). `host` and `caller_id` are those
-    of the message's sender: publisher, client or server (in a count: empty if there were several of one host); empty
-    for timed events. `number`, `seq` and `stamp` in the detail identify the message.
+    `kind` is verdict, drop, change, fault, log or publish. The prefix "shadow " marks what a monitor in shadow mode
+    would have done ("shadow missed": a message that it did not get). `time` is in nanoseconds since the epoch. `count`
+    is 0 for a complete event, otherwise the number of counted events.
+
+    `before` and `after` are the first bytes of the message; `size` is its whole length. `monitor` is the monitor that
+    acted, and for a change the last one; `changed_by` in the detail names the events of all monitors that changed the
+    message (in a count, only if there were several). `host` and `caller_id` identify the sender of the message:
+    publisher, client or server. They are empty for timed events; in a count, `caller_id` is empty for several senders
+    of one host. `number`, `seq` and `stamp` in the detail identify the message.
     """
 
     kind: str
@@ -412,8 +420,9 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MonitorsReported(Message):
-    """Events of monitors; batches, a few a second at most. `lost` is the number that could not be kept without a
-    control.
+    """The relay reports events of monitors in batches, at most a few times a second.
+
+    `lost` is the number of events that were lost while there was no control process.
     """
 
     events: list[MonitorEvent]
@@ -421,9 +430,9 @@ class MonitorsReported(Message):
 
 
 class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
-    """The state and counters of one running monitor; counters since it was loaded or the relay started.
+    """The state and counters of a running monitor. It counts since it was loaded, or since the relay started.
 
-    For a monitor in shadow mode (`shadow`), drops and changes are those that it would have made, and `missed` counts
+    A monitor in shadow mode (`shadow`) counts the drops and changes that it would have made. `missed` counts the
     messages that it would have received if it were in force. A parametric specification has `slices` slices now, and at
     most `slice_limit`.
     """
@@ -445,13 +454,13 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MonitorsCounted(Message):
-    """All monitors; once a second at most, when something has changed."""
+    """The relay reports the counters of all monitors after a change, at most once a second."""
 
     rows: list[MonitorRow]
 
 
 class LookWanted(Message):
-    """An operator wants the next messages of a topic, at most `messages`, with or without the `latched` one first."""
+    """Control asks for at most `messages` next messages of a topic. `latched`: the latched message comes first."""
 
     number: int
     topic: str
@@ -466,9 +475,9 @@ class LookEnded(Message):
 
 
 class MessageSeen(Message):
-    """A message of a tap, as subscribers get it: `time` in nanoseconds since the epoch, its type, its size in bytes.
+    """A message of a tap, as subscribers get it. `time` is in nanoseconds since the epoch, the size in bytes.
 
-    Long `fields` are shortened; `why` is the reason if there are only the first bytes.
+    Long `fields` are shortened. If there are only the first bytes, `why` is the reason.
     """
 
     number: int

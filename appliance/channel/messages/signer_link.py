@@ -1,4 +1,4 @@
-"""The link control <-> signer: signatures of audit checkpoints, certificates."""
+"""The link control <-> signer, for signatures of audit checkpoints and for certificates."""
 
 from typing import Annotated
 
@@ -15,7 +15,7 @@ class SignatureWanted(Message):
 
 
 class SignatureMade(Message):
-    """The signer's Ed25519 signature (64 bytes) over `SignatureWanted.text`, and its raw public key (32)."""
+    """The signer returns its Ed25519 signature of `SignatureWanted.text` (64 bytes), and its public key (32 bytes)."""
 
     number: int
     signature: bytes
@@ -23,7 +23,7 @@ class SignatureMade(Message):
 
 
 class SignatureRefused(Message):
-    """The signer's refusal to sign a checkpoint that does not follow the last signed one, with the reason."""
+    """The signer refuses to sign a checkpoint that does not follow the last signed checkpoint, for this reason."""
 
     number: int
     reason: str
@@ -32,7 +32,7 @@ class SignatureRefused(Message):
 class RemovalWanted(Message):
     """Control asks the signer to approve the removal of all records up to checkpoint `number`.
 
-    `checkpoint` is its text, `newest` that of the last checkpoint that was signed.
+    `checkpoint` is the text of this checkpoint, `newest` the text of the last signed checkpoint.
     """
 
     number: int
@@ -41,7 +41,7 @@ class RemovalWanted(Message):
 
 
 class RemovalApproved(Message):
-    """The removal follows from the settings: its text, and the signer's signature over it."""
+    """The settings require the removal. The signer returns the removal's text, and its signature over the text."""
 
     number: int
     text: bytes
@@ -50,7 +50,7 @@ class RemovalApproved(Message):
 
 
 class RemovalRefused(Message):
-    """The removal does not follow from the settings, with the reason. `early`: it will later."""
+    """The settings do not permit the removal, for this reason. `early`: they will permit it later."""
 
     number: int
     reason: str
@@ -58,23 +58,23 @@ class RemovalRefused(Message):
 
 
 class AuthorityRequest(Message):
-    """Control asks the signer for the certificate of the appliance's authority; `number` pairs all these."""
+    """Control asks for the certificate of the appliance's authority. An answer has the `number` of its request."""
 
     number: int
 
 
 class AuthorityStated(Message):
-    """The authority's certificate, in PEM."""
+    """The signer returns the authority's certificate, in PEM."""
 
     number: int
     certificate: bytes
 
 
 class CertificateWanted(Message):
-    """Control asks for a certificate in this name for the key of a signing request (PKCS #10, PEM).
+    """Control asks for a certificate in this name, for the key in a signing request (PKCS #10, PEM).
 
-    A `proof` must be a signature over the bytes of `request`, by the key of the certificate `former` (PEM), which the
-    authority made for the same name.
+    `proof`, if given, must be a signature over the bytes of `request` by the key of the certificate `former` (PEM). The
+    authority must have issued `former` for the same name.
     """
 
     number: int
@@ -86,7 +86,7 @@ class CertificateWanted(Message):
 
 
 class CertificateMade(Message):
-    """The certificate (PEM), its serial number in hexadecimal, and its end in seconds since the epoch."""
+    """The signer returns the certificate (PEM), its serial number (hexadecimal) and its end (s since the epoch)."""
 
     number: int
     certificate: bytes
@@ -95,7 +95,7 @@ class CertificateMade(Message):
 
 
 class CertificateRefused(Message):
-    """The signer's refusal to make a certificate for this request, with the reason."""
+    """The signer refuses to make a certificate for this request, for this reason."""
 
     number: int
     reason: str
@@ -109,14 +109,14 @@ class RevokedCertificate(msgspec.Struct, frozen=True):
 
 
 class RevocationsRequest(Message):
-    """Control asks for the signed list of exactly these revoked certificates."""
+    """Control asks for a signed list of exactly these revoked certificates."""
 
     number: int
     revoked: list[RevokedCertificate]
 
 
 class RevocationsMade(Message):
-    """The list of revoked certificates (CRL, PEM)."""
+    """The signer returns the signed list of revoked certificates (CRL, PEM)."""
 
     number: int
     revocations: bytes

@@ -1,4 +1,4 @@
-"""Tunnels: control -> supervisor over the lifeline, control <-> the process that runs charon."""
+"""Messages about tunnels: control -> supervisor over the lifeline, and control <-> the process that runs charon."""
 
 from typing import Literal
 
@@ -7,12 +7,14 @@ import msgspec
 from appliance.channel.messages.message import Message
 
 Esp = Literal["kernel", "user space"]
-APPLIANCE_NAME = "rosrv-appliance"  # in the appliance's own certificate; no host may have it
+APPLIANCE_NAME = "rosrv-appliance"  # the name in the appliance's own certificate; no host may have this name
 
 
 class TunnelsWanted(Message):
-    """Control asks the supervisor for tunnels: addresses of `pool` are accepted through IPsec only from now on,
-    the appliance has `address` (in `pool`), and the process that runs charon is there.
+    """Control asks the supervisor for tunnels.
+
+    From now on, addresses of `pool` are accepted only through IPsec, the appliance has `address` (in `pool`), and the
+    process that runs charon is started.
     """
 
     pool: str
@@ -20,27 +22,27 @@ class TunnelsWanted(Message):
 
 
 class TunnelsEnclosed(Message):
-    """Answer to `TunnelsWanted`: the firewall is in force, and where ESP runs; otherwise `reason` says why not."""
+    """The supervisor answers `TunnelsWanted`: the firewall is in force, and where ESP runs. Otherwise, see `reason`."""
 
     esp: Esp | None
     reason: str = ""
 
 
 class CertificateNeeded(Message):
-    """charon's process asks for a certificate for the appliance's own key, by a signing request (PEM)."""
+    """The charon process asks for a certificate for the appliance's own key, with a signing request (PEM)."""
 
     request: bytes
 
 
 class CharonStarted(Message):
-    """charon runs, in this version; `key_exchange` has the methods that it may offer, the best first."""
+    """charon is running with this version. `key_exchange` lists the methods that it may offer, best first."""
 
     version: str
     key_exchange: list[str]
 
 
 class TunnelHost(msgspec.Struct, frozen=True):
-    """A host that may come: its name, the virtual address kept for it, the serial of its certificate."""
+    """A host that may open a tunnel: its name, its virtual address, and the serial number of its certificate."""
 
     name: str
     address: str
@@ -48,7 +50,7 @@ class TunnelHost(msgspec.Struct, frozen=True):
 
 
 class TunnelsStated(Message):
-    """The data that charon needs: certificates and the list of revoked ones in PEM, the hosts that may come."""
+    """Control sends the data that charon needs: certificates, the revocation list (PEM), and the permitted hosts."""
 
     number: int
     esp: Esp
@@ -60,7 +62,7 @@ class TunnelsStated(Message):
 
 
 class TunnelChanged(Message):
-    """The tunnel of a host came up from, or went down to, this real address."""
+    """The tunnel between a host at this real address and the appliance went up or down."""
 
     name: str
     up: bool
@@ -68,9 +70,9 @@ class TunnelChanged(Message):
 
 
 class TunnelRefused(Message):
-    """A host at this real address asked for a tunnel and was refused; with `packets`, that many packets were.
+    """The host at this real address was refused: its request for a tunnel, or, if not 0, this number of `packets`.
 
-    The source that a packet of a tunnel claims is not verified.
+    The source address of a tunnel's packet is not verified.
     """
 
     remote: str
@@ -79,7 +81,7 @@ class TunnelRefused(Message):
 
 
 class TunnelSeen(msgspec.Struct, frozen=True):
-    """An established tunnel, its age in seconds, and its bytes as the appliance counts them."""
+    """An established tunnel, its age in seconds, and its traffic in bytes as counted by the appliance."""
 
     name: str
     remote: str
@@ -89,7 +91,7 @@ class TunnelSeen(msgspec.Struct, frozen=True):
 
 
 class TunnelsReported(Message):
-    """All present tunnels; charon has taken the statement with the number `taken`."""
+    """The charon process lists all present tunnels. It has carried out the `TunnelsStated` with the number `taken`."""
 
     taken: int
     rows: list[TunnelSeen]
