@@ -1,6 +1,6 @@
-"""RVMaster: listens where nodes expect the ROS master, decides every request and forwards granted ones.
+"""RVMaster listens where nodes expect the ROS master, decides every request, and forwards granted requests.
 
-The path of a request: `http` (socket, limits) → `pipeline` (parse, canonicalise, decide, record, perform, answer), by
-the rows of the call table. `gate` makes all decisions, `registry` has nodes and registrations, `endpoints` has the
-proxies between nodes, and `reconcile` makes the ROS master match the registry.
+`rpc.server` receives a request within limits. `calls/pipeline` parses, decides, records and answers the request by the
+rows of the call table. `calls/gate` makes all decisions. `graph/registry` has nodes and registrations. `endpoints` has
+the proxies between nodes. `reconcile` makes the ROS master match the registry.
 """

@@ -1,4 +1,4 @@
-"""Define the caller of RVMaster or of a proxy endpoint, the URI that a node gives for itself, and the answer."""
+"""Define the caller and the answer of a call to RVMaster or a proxy endpoint, and the URI that a node registers."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,17 +15,17 @@ Answer = list[Value]
 
 @dataclass(frozen=True, slots=True)
 class ApiUri:
-    """The URI of a node or service, as given and as parsed."""
+    """The URI of a node or service: the text as received, and the parsed URI."""
 
     text: str
     uri: NodeUri
 
 
 class Caller(NamedTuple):
-    """The caller: the peer, and the `caller_id` that it claims.
+    """The caller: the peer, and the `caller_id` that the peer claims.
 
-    `own` marks the appliance's own nodes, which call RVMaster on a separate listener. `target` is the incarnation that
-    a call to a proxy endpoint is for.
+    `own` marks the appliance's own nodes, which call RVMaster on a separate listener. For a call to a proxy endpoint,
+    `target` is the called incarnation.
     """
 
     peer: Peer
@@ -35,7 +35,7 @@ class Caller(NamedTuple):
     target: Incarnation | None = None
 
     def as_named(self, caller_id: str) -> "Caller":
-        """Return the same caller with the name that it claims in this call."""
+        """Return the same caller with the name that is claimed in this call."""
         return Caller(self.peer, caller_id, self.arrived, self.own, self.target)
 
     @property

@@ -1,13 +1,14 @@
-"""Charge each parameter, with the namespaces that were made for it, to the host that set it.
+"""Charge each parameter, and the namespaces that were made for it, to the host that set the parameter.
 
-A *place* is a key from which on parameters have another owner than above it, so there are few places for any number of
-parameters. Parameters that no host set are the appliance's (loopback): its own, and the tree of an earlier version.
+A *place* is a key where the owner changes: the parameters at this key and below have a different owner than those
+above. So there are few places, even for many parameters. Parameters that no host has set belong to the appliance
+(loopback): its own parameters, and the tree of an earlier version.
 
 Invariants:
 
-1. The weights of all places together are the weight of the tree.
+1. The sum of the weights of all places is the weight of the tree.
 2. A place and the nearest place above it have different owners.
-3. Every place except the root is a key of the tree, is stored by the journal, and is removed with its key.
+3. Every place except the root is a key of the tree. The journal stores the place; it is removed with its key.
 """
 
 from collections import Counter
@@ -24,20 +25,20 @@ from roswire.xmlrpc import Value
 
 APPLIANCE: Address = address_of("127.0.0.1")
 NAME_WEIGHT = 40
-"""The approximate bytes that a member of a namespace takes besides its name and its value."""
-_VALUE, _TEXT, _ARRAY, _STRUCT = 45, 35, 50, 40  # the same for other values
+"""The approximate bytes that a member of a namespace takes in addition to its name and value."""
+_VALUE, _TEXT, _ARRAY, _STRUCT = 45, 35, 50, 40  # the additional bytes of other values
 _NUMBERS = frozenset({bool, int, float})
 
 
 class LimitReachedError(Exception):
-    """A call would exceed a limit; the message has the limit."""
+    """A call would exceed a limit; the message names the limit."""
 
 
 class OwnersJournal(Protocol):
-    """A store of owners, which survives a crash of control."""
+    """A store of the owners of places. It survives a crash of control."""
 
     def parameter_owned(self, key: str, host: str) -> None:
-        """Store this host as the owner of the parameters at this key and below."""
+        """Store a host as the owner of the parameters at this key and below."""
 
     def parameters_disowned(self, key: str) -> None:
         """Remove the places at this key and below."""
@@ -45,10 +46,10 @@ class OwnersJournal(Protocol):
 
 @dataclass(slots=True)
 class _Place:
-    """A place if it has an owner, otherwise a key on the path to places below it."""
+    """A place, if it has an owner. Otherwise, a key on the path to places below."""
 
     owner: Address | None = None
-    weight: int = 0  # without the places below it
+    weight: int = 0  # bytes, without the places below
     below: "dict[str, _Place]" = field(default_factory=dict)
 
     def owned(self) -> "Iterator[_Place]":
@@ -60,7 +61,7 @@ class _Place:
 
 
 class ParameterCharges:
-    """The charges for parameters to a pool of bytes. `owners` are keys and hosts from the journal."""
+    """Charge parameters to a pool of bytes. `owners` has keys and hosts from the journal."""
 
     def __init__(
         self, pool: Pool[Address], journal: OwnersJournal, owners: Iterable[tuple[str, str]] = ()
@@ -75,7 +76,7 @@ class ParameterCharges:
             place.owner = address_of(host)
 
     def held(self, parts: Sequence[str], weight: int) -> Mapping[Address, int]:
-        """Return the weight of each owner at this key and below; `weight` is their sum."""
+        """Return the weight of each owner at this key and below. `weight` is the sum of these weights."""
         path = self._path(parts)
         owner = _owner(_region(path, parts))
         if len(path) <= len(parts):
@@ -87,10 +88,10 @@ class ParameterCharges:
         return held
 
     def replaced(self, parts: Sequence[str], before: int, after: int, owner: Address) -> None:
-        """Change the weight at this key from `before` to `after` (0: deleted), and charge this owner."""
+        """Change the weight at this key from `before` to `after` (0: the key is deleted), and charge the owner."""
         path = self._path(parts)
         region = _region(path, parts)
-        begun = len(path) > len(parts)  # whether it is a place, or on the path to one
+        begun = len(path) > len(parts)  # whether the key is a place, or on the path to a place
         place = path[-1] if begun else region
         if parts and place.owner == owner and not (begun and (place.below or not after)):
             place.weight += after - before  # the usual case: no place begins or ends
@@ -112,7 +113,7 @@ class ParameterCharges:
         self.pool.charge(owner, after)
 
     def recount(self, tree: Tree, *, final: bool) -> None:
-        """Weigh the places of a replaced tree again. `final`: remove places that the tree lacks."""
+        """Weigh all places again after the tree was replaced. `final`: remove places that the tree does not have."""
         self._recount(self._root, tree, measure(tree)[0], (), final=final)
 
     def _release(self, parts: Sequence[str], weight: int) -> None:
@@ -135,7 +136,7 @@ class ParameterCharges:
     def _recount(
         self, place: _Place, value: Value, weight: int, parts: tuple[str, ...], *, final: bool
     ) -> int:
-        """Weigh the places at this key and below again; return their sum. `weight` is the weight of the key."""
+        """Weigh the places at this key and below again. Return their sum. `weight` is the weight of the key."""
         owned = 0
         for name, below in list(place.below.items()):
             there = isinstance(value, dict) and name in value
@@ -167,7 +168,7 @@ class ParameterCharges:
 
 
 def _region(path: list[_Place], parts: Sequence[str]) -> _Place:
-    """Return the nearest place above a key; for the root, the root."""
+    """Return the nearest place above a key, or the root for the root."""
     for place in reversed(path[: len(parts)]):
         if place.owner is not None:
             return place
@@ -187,7 +188,7 @@ def _key(parts: Sequence[str]) -> str:
 def measure(value: Value) -> tuple[int, int]:
     """Return the approximate bytes that a value takes on the wire, and its depth (0: no array or struct).
 
-    Works level by level, because values may be large, and a level of numbers or texts is fast.
+    Values may be large, so they are measured level by level; a level of numbers or texts is fast.
 
     Raises `ProtocolError` for `<nil/>`.
     """
@@ -210,7 +211,7 @@ def measure(value: Value) -> tuple[int, int]:
 
 
 def _own_weight(value: Value, below: list[Value]) -> int:
-    """Return the weight of a value without its members, which are appended to `below`."""
+    """Return the weight of a value without its members. Append the members to `below`."""
     if isinstance(value, str):
         return _TEXT + text_weight(value)
     if isinstance(value, bytes):

@@ -1,6 +1,6 @@
-"""Mirror the ROS master's parameter tree, so that it survives the ROS master's death, and reserve room for writes.
+"""Mirror the ROS master's parameter tree, so that the tree survives the ROS master's death. Reserve room for writes.
 
-The mirror changes exactly like the ROS master's tree, and only after the ROS master accepted the change.
+The mirror changes exactly like the ROS master's tree, and only after the ROS master has accepted the change.
 """
 
 import contextlib
@@ -25,13 +25,14 @@ from roswire.xmlrpc import Value
 
 
 class ParameterMirror:
-    """A copy of the ROS master's parameter tree, and the hosts that are charged for it; `changed()` is called at each
-    change.
+    """A copy of the ROS master's parameter tree, and the hosts that are charged for its parameters.
 
-    `weight` is the approximate size of the whole tree in an answer to `getParam("/")`. Size and depth are limited: a
-    tree that the ROS master could no longer send would break it for all nodes, and could not be read after a restart.
-    `note(key, value)` is called for each change of one parameter (None: deleted); `since` are the changes after `tree`.
-    Changes inside `together()` are saved at its end.
+    `weight` is the approximate size of the whole tree in an answer to `getParam("/")`. Size and depth are limited,
+    because the ROS master must be able to send its tree. Otherwise, it would fail for all nodes, and the tree could not
+    be read after a restart.
+
+    `changed()` is called at each change. `note(key, value)` is called for each change of one parameter (None: it was
+    deleted). `since` has the changes after `tree`. Changes inside `together()` are saved at its end.
     """
 
     def __init__(
@@ -65,16 +66,16 @@ class ParameterMirror:
         return self.charges.pool.bounds.whole
 
     def check(self, key: str, depth: int) -> None:
-        """Raise `ProtocolError` for a value that would be too deep."""
+        """Raise `ProtocolError` if a value with this depth would be too deep at this key."""
         if len(parts_of(key)) + depth > self._depth_limit:
             raise ProtocolError(f"parameter {key[:80]} would nest deeper than {self._depth_limit} levels")
 
     def reserve(self, key: str, weight: int, host: Address) -> "Reservation":
-        """Reserve room for a value that a host is about to set. Raises `LimitReachedError` if there is none.
+        """Reserve room for a value that a host is about to set. Raises `LimitReachedError` if there is no room.
 
-        A value that is not larger than the present one always has room: it is charged to this host within its quota,
-        else still to the previous owner. So a host can always correct a parameter, and two hosts together cannot exceed
-        their quotas.
+        A value that is not larger than the present value always has room. It is charged to this host within its quota,
+        or otherwise still to the previous owner. So a host can always correct a parameter, and two hosts together
+        cannot exceed their quotas.
         """
         pool = self.charges.pool
         parts, before = self._place_of(key)
@@ -96,7 +97,7 @@ class ParameterMirror:
         self._changed()
 
     def set(self, key: str, value: Value, reserved: "Reservation") -> None:
-        """Set `key` (canonical) to this value, which the mirror keeps; a dictionary replaces the namespace."""
+        """Set `key` (canonical) to this value. A dictionary replaces the namespace. The mirror keeps the object."""
         reserved.release()
         parts, before = self._place_of(key)
         self._put_in(key, value)
@@ -125,7 +126,7 @@ class ParameterMirror:
         self.charges.recount(self.tree, final=final)
 
     def _place_of(self, key: str) -> tuple[tuple[str, ...], int]:
-        """Return the topmost key that setting `key` would create or replace, and its present weight."""
+        """Return the topmost key that a write of `key` would create or replace, and the present weight there."""
         parts = parts_of(key)
         node: Value = self.tree
         for depth, part in enumerate(parts, 1):
@@ -158,7 +159,7 @@ class ParameterMirror:
 
 
 class Reservation:
-    """Room for a value of this weight until the ROS master accepts or rejects it; `owner` is charged for it."""
+    """Room for a value of this weight, until the ROS master accepts or rejects the value. `owner` is charged."""
 
     __slots__ = ("_amount", "_pool", "owner", "weight")
 
@@ -169,14 +170,14 @@ class Reservation:
         self.weight = weight
 
     def release(self) -> None:
-        """Release the room, because the value is set and charged, or was rejected."""
+        """Release the room, because the value was set and charged, or was rejected."""
         if self._amount:
             self._pool.give_back(self.owner, self._amount)
             self._amount = 0
 
 
 def _with_namespaces(key: str, first: int, weight: int) -> int:
-    """Return the weight of a value with its name and the new namespaces of its key, from part `first` on."""
+    """Return the weight of a value, with its name and the new namespaces of its key from part `first` on."""
     if not first:
         return weight
     *namespaces, name = parts_of(key)[first - 1 :]

@@ -1,15 +1,17 @@
-"""Call the hidden ROS master over kept-alive connections, behind a door that is shut while it is rebuilt.
+"""Call the hidden ROS master over kept connections, behind a *door* that is shut while the ROS master is rebuilt.
 
-While the ROS master is down or not yet restored, calls of nodes wait at the door, for a limited time: a registering
-node notices only a delay. The reconcile loop shuts and opens the door, and passes it with `call_now`.
+While the ROS master is down or not yet restored, calls of nodes wait at the door for a limited time. So a registering
+node notices only a delay. The reconcile loop shuts and opens the door, and uses `call_now` to call in the meantime.
 
-Calls whose parameters and answers are a few names (`small` in the table of calls) go one after the other. Calls that
-arrive while one is under way wait for its answer, and then travel together as one `system.multicall`, in their order.
-The ROS master is one Python process, which does one thing at a time anyway; under load this saves most of the cost of
-two processes. A call goes at once if no other is under way. The answers are separated again, so that callers see no
-difference: a fault of one part only affects that part. A call that may be large, slow or impossible to write (a
-parameter's value) travels alone: if it failed, the calls of others would fail with it. A caller's own sequence of
-calls, whose order matters, travels together by `in_order`.
+Small calls (`small` in the table of calls: parameters and answers are a few names) are sent one after the other. A
+small call is sent at once if no other small call is under way. Small calls that arrive in the meantime wait for the
+answer. They are then sent together as one `system.multicall`, in order. The ROS master is one Python process and does
+only one thing at a time. So under load, multicalls save most of the cost in control and in the ROS master.
+
+The answers to a multicall are separated again. A fault of one part affects only this part, so callers see no
+difference. A call with a parameter's value may be large, slow or impossible to encode. It is sent alone, because its
+failure would make other calls fail. If the order of several calls of one caller matters, `in_order` sends them as one
+multicall.
 """
 
 import asyncio
@@ -31,13 +33,13 @@ from roswire.parameter_tree import Tree
 from roswire.uris import NodeUri
 from roswire.xmlrpc import Value, XmlRpcLimits
 
-_LARGEST = 64  # the most parts of a multicall, which one slow part delays
+_LARGEST = 64  # the most parts of a multicall, because one slow part delays all others
 Wanted = tuple[str, tuple[Value, ...]]
 _Waiting = tuple[str, tuple[Value, ...], "asyncio.Future[Value]"]
 
 
 class BatchingClient:
-    """A client that makes `small` calls over `client` one after the other, and sends waiting calls together."""
+    """A client that makes `small` calls one after the other over `client`, and sends waiting calls together."""
 
     def __init__(self, client: XmlRpcClient, small: Collection[str]) -> None:
         self._client = client
@@ -61,9 +63,9 @@ class BatchingClient:
             self._send_waiting()
 
     async def in_order(self, calls: Sequence[Wanted]) -> "list[Value | CallFailedError]":
-        """Make these calls in order, as one multicall; return the outcome of each.
+        """Make these calls in order, as one multicall. Return the outcome of each call.
 
-        Raises `CallFailedError` if the multicall has no usable answer, `EncodingError` if nothing was sent.
+        Raises `CallFailedError` if the multicall has no usable answer. Raises `EncodingError` if nothing was sent.
         """
         parts: list[Value] = [{"methodName": method, "params": list(params)} for method, params in calls]
         values = await self._client.call("system.multicall", parts)
@@ -108,7 +110,7 @@ def _settle(answer: "asyncio.Future[Value]", outcome: "Value | CallFailedError |
     if answer.done():
         return
     if isinstance(outcome, CallFailedError | EncodingError):
-        # Each caller gets its own exception: one object raised in many tasks would mix their tracebacks.
+        # Each caller gets its own exception object. One object in many tasks would mix their tracebacks.
         answer.set_exception(type(outcome)(*outcome.args))
     else:
         answer.set_result(outcome)
@@ -118,7 +120,10 @@ _T = TypeVar("_T")
 
 
 def limits_of_answers(limits: XmlRpcLimits, parameters: int) -> XmlRpcLimits:
-    """Return the limits of an answer: a parameter tree of `parameters` bytes, set by parts that `limits` allow."""
+    """Return the limits of answers. An answer may be a parameter tree of `parameters` bytes.
+
+    The tree consists of values that `limits` allow.
+    """
     return replace(
         limits,
         body=4 * parameters + limits.body,
@@ -129,9 +134,9 @@ def limits_of_answers(limits: XmlRpcLimits, parameters: int) -> XmlRpcLimits:
 
 
 class RosMaster:
-    """The ROS master at `127.0.0.1:port`; `doubtful` is set when it seems to be gone. Times are in seconds.
+    """The ROS master at `127.0.0.1:port`. `doubtful` is set when the ROS master seems to be gone.
 
-    Concurrent `small` calls are sent together.
+    `timeout` and `hold` are in seconds. Concurrent `small` calls are sent together.
     """
 
     def __init__(
@@ -163,20 +168,20 @@ class RosMaster:
 
     @property
     def reachable(self) -> bool:
-        """Whether the door is open: the ROS master is there and complete, and no reconcile round runs."""
+        """Whether the door is open: the ROS master is running and complete, and no reconcile round is under way."""
         return self._open.is_set()
 
     @property
     def whole(self) -> bool:
-        """Whether the ROS master is there and complete, even while a reconcile round has shut the door."""
+        """Whether the ROS master is running and complete, even while a reconcile round has shut the door."""
         return not self._away
 
     async def call(self, method: str, *params: Value) -> Answer:
-        """Call for a node; wait while the door is shut. Raises `CallFailedError` if it stays shut."""
+        """Make a call for a node. Wait while the door is shut. Raises `CallFailedError` if the door stays shut."""
         return await self._call(lambda: self.call_now(method, *params))
 
     async def call_in_order(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
-        """Make several calls in order, like `call`; return the outcome of each."""
+        """Make several calls in order, like `call`. Return the outcome of each call."""
         return await self._call(lambda: self._in_order(calls))
 
     async def _in_order(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
@@ -193,7 +198,7 @@ class RosMaster:
         try:
             async with asyncio.timeout(self._hold):
                 while True:
-                    while not self._open.is_set():  # it may be shut again before we are woken
+                    while not self._open.is_set():  # the door may be shut again before this task runs
                         await self._open.wait()
                     with contextlib.suppress(RefusedError, BrokenOffError):
                         return await self._pass(make)
@@ -201,7 +206,7 @@ class RosMaster:
             raise CallFailedError(f"the ROS master did not come back within {self._hold:g} s") from None
 
     async def _pass(self, make: Callable[[], Awaitable[_T]]) -> _T:
-        """Call through the open door; shut it if the ROS master refuses or breaks the connection."""
+        """Make a call through the open door. Shut the door if the ROS master refuses or breaks the connection."""
         self._enter()
         try:
             return await make()
@@ -212,7 +217,7 @@ class RosMaster:
             self._leave()
 
     async def call_now(self, method: str, *params: Value) -> Answer:
-        """Call even while the door is shut, for the reconcile loop. Raises `CallFailedError`."""
+        """Make a call for the reconcile loop, even while the door is shut. Raises `CallFailedError`."""
         answer = _answer_to(method, await self.calls.call(method, *params))
         if isinstance(answer, CallFailedError):
             raise answer
@@ -223,13 +228,13 @@ class RosMaster:
         self.doubtful.set()
 
     def shut(self) -> None:
-        """Let calls wait from now on, because the ROS master is away or not yet restored."""
+        """Shut the door, because the ROS master is away or not yet restored. Calls wait from now on."""
         self._open.clear()
         self._away = True
 
     @contextlib.asynccontextmanager
     async def alone(self) -> AsyncIterator[None]:
-        """Shut the door, and wait until calls under way have ended; open it again unless the `with` block fails."""
+        """Shut the door, and wait until calls under way have ended. Open the door again unless the block fails."""
         async with self._alone:
             self._open.clear()
             await self._empty.wait()
@@ -252,10 +257,10 @@ class RosMaster:
 
 
 async def together(calls: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
-    """Start these calls in order, without waiting for each other; return their results.
+    """Start these calls in order, without waiting for their answers in between. Return their results.
 
-    Used while the door is shut and all other calls wait, because there may be thousands. Raises `CallFailedError` after
-    cancelling the others.
+    There may be thousands of calls, made while the door is shut and all other calls wait. If a call fails, cancel the
+    others and raise `CallFailedError`.
     """
     try:
         async with asyncio.TaskGroup() as group:

@@ -1,8 +1,8 @@
 """Publish reports of monitors on `/rosout`, if configured: output, verdicts and faults as `rosgraph_msgs/Log`.
 
-ROS users look there (`rostopic echo /rosout_agg`, rqt_console). The audit log has everything. On `/rosout`, only the
-first report of each kind and second has its text, as the relay sends it, and at most `_A_SECOND` reports per second are
-published, with the number of further ones. As with a node's own logger, DEBUG is omitted.
+ROS users read this topic with `rostopic echo /rosout_agg` or rqt_console. The audit log has all reports. On `/rosout`,
+only the first report of each kind in a second has its text, as the relay sends it. At most `_A_SECOND` reports are
+published per second, with the number of omitted reports. As with a node's own logger, DEBUG is omitted.
 """
 
 import time
@@ -18,14 +18,14 @@ PUBLICATIONS = {TOPIC: TYPE}
 """The published topic, and its type."""
 _A_SECOND = 50
 _LEVELS = {"DEBUG": DEBUG, "INFO": INFO, "WARN": WARN, "ERROR": ERROR, "FATAL": FATAL}
-_ALARMING = frozenset({"violation", "fail", "timeout"})  # categories of verdicts
+_ALARMING = frozenset({"violation", "fail", "timeout"})  # categories of verdicts with level WARN
 
 
 @dataclass(slots=True)
 class Rosout:
-    """The publisher of reports of monitors on `/rosout` in the name of `node`; `publish(message)` sends one.
+    """Publish reports of monitors on `/rosout` in the name of `node`; `publish(message)` sends a message.
 
-    `file_of(monitor)` returns the file of its specification.
+    `file_of(monitor)` returns the file that defines a monitor.
     """
 
     node: str
@@ -38,7 +38,7 @@ class Rosout:
     _left_out: int = 0
 
     def reported(self, event: MonitorEvent) -> None:
-        """Publish output, a verdict or a fault of a monitor; other events are only in the audit log."""
+        """Publish output, a verdict or a fault of a monitor. Other events are only in the audit log."""
         level, text = _words(event)
         if level < INFO:
             return
@@ -69,9 +69,9 @@ def header(definitions: Definitions) -> OwnHeaderStated:
 
 
 def _words(event: MonitorEvent) -> tuple[int, str]:
-    """Return the level and the text of a report; level 0 if it is not for `/rosout`.
+    """Return the level and the text of a report. Level 0 means that the report is not for `/rosout`.
 
-    Reports with only a count have the level or category in their text.
+    The text of a report with only a count contains the level or category.
     """
     text, level, category = event.text, event.detail.get("level"), event.detail.get("category")
     if event.count and event.kind == "log":

@@ -1,10 +1,10 @@
 """Define a row of a table of calls, and an attempt to make such a call.
 
-`call_table.py` has the Master API's rows, `node_calls.py` those of the proxy endpoint. A row names the method that
-carries the call out; mypy compares the method's parameters with the row's.
+`call_table.py` has the rows of the Master API, `node_calls.py` the rows of a proxy endpoint. A row names the method
+that carries out the call. mypy checks that the parameters of the method fit the row.
 
-Before a decision, each parameter is converted to its canonical value: a name is resolved like in the ROS master, a URI
-is parsed. An invalid value is a `PeerError` with the name of the parameter, like in the ROS master's own validators.
+Before a decision, each parameter is converted to its canonical value: a name is resolved as in the ROS master, a URI
+is parsed. An invalid value raises a `PeerError` that names the parameter, as the ROS master's validators do.
 """
 
 import enum
@@ -30,8 +30,8 @@ T = TypeVar("T")
 class CallParameter(Generic[T]):
     """A parameter of a call: its name in the ROS documentation, and the conversion to its canonical value.
 
-    `recorded`: the record of a command has this parameter, a resolved name. The first such parameter of a call with a
-    kind is its resource.
+    `recorded`: the parameter is a resolved name, and the audit record of a command includes it. If a call has a kind,
+    its first recorded parameter is its resource.
     """
 
     name: str
@@ -91,7 +91,7 @@ def _parameter_value(value: Value, _caller_id: str) -> Value:
 
 
 def _check_members(value: Value, place: str) -> None:
-    """Raise for a member name such as `/a`, which the ROS master would read as the key of another parameter."""
+    """Raise `InvalidNameError` for a member name such as `/a`, which means another parameter to the ROS master."""
     if not isinstance(value, dict):
         return
     for name, member in value.items():
@@ -165,7 +165,7 @@ def _type_name(value: Value) -> str:
     return "nothing" if value is None else type(value).__name__
 
 
-_CLAIM_SHOWN = 1024  # characters of a caller_id that is not a name
+_CLAIM_SHOWN = 1024  # the most recorded characters of a caller_id that is not a valid name
 
 S = TypeVar("S")
 A = TypeVar("A")
@@ -174,22 +174,22 @@ C = TypeVar("C")
 
 
 class Identity(enum.Enum):
-    """The claim that a call makes with its `caller_id`, and the check of it."""
+    """The meaning of a call's `caller_id`, which determines its check."""
 
-    NODE = "node"  # makes the node part of the graph: [Nodes] must grant the name, no other host may hold it
-    FREE = "free"  # no other host may hold the name, which need not be a node's
+    NODE = "node"  # a node of the graph: [Nodes] must grant the name, and no other host may hold it
+    FREE = "free"  # any name, even without a node; no other host may hold it
     NOBODY = "nobody"  # the call has no caller_id
 
 
 class CallVerb(enum.StrEnum):
     """The effect of a call on its resource."""
 
-    REGISTER = "register"  # the node has the resource from then on
-    UNREGISTER = "unregister"  # the node gives the resource up
-    CONNECT = "connect"  # the caller gets an address, and may connect from then on
-    READ = "read"  # nothing changes: an empty caller_id is valid, and the audit log counts repetitions
-    WRITE = "write"  # a ROS parameter gets the value in the call, or is deleted if there is none
-    DO = "do"  # anything else
+    REGISTER = "register"  # the node gets the resource
+    UNREGISTER = "unregister"  # the node gives up the resource
+    CONNECT = "connect"  # the caller gets an address, and may then connect
+    READ = "read"  # nothing changes; an empty caller_id is valid, and the audit log counts repetitions
+    WRITE = "write"  # a ROS parameter is set to the value in the call, or deleted if there is no value
+    DO = "do"  # any other effect
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,22 +217,22 @@ def method(
     /,
 ) -> Method[S]: ...
 def method(perform: Callable[..., Awaitable[Value]], /, *parameters: CallParameter[Any]) -> Method[Any]:
-    """Return a method with the call's parameter for each of its own parameters."""
+    """Pair a method with the call parameters that it takes after the caller."""
     return Method(perform, parameters)
 
 
 @dataclass(frozen=True, slots=True)
 class RosCall(Generic[S]):
-    """One row of a table of calls. The fields below `in_run` follow from the others and from the policy's row.
+    """One row of a table of calls. The fields below `in_run` are derived from the others and from the policy's row.
 
-    method      the method that carries it out, and its parameters; `system.methodHelp` returns its docstring
-    verb        its effect on a resource
-    kind        the kind of the resource (None: it is decided by its name alone, whatever its parameters are)
-    denial      the value in a denial: of the type that the call returns, because client libraries check that
-    command     its name in the policy, if `policy/commands` does not derive it
+    method      the method that carries out the call, with its parameters; `system.methodHelp` returns its docstring
+    verb        the effect of the call on its resource
+    kind        the kind of the resource (None: the call is decided by its name alone, whatever its parameters are)
+    denial      the value in a denial; it has the type of the call's result, because client libraries check the type
+    command     the name of the call in the policy, if `policy/commands` does not derive the name
     tells       the answer is the value of the ROS parameter, which may be a large tree
-    small       parameters and answer are a few names: concurrent calls are sent to the ROS master as one
-    in_run      adjacent calls of this sort in a multicall are decided, recorded and carried out together
+    small       parameters and answer are a few names, so concurrent calls are sent to the ROS master as one call
+    in_run      adjacent calls with this flag in a multicall are decided, recorded and carried out together
     """
 
     name: str
@@ -245,13 +245,11 @@ class RosCall(Generic[S]):
     small: bool = False
     in_run: bool = False
     identity: Identity = field(init=False)  # the check of the caller_id
-    resource: int | None = field(init=False)  # the index of the parameter that is its resource
+    resource: int | None = field(init=False)  # the index of the parameter that is the call's resource
     api: int | None = field(init=False)  # the index of the caller's own URI
     policy_name: str = field(init=False)
-    category: Category = field(init=False)  # for decision and record
-    touches: Category | None = field(
-        init=False
-    )  # whether it reads or writes the ROS parameter that it is about
+    category: Category = field(init=False)  # the category of the decision and the record
+    touches: Category | None = field(init=False)  # whether the call reads or writes its ROS parameter
 
     def __post_init__(self) -> None:
         parameters = self.method.parameters
@@ -291,8 +289,10 @@ class RosCall(Generic[S]):
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """A valid call: its caller, its row, and its canonical arguments in the row's order. `resource` is its topic,
-    service or ROS parameter, or empty; `request` is its form for the decision and the record.
+    """A valid call: its caller, its row, and its canonical arguments in the order of the row.
+
+    `resource` is the topic, service or ROS parameter of the call, or empty. `request` is the policy's form of the call,
+    for the decision and the record.
     """
 
     caller: Caller
@@ -310,18 +310,18 @@ class Attempt:
 
     @property
     def api(self) -> ApiUri | None:
-        """Return the URI that the caller gives for itself."""
+        """Return the caller's own URI, if the call has one."""
         return None if self.call.api is None else cast(ApiUri, self.arguments[self.call.api])
 
     @property
     def value(self) -> Value:
-        """Return the value for a ROS parameter that the call sets; None if it deletes the parameter."""
+        """Return the value to which the call sets its ROS parameter, or None if the call sets no value."""
         brings = self.call.verb is CallVerb.WRITE and len(self.arguments) > 1
         return cast(Value, self.arguments[1]) if brings else None
 
     @property
     def about(self) -> dict[str, str]:
-        """Return the recorded parameters of a command (a key, a node's name), whose resource is only its name."""
+        """Return the recorded parameters of a command, such as a key, because its request has only the call's name."""
         if self.call.category is not Category.COMMAND:
             return {}
         return {
@@ -332,7 +332,7 @@ class Attempt:
 
 
 class ServedCall(NamedTuple):
-    """A served row, and the object whose method carries it out."""
+    """A row that a listener serves, and the object whose method carries out the call."""
 
     call: RosCall[Any]
     part: Any
@@ -343,20 +343,20 @@ Table = Mapping[str, ServedCall]
 
 
 def served(calls: Iterable[RosCall[S]], part: S) -> dict[str, ServedCall]:
-    """Return these calls by name, carried out by `part`."""
+    """Return a table of these calls by name; the methods of `part` carry them out."""
     return {call.name: ServedCall(call, part) for call in calls}
 
 
 def denial_text(decision: Decision, record: str, tell: str) -> str:
-    """Return the text for a denied caller: as much of the reason as the policy allows, and the record's id."""
+    """Return the text for a denied caller: the reason, as far as the policy allows, and the record's id."""
     return with_record(text_for_caller(decision, tell), record)
 
 
 def with_record(text: str, record: str) -> str:
-    """Add the id of the record to the text of a denial, unless it is empty."""
+    """Add the record's id to the text of a denial, unless the id is empty."""
     return f"{text} [{record}]" if record else text
 
 
 def claimed_name(params: Sequence[Value]) -> str:
-    """Return the `caller_id` that a rejected call claims, for the record."""
+    """Return the claimed `caller_id` of a rejected call, for the audit record."""
     return params[0][:_CLAIM_SHOWN] if params and isinstance(params[0], str) else ""

@@ -1,12 +1,13 @@
 """Carry out a call, from its parameters to its answer: canonicalise → decide → record → perform.
 
-1. A call is decided in its turn, by the policy and the registry of that time. A registering call waits for earlier ones
-   of the same name, a write of a parameter for earlier ones that overlap with it. Other calls do not wait.
-2. A call that is denied at its arrival is denied at once, and other calls do not wait for it. A call that had to wait
-   is decided again in its turn. For any other call nothing ran in between, so its decision is still valid.
-3. Whether the node that holds a name is still there is probed over the network, before the turn.
-4. If a new policy comes into force while a call is carried out, the caller's rights are decided again afterwards,
-   because the policy's own revocation could not see the result of the call yet.
+1. A registering call waits for earlier registering calls of the same name. A write of a parameter waits for earlier
+   writes of overlapping keys. Other calls do not wait for a turn.
+2. A call that is denied at its arrival is denied at once, and other calls do not wait for it.
+3. A call that had to wait is decided again in its turn, by the policy and the registry of that time. If a call did not
+   wait, no other code ran after its decision, so the decision is still valid.
+4. If another host holds the name, its node is probed over the network before the turn.
+5. If a new policy comes into force while a call is carried out, the caller's rights are decided again afterwards. The
+   revocation by the new policy could not see the result of the call yet.
 
 An error becomes a record and a well-formed answer, never an exception.
 """
@@ -52,7 +53,7 @@ _FAILURES = (NoPortError, LimitReachedError, PeerError, EncodingError, CallFaile
 
 
 class ServedRequest(NamedTuple):
-    """A request: the table that is served to it, its caller, and its bulk."""
+    """A request: the table of calls that its listener serves, its caller, and its bulk."""
 
     table: Table
     caller: Caller
@@ -61,9 +62,9 @@ class ServedRequest(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Execution:
-    """The execution of calls. A write of at least `large` bytes waits for other such writes.
+    """Carry out calls. A write of at least `large` bytes waits for other large writes.
 
-    `redecide_for(host, caller_id)` revokes what the policy in force does not allow this caller.
+    `redecide_for(host, caller_id)` revokes the rights of a caller that the policy in force does not allow.
     """
 
     gate: CallGate
@@ -82,7 +83,7 @@ class Execution:
     async def understand(
         self, visit: ServedRequest, method: str, params: Sequence[Value]
     ) -> Attempt | Answer:
-        """Return the call with its canonical arguments, still undecided; if it is invalid, return its answer."""
+        """Return the undecided call with canonical arguments. If the call is invalid, return the answer to it."""
         if method not in visit.table:
             return self._unknown(visit.caller, method, params)
         call = visit.table[method].call
@@ -114,16 +115,16 @@ class Execution:
             return await self._carry_out(visit, attempt, outcome)
 
     async def _in_turn(self, visit: ServedRequest, attempt: Attempt, outcome: Decision) -> Value:
-        """Carry out a write of, or a subscription to, a parameter while no other call writes the parameter."""
+        """Carry out a write of a parameter, or a subscription to it, while no other call writes the parameter."""
         async with self._turn([attempt]) as later:
             if later:
                 outcome = self._settled(attempt)
             return await self._carry_out(visit, attempt, outcome)
 
     async def answer_run(self, visit: ServedRequest, run: Sequence[Attempt]) -> list[Value]:
-        """Decide reads and writes of parameters one by one, and carry them out as if in their order.
+        """Decide reads and writes of parameters one by one, and carry them out as if in order.
 
-        No call of the run reads a parameter that an earlier one writes, so all reads are carried out first.
+        No call of the run reads a parameter that an earlier call of the run writes. So all reads are carried out first.
         """
         if sum(map(self.parameters.weight_of_answer, run)) >= self.large:
             await visit.bulk.take()
@@ -145,9 +146,9 @@ class Execution:
 
     @contextlib.asynccontextmanager
     async def _turn(self, attempts: Sequence[Attempt]) -> AsyncIterator[bool]:
-        """Wait until no other call writes the parameters of these calls; yield whether there was one.
+        """Wait until no other call writes the parameters of these calls. Yield whether other code may have run.
 
-        A subscription also has a turn, so that its node is notified of every write after the value in the answer.
+        A subscription also takes a turn. So its node gets the value in the answer, and then every later write.
         """
         keys = [attempt.resource for attempt in attempts if attempt.call.kind is Kind.PARAMETER]
         host, values = attempts[0].caller.peer.host, [attempt.value for attempt in attempts]
@@ -190,13 +191,13 @@ class Execution:
         wanted = [run[place] for place in writes]
         outcomes: Sequence[Value | Exception]
         stands = self.policy() is policy and not self.trail.obstacle
-        if stands and self.registry.version != version:  # another host may hold the caller's name now
+        if stands and self.registry.version != version:  # another host may now hold the caller's name
             stands = all(self._settled(one).allowed for one in wanted)
         if not wanted or stands:
             outcomes = await self.parameters.write(
                 [ParameterWrite(one.caller, one.resource, one.value) for one in wanted]
             )
-        else:  # the policy or registry changed while a read waited for the ROS master, or records for the disk
+        else:  # policy or registry changed while a read waited for the ROS master, or a record for the disk
             looks = [self._settled(one) for one in wanted]
             outcomes = await self._carry_out_run(visit, wanted, looks)
         for place, outcome in zip(writes, outcomes, strict=True):
@@ -213,7 +214,7 @@ class Execution:
         return self.gate.decide(attempt, self.parameters.mirror.tree)
 
     def _settled(self, attempt: Attempt, probe: Probe | None = None) -> Decision:
-        """Return the decision, in a name conflict by the probe of the node that holds the name."""
+        """Return the decision. In a name conflict, decide by the probe of the node that holds the name."""
         outcome = self._decide(attempt)
         return contested(outcome, probe) if isinstance(outcome, NameConflict) else outcome
 
@@ -232,7 +233,7 @@ class Execution:
         return None if decision.allowed else [0, self._denial_text(decision, record), call.denial]
 
     async def _obstacle(self) -> str | None:
-        """Wait until the records are on disk; return the text of a denial if they cannot be, else None."""
+        """Wait until the records are on disk. Return the text of a denial if that is impossible, otherwise None."""
         if await self.trail.durable() is None:
             return None
         return f"denied: {NOT_RECORDED}"

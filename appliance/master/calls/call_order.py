@@ -1,14 +1,14 @@
-"""Serialise overlapping calls: registrations with the same name, writes of overlapping parameter keys.
+"""Serialise overlapping calls: registrations of the same name, and writes of overlapping parameter keys.
 
-The registry gets a registration only after the ROS master's answer. Two hosts that register a free name at the same
-time would both be allowed, and the later one would take the name from the other. So registering calls of a name wait
-for each other, and are decided in their turn. A call that need not wait enters without a switch of tasks, so its
-decision is still valid.
+The registry gets a registration only after the ROS master's answer. If two hosts registered a free name at the same
+time, both would be allowed, and the later host would take the name away. So registering calls of a name wait for each
+other, and are decided in their turn. A call that need not wait enters without a switch of tasks, so its decision is
+still valid.
 
-The decision on a write depends on the present tree: a plain value in place of a namespace that the key needs is
-overwritten too. Until the ROS master's answer, another write could set such a value, which the decision did not cover.
-Two writes of one key could also reach the ROS master and the mirror in different orders. So a write waits for earlier
-writes of its key or of keys above or below it, and is decided in its turn.
+The decision on a write depends on the present tree, because the write may overwrite a plain value above its key.
+Another write could set such a value after the decision and before the ROS master's answer. Also, two writes of one key
+could reach the ROS master and the mirror in different orders. So a write waits for earlier writes of its key, and of
+keys above or below it, and is decided in its turn.
 """
 
 import asyncio
@@ -25,26 +25,26 @@ class KeyTurns:
         return len(self._turns)
 
     def alone(self, keys: Collection[str]) -> "KeyTurn":
-        """Return an `async with` that waits for earlier calls with these canonical keys, or with overlapping ones."""
+        """Return a context manager that waits for earlier calls with equal or overlapping keys (canonical)."""
         return KeyTurn(self._turns, _ended(keys))
 
     def of_name(self, name: str) -> "KeyTurn":
-        """Return an `async with` that waits for earlier calls with exactly this name."""
+        """Return a context manager that waits for earlier calls with exactly this name."""
         return self.alone([name.replace("/", ".")])
 
 
 class KeyTurn:
-    """The turn of a call: entered when earlier overlapping calls are done."""
+    """The turn of a call, an async context manager. It is entered when earlier overlapping calls are done."""
 
     __slots__ = ("_done", "_keys", "_turns")
 
     def __init__(self, turns: "dict[KeyTurn, None]", keys: tuple[str, ...]) -> None:
         self._turns = turns
         self._keys = keys
-        self._done: asyncio.Event | None = None  # made for calls that wait for this one
+        self._done: asyncio.Event | None = None  # made when another call waits for this call
 
     async def __aenter__(self) -> bool:
-        """Wait for the turn; return whether there was a call to wait for."""
+        """Wait for the turn. Return whether there was another call to wait for."""
         before = [turn for turn in self._turns if self._touches(turn)]
         self._turns[self] = None
         try:
@@ -76,12 +76,12 @@ class KeyTurn:
 
 
 def touch(keys: Collection[str], others: Collection[str]) -> bool:
-    """Whether a key of one side equals, or is above, a key of the other side."""
+    """Whether a key in one collection equals, or is above, a key in the other."""
     return _meet(_ended(keys), _ended(others))
 
 
 def _ended(keys: Collection[str]) -> tuple[str, ...]:
-    """Return the keys with a slash at the end, so that a key above another is a prefix of it."""
+    """Append a slash to each key. A key above another key is then its prefix."""
     return tuple({key if key == "/" else f"{key}/" for key in keys})
 
 

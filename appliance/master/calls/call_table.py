@@ -1,6 +1,6 @@
-"""Define the table of the Master API: one row per call. Other calls are denied.
+"""Define the table of the Master API, with one row for each call. Calls without a row are denied.
 
-`RosCall` explains the columns. To add a call, write its method, its row here, and the policy's row in
+`RosCall` explains the columns. To add a call, write its method, a row here, and the policy's row in
 `policy/commands.py`.
 """
 
@@ -117,7 +117,7 @@ def master_table(
     parameters: ParameterCalls,
     monitors: MonitorCalls,
 ) -> Table:
-    """Return the Master API, carried out by these parts."""
+    """Return the table of the Master API; these parts carry out its calls."""
     return {
         **served(_REGISTRATION, registration),
         **served(_LOOKUPS, lookups),

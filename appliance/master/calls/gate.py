@@ -1,8 +1,7 @@
-"""Decide calls: by the policy first, then by the limits per host and the binding of names to hosts.
+"""Decide calls: first by the policy, then by the limits per host and the binding of names to hosts.
 
-`CallGate.decide` is a function of the running policy, the registry and the parameters, without side effects. If the
-decision depends on whether the node that holds a name is still there, it returns a `NameConflict`; `contested` then
-decides by the probe of that node.
+`CallGate.decide` depends only on the policy in force, the registry and the parameters, and has no side effects. If a
+node on another host holds the name, it returns a `NameConflict`. `contested` then decides by a probe of that node.
 """
 
 import ipaddress
@@ -27,7 +26,7 @@ _TIMES_THE_REST = 3
 
 @dataclass(frozen=True, slots=True)
 class NameConflict:
-    """Another host holds the name; the call gets `decision` only if the node `holder` is gone."""
+    """Another host holds the name. `decision` is valid only if the node `holder` is gone."""
 
     holder: Incarnation
     decision: Decision
@@ -35,7 +34,7 @@ class NameConflict:
 
 @dataclass(frozen=True, slots=True)
 class HostLimits:
-    """The limits of a host in the registry, and of all hosts together."""
+    """The limits of one host, and of all hosts together, in the registry."""
 
     nodes: int = 500
     registrations: int = NAMES.bounds.host
@@ -43,7 +42,7 @@ class HostLimits:
 
 
 class CallGate:
-    """The decision point for calls, by the policy that `policy()` returns at the time of a call."""
+    """Decide calls by the policy that `policy()` returns at the time of a call."""
 
     def __init__(self, policy: Callable[[], Policy], registry: Registry, limits: HostLimits) -> None:
         self._policy = policy
@@ -51,7 +50,7 @@ class CallGate:
         self._limits = limits
 
     def decide(self, attempt: Attempt, tree: Tree) -> Decision | NameConflict:
-        """Return the decision on a call, given the parameters `tree`."""
+        """Return the decision on a call; `tree` is the present parameter tree."""
         caller, call = attempt.caller, attempt.call
         if caller.own:
             return _of_own_node(attempt)
@@ -90,7 +89,7 @@ class CallGate:
         holder = self._registry.holder(caller.caller_id)
         if holder is None:
             return decision
-        if holder.own:  # without isolation the robot's nodes have its address
+        if holder.own:  # without isolation, the robot's nodes have the same address as the appliance
             return _no(f"the name {holder.name} belongs to the appliance")
         if holder.host == caller.peer.host:
             return decision
@@ -102,7 +101,7 @@ class CallGate:
         return _no(f"{held} {holder.host}; {other}", told=f"{held} a node of another host; {other}")
 
     def _taken(self, attempt: Attempt) -> Decision | None:
-        """Deny registering a service of the appliance, because a service goes to the last provider."""
+        """Deny a registration of the appliance's own service, because the last provider gets a service."""
         if attempt.call.kind is Kind.SERVICE:
             for provider in self._registry.registered(Kind.SERVICE, attempt.resource):
                 if provider.of_monitors:
@@ -131,10 +130,10 @@ class CallGate:
         return None
 
     def _too_many_names(self, host: Address) -> Decision | None:
-        """Deny a registration of a host with too many names; hosts of one network in the policy count as one host."""
+        """Deny a registration of a host with too many names. Hosts that the policy names as a network count as one."""
         left = max(0, self._limits.registrations_in_all - self._registry.registrations)
         if self._registry.registrations < _TIMES_THE_REST * left:
-            return None  # no host has that many
+            return None  # no host can have too many
         policy = self._policy()
         named = policy.named_as(host)
         mine = sum(
@@ -151,7 +150,10 @@ class CallGate:
         )
 
     def to_make_room(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        """Return an unused or lost node of the caller's host to evict, if a new node would exceed the limit."""
+        """Return a node of the caller's host to evict, if a new node would exceed the host's limit.
+
+        Only an unused or lost node is evicted. Return None if there is no need, or no such node.
+        """
         return self._registry.evictable_of(caller.peer.host) if self._is_one_too_many(caller, api) else None
 
     def _is_one_too_many(self, caller: Caller, api: ApiUri) -> bool:
@@ -163,7 +165,7 @@ class CallGate:
 
 
 def _of_own_node(attempt: Attempt) -> Decision:
-    """Decide calls of the appliance's own nodes: only rosout's defined rights are granted, whatever the policy says."""
+    """Decide calls of the appliance's own nodes: grant only rosout's fixed rights, whatever the policy says."""
     caller_id, call = attempt.caller.caller_id, attempt.call
     known = False
     if caller_id != ROSOUT:
@@ -180,7 +182,7 @@ def _of_own_node(attempt: Attempt) -> Decision:
 
 
 def _unreachable(caller: Caller, api: ApiUri) -> Decision | None:
-    """Deny registrations with a loopback URI from another host: other hosts could not call that node."""
+    """Deny a registration from another machine with a loopback URI, because other hosts could not call the node."""
     if caller.peer.host.is_loopback or not _is_loopback(api.uri.host):
         return None
     return _no(
@@ -190,7 +192,7 @@ def _unreachable(caller: Caller, api: ApiUri) -> Decision | None:
 
 
 def contested(contest: NameConflict, probe: Probe | None) -> Decision:
-    """Return the decision on a name conflict by the probe of the holder; a missing or outdated probe denies."""
+    """Decide a name conflict by the probe of the holder. Deny the call if the probe is missing or outdated."""
     holder = contest.holder
     if probe is not None and probe.holder is holder:
         if probe.presence is Presence.GONE:
@@ -227,5 +229,5 @@ def _is_loopback(host: str) -> bool:
 
 
 def _no(reason: str, told: str | None = None) -> Decision:
-    """Return a denial without a rule; `told` is the text for the caller if the reason names another host."""
+    """Return a denial without a rule. `told` is the text for the caller if `reason` names another host."""
     return Decision(False, None, reason, told=told)

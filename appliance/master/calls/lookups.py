@@ -1,4 +1,4 @@
-"""Answer the calls about the graph and about RVMaster itself."""
+"""Answer calls about the graph and about RVMaster."""
 
 import os
 from collections.abc import Callable
@@ -17,10 +17,10 @@ from roswire.xmlrpc import Value
 
 @dataclass(frozen=True, slots=True)
 class LookupCalls:
-    """The lookup calls, answered from the registry with the proxies of nodes and services.
+    """The lookup calls. They are answered from the registry, with the URIs of proxies.
 
-    The registry has all registrations that the ROS master accepted and the policy allows, also while the ROS master is
-    away. `port` is RVMaster's port, `stop(reason)` ends the appliance, `getSystemState` omits the publisher `unseen`.
+    The registry has all registrations that the ROS master accepted and the policy allows, even while the ROS master is
+    away. `port` is RVMaster's port. `stop(reason)` ends the appliance. `getSystemState` omits the publisher `unseen`.
     """
 
     registry: Registry

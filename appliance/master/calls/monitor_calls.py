@@ -1,4 +1,4 @@
-"""Answer the calls of ROSRV's tools: list and switch monitors, and locate their topics."""
+"""Answer the calls of ROSRV's tools, which list and switch monitors and locate their topics."""
 
 from dataclasses import dataclass
 from typing import cast
@@ -17,7 +17,7 @@ _NOBODY = (0, 0)
 
 @dataclass(frozen=True, slots=True)
 class MonitorCalls:
-    """The calls about monitors. `real_port` is the port of the ROS master, `port` that of RVMaster."""
+    """The calls about monitors. `real_port` is the ROS master's port, `port` is RVMaster's port."""
 
     monitors: SpecificationManager
     registry: Registry

@@ -1,9 +1,10 @@
-"""Answer `system.multicall`: the parts are carried out in order, and a failed part does not affect the others.
+"""Answer `system.multicall`. The parts are carried out in order, and a failed part does not affect other parts.
 
 roslaunch clears and sets parameters in one multicall, and relies on the order. Adjacent reads and writes of parameters
-form a *run*: each is decided and recorded separately, but they wait for the disk and for the ROS master only once. A
-read of a parameter that the run writes begins the next run. Each run or other part waits for the previous one; after
-each of them, other hosts have their turn.
+form a *run*. Each call of a run is decided and recorded separately, but the whole run waits only once for the disk and
+for the ROS master. A read of a parameter that the run writes begins a new run.
+
+Other hosts have their turn after each run, and after each part outside a run.
 """
 
 import asyncio
@@ -23,7 +24,7 @@ from roswire.xmlrpc import Value
 MULTICALL = "system.multicall"
 PARSE_FAULT, LIMIT_FAULT = -32700, -32600
 _LONGEST_RUN = 64  # the most parts that reach the ROS master in one request
-_LONGEST_READING = 8  # the most parts of a run with reads, all answered before others have their turn
+_LONGEST_READING = 8  # the most parts of a run with reads; other hosts wait until all are answered
 _FORM = "a part of a multicall has methodName and params, nothing else"
 
 _Parts = deque["Value | Attempt"]
@@ -31,7 +32,7 @@ _Parts = deque["Value | Attempt"]
 
 @dataclass(frozen=True, slots=True)
 class Multicall:
-    """The answers to multicalls. All answers to one multicall together have at most `mirror.bytes_limit` bytes."""
+    """Answer multicalls. All answers to one multicall together have at most `mirror.bytes_limit` bytes."""
 
     execution: Execution
     parameters: ParameterCalls
@@ -55,14 +56,14 @@ class Multicall:
                 answers = [await self._one(visit, left.popleft())]
             room -= await self._weigh(visit, answers)
             results += answers
-            await asyncio.sleep(0)  # others have their turn
+            await asyncio.sleep(0)  # other hosts have their turn
         if left:
             why = f"{why}; {len(left)} more parts are not carried out"
             return results + [self._fault(visit, LIMIT_FAULT, "limit exceeded", why)] * len(left)
         return results
 
     async def _why_no_more(self, visit: ServedRequest, room: int) -> str:
-        """Return why no more parts are carried out, or an empty string."""
+        """Return why no further parts are carried out, or an empty string."""
         if room <= 0:
             return f"the answers to a multicall have more than {self.parameters.mirror.bytes_limit} bytes"
         return await self.trail.still_owing(visit.caller.peer.text)
@@ -92,7 +93,7 @@ class Multicall:
         return [await self.execution.answer(visit, attempt)] if isinstance(attempt, Attempt) else attempt
 
     async def _understand(self, visit: ServedRequest, part: "Value | Attempt") -> "Value | Attempt":
-        """Return a part as an attempt; if it is invalid, return its entry in the answer."""
+        """Return a part as an attempt. If the part is invalid, return its entry in the answer."""
         match part:
             case Attempt():
                 return part
@@ -129,7 +130,7 @@ class Multicall:
 
 @dataclass(slots=True)
 class _Run:
-    """The parts that are carried out together, and their answers (None: the attempt is not carried out yet)."""
+    """Parts that are carried out together, and their answers. None stands for an attempt without an answer yet."""
 
     answers: list[Value] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
@@ -142,7 +143,7 @@ class _Run:
         return _LONGEST_READING if self.reads else _LONGEST_RUN
 
     def answered(self, attempts: Iterable[Value]) -> list[Value]:
-        """Return the answers to all parts, given those to the attempts."""
+        """Return the answers to all parts. `attempts` has the answers to the attempts among them."""
         given = iter(attempts)
         return [[next(given)] if answer is None else answer for answer in self.answers]
 

@@ -1,10 +1,11 @@
-"""Answer the node API on a proxy endpoint, which other nodes and tools call as if it were the node itself.
+"""Answer the node API on a proxy endpoint. Other nodes and tools call the endpoint as if it were the node.
 
-The call is for the incarnation `caller.target`. Only `getPid`, `shutdown` and `requestTopic` for unrelayed topics are
-forwarded to the node; the registry and the relay answer the rest. If the node does not answer `getPid`, the connection
-breaks off: `rosnode` then skips the node, but would stop at an error. The publisher for monitors is control itself, so
-its process id is control's. `publisherUpdate` and `paramUpdate` are not in the table: only a master sends them, so they
-are denied like unknown calls.
+The call is for the incarnation `caller.target`. Only `getPid`, `shutdown`, and `requestTopic` for unrelayed topics are
+forwarded to the node. The registry and the relay answer all other calls.
+
+If the node does not answer `getPid`, the connection is reset: `rosnode` then skips the node, but would stop at an
+error. The publisher for monitors is control itself, so `getPid` returns control's process id. `publisherUpdate` and
+`paramUpdate` are not in the table, because only a master sends them. They are denied like unknown calls.
 """
 
 import os
@@ -56,7 +57,7 @@ class NodeCalls:
         if "TCPROS" not in names:
             offered = ", ".join(str(name)[:40] for name in names) or "nothing"
             return [0, f"the appliance relays only TCPROS; the subscriber offers {offered}", []]
-        own = target.own or self.gate.is_own_subscriber(caller, topic)  # reached through the relay only
+        own = target.own or self.gate.is_own_subscriber(caller, topic)  # always connected through the relay
         if not own and not self.mediation.carries_topic(topic):
             return await self._negotiated_directly(target, topic, caller)
         granted = self.graph.topic_granted(target, topic, caller.peer.host, caller.caller_id)
@@ -66,7 +67,7 @@ class NodeCalls:
         return [1, f"ready on {address}:{port}", ["TCPROS", address, port]]
 
     async def _negotiated_directly(self, target: Incarnation, topic: str, caller: Caller) -> Answer:
-        """Return the node's own TCPROS port at its peer address; the host in its answer is ignored."""
+        """Return the node's own TCPROS port, at its peer address. The host in the node's answer is ignored."""
         try:
             answer = await self.nodes.call(target, "requestTopic", caller.caller_id, topic, [["TCPROS"]])
             port = tcpros_port(answer)

@@ -1,12 +1,14 @@
 """Carry out the parameter calls. The mirror answers most reads, because a starting node makes hundreds.
 
-Reads of a large tree and `searchParam` go to the ROS master. While it is away or incomplete, all calls wait. Writes go
-to it in order, in few requests.
+The ROS master answers reads of a large tree and `searchParam`. Writes are sent to the ROS master in order, in few
+requests. While the ROS master is away or incomplete, all calls wait.
 
 `searchParam` finds parameters that the caller may read. The ROS master searches a relative key in the caller's
-namespace and then upwards. The `caller_id` is a claim, so any host can search anywhere. The answer must not reveal
-whether a parameter exists that the host may not read. So a global key is decided before the search, and a search
-upwards skips keys that the host may not read. The answer without a result depends on the policy alone.
+namespace and then upwards. The `caller_id` is not verified, so any host can search anywhere.
+
+The answer must not reveal whether a parameter exists that the host may not read. So a global key is decided before the
+search. A search upwards skips keys that the host may not read. If nothing is found, the answer depends only on the
+policy.
 """
 
 import asyncio
@@ -32,12 +34,12 @@ from roswire.parameter_tree import names_in, standing_at
 from roswire.xmlrpc import Value
 
 _SEARCH = "searchParam"
-_NAMES_AT_ONCE = 500  # some milliseconds
-_TOGETHER_BYTES = 256 << 10  # of the values in one request to the ROS master
+_NAMES_AT_ONCE = 500  # the names that are decided without a pause: a few milliseconds
+_TOGETHER_BYTES = 256 << 10  # the most bytes of values in one request to the ROS master
 
 
 class ParameterWrite(NamedTuple):
-    """A write of a parameter for a caller; `value` None deletes it."""
+    """A write of a parameter for a caller. `value` None deletes the parameter."""
 
     caller: Caller
     key: str
@@ -46,7 +48,7 @@ class ParameterWrite(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ParameterCalls:
-    """The parameter calls; the ROS master answers reads of at least `large` bytes."""
+    """The parameter calls. The ROS master answers reads of at least `large` bytes."""
 
     rosmaster: RosMaster
     mirror: ParameterMirror
@@ -93,7 +95,7 @@ class ParameterCalls:
             names, answer[2] = answer[2], (found := [])
             for begin in range(0, len(names), _NAMES_AT_ONCE):
                 if begin:
-                    await asyncio.sleep(0)  # each name is decided: others have their turn in between
+                    await asyncio.sleep(0)  # deciding many names takes time, so other hosts have a turn
                 some = names[begin : begin + _NAMES_AT_ONCE]
                 found += [name for name in some if self.rights.to_find(caller, str(name)).allowed]
         return answer
@@ -119,18 +121,18 @@ class ParameterCalls:
         return answer
 
     def _next_readable(self, key: str, places: dict[str, Decision], hidden: str) -> str | None:
-        """Return the name that would have been found without the parameters that may not be read."""
+        """Return the name that the search would have found if parameters that may not be read did not exist."""
         levels = len([part for part in key.split("/") if part])
         names = list(places)
         for name in names[names.index(hidden) + 1 :]:
-            # As in the ROS master, only the key's first part must exist.
+            # As in the ROS master, only the first part of the key must exist.
             first = "/".join(name.split("/")[: -levels + 1 or None])
             if places[name].allowed and standing_at(self.mirror.tree, first)[0] is not None:
                 return name
         return None
 
     def weight_of_answer(self, attempt: Attempt) -> int:
-        """Return the approximate size of an answer with a parameter's value in bytes, counted up to `large`."""
+        """Return the approximate bytes of the parameter's value in the answer, counted up to `large`; 0 if none."""
         if not attempt.call.tells:
             return 0
         return weigh(standing_at(self.mirror.tree, attempt.resource)[0], self.large)
@@ -142,9 +144,9 @@ class ParameterCalls:
         return outcome
 
     async def write(self, writes: Sequence[ParameterWrite]) -> list[Answer | Exception]:
-        """Carry out several writes in order, in few requests; return the outcome of each.
+        """Carry out several writes in order, in few requests. Return the outcome of each write.
 
-        A value is checked as if it were sent after the earlier ones; a failed write does not affect the others.
+        Each value is checked as if it were sent after the earlier values. A failed write does not affect other writes.
         """
         outcomes: list[Answer | Exception] = []
         waiting: list[tuple[ParameterWrite, Reservation | None]] = []
@@ -158,7 +160,7 @@ class ParameterCalls:
                     waiting, weight = [], 0
                 try:
                     reserved = self._reserved(write, measured)
-                except LimitReachedError:  # earlier writes may make room
+                except LimitReachedError:  # earlier writes may free room, so send them first
                     outcomes += await self._send(waiting)
                     waiting, weight = [], 0
                     reserved = self._reserved(write, measured)
@@ -179,7 +181,7 @@ class ParameterCalls:
     async def _send(
         self, waiting: list[tuple[ParameterWrite, Reservation | None]]
     ) -> list[Answer | Exception]:
-        """Make the calls, and update mirror, charges and subscribers by the writes that the ROS master accepted."""
+        """Send the writes. Update mirror, charges and subscribers for each write that the ROS master accepted."""
         try:
             outcomes = await self._make([_wanted(write) for write, _reserved in waiting])
         finally:
@@ -193,7 +195,7 @@ class ParameterCalls:
         return outcomes
 
     def _written(self, write: ParameterWrite, reserved: Reservation | None, outcome: Answer) -> None:
-        """Update mirror and subscribers by the ROS master's answer to a write."""
+        """Update mirror and subscribers according to the ROS master's answer to a write."""
         if reserved is not None and _is_set(outcome, write):
             self.mirror.set(write.key, write.value, reserved)
             self.enactor.carry_out(self.graph.parameter_set(write.key, write.value, write.caller.caller_id))
@@ -202,7 +204,7 @@ class ParameterCalls:
             self.enactor.carry_out(self.graph.parameter_deleted(write.key))
 
     async def _make(self, calls: list[Wanted]) -> list[Answer | Exception]:
-        """Return the outcomes of the calls; several calls are sent as one multicall."""
+        """Make calls and return their outcomes. Several calls are sent as one multicall."""
         if not calls:
             return []
         try:
@@ -225,17 +227,17 @@ def _wanted(write: ParameterWrite) -> Wanted:
 
 
 def _is_set(answer: Answer, write: ParameterWrite) -> bool:
-    """Whether the ROS master has the value, given its answer to `setParam`.
+    """Whether the ROS master has stored the value, given its answer to `setParam`.
 
-    The ROS master stores the value before it computes the updates for subscribers. If the latter fails, it answers with
-    an error although the value is set (for example a name such as `a/b` in a dictionary, and a subscriber to that key).
-    It only rejects a root that is not a namespace.
+    The ROS master stores the value before it computes the updates for subscribers. If this computation fails, the
+    answer is an error although the value is stored. An example is a name such as `a/b` in a dictionary, with a
+    subscriber to that key. The ROS master rejects only a root that is not a namespace.
     """
     return answer[0] == 1 or write.key != "/" or isinstance(write.value, dict)
 
 
 def _places(key: str, caller_id: str) -> list[str]:
-    """Return the names that the ROS master may find, in the order of its search."""
+    """Return the names that the ROS master's search tries, in order."""
     if key.startswith("/"):
         return [resolve_parameter(key, caller_id)]
     namespace = [part for part in caller_id.split("/") if part]

@@ -1,4 +1,4 @@
-"""Check parameters in answers and updates, which may contain more than the decision on the call covered."""
+"""Check the parameters in answers and updates. They may contain more than the decision on the call covered."""
 
 import time
 from collections.abc import Callable
@@ -17,15 +17,15 @@ from roswire.xmlrpc import Value
 
 @dataclass(frozen=True, slots=True)
 class ParameterRights:
-    """The checks of parameters by the policy in force (`policy()`); denials are recorded."""
+    """Check parameters by the policy in force (`policy()`), and record denials."""
 
     policy: Callable[[], Policy]
     trail: AuditTrail
 
     def hidden(self, caller: Caller, call: str, key: str, answer: Answer) -> str | None:
-        """Return the text that replaces a namespace which the caller may not read, or None if it may.
+        """Return a denial text if the caller may not read the answer's value, otherwise None.
 
-        The call was decided by the parameters at that time; the answer has the present ones.
+        The call was decided by an earlier state of the parameters; the answer has their present values.
         """
         if answer[0] != 1 or not isinstance(answer[2], dict) or caller.own:
             return None
@@ -33,9 +33,9 @@ class ParameterRights:
         return None if decision.allowed else self.recorded(caller, call, key, decision)
 
     def may_read_value(self, incarnation: Incarnation, key: str, value: Value) -> bool:
-        """Whether a node that subscribed to `key`, or to a key above it, may read the new value; denials are recorded.
+        """Whether a node that subscribed to `key`, or to a key above it, may read the new value. Record a denial.
 
-        The value of a deleted parameter is an empty namespace.
+        The new value of a deleted parameter is an empty namespace.
         """
         if incarnation.own:
             return True
@@ -46,12 +46,12 @@ class ParameterRights:
         return decision.allowed
 
     def to_find(self, caller: Caller, key: str) -> Decision:
-        """Return the decision whether a caller may learn that a parameter exists."""
+        """Decide whether a caller may learn that a parameter exists."""
         request = Request(caller.peer.host, caller.caller_id, Category.READ, key)
         return decide_right(self.policy(), right_to_find(request))
 
     def recorded(self, caller: Caller, call: str, key: str, decision: Decision) -> str:
-        """Record a decision on a parameter; return the text for the caller."""
+        """Record a decision on a parameter, and return the text for the caller."""
         record = self.trail.decided(caller.asker, call, Category.READ.value, key, decision)
         return denial_text(decision, record, self.policy().tell)
 

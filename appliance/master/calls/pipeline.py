@@ -1,4 +1,4 @@
-"""Serve requests: parse → answer the call, or the parts of a multicall → write the answer.
+"""Serve requests: parse the request, carry out the call or the parts of a multicall, and write the answer.
 
 The Master API and the proxy endpoints are served in the same way, with different tables of calls.
 """
@@ -30,9 +30,9 @@ _INTERNAL_FAULT = -32603
 
 @dataclass(frozen=True, slots=True)
 class Pipeline:
-    """The path of requests by a table of calls.
+    """Serve requests by a table of calls.
 
-    Bodies and answers over `offload` bytes are read and written in threads, for which hosts take turns in `bulk`.
+    Bodies and answers over `offload` bytes are parsed and written in threads. Hosts take turns for this (`bulk`).
     """
 
     execution: Execution
@@ -45,7 +45,7 @@ class Pipeline:
     processor: ProcessorTime
 
     def handler(self, table: Table, *, own: bool = False, target: Incarnation | None = None) -> Handler:
-        """Return the handler of a listener with this table; `own`: it is for the appliance's own nodes."""
+        """Return the handler of a listener with this table. `own`: the listener is for the appliance's own nodes."""
 
         async def handle(request: HttpRequest) -> bytes:
             await self.addresses.learn(request.peer)
@@ -88,7 +88,7 @@ class Pipeline:
         try:
             return await bulk.in_thread(parse_call, body, self.limits)
         finally:
-            bulk.give_back()  # carrying the call out may take long
+            bulk.give_back()  # other hosts must not wait while the call is carried out
 
     def _not_understood(self, caller: Caller, body: bytes, error: PeerError) -> bytes:
         limit = isinstance(error, LimitExceededError)

@@ -1,7 +1,7 @@
 """Carry out the calls that register and unregister topics, services, and subscriptions to parameters.
 
-A registration is durable before its node gets the answer (the store writes ahead), because a ROS 1 node never registers
-twice, and control and the ROS master may die at the same time.
+A registration is on disk before its node gets the answer. A ROS 1 node never registers twice, and control and the ROS
+master may die at the same time.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from appliance.master.rosmaster import RosMaster
 
 @dataclass(frozen=True, slots=True)
 class RegistrationCalls:
-    """The registering calls, made at the ROS master with the node's inner URI; accepted ones change the graph."""
+    """Forward registering calls to the ROS master with the node's inner URI. Accepted calls change the graph."""
 
     rosmaster: RosMaster
     registry: Registry
@@ -110,7 +110,7 @@ class RegistrationCalls:
                 holder
                 for holder in self.registry.registered(Kind.SERVICE, service)
                 if holder.name == caller.caller_id
-                # By its own port, or, like `rosnode cleanup`, by the port that lookupService returned.
+                # The URI has the node's own port, or the port that lookupService returned (`rosnode cleanup`).
                 and (
                     holder.registrations[Kind.SERVICE, service].detail == str(port)
                     or self.relay.port(holder, Kind.SERVICE, service) == port
@@ -144,15 +144,15 @@ class RegistrationCalls:
         return answer
 
     def _by_lookup_uri(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        """Return the node whose URI from lookupNode the caller gives, like `rosnode cleanup` on the node's host."""
+        """Return the node whose lookupNode URI is in the call, as `rosnode cleanup` on the node's host sends it."""
         holder = self.registry.holder(caller.caller_id)
         meant = holder is not None and (holder.host, holder.outer_port) == (caller.peer.host, api.uri.port)
         return holder if meant else None
 
     async def _registering(self, caller: Caller, api: ApiUri) -> EvictionGuard:
-        """Return a guard of the incarnation that registers, which prevents its eviction.
+        """Return a guard that prevents the eviction of the registering incarnation.
 
-        If the host is at its limit, a new incarnation replaces one of the host that is unused or gone.
+        If the host is at its limit, a new incarnation replaces an unused or lost incarnation of the host.
         """
         evicted = self.gate.to_make_room(caller, api)
         if evicted is not None:
@@ -161,7 +161,7 @@ class RegistrationCalls:
 
 
 def given_up(registry: Registry, denied: Attempt) -> list[Durable]:
-    """Forget a withdrawn registration that its node unregisters, although the call is denied; it will not come back."""
+    """Forget a withdrawn registration that its node unregisters, although this call is denied."""
     kind, caller = denied.call.kind, denied.caller
     asked = next(argument for argument in denied.arguments if isinstance(argument, ApiUri))
     kept: list[Durable] = []
@@ -176,5 +176,5 @@ def given_up(registry: Registry, denied: Attempt) -> list[Durable]:
 
 
 def _speak_as_asked(answer: Answer, told: str, asked: ApiUri) -> None:
-    """Replace the inner URI in the ROS master's text by the caller's own."""
+    """Replace the inner URI in the ROS master's text by the caller's URI."""
     answer[1] = str(answer[1]).replace(told, asked.text)

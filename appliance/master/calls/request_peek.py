@@ -1,8 +1,8 @@
-"""Parse the beginning of a request's body, for the record of a denial that reads no further. No I/O.
+"""Parse the beginning of a request's body, for the record of a denial. The rest is not read. No I/O.
 
-The beginning is untrusted, a few KiB. If it is a complete call of a known table, the record has the same fields as a
-decision on that call: category and resource, the claimed name, the key or node. Otherwise it has the method's name, if
-any.
+The beginning is untrusted and has a few KiB. If it contains a complete known call, the record has the same fields as a
+decision on that call: category, resource, claimed name, and key or node. Otherwise, the record has only the name of the
+method, if it can be found.
 """
 
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ _MOST_PARTS = 8
 
 
 class PeekedRequest(NamedTuple):
-    """The request as far as it was read; `about` has details like those of a decision's record."""
+    """The readable part of a request. `about` has the same details as the record of a decision."""
 
     category: Category
     resource: str
@@ -36,7 +36,7 @@ class PeekedRequest(NamedTuple):
 
 
 def asked_for(peer: Peer, beginning: bytes) -> PeekedRequest:
-    """Read the beginning of a peer's request; the resource is empty if it cannot be read."""
+    """Parse the beginning of a peer's request. The resource is empty if the request cannot be parsed."""
     try:
         call = parse_call(beginning, _LIMITS)
     except PeerError:
@@ -60,7 +60,7 @@ def _only_named(method: str, caller_id: str | None, about: dict[str, str] | None
 
 
 def _parts(params: tuple[Value, ...]) -> str:
-    """Return the names of the first methods in a multicall, and the number of further ones."""
+    """Return the names of the first methods in a multicall, and the number of further methods."""
     parts = params[0] if params and isinstance(params[0], list) else []
     names = [str(part.get("methodName"))[:_LONGEST] for part in parts if isinstance(part, dict)]
     more = f" and {len(names) - _MOST_PARTS} more" if len(names) > _MOST_PARTS else ""

@@ -1,8 +1,10 @@
-"""Deliver the calls that nodes expect from a master: each node has its own queue, in order.
+"""Deliver the calls that nodes expect from a master. Each node has its own queue, in order.
 
-A slow or dead node does not delay others. All lists of publishers for a topic are delivered, because roscpp must see a
-removal before the addition that follows it. A failed call is repeated a few times, then dropped and reported to
-`troubled`: the node is checked, and gets the missed updates when it answers (`Watchlist.could_not_tell`).
+A slow or dead node does not delay other nodes. Every list of publishers is delivered, even if a newer list waits,
+because roscpp must see a removal before the following addition.
+
+A failed call is repeated a few times, then dropped and reported to `troubled`. The node is then checked, and gets the
+missed updates when it answers again (`Watchlist.could_not_tell`).
 """
 
 import asyncio
@@ -28,7 +30,7 @@ MASTER_NAME = "/master"
 
 @dataclass(slots=True)
 class _Queue:
-    """The waiting calls for a node, each with its weight, and the sum of the weights."""
+    """The waiting calls for a node with their weights, and the sum of these weights."""
 
     incarnation: Incarnation
     calls: deque[tuple[NodeCall, int]] = field(default_factory=deque)
@@ -47,10 +49,11 @@ class _Queue:
 class Delivery:
     """The queues of calls. `troubled(incarnation, call, why)` is called for each lost call.
 
-    A queue holds at most `bound` calls; `queued` limits the bytes of a host and of all hosts. Above a limit the oldest
-    call of the largest queue is dropped: in the host's own queues, or in those of the host with most bytes.
+    A queue holds at most `bound` calls; beyond this, its oldest call is dropped. `queued` limits the bytes of each host
+    and of all hosts. If a host exceeds its limit, the oldest call of its largest queue is dropped. If all hosts
+    together exceed the limit, the host with the most bytes loses a call.
 
-    Hosts take turns at `at_once` calls, so that hanging nodes of one host do not delay calls to other hosts.
+    Hosts take turns for the calls under way (`at_once`), so hanging nodes of one host do not delay calls to others.
     """
 
     def __init__(
@@ -70,7 +73,7 @@ class Delivery:
         self._held: Pool[Address] = Pool(
             "bytes of calls that wait for nodes",
             queued,
-            lambda _host: QuotaClass.REGISTERED,  # only nodes with registrations get calls
+            lambda _host: QuotaClass.REGISTERED,  # only registered nodes get calls
         )
         self._turns = Turns(at_once, quota_class)
         self._tries = tries
@@ -108,7 +111,7 @@ class Delivery:
             self._held.give_back(incarnation.host, queue.weight)
 
     def _heaviest(self, host: Address) -> _Queue:
-        """Return the largest queue of this host if it exceeds its quota, else of the host with the most bytes."""
+        """Return the largest queue of this host if it exceeds its quota, otherwise of the host with the most bytes."""
         if self._held.held(host) <= self._held.bounds.host:
             host, _ = max(self._held.holders(), key=lambda holder: holder[1])
         queues = (queue for queue in self._queues.values() if queue.incarnation.host == host)
@@ -144,7 +147,7 @@ class Delivery:
             except CallFailedError as error:
                 failure, heard = str(error), isinstance(error.__cause__, FaultReceived)
                 if call.method == "shutdown":
-                    return  # success: a node often dies before it answers, or was already dead
+                    return  # a successful shutdown: a node often dies before it answers, or was already dead
             else:
                 return
             finally:

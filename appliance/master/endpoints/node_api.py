@@ -1,10 +1,11 @@
 """Call nodes at their peer address.
 
-When a node is killed, the next node may get its port. An order to shut down an earlier incarnation is therefore not
-sent to the address of a live node. (Two live nodes may share an address: some programs serve several names by one API.)
+After a node was killed, another node may get its port. So an order to shut down an earlier incarnation is not sent to
+the address of a live node. Several live nodes may share an address, because some programs serve several node names with
+one API.
 
-Every answer of a node is a code, a text, and a number or a protocol. Answers have a far smaller limit than requests,
-because thousands of nodes may answer at once, and each may be compromised.
+Each answer of a node is a code, a text, and a number or protocol. The size limit for answers is far smaller than for
+requests, because thousands of nodes may answer at once, and each node may be compromised.
 """
 
 from appliance.master.graph.registry import Incarnation, Life, Registry
@@ -16,18 +17,21 @@ ANSWER = XmlRpcLimits(body=16 << 10, elements=256, depth=4, string=16 << 10, par
 
 
 class NodeApiClient:
-    """The client for calls to nodes; `timeout` is in seconds per call."""
+    """Call nodes; `timeout` is in seconds per call."""
 
     def __init__(self, registry: Registry, *, timeout: float) -> None:
         self._registry = registry
         self._timeout = timeout
 
     def client(self, incarnation: Incarnation) -> XmlRpcClient:
-        """Return a client for the node's address, which another process may have now."""
+        """Return a client for the node's address. Another process may use this address now."""
         return XmlRpcClient(incarnation.call_uri, timeout=self._timeout, limits=ANSWER)
 
     async def call(self, incarnation: Incarnation, method: str, *params: Value) -> Value:
-        """Call a node. Raises `CallFailedError`; `RefusedError` also for a shutdown that another node would get."""
+        """Call a node. Raises `CallFailedError`.
+
+        Raises `RefusedError` for a shutdown if another live node has the address.
+        """
         if method == "shutdown" and incarnation.life is not Life.LIVE:
             uri = incarnation.call_uri
             there = next((other for other in self._registry.live() if other.call_uri == uri), None)

@@ -1,12 +1,13 @@
 """Manage the ports and listening sockets of each incarnation (proxy endpoint, relays), and the advertised address.
 
-Control opens every listening socket and gives the supervisor a duplicate to keep, so that the death of control or of a
-relay does not close a port. A restarted control gets the sockets back by name.
+Control opens every listening socket and gives the supervisor a duplicate. So the death of control or of a relay does
+not close a port. A restarted control gets the sockets back by name.
 
-Ports come from the policy's `[Ports]` range: per incarnation one, and one for each relay process. The longest unused
-port is taken first, so that a subscriber that still calls a dead node's port does not reach another node. A host may
-have `_TIMES_THE_REST` times as many ports as are left for others: the first host can get three quarters of the range,
-the next three quarters of the rest. Hosts that the policy names as one network count as one host.
+An incarnation needs one port for its proxy endpoint and one for each relay process, from the policy's `[Ports]` range.
+The longest unused port is taken first, because a subscriber may still call the port of a dead node.
+
+A host may have `_TIMES_THE_REST` times as many ports as are left: the first host can get three quarters of the range,
+the next host three quarters of the rest. Hosts that the policy names as one network count as one host.
 """
 
 import asyncio
@@ -35,8 +36,8 @@ class NoPortError(Exception):
 class NodePorts:
     """The listening sockets of all incarnations.
 
-    `keep(name, socket)` and `drop(name)` notify the supervisor; `host` is the address that RVMaster listens on;
-    `named_as(address)` returns the network by which the policy in force names a host.
+    `keep(name, socket)` and `drop(name)` notify the supervisor. `host` is the address that RVMaster listens on.
+    `named_as(address)` returns the address or network by which the policy in force names a host.
     """
 
     def __init__(
@@ -57,11 +58,11 @@ class NodePorts:
         self.unused = deque(ports)
         self._sockets: dict[str, sockets.socket] = {}
         self._named_as = named_as
-        self._owners: dict[int, tuple[Address, Network]] = {}  # by port: host, charged network
+        self._owners: dict[int, tuple[Address, Network]] = {}  # each port's host and charged network
         self.taken = self._counted()
 
     def policy_changed(self, ports: range) -> None:
-        """Take new ports from this range, keep those in use, and charge them by the names in the new policy."""
+        """Take new ports from this range, keep the ports in use, and charge them to the new policy's networks."""
         if ports != self._range:
             self._range = ports
             used = {socket.getsockname()[1] for socket in self._sockets.values()}
@@ -84,9 +85,9 @@ class NodePorts:
             self.taken.charge(named)
 
     def open(self, host: Address) -> tuple[int, ...]:
-        """Open listening sockets for a node of this host; return the ports: the outer one, and one for each relay.
+        """Open listening sockets for a node of this host. Raises `NoPortError`.
 
-        Raises `NoPortError`.
+        Return the ports: the outer port, and one port for each relay.
         """
         named = self._named_as(host)
         held, left = self.taken.held(named), len(self.unused)
@@ -128,7 +129,7 @@ class NodePorts:
             self.unused.remove(port)
 
     def reopen(self, incarnation: Incarnation) -> bool:
-        """Open the same ports again (after a restart of the appliance); return False if another process has one.
+        """Open the same ports again, after a restart of the appliance. Return False if a port cannot be opened.
 
         If the number of relays has changed, adapt the number of ports. Raises `NoPortError`.
         """
@@ -152,7 +153,7 @@ class NodePorts:
         return True
 
     def close(self, incarnation: Incarnation) -> None:
-        """Close the ports of an incarnation; they are reused last."""
+        """Close the ports of an incarnation. Closed ports are reused last."""
         for port in incarnation.ports:
             owner = self._owners.pop(port, None)
             if owner is not None:
@@ -166,14 +167,14 @@ class NodePorts:
                 self.unused.append(port)
 
     def close_unclaimed(self, claimed: set[int]) -> None:
-        """Close kept sockets without a known incarnation. Ports above the claimed ones are opened next."""
+        """Close kept sockets that no incarnation claims. The next new ports are above the claimed ports."""
         for name, sock in list(self._sockets.items()):
             port = sock.getsockname()[1]
             if port not in claimed:
                 del self._sockets[name]
                 sock.close()
                 self._drop(name)
-                if port in self._range:  # the range may have changed since
+                if port in self._range:  # the range may have changed in the meantime
                     self.unused.append(port)
         last = max(claimed, default=0)
         self.unused = deque(sorted(self.unused, key=lambda port: (port <= last, port)))
@@ -186,7 +187,7 @@ class NodePorts:
                 return listen(self._host, port)
             except OSError as error:
                 self.unused.append(port)
-                if error.errno not in (errno.EADDRINUSE, errno.EACCES):  # another program has it for now
+                if error.errno not in (errno.EADDRINUSE, errno.EACCES):  # these: another program has the port
                     raise NoPortError(
                         f"port {port} on {self._host} cannot be opened: {error.strerror}"
                     ) from error
@@ -201,13 +202,13 @@ _ANSWER_SECONDS = 3.0
 
 
 class AdvertisedAddresses:
-    """The choice of the appliance's address for each host.
+    """Choose the appliance's address that each host gets in URIs.
 
-    It is the address at which the host reached the appliance. But an address in `advertise:` for the host's network
-    comes first. In a namespace behind address translation, it is the machine's address that the host used.
+    The setting `advertise:` has priority, if it has an address for the host's network. Otherwise, the host gets the
+    address at which it reached the appliance; behind address translation, this is the machine's address.
 
-    `advertised` are (network, address) pairs; `route_to(host)` finds the translated address (None: no translation).
-    `listen` is the address that RVMaster, the proxy endpoints and the relay listen on.
+    `advertised` are (network, address) pairs. `route_to(host)` finds the machine's address that `host` used (None: no
+    translation). `listen` is the address that RVMaster, the proxy endpoints and the relay listen on.
     """
 
     def __init__(
@@ -227,11 +228,11 @@ class AdvertisedAddresses:
         for network, address in self._advertised:
             if peer.host in network:
                 return str(address)
-        # The appliance's own nodes use a separate loopback listener, where other services may not listen.
+        # The appliance's own nodes use a separate loopback listener. Proxy endpoints may not listen there.
         return self._routes.get(peer.host) or self.listen or peer.local
 
     async def learn(self, peer: Peer) -> None:
-        """Find out once at which address this peer reaches the appliance; call this before `address_for`."""
+        """Find out once at which address this peer reaches the appliance. Call this before `address_for`."""
         if self._route_to is None or peer.host in self._routes:
             return
         if len(self._routes) > 10_000:

@@ -1,12 +1,12 @@
 """Serve the two endpoints of every incarnation.
 
-*Inner* (master-side): one loopback listener for the ROS master; the path of the URI is the incarnation's key. *Outer*
-(peer-side): a separate port that other nodes call. Neither reveals the node's real URI, and each belongs to one
-incarnation.
+The *inner* (master-side) endpoint is for the ROS master: one loopback listener serves all incarnations, and the path of
+a URI is the key of an incarnation. The *outer* (peer-side) endpoint is for other nodes; it has its own port. Neither
+endpoint reveals the node's real URI.
 
-The ROS master's calls to a master-side endpoint are acknowledged and ignored: it joins the names in a value to keys
-that the policy did not decide, and its threads come late. Instead, `graph` has nodes called when a decided call is
-carried out: lists of publishers come from the registry, values of parameters from the call.
+The ROS master's calls to a master-side endpoint are acknowledged and ignored. The ROS master joins the names in a value
+to keys that the policy did not decide, and its threads may be late. Instead, `graph` makes the calls to nodes when a
+decided call is carried out: lists of publishers come from the registry, values of parameters from the call.
 """
 
 import socket
@@ -22,7 +22,7 @@ from roswire.xmlrpc import build_fault, build_response
 
 @dataclass(frozen=True, slots=True)
 class ProxyEndpoints:
-    """The open endpoints: `serve(incarnation)` makes the handler of an endpoint, `server` serves it on a socket."""
+    """The open endpoints. `serve(incarnation)` makes the handler of an endpoint; `server` serves it on a socket."""
 
     registry: Registry
     places: NodePorts
@@ -36,15 +36,15 @@ class ProxyEndpoints:
         return node_uri("127.0.0.1", self.inner_port, f"/{incarnation.key}/")
 
     def unassigned_uri(self) -> str:
-        """Return a master-side URI without an incarnation, for unregistering what was never registered."""
+        """Return a master-side URI without an incarnation, for unregistering a node that was never registered."""
         return node_uri("127.0.0.1", self.inner_port, "/nobody/")
 
     def by_inner_uri(self, text: str) -> Incarnation | None:
-        """Return the incarnation of a master-side URI, or None."""
+        """Return the incarnation with this master-side URI, or None."""
         return self.registry.by_key(text.rstrip("/").rpartition("/")[2])
 
     async def open(self, incarnation: Incarnation) -> None:
-        """Serve the proxy endpoint. Raises `NoPortError` after closing the ports."""
+        """Serve the proxy endpoint of an incarnation. If this fails, close its ports and raise `NoPortError`."""
         try:
             sock = self.places.socket(incarnation.outer_port).dup()
         except OSError as error:
@@ -55,7 +55,7 @@ class ProxyEndpoints:
         await server.start()
 
     async def reopen(self, incarnation: Incarnation) -> list[Durable]:
-        """Serve the proxy endpoint of a restored incarnation; return the change to save if its ports have changed.
+        """Serve the proxy endpoint of a restored incarnation. Return the change to save, if its ports have changed.
 
         Raises `NoPortError` if a port is in use.
         """
@@ -66,26 +66,26 @@ class ProxyEndpoints:
         return [SaveNode(incarnation)] if incarnation.ports != ports else []
 
     def close(self, incarnation: Incarnation) -> None:
-        """Close the proxy endpoint and all ports of an incarnation, if open; the ports may be reused."""
+        """Close the proxy endpoint and all ports of an incarnation, if they are open. The ports may be reused."""
         server = self.servers.pop(incarnation.key, None)
         if server is not None:
             server.close()
             self.places.close(incarnation)
 
     def close_all(self) -> None:
-        """Stop serving; the ports stay open for the next control process."""
+        """Stop serving. The ports stay open for the next control process."""
         for server in self.servers.values():
             server.close()
 
 
 class MasterSideApi:
-    """The server of the ROS master's calls to nodes. The path is the incarnation's key, which no other host knows."""
+    """Serve the ROS master's calls to nodes. The path is the incarnation's key, which no other host knows."""
 
     def __init__(self, registry: Registry) -> None:
         self._registry = registry
 
     async def handle(self, request: HttpRequest) -> bytes:
-        """Acknowledge a call, as a server's handler."""
+        """Acknowledge a call; this method is the handler of the server."""
         return self.acknowledge(request)
 
     def acknowledge(self, request: HttpRequest) -> bytes:

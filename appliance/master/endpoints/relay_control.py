@@ -1,7 +1,10 @@
-"""Send the relays their wanted state and the addresses of publishers, and handle their reports. The wanted state is
-derived from the registry (nodes, publications, services) and the grants. Each topic and service is sent to the relay
-that carries it (`allocation`), a node to all relays that carry its topics or services. When a relay (re)appears, its
-whole state is sent between `StateBegan` and `StateEnded`, and the relay removes everything else.
+"""Send the relays their wanted state and the addresses of publishers, and handle their reports.
+
+The wanted state is derived from the registry (nodes, publications, services) and the grants. Each topic and service is
+sent to the relay that carries it (`allocation`). A node is sent to all relays that carry its topics or services.
+
+When a relay starts, control sends its whole state between `StateBegan` and `StateEnded`. The relay removes everything
+else.
 """
 
 import asyncio
@@ -32,42 +35,45 @@ from roswire.xmlrpc import Value
 
 
 class RelayOutbox(Link):
-    """The link to relay `index`. A new relay gets the whole state, with all changes from the time without a relay.
+    """The link to relay `index`. A new relay gets the whole state, including all changes while there was no relay.
 
-    Messages with `soon` are batched for some milliseconds (a starting node registers ten topics in that time), or until
-    the next message without `soon`. This is safe because peers connect only with a grant, and grants and their
+    Messages with `soon` are batched for some milliseconds, or until the next message without `soon`. A starting node
+    registers about ten topics in that time. Batching is safe, because peers connect only with a grant, and grants and
     revocations are sent at once. `orders` sends its question after all earlier messages.
     """
 
     def __init__(self, index: int, heard: Callable[[Any], None], lost: Callable[[str], None]) -> None:
         super().__init__(heard, lost)
         self.index = index
-        self.placed: set[str] = set()  # keys of the incarnations whose port this relay has
+        self.placed: set[str] = set()  # the keys of incarnations whose port this relay has
         self._epoch = 0
         self._orders: deque[asyncio.Future[None]] = deque()
 
     def close(self) -> None:
-        """Close the link, and end the wait for its orders."""
+        """Close the link. Nothing waits any longer for the relay's orders."""
         super().close()
         self.placed.clear()
         while self._orders:
             self.carried_out()
 
     def orders(self) -> list[asyncio.Future[None]]:
-        """Return one future, done when the relay has carried out its orders or ends; [] if no relay is connected."""
+        """Return a list of one future, which is done when the relay has carried out its orders or has ended.
+
+        The list is empty if the relay is not connected.
+        """
         if not self.send(messages.OrdersAsked()):
             return []
         self._orders.append(asyncio.get_running_loop().create_future())
         return [self._orders[-1]]
 
     def carried_out(self) -> None:
-        """Handle the relay's answer to the oldest question: its orders are carried out."""
+        """Handle the relay's answer to the oldest question: it has carried out its orders."""
         if not (done := self._orders.popleft()).done():
             done.set_result(None)
 
     @contextmanager
     def restating(self) -> Iterator[None]:
-        """Mark the messages sent inside this block as the whole state of the relay."""
+        """Mark the messages that are sent inside this block as the whole state of the relay."""
         self._epoch += 1
         self.send(messages.StateBegan(self._epoch))
         yield
@@ -83,9 +89,8 @@ _WORDS = {kind: word for word, kind in _KINDS.items()}
 class RelayControl:
     """Control's end of the links to the relays.
 
-    `broken(incarnation)` is called for lost upstreams. `own_header` is the header of control's own publications,
-    `own_call` answers calls of the appliance's own service. `monitors()` returns the monitors that relays get and
-    report on.
+    `broken(incarnation)` is called for lost upstreams. `own_header` is the header of control's own publications.
+    `own_call` answers calls of the appliance's own service. `monitors()` returns the specifications that relays run.
     """
 
     registry: Registry
@@ -112,14 +117,14 @@ class RelayControl:
 
     @property
     def presence(self) -> str:
-        """Return `connected` if all relays are connected, `away` if none is, else the number of missing ones."""
+        """Return `connected` if all relays are connected, `away` if none is, or the number of missing relays."""
         away = sum(post.channel is None for post in self._posts)
         if not away:
             return "connected"
         return "away" if away == len(self._posts) else f"{away} of {len(self._posts)} are away"
 
     def port(self, incarnation: Incarnation, kind: Kind, resource: str) -> int:
-        """Return the relay's port for a publication or a service of an incarnation."""
+        """Return the relay port of a publication or service of an incarnation."""
         return incarnation.relay_ports[self.allocation.of(_WORDS[kind], resource)]
 
     # --- the links ---
@@ -129,7 +134,7 @@ class RelayControl:
         post = self._posts[index]
         self.carried.lost(index)
         post.attach(channel)
-        # Before the topics, so that no message bypasses the monitors.
+        # Send the specifications before the topics, so that no message bypasses the monitors.
         post.send(self.monitors().statement(index))
         if self.own_header is not None:
             post.send(self.own_header)
@@ -142,15 +147,15 @@ class RelayControl:
         self.monitors().relay_lost(index)
 
     def send(self, message: messages.Message, relay: int) -> bool:
-        """Send a message to a relay; return False if it is not connected."""
+        """Send a message to a relay. Return False if the relay is not connected."""
         return self._posts[relay].send(message)
 
     def publish(self, message: messages.OwnPublished) -> None:
-        """Publish a message of the appliance's own publisher to the present subscribers."""
+        """Send a message of the appliance's own publisher to the present subscribers."""
         self._post(TOPIC, message.topic).send(message)
 
     async def carried_out(self) -> None:
-        """Wait until every relay has carried out its orders; a relay that starts meanwhile starts with them."""
+        """Wait until every relay has carried out its orders. A relay that starts in the meantime begins with them."""
         if waiting := [order for post in self._posts for order in post.orders()]:
             await asyncio.wait(waiting)
 
@@ -358,7 +363,7 @@ def _grant(policy: Policy, row: PermissionRow) -> messages.GrantInstalled:
 
 
 def _names(policy: Policy, host: Address) -> bool:
-    """Whether the policy names a host; loopback (the appliance itself) counts as named."""
+    """Whether the policy names a host. Loopback (the appliance itself) counts as named."""
     return host.is_loopback or policy.names(host)
 
 

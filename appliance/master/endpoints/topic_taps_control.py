@@ -10,7 +10,7 @@ MOST = 8
 
 
 class TooManyTapsError(Exception):
-    """The most taps are already open."""
+    """The maximum number of taps is already open."""
 
 
 class TapRequests:
@@ -29,7 +29,7 @@ class TapRequests:
         *,
         latched: bool,
     ) -> list[messages.MessageSeen]:
-        """Return the next `count` messages of a topic, or those that came in time. Raises `TooManyTapsError`."""
+        """Return the next `count` messages of a topic, fewer after the time limit. Raises `TooManyTapsError`."""
         if len(self._open) >= MOST:
             raise TooManyTapsError(f"{MOST} queries of topics' messages are running: try again")
         self._number += 1

@@ -19,7 +19,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 MOST_RESOURCES = 2000
 OTHERS = "(others)"  # ROS names cannot contain brackets
 
-_STILL_SECONDS = 3.0  # without a report, after which rates are 0
+_STILL_SECONDS = 3.0  # after this time without a report, rates are 0
 
 
 @dataclass(slots=True)
@@ -29,16 +29,16 @@ class Traffic:
     messages: int = 0
     bytes: int = 0
     dropped: int = 0
-    seconds: float = 0.0  # monotonic, of the last report
-    messages_per_second: float = 0.0  # between the last two reports
+    seconds: float = 0.0  # the time of the last report (monotonic)
+    messages_per_second: float = 0.0  # the rate between the last two reports
     bytes_per_second: float = 0.0
     delays: list[int] = field(default_factory=list)  # as in `TopicTraffic`
     delay_seconds: float = 0.0
     delay: float = 0.0  # mean seconds per message in the last report
-    md5sum: str = ""  # of the publisher; empty until a relay has seen it
+    md5sum: str = ""  # the publisher's md5sum; empty until a relay has seen it
 
     def add(self, row: TopicTraffic, now: float, over: float) -> None:
-        """Add a relay's report of `over` seconds; relays report once a second, and only changed rows."""
+        """Add a relay's report about the last `over` seconds. Relays report once a second, and only changed rows."""
         self.messages += row.messages
         self.bytes += row.bytes
         self.dropped += row.dropped
@@ -69,7 +69,7 @@ class RelayTraffic:
         self._registry = registry
         self._relays = relays
         self.connections: dict[tuple[int, int], messages.ConnectionOpened] = {}
-        """The connections, by relay and the relay's number of the connection; `number` is unique among all relays."""
+        """The connections, by relay and the relay's own number. `number` is unique among all relays."""
         self.traffic: dict[tuple[str, str], Traffic] = {}
         self.limited_messages: Counter[tuple[str, str]] = Counter()
         """The messages that limits dropped, by topic and limit; at most `MOST_RESOURCES` topics."""
@@ -79,7 +79,7 @@ class RelayTraffic:
         self.past: dict[str, Traffic] = {}
         """The traffic of forgotten incarnations, by topic and service, so that counters never decrease.
 
-        It has at most `MOST_RESOURCES` entries, and `OTHERS` for the rest.
+        At most `MOST_RESOURCES` have their own entry; `OTHERS` has the sum of the rest.
         """
 
     def used(self) -> set[PermissionRow]:
@@ -93,7 +93,7 @@ class RelayTraffic:
 
     @property
     def total(self) -> Traffic:
-        """Return the total traffic, forgotten incarnations included."""
+        """Return the total traffic, including forgotten incarnations."""
         total = Traffic()
         for traffic in (*self.past.values(), *self.traffic.values()):
             total.include(traffic)
@@ -125,7 +125,7 @@ class RelayTraffic:
             self.past.setdefault(name, Traffic()).include(self.traffic.pop(carried))
 
     def reported(self, rows: list[TopicTraffic], over: float = 1.0) -> None:
-        """Add a relay's counters; those of a forgotten node are ignored."""
+        """Add a relay's counters. Counters of a forgotten node are ignored."""
         now = time.monotonic()
         for row in rows:
             if self._registry.by_key(row.key) is not None:
@@ -171,7 +171,7 @@ class RelayTraffic:
         )
 
     def refused(self, message: messages.ConnectionRefused) -> None:
-        """Record a refused peer. The appliance's own node may connect too late, which is not an attack."""
+        """Record a refused peer. If the appliance's own node connects too late, this is not recorded as an attack."""
         own = self._is_own(message.host, message.caller_id, message.resource)
         self._trail.happened(
             "connection refused",
@@ -215,7 +215,7 @@ class RelayTraffic:
         )
 
     def limited(self, row: messages.LimitedRow, rule: LimitRule | None) -> None:
-        """Record that a relay dropped messages beyond a limit of the policy (`rule`; None if it has changed since)."""
+        """Record that a relay dropped messages beyond a limit (`rule`; None if the policy no longer has the rule)."""
         topic = row.topic or OTHERS
         known = topic in self._limited_topics or len(self._limited_topics) < MOST_RESOURCES
         self._limited_topics.add(name := topic if known else OTHERS)
@@ -256,7 +256,7 @@ class RelayTraffic:
         return node.name if node is not None else ""
 
     def _is_own(self, host: str, caller_id: str, topic: str) -> bool:
-        """Whether this is one of the appliance's own nodes, at its address, with a topic that it subscribed to."""
+        """Whether the peer is one of the appliance's own nodes, at its address, for a topic that it subscribed to."""
         holder = self._registry.holder(caller_id)
         return (
             holder is not None

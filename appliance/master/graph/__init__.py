@@ -1,1 +1,1 @@
-"""The graph: nodes, registrations, updates for subscribers, and the effects of a change of the policy."""
+"""The graph: nodes, registrations, grants, updates for subscribers, and the effects of a new policy."""

@@ -1,7 +1,7 @@
-"""Define the effects of a change of the graph, as data: `graph`, `registry`, `grants` and `revocation` return them.
+"""Define the effects of a change of the graph as data.
 
-`enactor` carries the effects out, in order and in the same turn of the event loop, so that no reader sees a change
-without its effects.
+`graph`, `registry`, `grants` and `revocation` return effects. `enactor` carries them out, in order and in the same turn
+of the event loop, so that no reader sees a change without its effects.
 """
 
 from collections.abc import Mapping
@@ -13,15 +13,15 @@ from appliance.policy.model import Rule
 from appliance.store.state_file import PermissionRow
 from roswire.xmlrpc import Value
 
-_CALL_BYTES = 200  # an empty call, and an empty text, in Python's memory
-_TEXT_BYTES = 60
+_CALL_BYTES = 200  # an empty call in Python's memory
+_TEXT_BYTES = 60  # an empty text in Python's memory
 
 
 @dataclass(frozen=True, slots=True)
 class NodeCall:
-    """A call to a node: method and parameters after the caller's name.
+    """A call to a node: the method, and the parameters after the caller's name.
 
-    `size` is its approximate size in bytes, if known; otherwise `weight` measures the call.
+    `size` is the approximate size of the call in bytes, if known. Otherwise, `weight` measures the call.
     """
 
     method: str
@@ -41,7 +41,7 @@ class NodeCall:
 
 @dataclass(frozen=True, slots=True)
 class TellNode:
-    """A call to a node, after the calls that already wait for it."""
+    """Queue a call to a node, after the calls that already wait for this node."""
 
     node: Incarnation
     call: NodeCall
@@ -49,14 +49,14 @@ class TellNode:
 
 @dataclass(frozen=True, slots=True)
 class DropCalls:
-    """The end of all waiting calls to a node."""
+    """Drop all waiting calls to a node."""
 
     node: Incarnation
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceResource:
-    """A publication or service that its relay carries from now on."""
+    """Have a relay carry a publication or service from now on."""
 
     node: Incarnation
     kind: Kind
@@ -66,7 +66,7 @@ class PlaceResource:
 
 @dataclass(frozen=True, slots=True)
 class WithdrawResource:
-    """A publication or service that its relay no longer carries."""
+    """Have the relay stop carrying a publication or service."""
 
     node: Incarnation
     kind: Kind
@@ -75,56 +75,56 @@ class WithdrawResource:
 
 @dataclass(frozen=True, slots=True)
 class PlaceNode:
-    """A node whose topics, services and grants the relays carry from now on."""
+    """Have the relays carry a node's topics and services, with their grants, from now on."""
 
     node: Incarnation
 
 
 @dataclass(frozen=True, slots=True)
 class WithdrawNode:
-    """A node that the relays no longer carry."""
+    """Have the relays stop carrying a node."""
 
     node: Incarnation
 
 
 @dataclass(frozen=True, slots=True)
 class CloseNode:
-    """A node whose endpoints are closed, and whose traffic is added to the past traffic."""
+    """Close a node's endpoints, and add its traffic to the past traffic."""
 
     node: Incarnation
 
 
 @dataclass(frozen=True, slots=True)
 class SaveGrant:
-    """A grant to store, because its node never asks again."""
+    """Store a grant, because its node never asks again."""
 
     row: PermissionRow
 
 
 @dataclass(frozen=True, slots=True)
 class EraseGrant:
-    """A grant to remove from the store."""
+    """Remove a grant from the store."""
 
     row: PermissionRow
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceGrant:
-    """A grant by which the relay admits a subscriber or client."""
+    """Have the relay admit the subscriber or client of a grant."""
 
     row: PermissionRow
 
 
 @dataclass(frozen=True, slots=True)
 class RevokeGrant:
-    """A grant that the relay revokes, and whose connection it cuts."""
+    """Have the relay revoke a grant and cut its connection."""
 
     row: PermissionRow
 
 
 @dataclass(frozen=True, slots=True)
 class PutBack:
-    """Restored registrations of a node, to make at the ROS master in their turn."""
+    """Make restored registrations of a node at the ROS master, in their turn."""
 
     node: Incarnation
     registrations: tuple[NodeRegistration, ...]
@@ -132,7 +132,7 @@ class PutBack:
 
 @dataclass(frozen=True, slots=True)
 class TakeBack:
-    """A revoked registration of a node, to end at the ROS master in its turn."""
+    """End a revoked registration of a node at the ROS master, in its turn."""
 
     node: Incarnation
     registration: NodeRegistration
@@ -140,14 +140,14 @@ class TakeBack:
 
 @dataclass(frozen=True, slots=True)
 class UsePorts:
-    """The range of ports for new nodes under a new policy, which may name hosts differently."""
+    """Use the port range of a new policy for new nodes. The policy may also name hosts differently."""
 
     ports: range
 
 
 @dataclass(frozen=True, slots=True)
 class WriteRecord:
-    """A record for the audit log, with the fields of `AuditTrail.happened`."""
+    """Write an audit record, with the arguments of `AuditTrail.happened`."""
 
     event: str
     reason: str

@@ -1,7 +1,7 @@
-"""Keep the grants of the relays: clients, with the topics and services that they may use. Plain state, no I/O.
+"""Keep the grants of the relays: the topics and services that each client may use. No I/O.
 
-Grants are stored, because a ROS node never asks twice. Above the limit of a host, it loses its oldest grants without a
-connection; above the limit of all hosts, the host with most grants does.
+Grants are stored, because a ROS node never asks twice. A host above its limit loses its oldest grants that have no
+connection. Above the limit of all hosts, the host with the most grants loses them.
 """
 
 from collections.abc import Callable, Collection, Iterable
@@ -15,17 +15,20 @@ _CLEARED_AT_ONCE = 1000
 
 
 class Grants:
-    """All grants. `used()` returns those with a connection now."""
+    """All grants. `used()` returns the grants that have a connection now."""
 
     def __init__(self, used: Callable[[], Collection[PermissionRow]], bounds: Bounds = GRANTS.bounds) -> None:
         self.used = used
         self._bounds = bounds
-        self._of_node: dict[str, set[PermissionRow]] = {}  # by the key of the publisher or provider
-        self._of_host: dict[str, dict[PermissionRow, None]] = {}  # by client host, in order of granting
+        self._of_node: dict[str, set[PermissionRow]] = {}  # by key of the publisher or provider
+        self._of_host: dict[str, dict[PermissionRow, None]] = {}  # by client host, oldest grant first
         self._count = 0
 
     def restore(self, rows: Iterable[PermissionRow]) -> Effects:
-        """Restore stored grants. Erase grants of an earlier version for all names of a host, which looks up again."""
+        """Restore stored grants. Erase grants of an earlier version that were for all names of a host.
+
+        The clients of erased grants look up the service again.
+        """
         effects: Effects = []
         for row in rows:
             if row.caller_id:
@@ -43,7 +46,7 @@ class Grants:
         return self._of_node.get(key, ())
 
     def give(self, row: PermissionRow) -> Effects:
-        """Give a grant, also if it exists; it becomes the newest grant of its host."""
+        """Give a grant. It becomes the newest grant of its host, even if it existed before."""
         effects: Effects = []
         if row not in self._of_node.get(row.key, ()):
             effects.append(SaveGrant(row))
@@ -55,7 +58,7 @@ class Grants:
         return [*effects, PlaceGrant(row)]
 
     def take(self, row: PermissionRow) -> Effects:
-        """Revoke a grant, if it exists; its connection is cut."""
+        """Revoke a grant if it exists. Its connection is cut."""
         rows = self._of_node.get(row.key, set())
         if row not in rows:
             return []
@@ -63,7 +66,7 @@ class Grants:
         return [*self._drop(row), RevokeGrant(row)]
 
     def forget(self, key: str) -> Effects:
-        """Forget an incarnation that is gone for good, with the grants for its topics and services."""
+        """Forget an incarnation permanently, with the grants for its topics and services."""
         return [effect for row in self._of_node.pop(key, ()) for effect in self._drop(row)]
 
     def _add(self, row: PermissionRow) -> None:

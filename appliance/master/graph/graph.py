@@ -1,9 +1,11 @@
 """Change the registry, and return the effects: updates for nodes, relayed topics, records.
 
 Every change of the graph is a method here, so that no change lacks its effects. The method changes the registry and the
-grants, and returns the effects, which the caller passes to `enactor`. Lists of publishers come from the registry at the
-time of the change, and values of parameters from the call that set them. Later reports of the ROS master's notification
-threads are ignored, because they can be partial (while it is rebuilt), outdated or wrong.
+grants, and returns the effects. The caller passes the effects to `enactor`.
+
+Lists of publishers come from the registry at the time of the change, and values of parameters from the call that set
+them. Later calls of the ROS master's notification threads are ignored, because they can be outdated, wrong, or partial
+(while the ROS master is rebuilt).
 """
 
 import sys
@@ -42,9 +44,7 @@ _CARRIED = (Kind.PUBLICATION, Kind.SERVICE)
 
 @dataclass(frozen=True, slots=True)
 class RosGraph:
-    """The changes of the graph. `may_read_value(node, key, value)`: whether the policy lets a node read a parameter's
-    value.
-    """
+    """Change the graph. `may_read_value(node, key, value)` returns whether a node may read a parameter's value."""
 
     registry: Registry
     grants: Grants
@@ -54,11 +54,11 @@ class RosGraph:
     def registered(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> Effects:
         """Record a registration that the ROS master accepted."""
         effects = self._take_name(incarnation)
-        if incarnation.life is Life.SHADOW:  # it was lost while its call was under way
+        if incarnation.life is Life.SHADOW:  # the node was lost while its call was under way
             effects += self.returned(incarnation)
         if kind is Kind.SERVICE:
             for provider in list(self.registry.registered(Kind.SERVICE, resource)):
-                if provider is not incarnation:  # the ROS master keeps one provider of a service: the last
+                if provider is not incarnation:  # the ROS master keeps only the last provider of a service
                     effects += self.unregistered(provider, Kind.SERVICE, resource)
         new = (kind, resource) not in incarnation.registrations
         effects += self.registry.register(incarnation, kind, resource, detail)
@@ -72,7 +72,7 @@ class RosGraph:
         return effects
 
     def unregistered(self, incarnation: Incarnation, kind: Kind, resource: str) -> Effects:
-        """Record that a registration is gone at the ROS master."""
+        """Record that a registration has ended at the ROS master."""
         effects: Effects = [*self.registry.unregister(incarnation, kind, resource)]
         if not effects:
             return [*self.registry.unshelve(incarnation, kind, resource)]
@@ -89,7 +89,7 @@ class RosGraph:
     def revoked(
         self, incarnation: Incarnation, registration: NodeRegistration, decision: Decision, call: str
     ) -> Effects:
-        """Withdraw a registration that is no longer allowed (`call`: see `revocation`), also at the ROS master."""
+        """Withdraw a registration that is no longer allowed, and store it for later. `call`: see `revocation`."""
         kind, resource = registration.kind, registration.resource
         effects: Effects = [
             revocation(decision, str(incarnation.host), incarnation.name, kind.value, resource, call=call),
@@ -101,7 +101,7 @@ class RosGraph:
         return effects
 
     def granted_again(self, incarnation: Incarnation, registration: NodeRegistration) -> Effects:
-        """Restore a registration that the policy took, also at the ROS master, unless another node has it now."""
+        """Restore a registration that the policy withdrew. Forget a service that another node now offers."""
         kind, resource = registration.kind, registration.resource
         if kind is Kind.SERVICE and self._others_offer(incarnation, resource):
             return [*self.registry.unshelve(incarnation, kind, resource)]
@@ -112,7 +112,7 @@ class RosGraph:
         return any(holder is not incarnation for holder in self.registry.registered(Kind.SERVICE, service))
 
     def _take_name(self, incarnation: Incarnation) -> Effects:
-        """Take the name from its holder, and forget all that the holder could get back."""
+        """Take the name from its holder, and forget the holder's withdrawn registrations."""
         other = self.registry.occupant(incarnation.name)
         if other is None or other is incarnation:
             return []
@@ -122,7 +122,7 @@ class RosGraph:
         return effects
 
     def replaced(self, incarnation: Incarnation, by: Incarnation) -> Effects:
-        """Replace an incarnation whose name another one took; shut it down with the ROS master's text."""
+        """Replace an incarnation whose name another incarnation took. Shut it down with the ROS master's text."""
         lost = list(incarnation.registrations.values())
         reason = f"[{incarnation.name}] Reason: new node registered with same name"
         other = by.host != incarnation.host
@@ -140,7 +140,7 @@ class RosGraph:
         ]
 
     def lost(self, incarnation: Incarnation, why: str) -> Effects:
-        """Suspend the registrations of a node that does not answer any more, until it returns."""
+        """Suspend the registrations of a node that no longer answers, until it returns."""
         return [
             *self.registry.overshadow(incarnation, time.monotonic()),
             *self._tell_withdrawn(incarnation.registrations.values()),
@@ -150,9 +150,9 @@ class RosGraph:
         ]
 
     def returned(self, incarnation: Incarnation) -> Effects:
-        """Restore the registrations of a lost node that answers again, also at the ROS master.
+        """Restore the registrations of a lost node that answers again.
 
-        A service that another node offers meanwhile stays with that node, the last provider.
+        If another node has offered a service of the lost node in the meantime, that node keeps the service.
         """
         effects = self._take_name(incarnation)
         for service in incarnation.resources(Kind.SERVICE):
@@ -166,13 +166,13 @@ class RosGraph:
             elif registration.kind is Kind.SUBSCRIPTION:
                 effects += self._tell_one(incarnation, registration.resource, always=True)
         for kind, topic in incarnation.shelf:
-            # Withdrawn while the node was away, or earlier without reaching it.
+            # The policy withdrew these while the node was away, or earlier without reaching the node.
             if kind is Kind.SUBSCRIPTION:
                 effects.append(_emptied(incarnation, topic))
         return [*effects, _record("node returned", f"{incarnation.name} answers again", incarnation)]
 
     def forgotten(self, incarnation: Incarnation) -> Effects:
-        """Forget an incarnation for good."""
+        """Forget an incarnation permanently."""
         registrations = list(incarnation.registrations.values())
         effects: Effects = [*self.registry.forget(incarnation), *self._tell_withdrawn(registrations)]
         if self.registry.holder(incarnation.name) is None:
@@ -188,18 +188,18 @@ class RosGraph:
     # --- grants ---
 
     def topic_granted(self, publisher: Incarnation, topic: str, host: Address, caller_id: str) -> Effects:
-        """Grant a subscriber a topic of a publisher."""
+        """Let a subscriber connect to a topic of a publisher."""
         return self.grants.give(PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id))
 
     def service_granted(self, provider: Incarnation, service: str, host: Address, caller_id: str) -> Effects:
-        """Grant a client a service of a provider, unless the client has no name."""
+        """Let a client call a service of a provider, unless the client has no name."""
         row = PermissionRow(provider.key, SERVICE, service, str(host), caller_id)
         return self.grants.give(row) if caller_id else []
 
     def _give_up(self, subscriber: Incarnation, topic: str) -> Effects:
-        """Remove the grants of a subscriber that gave the topic up, on every publisher.
+        """Remove the grants of a subscriber that gave up a topic, for all publishers of the topic.
 
-        A later subscriber with the same name and host keeps them, because grants are for name and host.
+        Grants are for a name and a host. So if a later subscriber has the same name and host, it keeps the grants.
         """
         other = self.registry.holder(subscriber.name)
         if (
@@ -217,7 +217,7 @@ class RosGraph:
         ]
 
     def limits_changed(self, before: Policy, now: Policy) -> Effects:
-        """Return the effects that send the relays changed limits, and changes of the hosts that the policy names."""
+        """Send the relays all changed limits, and whether the policy names a host if that has changed."""
         effects: Effects = []
         for node in self.registry.live():
             for registration in node.registrations.values():
@@ -244,7 +244,7 @@ class RosGraph:
     # --- updates for subscribers ---
 
     def tell(self, topic: str, *, always: bool = False) -> Effects:
-        """Send every subscriber of a topic its list of publishers, if it has changed (or `always`)."""
+        """Send every subscriber of a topic its list of publishers, if the list has changed or `always` is true."""
         subscribers = self.registry.registered(Kind.SUBSCRIPTION, topic)
         return [
             effect
@@ -255,7 +255,7 @@ class RosGraph:
     def tell_everybody(self, concerned: Callable[[str], bool] = lambda _topic: True) -> Effects:
         """Send all subscribers the lists of all `concerned` topics: after a rebuild, for a new relay or control.
 
-        The list of a revoked topic is empty: control may have died before the subscriber received it.
+        The list of a revoked topic is empty. It is sent again, because control may have died before it was delivered.
         """
         topics = {
             registration.resource
@@ -278,13 +278,13 @@ class RosGraph:
         return [effect for subscriber in subscribers for effect in self.renew(subscriber, topic, publishers)]
 
     def remind(self, subscriber: Incarnation, topic: str) -> Effects:
-        """Send a subscriber its list of a topic again; an empty list if the policy withdrew the topic."""
+        """Send a subscriber its list for a topic again, or an empty list if the policy withdrew the subscription."""
         if (Kind.SUBSCRIPTION, topic) in subscriber.registrations:
             return self._tell_one(subscriber, topic, always=True)
         return [_emptied(subscriber, topic)] if (Kind.SUBSCRIPTION, topic) in subscriber.shelf else []
 
     def parameter_set(self, key: str, value: Value, caller_id: str) -> Effects:
-        """Return the updates for a value that the ROS master accepted; the caller gets none for exactly this key."""
+        """Return the updates for a value that the ROS master accepted. The caller gets none for exactly this key."""
         return self._tell_parameters(key, value, caller_id)
 
     def parameter_deleted(self, key: str) -> Effects:
@@ -307,9 +307,9 @@ class RosGraph:
         return effects
 
     def tell_parameter(self, subscriber: Incarnation, key: str, value: Value) -> Effects:
-        """Send a node the present value of a parameter, if the node may read it.
+        """Send a node the present value of a parameter, if the node may read this value.
 
-        The subscription was decided by the keys that existed at that time, so the value is checked again.
+        The subscription was decided by the keys that existed then, so the right to read is checked again.
         """
         told = self.may_read_value(subscriber, key, value)
         return [TellNode(subscriber, _param_update(key, value))] if told else []
@@ -325,10 +325,10 @@ class RosGraph:
     def absent(
         self, subscribers: Iterable[Incarnation]
     ) -> Iterator[tuple[Incarnation, str, list[Incarnation]]]:
-        """Yield these subscribers' relayed topics, with the publishers that they are not connected to.
+        """Yield each relayed topic of these subscribers with the publishers that the subscriber is not connected to.
 
-        Grants are not considered: if one was withdrawn unnoticed, the subscriber asks again only after it drops the
-        publisher. So the result depends only on data that survive a restart.
+        Whether there is a grant does not matter. If a grant was withdrawn unnoticed, the subscriber asks again only
+        after it drops the publisher. So the result depends only on data that survive a restart.
         """
         used = self.grants.used()
         for subscriber in subscribers:
@@ -345,7 +345,7 @@ class RosGraph:
                     yield subscriber, topic, publishers
 
     def list_for(self, subscriber: Incarnation, topic: str) -> list[str]:
-        """Return the list that answers a registration, and store it, so that only later changes are sent."""
+        """Return the list for the answer to a registration, and store the list so that only later changes are sent."""
         uris = self._publishers_for(subscriber, topic)
         subscriber.told_lists[topic] = uris
         return list(uris)
@@ -371,8 +371,9 @@ class RosGraph:
 def revocation(
     decision: Decision, host: str, caller_id: str, category: str, resource: str, *, call: str
 ) -> WriteRecord:
-    """Return the record of a withdrawal. `call` is the call that the policy no longer allows; empty if the policy is
-    not the reason.
+    """Return the audit record of a withdrawal.
+
+    `call` is the call that the policy no longer allows. It is empty if the policy is not the reason.
     """
     about = {"call": call, "needs": decision.needs}
     return WriteRecord(
@@ -407,7 +408,7 @@ def _list(subscriber: Incarnation, topic: str, uris: Iterable[str]) -> TellNode:
 
 
 def _emptied(subscriber: Incarnation, topic: str) -> TellNode:
-    """Return an empty list for a subscriber, because client libraries drop a publisher only if a list lacks it."""
+    """Send a subscriber an empty list, because client libraries drop a publisher only if a list does not contain it."""
     return _list(subscriber, topic, ())
 
 
@@ -418,5 +419,5 @@ def _differ(
 
 
 def _param_update(key: str, value: Value) -> NodeCall:
-    """Return the call like the ROS master's: the key ends with `/`; the value of an unset key is `{}`."""
+    """Return the same call as the ROS master makes: the key ends with `/`, and the value of an unset key is `{}`."""
     return NodeCall("paramUpdate", (f"{key.rstrip('/')}/", value), weigh(value, sys.maxsize))

@@ -1,9 +1,11 @@
 """Decide which topics and services are relayed, and which URIs nodes get.
 
-The default, `all` and `full`, is a security boundary. With `relaying: monitored`, the thesis's mode, the relay carries
-only topics and services that the policy's `[Monitor]` names or that a specification has events on; nodes connect
-directly for the rest. With `mediation: monitored`, which requires it, nodes also get each other's real URIs. Both are
-faster, but not a boundary: a node that knows a port can send any request to it.
+The default, `relaying: all` and `mediation: full`, is a security boundary.
+
+With `relaying: monitored` (the thesis's mode), the relay carries only topics and services in the policy's `[Monitor]`,
+or with events of a specification. For all others, nodes connect directly. With `mediation: monitored`, nodes also get
+each other's real URIs; this mode requires `relaying: monitored`. Both modes are faster, but not a security boundary: a
+node that knows a port can send any request to it.
 """
 
 from collections.abc import Callable
@@ -15,7 +17,7 @@ from appliance.specifications.specification_files import CheckedSpecifications
 
 @dataclass(frozen=True, slots=True)
 class Mediation:
-    """The two modes, applied to the running policy."""
+    """The two modes, applied to the policy in force."""
 
     policy: Callable[[], Policy]
     specifications: Callable[[], CheckedSpecifications]
@@ -40,5 +42,5 @@ class Mediation:
         )
 
     def hides_publishers(self, topic: str) -> bool:
-        """Whether subscribers of a topic get the publishers' outer URIs instead of the real ones."""
+        """Whether subscribers of a topic get the publishers' outer URIs instead of the real URIs."""
         return self.stand_ins or self.carries_topic(topic)

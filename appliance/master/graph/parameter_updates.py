@@ -1,11 +1,11 @@
-"""Compute the updates for subscribers of a set or deleted parameter, from the decided key and value.
+"""Compute the updates for subscribers when a parameter is set or deleted, from the decided key and value.
 
-Like rosmaster's `compute_param_updates`, but from canonical keys alone, so that subscribers get only the decided key
-and keys below it, whatever the names in a value are:
+This works like rosmaster's `compute_param_updates`, but uses only canonical keys. So subscribers get only the decided
+key and keys below it, whatever names a value contains:
 
-1. Subscribers to the key, or to a key above it, get the key and its value.
-2. Subscribers to a key below it get their part of the new value, or `{}` if it is not set any more.
-   A value that is not a namespace causes no updates for keys below it.
+1. Subscribers to the decided key, or to a key above it, get the decided key and its value.
+2. Subscribers to a key below the decided key get their part of the new value, or `{}` if their key is no longer set.
+3. If the value is not a namespace, there are no updates for keys below the decided key.
 """
 
 from collections.abc import Iterable, Iterator
@@ -15,7 +15,7 @@ from roswire.xmlrpc import Value
 
 
 class ParameterUpdate(NamedTuple):
-    """An update: subscribers to `subscribed` get this value of `key`; both keys are canonical."""
+    """An update: subscribers to `subscribed` get this value of `key`. Both keys are canonical."""
 
     subscribed: str
     key: str
@@ -23,7 +23,7 @@ class ParameterUpdate(NamedTuple):
 
 
 def updates_of(key: str, value: Value, below: Iterable[str]) -> Iterator[ParameterUpdate]:
-    """Yield the updates for a new value of `key` (`{}` if deleted). `below` are the subscribed keys below it."""
+    """Yield the updates for a new value of `key` (`{}` if deleted). `below` are the subscribed keys below `key`."""
     for above in _upwards(key):
         yield ParameterUpdate(above, key, value)
     if isinstance(value, dict):
@@ -34,7 +34,7 @@ def updates_of(key: str, value: Value, below: Iterable[str]) -> Iterator[Paramet
 
 
 def settled(value: Value) -> Value:
-    """Return a snapshot of a value: its namespaces are copied, because later calls change them in place."""
+    """Return a snapshot of a value. Its namespaces are copied, because later calls change them in place."""
     return {name: settled(member) for name, member in value.items()} if isinstance(value, dict) else value
 
 

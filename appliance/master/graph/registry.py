@@ -1,17 +1,17 @@
 """Keep the registry: nodes, their registrations, and the lists that subscribers have. No I/O, no clock.
 
-An *incarnation* is one life of a node: its name and the API URI that it registered with, from one host. It has the two
-endpoints and the relay ports that represent the node. Every change returns the changes to save (`Durable`), which
-`enactor` carries out.
+An *incarnation* is one life of a node: a name and an API URI that were registered from one host. Two endpoints and the
+relay ports represent the node. Every change of the registry returns the changes to save (`Durable`); `enactor` saves
+them.
 
 Invariants:
 
-1. At most one incarnation of a name is *live*; it alone holds the name. An earlier one is *replaced* and never
-   comes back.
-2. A live incarnation that no longer answers becomes a *shadow*: its registrations are kept but have no effect until it
-   returns or expires. A shadow does not hold its name.
-3. Registrations have a number, by which a rebuilt ROS master gets them in the order in which they were made.
-4. Other incarnations do not get the key or ports of an incarnation while it is known.
+1. At most one incarnation of a name is *live*. Only the live incarnation holds the name. An earlier incarnation of the
+   name is *replaced*, and never comes back.
+2. A live incarnation that no longer answers becomes a *shadow*. Its registrations are kept, but have no effect until
+   the node returns or the shadow expires. A shadow does not hold its name.
+3. Registrations are numbered, so that a rebuilt ROS master gets them in their original order.
+4. While an incarnation is known, no other incarnation gets its key or ports.
 """
 
 import enum
@@ -29,10 +29,10 @@ ANY_TYPE = "*"
 """The type of a topic for subscribers that accept any type."""
 
 _MOST_UNUSED_TYPES = 10_000
-"""The most topics without a node whose types are kept, to limit memory."""
+"""The most topics without a node whose types are kept. This limits memory."""
 
 PUBLISHER_PATH = "/publisher/"
-"""The path of the API of the appliance's own publisher, on the listener of the master-side endpoints."""
+"""The path of the node API of the appliance's own publisher, on the listener of the master-side endpoints."""
 
 
 class Kind(enum.StrEnum):
@@ -57,7 +57,7 @@ class Life(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class NodeRegistration:
-    """A registration of a node; `detail` is the topic's type, or the service's `rosrpc` port."""
+    """A registration of a node. `detail` is the topic's type or the service's `rosrpc` port."""
 
     kind: Kind
     resource: str
@@ -69,9 +69,10 @@ class NodeRegistration:
 class Incarnation:
     """One life of a node.
 
-    `api` is the URI it gave, whose host is a claim and never used. `told` is the address at which this node reaches the
-    appliance, used in all URIs for it. `own` marks the appliance's own nodes (rosout, and the publisher for monitors).
-    It has a port on every relay process: `relay_port` on the first, `more_relay_ports` on the others.
+    `api` is the URI that the node registered; its host part is not verified and never used. `told` is the address at
+    which this node reaches the appliance; all URIs for this node use it. `own` marks the appliance's own nodes (rosout,
+    and the publisher for monitors). Each relay process has a port for the incarnation: the first has `relay_port`, the
+    others have `more_relay_ports`.
     """
 
     key: str
@@ -90,11 +91,14 @@ class Incarnation:
     shelf: dict[tuple[Kind, str], NodeRegistration] = field(default_factory=dict)  # withdrawn by the policy
     told_lists: dict[str, tuple[str, ...]] = field(default_factory=dict)
     more_relay_ports: tuple[int, ...] = ()
-    calls: int = 0  # the number of its registering calls under way
+    calls: int = 0  # the number of registering calls of this incarnation that are under way
 
     @property
     def evictable(self) -> bool:
-        """Whether it can be evicted: it is replaced, or has no registrations, withdrawn ones or calls under way."""
+        """Whether this incarnation can be evicted.
+
+        It must be replaced, or have no registrations, no withdrawn registrations and no calls under way.
+        """
         return not (self.registrations or self.shelf or self.calls or self.own) or self.life is Life.REPLACED
 
     @property
@@ -104,22 +108,22 @@ class Incarnation:
 
     @property
     def relay_ports(self) -> tuple[int, ...]:
-        """Return its port on each relay process."""
+        """Return the incarnation's port on each relay process."""
         return (self.relay_port, *self.more_relay_ports)
 
     @property
     def ports(self) -> tuple[int, ...]:
-        """Return every port that represents it."""
+        """Return every port that represents the incarnation."""
         return (self.outer_port, *self.relay_ports)
 
     @property
     def real_uri(self) -> str:
-        """Return the node's own API at its peer address (only for nodes without a proxy endpoint in between)."""
+        """Return the URI of the node's own API at its peer address, for direct calls without a proxy endpoint."""
         return node_uri(str(self.host), self.api.port, self.api.path)
 
     @property
     def call_uri(self) -> NodeUri:
-        """Return the URI for calls to the node: at its peer address, whatever host it claimed; rosout has its own."""
+        """Return the URI for calls to the node, at its peer address. rosout has a fixed address."""
         host = rosout_address.ADDRESS if self.own and not self.of_monitors else str(self.host)
         return NodeUri("http", host, self.api.port, self.api.path)
 
@@ -128,15 +132,15 @@ class Incarnation:
         return node_uri(told, self.outer_port)
 
     def uri_for(self, told: str, *, hidden: bool) -> str:
-        """Return the outer URI when `hidden`, else the real one; the appliance's own nodes have only the outer one."""
+        """Return the outer URI if `hidden`, otherwise the real URI. The appliance's own nodes have only outer URIs."""
         return self.outer_uri(told) if hidden or self.own else self.real_uri
 
     def in_order(self) -> list[NodeRegistration]:
-        """Return its registrations, in their order."""
+        """Return the registrations in the order in which they were made."""
         return sorted(self.registrations.values(), key=lambda registration: registration.order)
 
     def resources(self, kind: Kind) -> list[str]:
-        """Return its registrations of that kind, in their order."""
+        """Return the resources of all registrations of this kind."""
         return [
             registration.resource for registration in self.registrations.values() if registration.kind is kind
         ]
@@ -144,21 +148,21 @@ class Incarnation:
 
 @dataclass(frozen=True, slots=True)
 class SaveNode:
-    """An incarnation to save: it is new, or its `life` or ports have changed."""
+    """Save an incarnation, because it is new, or because its `life` or ports have changed."""
 
     node: Incarnation
 
 
 @dataclass(frozen=True, slots=True)
 class EraseNode:
-    """An incarnation to erase, with all its registrations."""
+    """Erase an incarnation, with all its registrations."""
 
     key: str
 
 
 @dataclass(frozen=True, slots=True)
 class SaveRegistration:
-    """A registration to save, of the incarnation with this key; `shelved`: the policy withdrew it."""
+    """Save a registration of the incarnation with this key. `shelved`: the policy withdrew the registration."""
 
     key: str
     registration: NodeRegistration
@@ -167,7 +171,7 @@ class SaveRegistration:
 
 @dataclass(frozen=True, slots=True)
 class EraseRegistration:
-    """A registration to erase; `shelved`: one that the policy withdrew."""
+    """Erase a registration. `shelved`: the registration is one that the policy withdrew."""
 
     key: str
     kind: Kind
@@ -186,9 +190,9 @@ class Registry:
         self._known: dict[tuple[str, Address, str], Incarnation] = {}
         self._live: dict[str, Incarnation] = {}
         self._topics: dict[tuple[Kind, str], dict[str, Incarnation]] = {}
-        self._types: dict[str, str] = {}  # of topics, as in the ROS master
-        self._unused_types: dict[str, None] = {}  # of topics without a node, the oldest first
-        self._subscribed_keys: list[str] = []  # the parameters of `_topics`, sorted
+        self._types: dict[str, str] = {}  # the type of each topic, as in the ROS master
+        self._unused_types: dict[str, None] = {}  # topics without a node, oldest first
+        self._subscribed_keys: list[str] = []  # the subscribed parameters in `_topics`, sorted
         self._nodes_of: Counter[Address] = Counter()
         self._registrations_of: Counter[Address] = Counter()
         self._order = 0
@@ -197,7 +201,7 @@ class Registry:
     # --- looking ---
 
     def by_key(self, key: str) -> Incarnation | None:
-        """Return the incarnation with this key, whatever its life."""
+        """Return the incarnation with this key, live or not."""
         return self._by_key.get(key)
 
     def find(self, name: str, host: Address, api_text: str) -> Incarnation | None:
@@ -205,12 +209,12 @@ class Registry:
         return self._known.get((name, host, api_text))
 
     def holder(self, name: str) -> Incarnation | None:
-        """Return the live incarnation that holds a name: one with at least one registration."""
+        """Return the live incarnation that holds a name. It must have at least one registration."""
         incarnation = self._live.get(name)
         return incarnation if incarnation is not None and incarnation.registrations else None
 
     def occupant(self, name: str) -> Incarnation | None:
-        """Return the live incarnation that holds a name, or would if the policy restored its registrations."""
+        """Return the live incarnation that holds a name, or that would hold it with its withdrawn registrations."""
         incarnation = self._live.get(name)
         there = incarnation is not None and (incarnation.registrations or incarnation.shelf)
         return incarnation if there else None
@@ -232,11 +236,11 @@ class Registry:
         return ((kind, resource, holders.values()) for (kind, resource), holders in self._topics.items())
 
     def type_of(self, topic: str) -> str:
-        """Return the type of a topic: from the last publisher, or else from the first subscriber that named one."""
+        """Return the type of a topic, from the last publisher or otherwise from the first subscriber with a type."""
         return self._types.get(topic, ANY_TYPE)
 
     def types(self) -> Iterable[tuple[str, str]]:
-        """Return all topics with their types, including topics without a node, like the ROS master."""
+        """Return all topics with their types. Like the ROS master, include topics without a node."""
         return self._types.items()
 
     @property
@@ -247,7 +251,7 @@ class Registry:
     def subscribed_below(self, key: str) -> list[str]:
         """Return the keys of parameters below `key` that live incarnations subscribed to, sorted."""
         keys, above = self._subscribed_keys, key.rstrip("/")
-        # Keys that begin with `above/` are adjacent, before `above0`: '0' follows '/'.
+        # All keys that begin with `above/` are adjacent. `above0` is after them, because '0' follows '/' in ASCII.
         below = keys[bisect_left(keys, f"{above}/") : bisect_left(keys, f"{above}0")]
         return [found for found in below if found != "/"]
 
@@ -256,14 +260,17 @@ class Registry:
         return self._nodes_of.get(host, 0)
 
     def evictable_of(self, host: Address) -> Incarnation | None:
-        """Return the incarnation of a host to evict first: an evictable one, or else the one that was lost first."""
+        """Return the first incarnation of a host to evict: an evictable one, or otherwise the first that was lost."""
         mine = [incarnation for incarnation in self._by_key.values() if incarnation.host == host]
         idle = next((incarnation for incarnation in mine if incarnation.evictable), None)
         gone = (incarnation for incarnation in mine if incarnation.life is not Life.LIVE)
         return idle or min(gone, key=lambda incarnation: incarnation.changed, default=None)
 
     def evictable_for(self, host: Address) -> Incarnation | None:
-        """Return the incarnation to evict for a new one of this host: its own, or an evictable one of another host."""
+        """Return the incarnation to evict for a new incarnation of this host.
+
+        This is an incarnation of the same host, or otherwise an evictable incarnation of another host.
+        """
         return self.evictable_of(host) or next(
             (incarnation for incarnation in self._by_key.values() if incarnation.evictable), None
         )
@@ -282,13 +289,13 @@ class Registry:
         return self._registrations_of.get(host, 0)
 
     def machines(self) -> dict[str, int]:
-        """Return the number of live nodes by address, without the appliance's own."""
+        """Return the number of live nodes by address, without the appliance's own nodes."""
         return Counter(
             str(one.host) for one in self._by_key.values() if one.life is Life.LIVE and not one.own
         )
 
     def in_order(self) -> Iterator[tuple[Incarnation, NodeRegistration]]:
-        """Yield every registration of live incarnations, in the order they were made."""
+        """Yield all registrations of live incarnations, in the order in which they were made."""
         pairs = [
             (incarnation, registration)
             for incarnation in self._live.values()
@@ -299,8 +306,8 @@ class Registry:
     def uris_for(self, reader: Incarnation, kind: Kind, topic: str, *, hidden: bool) -> tuple[str, ...]:
         """Return the URIs of a topic's publishers or subscribers for `reader`.
 
-        Its own entry is the URI that it gave; the others come from `Incarnation.uri_for`. The appliance's own nodes
-        reach other nodes only through the appliance.
+        The entry of `reader` is the URI that it registered; other entries come from `Incarnation.uri_for`. The
+        appliance's own nodes reach other nodes only through the appliance.
         """
         return tuple(
             incarnation.api_text
@@ -338,7 +345,7 @@ class Registry:
         """Record that the ROS master accepted a registration."""
         kept: list[Durable] = []
         self.version += 1
-        if incarnation.life is Life.SHADOW:  # it was lost while its call was under way
+        if incarnation.life is Life.SHADOW:  # the node was lost while its call was under way
             kept += self.revive(incarnation, incarnation.changed)
         self._live[incarnation.name] = incarnation
         registration = incarnation.registrations.get((kind, resource))
@@ -353,7 +360,7 @@ class Registry:
         return kept + self.unshelve(incarnation, kind, resource)
 
     def shelve(self, incarnation: Incarnation, registration: NodeRegistration) -> list[Durable]:
-        """Store a registration that the policy withdrew, because its node would not repeat it when granted again."""
+        """Store a registration that the policy withdrew, because its node never registers again."""
         incarnation.shelf[registration.kind, registration.resource] = registration
         return [SaveRegistration(incarnation.key, registration, shelved=True)]
 
@@ -373,7 +380,7 @@ class Registry:
         return [EraseRegistration(incarnation.key, kind, resource)]
 
     def replace(self, incarnation: Incarnation, when: float) -> list[Durable]:
-        """Remove the registrations of an incarnation whose name another one took."""
+        """Remove the registrations of an incarnation whose name another incarnation took."""
         kept = [
             kept
             for kind, resource in list(incarnation.registrations)
@@ -388,7 +395,7 @@ class Registry:
         return self._retire(incarnation, Life.SHADOW, when)
 
     def revive(self, incarnation: Incarnation, when: float) -> list[Durable]:
-        """Make a shadow live again: it answers, and its name is free."""
+        """Make a shadow live again, because its node answers and its name is free."""
         self.version += 1
         incarnation.life, incarnation.changed = Life.LIVE, when
         self._live[incarnation.name] = incarnation
@@ -397,7 +404,7 @@ class Registry:
         return [SaveNode(incarnation)]
 
     def forget(self, incarnation: Incarnation) -> list[Durable]:
-        """Forget an incarnation for good; its ports may be reused."""
+        """Forget an incarnation permanently. Its ports may be reused."""
         self.version += 1
         for kind, resource in incarnation.registrations:
             self._unindex(incarnation, kind, resource)
@@ -427,7 +434,7 @@ class Registry:
         self._note_type(registration)
 
     def _note_type(self, registration: NodeRegistration) -> None:
-        """Store a topic's type as the ROS master does: the publisher's, or else the subscriber's."""
+        """Store a topic's type as the ROS master does: the publisher's type, or otherwise the subscriber's."""
         kind, topic, told = registration.kind, registration.resource, registration.detail
         if kind not in _OF_TOPICS:
             return
@@ -437,7 +444,7 @@ class Registry:
             self._types[topic] = told
 
     def adopt_types(self, types: Iterable[tuple[str, str]]) -> None:
-        """Adopt the ROS master's types of topics from before the start of control."""
+        """Adopt the types of topics that the ROS master knew before control started."""
         self.version += 1
         for topic, told in types:
             self._types[topic] = told
@@ -445,7 +452,7 @@ class Registry:
                 self._remember_unused(topic)
 
     def forget_types(self) -> None:
-        """Forget topics without a node, which a new ROS master does not know."""
+        """Forget topics without a node, because a new ROS master does not know them."""
         self.version += 1
         for topic in self._unused_types:
             self._types.pop(topic, None)
@@ -474,5 +481,5 @@ class Registry:
 
 
 def new_key() -> str:
-    """Return a key for a new incarnation: 128 random bits, so that a master-side URI cannot be guessed."""
+    """Return a key of 128 random bits for a new incarnation, so that its master-side URI cannot be guessed."""
     return secrets.token_hex(16)

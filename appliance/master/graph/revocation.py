@@ -1,7 +1,7 @@
-"""Decide all registrations and grants again after a change of the policy, for live nodes and for lost ones.
+"""Decide all registrations and grants again after a change of the policy, for live nodes and for lost nodes.
 
-Registrations that are no longer allowed are withdrawn and stored. If they are allowed again (a rollback, a change that
-was not confirmed in time), they are registered again, because a ROS 1 node never registers twice.
+Registrations that are no longer allowed are withdrawn and stored. If a later policy allows them (for example after a
+rollback), they are registered again, because a ROS 1 node never registers twice.
 """
 
 from collections.abc import Callable, Iterable
@@ -25,12 +25,12 @@ CALLS = {
     Kind.SERVICE: ("registerService", "unregisterService"),
     Kind.PARAMETER: ("subscribeParam", "unsubscribeParam"),
 }
-"""The calls of the Master API that register and unregister each kind."""
+"""The calls of the Master API that register and unregister each kind of resource."""
 
 
 @dataclass(frozen=True, slots=True)
 class Revocation:
-    """The repeated decision on registrations and grants, by the present policy and the present parameters (`tree`)."""
+    """Decide registrations and grants again, by the present policy and the present parameters (`tree`)."""
 
     registry: Registry
     grants: Grants
@@ -39,7 +39,7 @@ class Revocation:
     tree: Callable[[], Tree]
 
     def live(self) -> list[LiveRight]:
-        """Return all registrations and grants of nodes, except the appliance's own, which `redecide` decides."""
+        """Return the registrations and grants of all nodes except the appliance's own nodes."""
         return [
             *(
                 self._registered(incarnation, registration.kind, registration.resource)
@@ -50,18 +50,18 @@ class Revocation:
         ]
 
     def policy_changed(self, before: Policy, now: Policy) -> Effects:
-        """Return all effects of a new policy, which is already in force."""
+        """Return all effects of a new policy. The policy must already be in force."""
         return [UsePorts(now.ports), *self.redecide(), *self.graph.limits_changed(before, now)]
 
     def redecide(self) -> Effects:
-        """Revoke rights that the running policy no longer allows, and restore registrations that it grants again."""
+        """Revoke rights that the policy in force no longer allows, and restore registrations that it grants again."""
         effects = self._redecide(self._registrations(), self.grants.all())
         for incarnation in self.registry.live():
             effects += self.returned(incarnation)
         return effects
 
     def redecide_for(self, host: Address, caller_id: str) -> Effects:
-        """Revoke denied rights of a caller whose call was decided before a change of the policy and made after it."""
+        """Revoke denied rights of a caller, if its call was decided before a policy change and carried out after it."""
         return self._redecide(
             [pair for pair in self._registrations() if (pair[0].host, pair[0].name) == (host, caller_id)],
             [row for row in self.grants.all() if (row.host, row.caller_id) == (str(host), caller_id)],
@@ -95,9 +95,10 @@ class Revocation:
         return effects
 
     def returned(self, incarnation: Incarnation) -> Effects:
-        """Restore withdrawn registrations that are granted now, because a node never registers twice.
+        """Restore withdrawn registrations that are now granted, because a node never registers twice.
 
-        The registry has them at once, so that the next change of the policy finds them; the ROS master gets them later.
+        They are in the registry at once, so that the next change of the policy finds them. The ROS master gets them
+        later.
         """
         holder = self.registry.holder(incarnation.name)
         if holder is not None and holder is not incarnation:
@@ -125,7 +126,7 @@ class Revocation:
         self, incarnation: Incarnation, registration: NodeRegistration, decision: Decision, call: str
     ) -> Effects:
         effects = self.graph.revoked(incarnation, registration, decision, call)
-        if incarnation.life is Life.LIVE:  # otherwise the ROS master does not have it
+        if incarnation.life is Life.LIVE:  # otherwise the ROS master does not have the registration
             effects.append(TakeBack(incarnation, registration))
         return effects
 

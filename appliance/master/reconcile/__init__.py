@@ -1,1 +1,1 @@
-"""Keep the graph, the ROS master and the robot's nodes consistent: carry out effects, check nodes, reconcile."""
+"""Keep graph, ROS master and the robot's nodes consistent: carry out effects, check nodes, reconcile differences."""

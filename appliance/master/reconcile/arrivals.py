@@ -1,7 +1,7 @@
-"""Make incarnations: each registering call has a name, a host and an API URI.
+"""Find or make the incarnation of a registering call, by its name, host and API URI.
 
-An incarnation with a registering call under way is not evicted. Otherwise two nodes that arrive at once, with room for
-one, would evict each other forever.
+An incarnation with a registering call under way is not evicted. Otherwise, two nodes that arrive at the same time, with
+room for only one, would evict each other forever.
 """
 
 import time
@@ -19,7 +19,7 @@ from appliance.policy.model import Address
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """The finder and maker of incarnations for callers."""
+    """Find or make the incarnations of callers."""
 
     registry: Registry
     graph: RosGraph
@@ -30,13 +30,13 @@ class Arrivals:
     addresses: AdvertisedAddresses
 
     def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        """Return the calling incarnation, if it is known."""
+        """Return the calling incarnation, or None if it is unknown."""
         return self.registry.find(caller.caller_id, caller.peer.host, api.text)
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
-        """Return the calling incarnation; make and save a new one with its ports if it is unknown.
+        """Return the calling incarnation. If it is unknown, make and save a new incarnation with its ports.
 
-        Raises `NoPortError` if the range of ports is exhausted, or control has no descriptors; nothing is changed then.
+        Raises `NoPortError`, without any change, if the range of ports is exhausted or control has no descriptors left.
         """
         identity = (caller.caller_id, caller.peer.host, api.text)
         incarnation = self.registry.find(*identity)
@@ -46,11 +46,11 @@ class Arrivals:
             return incarnation
         if incarnation is not None and incarnation.life is Life.SHADOW:
             if self.registry.holder(incarnation.name) is None:
-                # It registers again before a check has found that it is back.
+                # A lost node registers again before a check has found that it is back.
                 with EvictionGuard(incarnation):
                     await self.liveness.revive(incarnation)
                 return incarnation
-            # Another incarnation took its name meanwhile, so it begins again.
+            # Another incarnation took the name in the meantime, so this node starts as a new incarnation.
             self.enactor.carry_out(self.graph.forgotten(incarnation))
         incarnation = self._make(caller, api)
         try:
@@ -81,7 +81,7 @@ class Arrivals:
         return incarnation
 
     def _open_ports(self, host: Address) -> tuple[int, ...]:
-        """Return ports for a node of this host; evict unused incarnations if necessary. Raises `NoPortError`."""
+        """Return ports for a node of this host. Evict unused incarnations if necessary. Raises `NoPortError`."""
         while True:
             try:
                 return self.places.open(host)
@@ -93,7 +93,7 @@ class Arrivals:
 
 
 class EvictionGuard:
-    """A guard for the time of a registering call, in which its incarnation is not evicted."""
+    """A context manager for a registering call. Its incarnation is not evicted inside the `with` block."""
 
     __slots__ = ("_incarnation",)
 

@@ -1,4 +1,4 @@
-"""Carry out the effects of changes of the graph (`effects.py`), which all other code only returns.
+"""Carry out the effects of changes of the graph (`effects.py`). All other code only returns effects.
 
 After a restart, `restore` reads the registry from the store.
 """
@@ -61,7 +61,7 @@ _log = structlog.get_logger()
 
 @dataclass(slots=True)
 class Enactor:
-    """The executor of effects on nodes, relays, the ROS master (in order), the store and the audit log."""
+    """Carry out effects on nodes, relays, the ROS master (in order), the store and the audit log."""
 
     graph: RosGraph
     entries: MasterRegistrations
@@ -74,7 +74,7 @@ class Enactor:
     _last: asyncio.Task[None] | None = None  # the last call to the ROS master
 
     def carry_out(self, effects: Iterable[Effect]) -> None:
-        """Carry out effects now and in this order; calls to the ROS master are queued."""
+        """Carry out effects now, in this order. Calls to the ROS master are queued."""
         for effect in effects:
             match effect:
                 case TellNode(node, call):
@@ -132,7 +132,7 @@ class Enactor:
     # --- the ROS master ---
 
     async def put_back(self, node: Incarnation, registrations: Sequence[NodeRegistration]) -> None:
-        """Register a returned node's registrations at the ROS master; after a failure the reconcile loop does it."""
+        """Make a returned node's registrations at the ROS master. After a failure, the reconcile loop makes them."""
         try:
             values = await self.entries.put_back(node, registrations)
         except CallFailedError as error:
@@ -142,7 +142,7 @@ class Enactor:
             self.carry_out(self.graph.tell_parameter(node, key, value))
 
     async def take_out(self, node: Incarnation, registrations: Sequence[NodeRegistration]) -> None:
-        """Unregister a lost node's registrations at the ROS master; after a failure the reconcile loop does it."""
+        """End a lost node's registrations at the ROS master. After a failure, the reconcile loop ends them."""
         try:
             await self.entries.end_lost(node, registrations)
         except CallFailedError as error:
@@ -155,7 +155,7 @@ class Enactor:
             await self.put_back(effect.node, effect.registrations)
             return
         node, taken = effect.node, effect.registration
-        if (taken.kind, taken.resource) in node.registrations:  # it has been granted again
+        if (taken.kind, taken.resource) in node.registrations:  # the registration was granted again
             return
         try:
             await self.entries.end(node, taken.kind, taken.resource)
@@ -169,21 +169,21 @@ def _log_failed_call(node: Incarnation, error: CallFailedError) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Enforcement:
-    """The revocation of rights that are no longer allowed."""
+    """Revoke rights that are no longer allowed."""
 
     revocation: Revocation
     enactor: Enactor
 
     def policy_changed(self, before: Policy, policy: Policy) -> int:
-        """Revoke rights that a new policy does not allow; return their number."""
+        """Revoke rights that a new policy does not allow. Return their number."""
         return self._take_back(self.revocation.policy_changed(before, policy))
 
     def expel(self, host: Address, reason: str) -> int:
-        """Revoke all rights of a host; return their number."""
+        """Revoke all rights of a host. Return their number."""
         return self._take_back(self.revocation.expel(host, reason))
 
     def redecide_for(self, host: Address, caller_id: str) -> None:
-        """Revoke rights that the policy in force does not allow this caller."""
+        """Revoke the rights of a caller that the policy in force does not allow."""
         self.enactor.carry_out(self.revocation.redecide_for(host, caller_id))
 
     async def carried_out(self) -> None:
@@ -195,7 +195,7 @@ class Enforcement:
         return revoked(effects)
 
 
-_SHELVED = "revoked "  # prefix of the stored kind of a withdrawn registration
+_SHELVED = "revoked "  # the prefix of the stored kind of a withdrawn registration
 
 
 def write(effect: Durable, store: StateStore) -> None:
@@ -223,7 +223,7 @@ def _kept_kind(kind: Kind, shelved: bool) -> str:
 
 
 def restore(registry: Registry, store: StateStore) -> int:
-    """Fill `registry` from the store; return the number of incarnations."""
+    """Fill `registry` from the store. Return the number of incarnations."""
     incarnations, registrations = store.load_registry()
     by_key = {
         row.key: Incarnation(

@@ -1,6 +1,6 @@
 """Make, end and restore registrations at the hidden ROS master, with the node's inner URI.
 
-Services are registered with a stand-in URI, which clients never get.
+Services are registered with a stand-in URI. Clients never get this URI.
 """
 
 from collections.abc import Callable, Iterable
@@ -19,9 +19,9 @@ NO_SERVICE = "rosrpc://nobody:1"
 
 
 class MasterRegistrations:
-    """The registrations at the ROS master; `inner_uri(node)` is the URI by which it knows a node.
+    """The registrations at the ROS master. `inner_uri(node)` returns the URI by which the ROS master knows a node.
 
-    `pid` is the process id of the ROS master that has all registrations; None before the first one.
+    `pid` is the process id of the ROS master that has all registrations. It is None before the first such process.
     """
 
     def __init__(self, rosmaster: RosMaster, inner_uri: Callable[[Incarnation], str]) -> None:
@@ -41,14 +41,14 @@ class MasterRegistrations:
         return await self._rosmaster.call_now(CALLS[registration.kind][0], name, *told)
 
     async def end(self, node: Incarnation, kind: Kind, resource: str) -> None:
-        """End a registration of a node that is gone or may not have it any more."""
+        """End a registration of a node, because the node is gone or may no longer have the registration."""
         told = [resource, stand_in(node) if kind is Kind.SERVICE else self._inner_uri(node)]
         if kind is Kind.PARAMETER:  # only this call has the reverse order
             told.reverse()
         await self._rosmaster.call(CALLS[kind][1], node.name, *told)
 
     async def end_lost(self, node: Incarnation, registrations: Iterable[NodeRegistration]) -> None:
-        """End the registrations of a lost node, until it comes back."""
+        """End the registrations of a lost node one by one. Stop if the node is live again."""
         for registration in registrations:
             if node.life is Life.LIVE:
                 return
@@ -57,13 +57,13 @@ class MasterRegistrations:
     async def put_back(
         self, node: Incarnation, registrations: Iterable[NodeRegistration]
     ) -> list[tuple[str, Value]]:
-        """Register the former registrations of a returned node, as far as it still has them when the ROS master is
-        reachable.
+        """Make the former registrations of a returned node again, once the ROS master is reachable.
 
-        Registrations that were withdrawn meanwhile are left out, as is an earlier life of a node, because the ROS
-        master would end the later one. Return the parameters that the node subscribed to with their values: it missed
-        their changes, and the ROS master reports each change once. Raises `CallFailedError`, and then a round of the
-        reconcile loop is due.
+        Registrations that were withdrawn in the meantime are left out. If the node is no longer live, all are left out,
+        because the ROS master would then end the later life of the node.
+
+        Return the parameters that the node subscribed to, with their values: the node missed their changes, and the ROS
+        master reports each change only once. Raises `CallFailedError`; the reconcile loop then runs a round.
         """
 
         async def put(registration: NodeRegistration) -> tuple[str, Value] | None:
@@ -91,5 +91,5 @@ class MasterRegistrations:
 
 
 def stand_in(node: Incarnation) -> str:
-    """Return the service URI under which the ROS master knows an incarnation's services; clients never get it."""
+    """Return the URI under which the ROS master knows an incarnation's services. Clients never get this URI."""
     return service_uri(node.key, node.relay_port)

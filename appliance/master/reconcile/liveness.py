@@ -1,8 +1,9 @@
 """Check nodes every few seconds, and at once after a failure.
 
-A node is *lost* if its API refuses connections (twice in a row), if another process answers there, or if it does not
-answer for `silent` seconds. It is then unregistered at the ROS master, as `rosnode cleanup` does, and its registrations
-are kept as a shadow. If its API answers again, they are restored, because a ROS 1 node never registers twice.
+A node is *lost* in three cases: its API refuses connections twice in a row, another process answers at its address, or
+there is no answer for `silent` seconds. A lost node is unregistered at the ROS master, as `rosnode cleanup` does, and
+becomes a shadow that keeps its registrations. If its API answers again, the registrations are restored, because a ROS 1
+node never registers twice.
 """
 
 import asyncio
@@ -37,14 +38,14 @@ from appliance.rpc.xmlrpc_client import (
 class Presence(enum.Enum):
     """The result of an attempt to call a node."""
 
-    GONE = "gone"  # it refuses connections, or cannot be reached
-    SILENT = "silent"  # it takes connections and does not answer
+    GONE = "gone"  # the node refuses connections, or cannot be reached
+    SILENT = "silent"  # the node accepts connections but does not answer
     ANSWERS = "answers"
 
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """The probe of the holder of a name; `patience` is the seconds until a silent node is unregistered."""
+    """The probe of the holder of a name. `patience` is the number of seconds until a silent node is unregistered."""
 
     holder: Incarnation
     presence: Presence
@@ -53,13 +54,13 @@ class Probe:
 
 _log = structlog.get_logger()
 _REPLACED_SECONDS = 60.0
-_IDLE_SECONDS = 30.0  # longer than a registering call can be on its way
+_IDLE_SECONDS = 30.0  # longer than any registering call takes
 _LOOK_AGAIN_SECONDS = 0.3
 
 
 @dataclass(slots=True)
 class MissedUpdates:
-    """The updates that did not reach a node; `made_up` is the time of the last repetition (monotonic)."""
+    """The updates that did not reach a node. `made_up` is the monotonic time when missed updates were last repeated."""
 
     topics: set[str] = field(default_factory=set)
     parameters: bool = False
@@ -67,7 +68,7 @@ class MissedUpdates:
 
 
 class Watchlist:
-    """The nodes to check because of a failure: their callers add them, `Liveness` checks them."""
+    """The nodes to check because of a failure. Their callers add them, and `Liveness` checks them."""
 
     def __init__(self) -> None:
         self._nodes: dict[str, Incarnation] = {}
@@ -80,7 +81,7 @@ class Watchlist:
         self._filled.set()
 
     def could_not_tell(self, node: Incarnation, call: NodeCall, why: str) -> None:
-        """Store a call that did not reach a node, and check the node. Once it answers, it gets the present state."""
+        """Note that a call did not reach a node, and check the node. Once it answers, it gets the present state."""
         _log.info("a call to a node failed", node=node.name, call=call.method, why=why)
         missed = self._missed.setdefault(node.key, MissedUpdates())
         if call.method == "publisherUpdate":
@@ -99,7 +100,10 @@ class Watchlist:
         return list(nodes.values())
 
     def to_make_up(self, node: Incarnation, interval: float) -> MissedUpdates | None:
-        """Return and clear the missed updates of a node; None within `interval` seconds after the last time."""
+        """Return and clear the missed updates of a node.
+
+        Return None if there are none, or if the last repetition was less than `interval` seconds ago.
+        """
         missed, now = self._missed.get(node.key), time.monotonic()
         if missed is None or (missed.made_up is not None and now - missed.made_up < interval):
             return None
@@ -107,13 +111,13 @@ class Watchlist:
         return missed
 
     def keep_only(self, keys: Collection[str]) -> None:
-        """Forget the missed updates of all other nodes."""
+        """Forget the missed updates of all nodes, except the nodes with these keys."""
         self._missed = {key: missed for key, missed in self._missed.items() if key in keys}
 
 
 @dataclass(eq=False)
 class Liveness:
-    """The checks of nodes. Hosts take turns, so that hanging nodes of one host do not delay the checks of others."""
+    """Check nodes. Hosts take turns, so that hanging nodes of one host do not delay checks of other hosts' nodes."""
 
     registry: Registry
     graph: RosGraph
@@ -127,13 +131,13 @@ class Liveness:
 
     def __post_init__(self, quota_class: Callable[[Address], QuotaClass]) -> None:
         self._answered: dict[str, float] = {}
-        # For each node: the time of its last registration, and the process that answered then.
+        # For each node: the time of its last registration, and the process id that first answered afterwards.
         self._processes: dict[str, tuple[float, int]] = {}
         self._checks: dict[str, asyncio.Task[None]] = {}
         self._turns = Turns(PROBES.bounds, quota_class)
 
     async def run(self) -> None:
-        """Check all incarnations every `interval` seconds, and those on the watchlist at once, until cancelled."""
+        """Check all incarnations every `interval` seconds, and nodes on the watchlist at once. Run until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._look_at_all())
             tasks.create_task(self._watch())
@@ -162,10 +166,10 @@ class Liveness:
             self.look_at(incarnation)
 
     def look_at(self, incarnation: Incarnation) -> None:
-        """Start checking a node, unless a check is under way.
+        """Start a check of a node, unless a check is under way.
 
-        The publisher for monitors is not checked: it is control itself, and the firewall lets only the ROS master call
-        it.
+        The publisher for monitors is not checked, because it is control itself. Also, the firewall lets only the ROS
+        master call this publisher.
         """
         if incarnation.key not in self._checks and not incarnation.of_monitors:
             task = asyncio.get_running_loop().create_task(self.look(incarnation))
@@ -173,7 +177,7 @@ class Liveness:
             task.add_done_callback(lambda _done: self._checks.pop(incarnation.key, None))
 
     async def probe(self, incarnation: Incarnation) -> Probe:
-        """Probe now whether a node is there."""
+        """Call a node now to find out whether it is there."""
         now = time.monotonic()
         since = self._answered.setdefault(incarnation.key, now)
         patience = max(0.0, self.settings.silent - (now - since)) + self.settings.interval
@@ -190,7 +194,7 @@ class Liveness:
         return Probe(incarnation, presence, patience)
 
     async def revive(self, incarnation: Incarnation) -> None:
-        """Restore a shadow that registers again, with all its registrations."""
+        """Restore a shadow with all its registrations, because its node registers again."""
         self._answered[incarnation.key] = time.monotonic()
         self._processes.pop(incarnation.key, None)
         await self._bring_back(incarnation)
@@ -240,7 +244,7 @@ class Liveness:
             await self.enactor.put_back(incarnation, subscribed)
 
     async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str]:
-        """Return whether a node answers (None: it refuses connections), and the reason if not."""
+        """Return whether a node answers (None: the node refuses connections), and the reason if it does not."""
         for attempt in (1, 2):
             try:
                 await self._call(incarnation)
@@ -255,10 +259,10 @@ class Liveness:
         return False, ""
 
     async def _call(self, incarnation: Incarnation) -> None:
-        """Call a node. Raises `CallFailedError`; `RefusedError` also if another process has its port.
+        """Call a node. Raises `CallFailedError`. Raises `RefusedError` also if another process has the node's port.
 
-        A node that registers again at the same address may be a new process. So the first process that answers after
-        a registration is the expected one.
+        A node that registers again at the same address may be a new process. So after each registration, the first
+        process that answers becomes the expected process.
         """
         answer = await self.nodes.call(incarnation, "getPid", RELAY_NAME)
         match answer:

@@ -1,7 +1,8 @@
-"""Register the node that publishes for monitors and offers the appliance's service, like any other node.
+"""Register the appliance's own node, which publishes for monitors and offers the appliance's service.
 
-Its node API is the listener of the master-side endpoints, under a separate path (`PUBLISHER_PATH`). It needs no
-updates, so all calls of a master are only acknowledged. The relay serves its messages (`NodePlaced.monitors`).
+The node is registered like any other node. Its node API has a separate path (`PUBLISHER_PATH`) on the listener of the
+master-side endpoints. The node needs no updates, so all calls of a master are only acknowledged. The relay serves its
+messages (`NodePlaced.monitors`).
 """
 
 import asyncio
@@ -31,8 +32,8 @@ _AGAIN_SECONDS = 1.0
 class OwnPublisher:
     """The node `name`, with exactly the publications in `wanted()` (topic to type) and the services in `services`.
 
-    `register(caller, topic, type, api)` is `registerPublisher`, `offer(caller, service, service_api, api)`
-    `registerService`.
+    `register(caller, topic, type, api)` makes the call `registerPublisher`. `offer(caller, service, service_api, api)`
+    makes the call `registerService`.
     """
 
     registry: Registry
@@ -50,7 +51,7 @@ class OwnPublisher:
     def __post_init__(self) -> None:
         uri = node_uri(_LOOPBACK, self.inner_port, PUBLISHER_PATH)
         self._api = ApiUri(uri, parse_node_uri(uri))
-        # The relay answers calls itself, so any valid port will do in this URI.
+        # The relay answers the calls of the service, so the port in this URI can be any valid port.
         uri = service_uri(_LOOPBACK, self.inner_port)
         self._service_api = ApiUri(uri, parse_service_uri(uri))
         self._woken = asyncio.Event()
@@ -61,7 +62,7 @@ class OwnPublisher:
         self._woken.set()
 
     async def run(self, ready: asyncio.Event) -> None:
-        """Register and unregister until cancelled; `ready` is set once the ROS master is complete."""
+        """Register and unregister until cancelled. `ready` is set once the ROS master is complete."""
         await ready.wait()
         while True:
             await self._woken.wait()

@@ -1,14 +1,14 @@
 """Reconcile the *wanted* state (the registry, the parameter mirror) with the *seen* state of the ROS master.
 
-The same loop covers all failures: the ROS master died, control died, a call was interrupted.
+The same loop handles all failures: the ROS master died, control died, a call was interrupted.
 
-- a new ROS master gets everything again, in the original order, while calls wait at the door;
-- a registration that is wanted and not seen is made again; one that is seen and not wanted is adopted when it carries
-  the key of a known incarnation and the policy in force grants it (control died before it was written down), and
-  unregistered otherwise, as when the policy has taken it and the ROS master is not told yet: that the ROS master has it
-  is a claim, no right;
-- after a rebuild, or when a relay is new, every subscriber gets each of its lists once; when control is new, the values
-  of its parameters.
+- A new ROS master gets everything again, in the original order. Calls wait at the door until then.
+- A registration that is wanted but not seen is made again.
+- A registration that is seen but not wanted is adopted if two conditions hold: it has the key of a known incarnation,
+  and the policy in force grants it. In this case, control died before it saved the registration. Otherwise, the
+  registration is ended. A registration at the ROS master is not a right: the policy may have withdrawn it just before.
+- After a rebuild, and after a relay starts, every subscriber gets each of its lists once. After a restart of control,
+  every node gets the values of the parameters that it subscribed to.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ Seen = set[tuple[Kind, str, str]]
 
 @dataclass(frozen=True, slots=True)
 class Reconciler:
-    """The loop: a round when the ROS master is in doubt, and every `_ROUND_SECONDS`. The first success sets `ready`."""
+    """Run a round whenever the ROS master is in doubt, and every `_ROUND_SECONDS`. The first success sets `ready`."""
 
     rosmaster: RosMaster
     entries: MasterRegistrations
@@ -76,7 +76,7 @@ class Reconciler:
                 pass
 
     async def round(self) -> None:
-        """Compare the ROS master with the registry once, and settle all differences."""
+        """Compare the ROS master with the registry once, and remove all differences."""
         async with self.rosmaster.alone():
             pid = (await self.rosmaster.call_now("getPid", NAME))[2]
             if pid == self.entries.pid:
@@ -180,7 +180,7 @@ class Reconciler:
             adopted = self.graph.registered(incarnation, kind, resource, types.get(resource, "*"))
             self.enactor.carry_out(adopted)
             return
-        # The ROS master does not know a service's real port, so a service that was not stored is unregistered.
+        # The ROS master does not know the real port of a service. So a service that was not saved is unregistered.
         call = self.rosmaster.call_now
         if kind is Kind.SERVICE:
             uri = stand_in(incarnation) if incarnation is not None else NO_SERVICE

@@ -1,10 +1,12 @@
-"""Send subscribers their lists of publishers again, after a relay is new or a topic moved to another relay.
+"""Send subscribers their lists of publishers again, after a relay started or a topic moved to another relay.
 
-rospy reconnects only for a list that arrives *after* it noticed the broken connection; an earlier list has no effect
-(the machine is busy, the relay hung before it died). roscpp reconnects to a port that stayed open; if the port was
-closed for a while (the appliance was restarted) it gives up, and ignores an unchanged list. So a subscriber that is
-still absent after the first reminders gets a list without the publisher and then the publisher again. The same holds
-for a subscriber without a grant: the policy withdrew and restored the topic, and the subscriber or control missed it.
+rospy reconnects only for a list that arrives *after* rospy noticed the broken connection. An earlier list has no
+effect, for example if the machine is busy, or if the relay hung before it died. roscpp reconnects to a port that stayed
+open. If the port was closed for a while (the appliance was restarted), roscpp gives up and ignores an unchanged list.
+
+So a subscriber that is still absent after the first reminders gets a list without the publisher, and then a list with
+the publisher again. A subscriber without a grant is handled in the same way: the policy withdrew and restored the
+topic, and the subscriber or control missed this.
 """
 
 import asyncio
@@ -17,12 +19,12 @@ from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.enactor import Enactor
 from appliance.specifications.allocation import TOPIC, Move, Resource
 
-_GENTLE = 2  # reminders before a subscriber must drop the publisher and connect again
-_PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds before each check
+_GENTLE = 2  # the reminders before a subscriber must drop the publisher and connect again
+_PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # the seconds before each check
 
 
 class Reminders:
-    """The checks, after a relay was attached, whether all subscribers are back."""
+    """Check whether all subscribers are connected again after a relay was attached."""
 
     def __init__(self, registry: Registry, graph: RosGraph, enactor: Enactor) -> None:
         self._registry = registry
@@ -55,8 +57,8 @@ class Reminders:
 class RelayMoves:
     """The interface to the relays for specifications (`specifications.relays`).
 
-    A topic moves when a specification connects it with a topic or service of another relay. It is not carried while its
-    connections are made again.
+    A topic moves when a specification connects it with a topic or service of another relay. No relay carries the topic
+    until its connections are made again.
     """
 
     def __init__(self, relay: RelayControl, graph: RosGraph, enactor: Enactor, reminders: Reminders) -> None:
@@ -66,7 +68,7 @@ class RelayMoves:
         self._reminders = reminders
 
     def send(self, message: Message, relay: int) -> bool:
-        """Send a message to a relay; return False if it is not connected."""
+        """Send a message to a relay. Return False if the relay is not connected."""
         return self._relay.send(message, relay)
 
     async def carried_out(self) -> None:
@@ -82,7 +84,7 @@ class RelayMoves:
         self._relay.withdraw_moving(moves)
 
     def place(self, moves: Sequence[Move]) -> None:
-        """Place moved topics and services, after the new allocation was adopted, and reconnect subscribers."""
+        """Place moved topics and services after the new allocation was adopted, and reconnect their subscribers."""
         self._relay.place_moved(moves)
         for move in moves:
             if move.kind == TOPIC:
