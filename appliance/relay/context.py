@@ -14,7 +14,7 @@ from appliance.relay.transport.memory import RelayMemory
 
 @dataclass(frozen=True, slots=True)
 class RelayContext:
-    """The loop, limits, reports, memory of hosts, scratch area and monitors of one relay."""
+    """The loop, limits, reporter, hosts' memory, scratch area and monitors of one relay."""
 
     loop: EventLoop
     limits: RelayLimits

@@ -1,12 +1,12 @@
 """The data plane of a relay: carries out control's messages, and connects peers with topics and services.
 
-It makes no decisions. Control's messages change the `GrantTable`. A peer is served if the table has a grant for its
-address, its `callerid` and the topic or service in its header.
+The data plane makes no decisions. Control's messages change the `GrantTable`. A peer is served if the table has a grant
+for its address, its `callerid`, and the topic or service in its header.
 
 Invariants:
 - Each served connection has a grant in the table; withdrawing the grant cuts the connection.
-- Without a link to control everything continues as stated; nothing new is granted.
-- Messages after the first specifications wait until these are in force, and are then carried out in order.
+- Without a link to control, existing grants stay valid, and no new ones are added.
+- Control's messages behind the first specifications wait until these are in force, and are then carried out in order.
 """
 
 import socket
@@ -38,7 +38,7 @@ from appliance.relay.topic_taps import TopicTaps
 from appliance.relay.transport.loop_channel import LoopLink
 from appliance.relay.transport.rate_limit import RateLimits
 
-_TIDIED = 16  # topics between two readings of the processor time
+_TIDIED = 16  # number of topics between two checks of the processor time
 
 
 class DataPlane:
@@ -89,18 +89,18 @@ class DataPlane:
         loop.after(limits.report_every, self._tick)
 
     def attach(self, link: LoopLink | None) -> None:
-        """Report to this control from now on; the earlier statements stay valid until it restates."""
+        """Report to this control from now on; earlier statements stay valid until the restatement ends."""
         self._link = link
         self._reporter.attach(link)
         self._topic_taps.end_all()
         self._own_service.control_gone()
 
     def record(self, recorded: RecorderRing) -> None:
-        """Record the messages of publishers from their next connection on."""
+        """Record the messages of publishers whose topics are placed from now on."""
         self._recorded = recorded
 
     def take(self, message: messages.Message, descriptors: tuple[int, ...]) -> bool:
-        """Carry out one message of control; return True if it has to wait for specifications."""
+        """Carry out one message of control; return True if the message must wait for specifications."""
         if self.interceptor.preparing:
             return True
         self._carry_out(message, descriptors)
@@ -147,7 +147,7 @@ class DataPlane:
         for farewell in list(self.refused_connections):
             farewell.close()
 
-    # --- what control states ------------------------------------------------------------------------------
+    # --- control's statements ------------------------------------------------------------------------------
 
     def _state(self, message: Statement, descriptors: tuple[int, ...]) -> None:
         self._table.state(message)
@@ -256,7 +256,7 @@ class DataPlane:
                 subscriber.flow = flow
 
     def _make_room(self, host: str, size: int) -> None:
-        """Free memory for a latched message: hosts that would hold more than this one give up theirs."""
+        """Free memory for a latched message: drop latched messages of hosts that hold more than this host would."""
         latched, share = self.memory.latched, self.memory.latched.of(host)
         while share.refusal(size):
             greatest, held = max(latched.holders(), key=lambda holder: holder[1], default=("", 0))
@@ -267,7 +267,7 @@ class DataPlane:
             largest.give_up_latched()
 
     def _attach_monitors(self, relayed: RelayedTopic) -> None:
-        """Send a topic's messages through its monitors, or past them if it has none."""
+        """Send a topic's messages through its monitors, if it has any."""
         interceptor, topic = self.interceptor, relayed.topic
         through = None
         if interceptor.intercepts(topic):
@@ -276,7 +276,7 @@ class DataPlane:
         relayed.monitor(through, wanted=interceptor.wants(topic))
 
     def _holder(self, host: str) -> str:
-        """Return the host if it has a registration; all others count as one."""
+        """Return the host if it is registered; all other hosts count as one holder, the empty string."""
         return host if self._table.quota_class(host) is QuotaClass.REGISTERED else ""
 
     def _monitors_changed(self, topics: frozenset[str] | None) -> None:
@@ -293,9 +293,9 @@ class DataPlane:
             self._link.go_on()
 
     def _ask_for_latched(self, topics: frozenset[str] | None) -> None:
-        """Have latching publishers send messages again that monitors held back.
+        """Make latching publishers send the messages again that monitors held back.
 
-        Only on these topics (None: all), because other monitors would judge the same message twice.
+        Ask only on these topics (None: all): monitors of other topics would judge the same message twice.
         """
         for relayed, publisher in list(self.topics.values()):
             concerned = topics is None or relayed.topic in topics
@@ -318,7 +318,7 @@ class DataPlane:
         return self.interceptor.header_of(topic) or self._own_headers.get(topic)
 
     def _publish(self, topic: str, data: bytes) -> None:
-        """Publish on a topic of the appliance; never during a batch of the same topic."""
+        """Publish on a topic of the appliance. Do not call this while a batch of the same topic is processed."""
         publisher = self._own.get(topic)
         if publisher is not None:
             publisher.publish(data)
@@ -333,7 +333,7 @@ class DataPlane:
         self._cut_members(relayed, reason)
 
     def _cut_members(self, relayed: RelayedTopic, reason: str) -> None:
-        """Close the connections of a removed topic, a quantum at a time: there may be thousands."""
+        """Close the connections of a removed topic, one quantum at a time: there may be thousands."""
         for member in relayed.members:
             member.cut(reason)
             if self._loop.over():
@@ -375,7 +375,7 @@ class DataPlane:
         self.incoming_connections.add(incoming)
 
     def _make_connection_room(self, host: str) -> bool:
-        """End a connection for this host: one that is not served, else one of the host that has the most."""
+        """End a connection in favour of this host: an unserved one, else one of the host with the most connections."""
         if self._pending.make_room(host):
             return True
         pool = self.ports.connected
@@ -396,7 +396,7 @@ class DataPlane:
             yield from [member for member in relayed.members if isinstance(member, Subscriber)]
 
     def _incoming_failed(self, incoming: IncomingConnection, reason: str) -> None:
-        """Forget a peer that is gone; report what it asked for without a grant."""
+        """Forget a peer that is gone; report its refusal if it had no grant."""
         incoming.close()
         self._forget_incoming(incoming)
         self.ports.left(incoming.host)
@@ -414,7 +414,7 @@ class DataPlane:
             self._judge(incoming, patient=True)
 
     def _judge(self, incoming: IncomingConnection, *, patient: bool) -> None:
-        """Serve the peer or refuse it; if `patient`, wait for grants that the table does not have yet."""
+        """Serve or refuse the peer; if `patient`, wait for a grant that the table does not have yet."""
         fields, rest = incoming.fields, incoming.rest
         reason = flaw(fields, rest)
         if not reason:
@@ -439,7 +439,7 @@ class DataPlane:
         return self._table.restating or self.interceptor.preparing
 
     def _recheck_waiting(self, message: Statement) -> None:
-        """Serve the waiting peers that this statement about their incarnation allows: a grant, those of its host."""
+        """Serve the waiting peers that this statement allows; a grant concerns only peers of its host."""
         hosts = self.waiting[message.key]
         if isinstance(message, messages.GrantInstalled | messages.ClientGranted):
             found = list(hosts.get(message.host, ()))
@@ -516,7 +516,7 @@ class DataPlane:
             self._by_grant.pop(peer.grant, None)
 
     def _refuse(self, asked: PeerGrant, sock: socket.socket, reason: str) -> None:
-        """Send the peer the reason and close; until then it counts for its host."""
+        """Send the peer the reason, then close its connection, which counts for its host until then."""
         kind, key, name, host, caller_id = asked
         self._reporter.refused(key, (kind, name), host, caller_id, reason)
 
@@ -543,12 +543,12 @@ class DataPlane:
         return rows
 
     def _tick(self) -> None:
-        """Do what is due once a second."""
+        """Start the tasks that are due once a second."""
         self._tidying = self._tidy()
         self._go_on_tidying()
 
     def _go_on_tidying(self) -> None:
-        """Tidy up, a quantum at a time: there may be thousands of topics."""
+        """Tidy up, one quantum at a time (there may be thousands of topics), then report."""
         for _ in self._tidying:
             if self._loop.over():
                 self._loop.after(0, self._go_on_tidying)

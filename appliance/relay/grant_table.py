@@ -1,13 +1,13 @@
 """The state that control wants: incarnations, publications, services, and the grants for them.
 
-The table answers two questions, "is there a grant for this peer?" and "what is at this port?", and turns a restatement
-into withdrawals.
+The table answers two questions: "does this peer have a grant?" and "which topics and services are at this port?". It
+also turns a restatement into withdrawals.
 
 Invariants:
-- Nothing is served that is not in the table.
-- Between `StateBegan` and `StateEnded` everything stated before is valid, so a restart of control interrupts no
-  connection; `StateEnded` withdraws what was not stated again. A `StateBegan` that is followed by another one (control
-  died before the end) is not a withdrawal.
+- The relay serves only what the table lists.
+- Between `StateBegan` and `StateEnded`, all earlier facts stay valid, so a restart of control interrupts no connection.
+  `StateEnded` withdraws the facts that were not stated again. If control dies before `StateEnded`, the next
+  `StateBegan` starts over and withdraws nothing.
 - Withdrawing an incarnation withdraws its publications, services and grants.
 """
 
@@ -70,8 +70,8 @@ class GrantTable:
         self._facts: dict[_Fact, messages.Message] = {}
         self._by_key: dict[str, dict[_Fact, None]] = {}
         self._hosts: Counter[str] = Counter()
-        self._named: set[str] = set()  # hosts that the policy names, by the last statement
-        self._clients: dict[_Fact, dict[str, None]] = {}  # names, by service and host
+        self._named: set[str] = set()  # hosts that the policy names, according to their last statement
+        self._clients: dict[_Fact, dict[str, None]] = {}  # names of clients by service and host
         self._restated: set[_Fact] | None = None
         self._epoch = 0
 
@@ -118,7 +118,7 @@ class GrantTable:
             self._forget(_fact(message))
 
     def quota_class(self, host: str) -> QuotaClass:
-        """Return the quota class of a host: registered, if it has a node or a grant."""
+        """Return the quota class of a host: registered if the host has a node or a grant."""
         return QuotaClass.REGISTERED if host in self._hosts else QuotaClass.UNKNOWN
 
     def payer(self, host: str) -> str:
@@ -197,7 +197,7 @@ class GrantTable:
 
 
 def _fact(message: messages.Message) -> _Fact:
-    """Return what a statement, or its withdrawal, is about."""
+    """Return the fact that a statement or withdrawal concerns. Raises `TypeError` for other messages."""
     kind = _KINDS.get(type(message))
     if kind is None:
         raise TypeError(f"{type(message).__name__} is not a withdrawal")

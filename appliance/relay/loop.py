@@ -1,24 +1,25 @@
 """The relay's event loop: epoll and timers, single-threaded, nothing else.
 
-Not asyncio, which costs a callback, a transport and a future for each read: raw epoll with one bound method per
-descriptor halves the delay of a relayed message.
+The loop does not use asyncio, which costs a callback, a transport and a future for each read. Raw epoll with one bound
+method per descriptor halves the delay of a relayed message.
 
-Processor time is a quota. A descriptor is watched for a *payer*: a host that the policy names, all other hosts with a
-registration together, all hosts without one, or new connections. The relay's own descriptors (control, lifeline) have
-no payer. A payer with more than `_DIRECT` descriptors has its own epoll inside the loop's. However many of them are
-ready, those of others are found in time. Payers are served by deficit round robin in its continuous form: the payer
-that has used the least processor time goes first, for at most `QUANTUM`; credit for idle time is one quantum, and a new
-payer begins behind others. A payer is *costly* when it used much more than a quantum the last time. All others that are
-ready come before the next costly one, for a quantum together, even if they have used more.
+Processor time is a quota. Each descriptor has a *payer*: a host that the policy names, all other registered hosts
+together, all unregistered hosts together, or new connections. The relay's own descriptors (control, lifeline) have no
+payer. A payer with more than `_DIRECT` descriptors has its own epoll inside the loop's epoll. Therefore the loop finds
+the ready descriptors of other payers in time, however many of this payer's are ready. Payers are served by deficit
+round robin in its continuous form. The payer that has used the least processor time goes first, for at most `QUANTUM`.
+Idle time earns a credit of at most one quantum, and a new payer starts behind the others. A payer is *costly* if it
+used much more than a quantum in its last turn. All other ready payers, for one quantum together, come before the next
+costly payer, even if they have used more.
 
 Invariants:
-- A handler is never called for a descriptor that was unwatched earlier in the same turn, and a descriptor closed
-  through `discard` is closed only at the end of the turn, so its number cannot mean another socket in that turn. An
-  event that waits for the payer's next turn is forgotten when the descriptor is unwatched or changed.
-- A turn calls the relay's own handlers first. It begins no further handler or timer after `QUANTUM`, except for one
-  costly payer, so it lasts that long and the time of two handlers, of which one is not costly. Handlers with much to do
-  stop when the quantum is `over` and call `later`.
-- A handler that raises is a defect; the exception ends the process and the supervisor starts another.
+- A handler is never called for a descriptor that was unwatched earlier in the same turn. `discard` closes a socket only
+  at the end of the turn, so its number cannot refer to another socket in that turn. An event that waits for the payer's
+  next turn is forgotten when its descriptor is unwatched or changed.
+- A turn calls the relay's own handlers first. After `QUANTUM`, a turn starts no further handler or timer, except one
+  costly payer's. So a turn lasts at most a quantum and the time of two handlers, one of them costly. A handler with
+  much to do stops when the quantum is `over`, and passes the rest to `later`.
+- A handler that raises an exception has a defect: the process ends, and the supervisor starts another.
 """
 
 import heapq
@@ -43,20 +44,20 @@ UNKNOWN = "unknown hosts"
 """The payer for all hosts without a registration."""
 
 ANYBODY = "hosts with a registration, by *"
-"""The payer for all hosts with a registration that the policy only names by `*`."""
+"""The payer for all registered hosts that the policy names only by `*`."""
 
 ACCEPTING = "new connections"
 """The payer for listening sockets."""
 
 QUANTUM = RELAY_TURN.bounds.host * 1000
-"""Nanoseconds of processor time that a payer gets in one go."""
+"""Nanoseconds of processor time that a payer gets in one turn."""
 
-_DIRECT = 64  # descriptors of a payer in the loop's epoll; in its own epoll each event costs 0.7 µs more
+_DIRECT = 64  # a payer's descriptors in the loop's epoll; in its own epoll, each event costs 0.7 µs more
 _PAYERS = 512  # number of payers beyond which idle ones are forgotten
-_COSTLY = 3 * QUANTUM  # more than a payer uses whose handlers stop when the quantum is over
+_COSTLY = 3 * QUANTUM  # more than a payer uses if its handlers stop when the quantum is over
 _LITTLE = 1e-4  # seconds that are not charged while no other payer is ready
 
-# Python allocates memory for this number each time; for more, it leaves its fast allocator
+# `epoll.poll` allocates memory for this number of events; Python's fast allocator serves no more
 _EVENTS_PER_TURN = 64
 _LONGEST_WAIT = 3600.0
 _UNKNOWN = -1
@@ -78,7 +79,7 @@ class LoopTimer:
 
 
 class _Payer:
-    """A payer: its ready events, what waits for its next turn, and the processor time that it has used."""
+    """A payer: its ready events, the callbacks for its next turn, and the processor time that it has used."""
 
     __slots__ = (
         "costly",
@@ -99,7 +100,7 @@ class _Payer:
         self.watched = self.direct = 0
         self.crowd: select.epoll | None = None  # of its descriptors beyond `_DIRECT`
         self.crowd_ready = self.costly = False
-        self.events: dict[int, int] = {}  # that are ready, in order
+        self.events: dict[int, int] = {}  # ready events by descriptor, in order
         self.later: deque[Callable[[], None]] = deque()
         self.later_first = False
 
@@ -119,7 +120,7 @@ class EventLoop:
         self._payers: dict[str, _Payer] = {}
         self._crowds: dict[int, _Payer] = {}  # by the descriptors of their epolls
         self._waiting: dict[str, _Payer] = {}
-        self._floor = 0  # the least time used by a payer with something to do
+        self._floor = 0  # the least time used by any payer with work to do
         self._room = _EVENTS_PER_TURN
         self._timers: list[tuple[float, int, LoopTimer]] = []
         self._order = itertools.count()
@@ -127,11 +128,11 @@ class EventLoop:
         self._running = False
         self._processor_time = processor_time
         self._since = _UNKNOWN  # when the running handler began
-        self._alone = False  # whether its descriptor is the only ready one
+        self._alone = False  # whether the running handler's descriptor is the only ready one
         self.clock = time.monotonic
 
     def watch(self, descriptor: int, events: int, handler: Handler, payer: str = SYSTEM) -> None:
-        """Call `handler(events)` whenever one of `events` is there (level-triggered), at the cost of the payer."""
+        """Call `handler(events)` while any of `events` is ready (level-triggered), and charge its time to the payer."""
         epoll, found = self._epoll, None
         if payer != SYSTEM:
             found = self._payer(payer)
@@ -181,20 +182,20 @@ class EventLoop:
         self._waiting[payer] = found
 
     def used(self) -> int:
-        """Return the processor time (ns) of the running handler; if its start is unknown, since its first call."""
+        """Return the processor time (ns) of the running handler, or since the first call if its start is unknown."""
         now = self._processor_time()
         if self._since == _UNKNOWN:
             self._since = now
         return now - self._since
 
     def over(self) -> bool:
-        """Whether the quantum of the running handler is used up; then it leaves the rest for `later`."""
+        """Whether the running handler has used up its quantum; it should then pass the rest to `later`."""
         return self.used() >= QUANTUM
 
     def charge(self, payer: str, used: int) -> None:
-        """Charge this processor time to a payer, besides the one whose handler runs.
+        """Charge this processor time to a payer, in addition to the payer of the running handler.
 
-        While no other descriptor is ready, that takes time from no other host and leaves no debt.
+        While no other descriptor is ready, the use takes time from no other host, so it leaves no debt.
         """
         found = self._payer(payer)
         found.spent += used
@@ -212,7 +213,7 @@ class EventLoop:
             self.turn(_LONGEST_WAIT)
 
     def turn(self, longest: float) -> None:
-        """Wait for at most `longest` seconds, then call what is due, for a quantum."""
+        """Wait for at most `longest` seconds, then call ready handlers and due timers, for a quantum."""
         timers = self._timers
         if timers:
             left = timers[0][0] - self.clock()
@@ -255,7 +256,7 @@ class EventLoop:
         return payer.crowd
 
     def _forget_idle(self) -> None:
-        """Forget payers without descriptors that owe nothing."""
+        """Forget payers that have no descriptors and owe nothing."""
         for payer in list(self._payers.values()):
             if not payer.watched and not payer.later and payer.spent <= self._floor:
                 del self._payers[payer.name]
@@ -264,7 +265,7 @@ class EventLoop:
                     payer.crowd.close()
 
     def _serve_alone(self, number: int, events: int) -> None:
-        """Serve the only ready descriptor; a short handler is not even charged."""
+        """Serve the only ready descriptor; do not charge a short handler."""
         self._since, began = _UNKNOWN, self.clock()
         handler, payer, _ = self._watched[number]
         self._alone = True
@@ -278,7 +279,7 @@ class EventLoop:
             self._floor = max(self._floor, payer.spent)
 
     def _serve_many(self, found: list[tuple[int, int]]) -> None:
-        """Call the relay's own handlers, then serve the payers that have used least, until a quantum is over."""
+        """Call the relay's own handlers, then serve payers, those with the least use first, until a quantum is over."""
         ready = dict(self._waiting)
         for number, events in found:
             watched = self._watched.get(number)
@@ -292,7 +293,7 @@ class EventLoop:
             elif watched is not None:
                 self._since = _UNKNOWN
                 watched.handler(events)
-        # The kernel reports ready descriptors in turn: the next report has others.
+        # If the report is full, others may be ready as well; the kernel's next report begins with these.
         if len(found) == self._room:
             self._room *= 2
         elif len(found) < self._room // 4:
@@ -317,7 +318,7 @@ class EventLoop:
         self._floor = max(self._floor, min(map(_spent, in_order)))
 
     def _serve(self, payer: _Payer) -> None:
-        """Serve one payer for a quantum; its events and what it left for later take turns in beginning."""
+        """Serve one payer for a quantum; its events and its postponed callbacks take turns in going first."""
         began = self._since
         if not payer.later:
             self._call_ready(payer, began)

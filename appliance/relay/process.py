@@ -1,7 +1,7 @@
 """The relay as a process of the appliance: lifeline, link to control, and the loop.
 
-The process ends when the supervisor sends `Stop` or ends (the lifeline closes). It outlives control: without a link it
-continues under the existing grants until the supervisor opens a link to the next control.
+The process ends when the supervisor sends `Stop` or exits (which closes the lifeline). The relay outlives control:
+without a link, it continues under the existing grants until the supervisor opens a link to the next control.
 """
 
 import contextlib
@@ -25,8 +25,8 @@ from appliance.relay.transport.sockets import congestion_control
 
 _DESCRIPTORS_BESIDE = 1024
 
-# Young collections between two full ones (default: 10). A full one takes 15 ms with 20,000 slices and stops all
-# messages. In between, cycles of at most 700,000 objects wait, about 100 MB.
+# Collections of the middle generation before a full one (default: 10). With 20,000 slices, a full collection stops all
+# messages for 15 ms. Until then, unreachable cycles of at most 700,000 objects (about 100 MB) stay in memory.
 _UNTIL_FULL_COLLECTION = 100
 
 
@@ -38,7 +38,7 @@ def main(lifeline_fd: int, index: int, limits: RelayLimits | None = None) -> Non
 
 
 class RelayProcess:
-    """Connects a `DataPlane` to the lifeline and to the present control."""
+    """Connects a `DataPlane` to the lifeline and to the current control."""
 
     def __init__(self, lifeline: socket.socket, index: int, limits: RelayLimits) -> None:
         self._index = index
@@ -85,7 +85,7 @@ class RelayProcess:
             raise TypeError(f"the supervisor sent a relay {type(message).__name__}")
 
     def _keep_state(self, given: messages.StateGiven, descriptor: int) -> None:
-        """Map memory for the state of monitors; keep the state in this relay's own from now on."""
+        """Map memory for monitors' state; keep the state there from now on if it is this relay's own memory."""
         memory = mapped(descriptor, writable=given.own)
         if given.own:
             self._engine.interceptor.remember(StateKeeper(given, memory, self._earlier))
@@ -112,7 +112,7 @@ class RelayProcess:
 
 
 def descriptors_for(connections: int) -> int:
-    """Return the number of descriptors that a relay needs: each connection of a peer may need another one."""
+    """Return the number of descriptors that a relay needs: each connection of a peer may need a second connection."""
     return 2 * connections + _DESCRIPTORS_BESIDE
 
 
@@ -127,7 +127,7 @@ def fitted(limits: RelayLimits, descriptors: int) -> RelayLimits:
 
 
 def _raise_descriptor_limit(wanted: int) -> int:
-    """Raise this process's limit of descriptors as far as the system allows; return the limit."""
+    """Raise this process's limit of descriptors as far as the system allows; return the resulting limit."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         reachable = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)

@@ -1,4 +1,4 @@
-"""The memory, held by the supervisor, into which a relay writes messages for the flight recorder."""
+"""Write messages for the flight recorder into memory that the supervisor holds."""
 
 import mmap
 import os
@@ -16,10 +16,10 @@ _NOTHING = memoryview(b"")
 
 
 class RecorderRing:
-    """The memory that was given, written after the data of the process before; takes over the descriptor.
+    """Writes to the given memory, behind the data of the previous process; takes over the descriptor.
 
-    A recorded message has the time at which the monitors judged it, by their clock `now`, so that they judge it at the
-    same time in a replay. After the machine's clock was set, the recording follows the new time.
+    A recorded message has the time at which monitors judged it, by their clock `now`, so that a replay judges it at the
+    same time. If the machine's clock is set, later messages have times by the new setting.
     """
 
     def __init__(self, given: RingGiven, descriptor: int, now: Callable[[], int]) -> None:
@@ -45,7 +45,7 @@ class RecorderRing:
         return (judged or now) + self._set
 
     def open(self, topic: str, host: str, header: Mapping[str, str]) -> "RingStream | ExcludedStream | None":
-        """Begin to record a publisher's messages; return None if they are not to be recorded, or have no room."""
+        """Begin to record a publisher's messages; return None if its topic is not recorded or the memory is full."""
         if not fits(self._topics, topic):
             return None
         why = left_out_because(self._never, self._sums, topic, header)
@@ -56,7 +56,7 @@ class RecorderRing:
 
 
 class ExcludedStream:
-    """The stream of a publisher of which only the times of messages are recorded."""
+    """A publisher's stream in which only the times of messages are recorded."""
 
     keeps = False
 
@@ -64,7 +64,7 @@ class ExcludedStream:
         self._marked = marked
 
     def write(self, _frames: memoryview, _messages: int, first: int, judged: int = 0) -> None:
-        """Write a mark in place of these frames."""
+        """Write a mark with the time instead of these frames."""
         self._marked.write(_NOTHING, 0, first, judged)
 
     def close(self) -> None:

@@ -1,14 +1,14 @@
 """Reports to control: connections, refusals, lost publishers, traffic.
 
-Without a link the counters continue, and refusals are counted. A new control gets both, and the connections that are
-open or have ended meanwhile.
+Without a link, the counters continue, and refusals are counted. A new control gets both counts, and the connections
+that are open or have ended meanwhile.
 
 Invariants:
 - `TrafficReported` is sent at most once per `report_every`.
-- Equal refusals within that time are one message with a count, and there are at most `refusals` different ones, so
-  floods of unknown hosts cannot grow the relay or fill the link.
-- Messages that limits dropped are counted for at most `_KEPT` parts; the others are counted together.
-- Of the connections that end without a link, `_KEPT` are kept for the next control; the others are counted.
+- Equal refusals within that time become one message with a count, and at most `refusals` different ones are sent. So a
+  flood of unknown hosts can neither grow the relay nor fill the link.
+- Messages dropped by limits are counted separately for at most `_KEPT` limits; the others are counted together.
+- At most `_KEPT` connections that end without a link are kept for the next control; the others are only counted.
 """
 
 from collections.abc import Callable, Mapping
@@ -44,7 +44,7 @@ class Reporter:
         self._open: dict[int, ConnectionOpened] = {}
         self._number = 0
         self._refused: dict[_Refusal, int] = {}
-        self._ended: list[tuple[ConnectionOpened, str]] = []  # without a link
+        self._ended: list[tuple[ConnectionOpened, str]] = []  # connections that ended without a link
         self._unrecorded = 0
         self._silent = 0  # ticks without a link
         self._memory: dict[str, int] = {}  # as last reported
@@ -60,7 +60,7 @@ class Reporter:
         return self._link is not None
 
     def repeat_connections(self) -> None:
-        """Report to a new control the connections that have ended without one, and those that are open."""
+        """Report open connections to a new control, and those that ended while there was no control."""
         ended, self._ended = self._ended, []
         for opened, reason in ended:
             self.send(opened)
@@ -70,7 +70,7 @@ class Reporter:
         self._memory = {}
 
     def send(self, message: Message) -> None:
-        """Send a message to control, if it is there."""
+        """Send a message to control, if control is connected."""
         if self._link is not None:
             self._link.send(message)
 
@@ -95,9 +95,9 @@ class Reporter:
             self._unrecorded += 1
 
     def refused(self, key: str, asked: tuple[str, str], host: str, caller_id: str, reason: str) -> None:
-        """Report a refused connection at once the first time, then counted at the next `tick`.
+        """Report the first such refusal at once, and count repetitions until the next `tick`.
 
-        `asked` is the kind and the name of the topic or service in its header.
+        `asked` is the kind and name of the topic or service in the connection's header.
         """
         kind, resource = asked
         refusal = (key, kind, resource[:_TEXT], host, caller_id[:_TEXT], reason[:_TEXT])
@@ -119,9 +119,9 @@ class Reporter:
         row[1] += size
 
     def tick(self, traffic: Callable[[], list[TopicTraffic]], memory: Mapping[str, int]) -> None:
-        """Send the counts since the last tick; without a link they wait for the next (`traffic` takes them).
+        """Send the counts since the last tick; without a link, keep them until the next one.
 
-        `memory` has the bytes that are held now.
+        `traffic` returns and resets the traffic counts; `memory` has the bytes held now in each pool.
         """
         if self._link is None:
             self._silent += 1

@@ -1,7 +1,8 @@
-"""Topic taps: a few messages as subscribers get them, parsed and sent to control for an operator.
+"""Tap topics: send control a few messages, parsed, as subscribers get them; an operator requests this.
 
-A message is parsed in the relay, which handles untrusted bytes anyway, by the definition in its publisher's header.
-The data for control is bounded: `roswire/message_view.py` cuts long values, and a tap has at most `MOST_MESSAGES`.
+The relay parses the messages, because it handles untrusted bytes anyway; the definition comes from the publisher's
+header. The data for control is bounded: `roswire/message_view.py` cuts long values, and a tap sends at most
+`MOST_MESSAGES`.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ Tap = Callable[[Batch], None]
 
 
 class TopicTaps:
-    """The topics that operators tap; `tell(message)` reaches control."""
+    """The topics that operators tap; `tell(message)` sends a message to control."""
 
     def __init__(self, tell: Callable[[Message], None]) -> None:
         self._tell = tell
@@ -30,7 +31,7 @@ class TopicTaps:
         self._left: dict[int, int] = {}
 
     def begin(self, wanted: LookWanted, topics: Iterable[RelayedTopic]) -> None:
-        """Tap a topic of all its publishers; do nothing if `MOST_LOOKS` taps are open."""
+        """Tap a topic at all its publishers; do nothing if `MOST_LOOKS` taps are open."""
         if len(self._open) >= MOST_LOOKS:
             return
         taps = self._open[wanted.number] = []
@@ -63,7 +64,7 @@ class TopicTaps:
 
 
 class _Reader:
-    """A reader of one publisher's messages, by the definition in its current header."""
+    """Reads one publisher's messages by the definition in the publisher's current header."""
 
     def __init__(self, topic: RelayedTopic) -> None:
         self._topic = topic
@@ -74,7 +75,7 @@ class _Reader:
         self._reader = PublisherReader({})
 
     def read(self, data: bytes) -> tuple[str, dict[str, Any], str]:
-        """Return the type, the fields, and why there are only the first bytes (else empty)."""
+        """Return the type, the fields, and why only the first bytes are shown (empty if the message was parsed)."""
         header = self._topic.header or {}
         if header is not self._header:
             self._header, self._reader = header, self._made_for(header)

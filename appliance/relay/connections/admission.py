@@ -1,8 +1,8 @@
-"""Check a peer's header: for flaws of its own, and against the grant table.
+"""Check a peer's header for flaws, and compare it with the grant table.
 
-A flawed header is refused at once. A missing grant may be on its way: on the link, or in the restatement of a new
-control. roscpp never tries again after an error header, so such a peer waits (`RelayLimits.grant_seconds`, and for as
-long as a restatement goes on).
+A flawed header is refused at once. A missing grant may still arrive: on the link, or in the restatement of a new
+control. roscpp never tries again after an error header. Therefore a peer without a grant waits for
+`RelayLimits.grant_seconds`, and until a restatement ends.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from roswire.names import check_tool_id
 _REQUIRED = {"topic": ("md5sum", "callerid"), "service": ("md5sum", "callerid")}
 
 NOTHING = ("", "")
-"""Stands for a header that names neither a topic nor a service, or is missing."""
+"""The kind and name for a missing header, or for a header that names neither a topic nor a service."""
 
 
 def asked_for(fields: Mapping[str, str]) -> tuple[str, str]:
@@ -25,7 +25,7 @@ def asked_for(fields: Mapping[str, str]) -> tuple[str, str]:
 
 
 def flaw(fields: Mapping[str, str], rest: bytes) -> str:
-    """Return why a header is rejected, in rospy's words where it has any; empty if the header is valid."""
+    """Return why a header is rejected, in rospy's words where possible; an empty string if the header is valid."""
     if "topic" in fields and "service" in fields:
         return "its header names a topic and a service; a connection is for one of them"
     for kind, required in _REQUIRED.items():
@@ -44,7 +44,7 @@ def flaw(fields: Mapping[str, str], rest: bytes) -> str:
 
 
 def missing(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -> str:
-    """Return what the table lacks to serve this peer at the port of incarnation `key`; empty if nothing."""
+    """Return which entry or grant is missing to serve this peer at the port of incarnation `key`; empty if none."""
     node = table.node(key)
     name = key if node is None else node.name
     caller_id = fields["callerid"]
@@ -64,10 +64,10 @@ def missing(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -
 
 
 def bound_name(table: GrantTable, key: str, host: str, fields: Mapping[str, str]) -> str | None:
-    """Return the name under which a client calls a service: its own, under which it has looked up the service.
+    """Return the name under which a client calls a service; None if it may not call the service.
 
-    A probe calls nothing. A tool may probe under another name than it looked up the service (roswtf probes as
-    `/rosservice`): then the service sees the name of the look-up.
+    A client with a grant keeps its own name. A probe calls nothing, so a tool may look up a service under one name and
+    probe under another (roswtf probes as `/rosservice`). The service then sees the name of the lookup.
     """
     caller_id, service = fields["callerid"], fields["service"]
     if table.may_call(key, service, host, caller_id):

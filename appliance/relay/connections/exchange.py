@@ -1,11 +1,11 @@
 """The requests and replies of one service connection after the headers, without sockets.
 
-The client sends a request, then the service a reply; on a persistent connection repeatedly. An early request waits, and
-the client is not read meanwhile (`may_read`). Requests and replies are parsed and encoded again, and each is judged by
-monitors (`_request`, `_reply`).
+The client sends a request, and the service answers with a reply. A persistent connection repeats this. A request that
+comes before the previous reply waits, and the relay stops reading the client (`may_read`). The relay parses every
+request and reply, has monitors judge it, and encodes it again (`_request`, `_reply`).
 
 Invariants:
-- There is at most one request at the service, and no reply without one.
+- The service has at most one request at a time. A reply without a request is an error.
 - A client that does not read its replies gets no further request through.
 """
 
@@ -29,8 +29,8 @@ _REPLY_HEAD = 5  # bytes before the body of a reply
 class ServiceExchange:
     """The requests and replies of one connection; `to_service(data)` and `to_client(data)` write them.
 
-    `count(size)` is called for each request and reply. `held` is the bytes of requests that are not whole or have to
-    wait, `held_replies` those of replies that are not whole. `judge(part, body)` returns the monitors' verdict on a
+    `count(size)` is called for each request and reply. `held` counts the bytes of incomplete and waiting requests;
+    `held_replies` counts the bytes of incomplete replies. `judge(part, body)` returns the monitors' verdict on a
     `request` or `response`.
     """
 
@@ -59,7 +59,7 @@ class ServiceExchange:
 
     @property
     def may_read(self) -> bool:
-        """Whether the client may be read: no request is at the service or waits for it."""
+        """Whether the client may be read: no request waits, and the service is not busy with one."""
         return not self._busy and not self._waiting and not self.done
 
     @property
@@ -73,12 +73,12 @@ class ServiceExchange:
         return self.held_replies + (0 if self._waiting else self.held)
 
     def from_client(self, data: bytes) -> None:
-        """Take bytes from the client. Raises `PeerError` when they are not a request."""
+        """Parse bytes from the client. Raises `PeerError` if they are not a request."""
         self.held += len(data)
         self._waiting.extend(self._requests.feed(data))
 
     def from_service(self, data: bytes) -> None:
-        """Take bytes from the service. Raises `PeerError` when they are not a reply to a request."""
+        """Parse bytes from the service. Raises `PeerError` if they are not a reply to a request."""
         self.held_replies += len(data)
         for reply in self._replies.feed(data):
             if not self._busy:
@@ -86,7 +86,7 @@ class ServiceExchange:
             self._reply(reply)
 
     def advance(self) -> None:
-        """Send the next request, now that the client has read all that was written to it."""
+        """Send the next waiting request. Call this only when the client has read everything written to it."""
         if self.ready:
             self._request(self._waiting.popleft())
 

@@ -1,4 +1,4 @@
-"""The connection headers that the relay writes for others: known fields only, with verified names.
+"""Write the connection headers for peers, services and publishers: known fields only, with verified names.
 
 Headers are not trusted. The sender's name is replaced by the registered one. Fields that ROS does not define are
 dropped, because no rule decides on them.
@@ -15,7 +15,7 @@ _TRUE = frozenset({"1", "true"})
 
 _OF_PEER = ("callerid", "topic", "service", *_OF_CLIENT, *_SWITCHES)
 _LONGEST = 1024
-"""Most characters of a field that is kept as long as its connection: names, types, md5sums."""
+"""The most characters of a header field; the relay keeps names, types and md5sums while the peer is connected."""
 
 
 def kept(fields: Mapping[str, str]) -> dict[str, str]:
@@ -24,7 +24,7 @@ def kept(fields: Mapping[str, str]) -> dict[str, str]:
 
 
 def too_long(fields: Mapping[str, str]) -> str:
-    """Return why a header is too long to keep (a field is longer than any ROS name); empty if it is not."""
+    """Return why a header cannot be kept (a field is longer than any ROS name); empty if it can."""
     for name in _OF_PEER:
         if len(fields.get(name, "")) > _LONGEST:
             return f"its header has a {name} of {len(fields[name])} characters"
@@ -37,7 +37,7 @@ def size_of(fields: Mapping[str, str]) -> int:
 
 
 def switched_on(fields: Mapping[str, str], name: str) -> bool:
-    """Whether a field is set, in any of the spellings that the client libraries take."""
+    """Whether a field is set, in any spelling that the client libraries accept."""
     return fields.get(name, "").lower() in _TRUE
 
 

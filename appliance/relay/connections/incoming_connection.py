@@ -1,10 +1,11 @@
 """Accepted connections until their headers are known, and refused connections.
 
 Invariants:
-- A peer has `header_seconds` and `header_bytes` for its header. Until then it costs one socket and the bytes it has
-  sent, which are counted (`pending_connections`); without memory for them it is refused.
-- A refused peer gets a TCPROS header with `error=<reason>` as from any publisher or service, and `farewell` seconds to
-  read it. Its connection is shut for writing first: closing over unread data would reset it and lose the reason.
+- A peer has `header_seconds` and `header_bytes` for its header. Until its header is complete, a peer costs one socket
+  and the bytes that it has sent. `pending_connections` counts these bytes, and refuses a peer without memory for them.
+- A refused peer gets a TCPROS header with `error=<reason>`, as from any publisher or service. The peer has `farewell`
+  seconds to read the header. The relay shuts the connection for writing before closing it: closing a socket with unread
+  data resets the connection, and the reason would be lost.
 """
 
 import socket
@@ -21,8 +22,8 @@ from roswire.tcpros import HeaderParser, encode_header
 class IncomingConnection:
     """An accepted connection whose header is not complete.
 
-    `introduced(self)` is called when its header (`fields`) and the bytes after it (`rest`) have come, `failed(self,
-    reason)` when no header will come. Either ends this stage.
+    When the header is complete, `fields` holds it, `rest` holds the bytes after it, and `introduced(self)` is called.
+    If no header will come, `failed(self, reason)` is called. Each of the two calls ends this stage.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class IncomingConnection:
         self._stream.close()
 
     def make_room(self) -> None:
-        """End the connection for a peer that has a better claim to its place."""
+        """End the connection in favour of a peer with a higher claim."""
         self._failed(self, "it waited longest when the limit of connections was reached")
 
     def _received(self, data: bytes) -> None:
@@ -99,7 +100,7 @@ class IncomingConnection:
 
 
 class RefusedConnection:
-    """A refused peer that has yet to read the reason; `ended(self)` is called when its connection is closed."""
+    """A refused peer that has not read the reason yet; `ended(self)` is called when its connection is closed."""
 
     def __init__(
         self,
@@ -122,7 +123,7 @@ class RefusedConnection:
             self._told()
 
     def make_room(self) -> None:
-        """End the connection for a peer that has a better claim to its place."""
+        """End the connection in favour of a peer with a higher claim."""
         self.close()
 
     def close(self) -> None:

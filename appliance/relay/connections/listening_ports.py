@@ -1,10 +1,10 @@
 """The relay's listening sockets, one for each incarnation, and the limits on connections.
 
 Invariants:
-- There are at most `connections` peers, `connections_per_host` of one host, and a quota for all unknown hosts together
-  (`RELAY_CONNECTIONS`), in any stage. A peer within its quota that finds no room is accepted if `make_room` ends
-  another connection.
-- Accepting is a payer of its own in the loop: a flood of connections is accepted a quantum at a time, and each
+- At most `connections` peers are connected, with at most `connections_per_host` from one host. All unknown hosts share
+  one quota (`RELAY_CONNECTIONS`). The limits include peers that are not served yet. If all connections are in use, a
+  peer within its quota is accepted if `make_room` ends another connection.
+- The loop has a separate payer for accepting. A flood of connections is accepted one quantum at a time, and each
   connection is also charged to its host. When the process has no descriptor left, listening pauses.
 """
 
@@ -23,10 +23,10 @@ _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 
 
 class ListeningPorts:
-    """The acceptor of peers: calls `arrived(key, sock, host)`, or `turned_away(key, host, reason)` without room.
+    """Accepts peers: calls `arrived(key, sock, host)`, or `turned_away(key, host, reason)` when a limit is reached.
 
     `quota_class(host)` returns a host's class in the table, `payer(host)` its payer in the loop. `make_room(host)` ends
-    a connection to make room for one of this host, and returns whether there was one.
+    another connection in favour of this host, and returns False if it found none to end.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class ListeningPorts:
             self.close(key)
 
     def left(self, host: str) -> None:
-        """Count one peer of this host less."""
+        """Count one peer fewer for this host."""
         self.connected.give_back(host)
 
     def _watch(self, key: str, sock: socket.socket) -> None:
@@ -115,7 +115,7 @@ class ListeningPorts:
         self._loop.after(_NO_DESCRIPTOR_PAUSE, resume)
 
     def _take(self, host: str) -> str:
-        """Count one more connection of this host; return the reason if there is no room and none can be made."""
+        """Count one more connection of this host; return the reason if a limit forbids it and no other can be ended."""
         pool = self.connected
         reason = pool.take(host)
         while reason and pool.held(host) < pool.bounds.host and self._make_room(host):

@@ -1,10 +1,11 @@
-"""Extra connections for subscribers that their publisher must see by name: the topics of actions.
+"""Extra connections that show a publisher the names of its subscribers; only action topics need them.
 
-A publisher sees one connection of the relay for all subscribers. But an action client waits until the topics of its
-goals and cancellations are connected to *its server*, which it knows by the `callerid` of the status messages
-(actionlib, `wait_for_server`). For these topics each served subscriber (the first sixteen names of a host) gets another
-connection to the publisher with the subscriber's `callerid`; its messages are discarded. It is opened after the
-subscriber is served, so that the subscriber gets everything that the publisher then sends.
+A publisher sees one connection of the relay for all subscribers. However, an action client publishes goals and
+cancellations, and waits until *its server* subscribes to both (actionlib, `wait_for_server`). The client recognizes the
+server by the `callerid` of the status messages. On these topics the relay opens one more connection to the publisher
+for each served subscriber, with the subscriber's `callerid`. Messages on that connection are discarded. At most sixteen
+names of a host get such a connection. The relay opens it after it has begun to serve the subscriber, so the subscriber
+gets everything that the publisher sends from then on.
 """
 
 from functools import partial

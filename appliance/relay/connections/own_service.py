@@ -1,11 +1,11 @@
 """The service that the appliance itself offers (`std_srvs/Trigger`); control answers it through the relay.
 
-`OwnServer` replaces the connection to a node, so grants, headers, monitors and limits are those of every service.
+`OwnServer` replaces the connection to a node, so grants, headers, monitors and limits apply as for any other service.
 
 Invariants:
-- Control gets at most one call of a host at a time, and one a second. Further calls get the same answer, so no host can
-  keep control busy.
-- Every call is answered; if control ends first, the answer says so.
+- Control gets at most one call of a host at a time, and at most one a second. Further calls of that host get the same
+  answer, so a single host cannot keep control busy.
+- Every call is answered. If control ends first, the answer reports that control is not running.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ _SECOND = 1.0
 
 @dataclass(slots=True)
 class _Call:
-    """The last call of a host: the clients that wait for its answer, or the answer and until when it is valid."""
+    """The last call of a host: the clients that wait for the answer, or the answer and the time when it expires."""
 
     number: int
     waiting: list["OwnServer"] = field(default_factory=list)
@@ -37,7 +37,7 @@ class _Call:
 
 
 class OwnService:
-    """The clients and calls of the service that the appliance offers; `send` sends to control, if it is there."""
+    """The clients and calls of the service that the appliance offers; `send` passes a message to a running control."""
 
     def __init__(self, loop: EventLoop, send: Callable[[Message], None]) -> None:
         self._loop = loop
@@ -46,7 +46,7 @@ class OwnService:
         self._number = 0
 
     def call(self, service: str, host: str, caller_id: str, server: "OwnServer") -> None:
-        """Ask control, or give the answer to this host's last call if that was within a second."""
+        """Ask control, or repeat the answer to this host's last call if that answer is less than a second old."""
         last = self._calls.get(host)
         if last is not None and not last.until:
             last.waiting.append(server)
@@ -89,9 +89,10 @@ class OwnService:
 
 
 class OwnServer:
-    """One client's connection, in the place of a `BufferedSocket`: `received` gets what a service would send.
+    """One client's connection, used like a `BufferedSocket`; `received` gets the bytes that a service would send.
 
-    `opened()` is called in the next turn of the loop; then the client's header must be sent, and its requests.
+    `opened()` is called in the next turn of the loop. After that, `send` expects the client's header, and then its
+    requests.
     """
 
     backlog = 0

@@ -1,10 +1,10 @@
-"""Connections that are not served yet: the memory of their headers, and which one makes room.
+"""Connections that are not served yet: the memory for their headers, and the order in which they are ended.
 
 Invariants:
 - The first `_FREE` bytes of a header are not counted, so a flood of long headers does not keep out normal ones. The
-  rest counts in the memory of its host.
-- The connection that has waited longest makes room first, and those of hosts without a grant before those of hosts with
-  one. The latter make room only after `_PATIENCE` seconds.
+  other bytes count as memory of the connection's host.
+- When a connection must end, connections of hosts without a grant come first, and the one that has waited longest ends.
+  A connection of a host with a grant is ended only after it has waited `_PATIENCE` seconds.
 """
 
 from collections.abc import Callable
@@ -57,7 +57,7 @@ class PendingConnections:
             self._headers.of(host).add(-held)
 
     def hold(self, guest: PendingConnection, size: int) -> str:
-        """Count the bytes that its header has by now; return the reason if there are too many (else empty)."""
+        """Count the header bytes received so far; return the reason if there are too many, else an empty string."""
         host, before = self._hosts[guest], self._long.get(guest, 0)
         more = max(0, size - _FREE) - before
         if more <= 0:
@@ -78,7 +78,7 @@ class PendingConnections:
         return why
 
     def make_room(self, host: str) -> bool:
-        """End a connection that has a lesser claim than this host; return whether there was one."""
+        """End a connection with a lower claim than this host; return False if there is none."""
         return self._end_longest(self._waiting, host)
 
     def _end_longest(

@@ -1,22 +1,27 @@
 """One relayed topic of one publisher: its subscribers and the messages that they get, without sockets.
 
 A topic has one upstream (the connection to the publisher), subscribers that wait for the publisher's header, and
-subscribers that are served. The upstream exists while there is a subscriber or a monitor, and lingers shortly.
+subscribers that are served. The upstream stays open while a subscriber, monitor or tap needs it, and a short time
+longer.
 
-The subscribers stay when the upstream is lost: their publication is still placed, and control withdraws it if the node
-is gone. rospy never reconnects to an address that closed its connection, and roscpp waits up to 20 s; over the kept
-connections messages go on at once. Frames are passed on whole (`frames`), so no subscriber gets a torn one. Subscribers
-are cut only if the publisher returns with another type or md5sum, because they must read the new header.
+Subscribers stay connected when the upstream is lost. Their publication stays valid until control withdraws it; control
+does so when the node is gone. Cutting subscribers would be costly: rospy never reconnects to an address that closed its
+connection, and roscpp waits up to 20 s. Over the kept connections, messages continue at once. Frames are passed on
+whole (`frames`), so no subscriber gets a torn frame. Subscribers are cut only if the publisher returns with another
+type, md5sum, definition or latching flag, because they must read the new header.
 
-Subscribers get, and the relay latches, only what monitors pass on. Messages that monitors publish have no upstream and
-bypass monitors (`published`). First messages are kept for subscribers on their way (`startup_replay`).
+Subscribers get only messages that monitors pass on, and the relay latches only these. Messages that monitors publish
+have no upstream and bypass monitors (`published`). The first messages of a new publisher are kept for subscribers that
+are about to connect (`startup_replay`).
 
-A latched message without memory for its publisher's host is passed on and not kept. A later subscriber gets it from
-the publisher, to which the relay reconnects when there is memory again; the other subscribers get it twice.
+If the publisher's host has no memory left, a latched message is passed on but not kept. A later subscriber makes the
+relay reconnect to the publisher, once memory is free again, to get the message. The other subscribers then get it
+twice.
 
-While *all* subscribers are behind, the publisher is not read until one has caught up, for at most `queue_grace`: a
-subscriber that the scheduler paused for some milliseconds loses nothing. Beyond its bounds, the oldest messages of a
-slower subscriber are dropped. It never delays the others, since one that keeps up is not behind.
+While *all* subscribers are behind, the relay stops reading the publisher until a subscriber has caught up, for at most
+`queue_grace`. Therefore a subscriber that the scheduler paused for some milliseconds loses nothing. When the queue of a
+slow subscriber reaches its bounds, its oldest messages are dropped. A slow subscriber never delays the others: the
+publisher is read as long as one subscriber keeps up.
 """
 
 from bisect import bisect_left
@@ -52,10 +57,10 @@ class TopicSubscriber(Protocol):
     """When its queue first became so long that it is behind; None once it has caught up completely."""
 
     def greet(self, header: Mapping[str, str]) -> bool:
-        """Answer with the publisher's header, or refuse if the types differ; return whether it is served now."""
+        """Answer with the publisher's header, or refuse a different type; return whether the subscriber is served."""
 
     def deliver(self, batch: Batch) -> int:
-        """Send the batch or queue it; return how many messages it does not get."""
+        """Send or queue the batch; return how many messages are dropped."""
 
     @property
     def full(self) -> bool:
@@ -87,10 +92,10 @@ class Upstream:
         """Go on reading."""
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
-        """Report new subscribers of a topic of this type; `names` returns them when the turn of the loop is over."""
+        """Report new subscribers of a topic of this type; `names` is called after the current turn of the loop."""
 
     def request_latched(self) -> None:
-        """Have a latching publisher give its message again."""
+        """Make a latching publisher send its message again."""
 
     def ask_again(self) -> None:
         """Repeat an open question to a new control."""
@@ -112,16 +117,16 @@ class Upstream:
 
 
 Through = Callable[[Batch], Batch | None]
-"""Passes frames through monitors; returns the frames that go on, None if none does."""
+"""Passes frames through monitors; returns the frames that are passed on, or None."""
 
 
 class RelayedTopic:
-    """A topic of an incarnation at `host`, with its subscribers; `share` counts what is kept of it.
+    """A topic of an incarnation at `host`, with its subscribers; `share` counts the memory of its kept messages.
 
-    `fresh`: the publisher has just appeared. `limited(part, messages, size)` is called with what rate limits dropped;
-    `flow` sets them. `make_room(size)` tries to free that much memory of others, `refused(message)` is called if a
-    latched message is not kept. Once the publisher's quantum is used up (`over()`), the remaining subscribers get the
-    batch at its next turn, before anything else is read.
+    `fresh`: the publisher has just appeared. `flow` holds the rate limits, and `limited(part, messages, size)` reports
+    the messages that they dropped. `make_room(size)` tries to free that many bytes of other hosts, and
+    `refused(message)` is called if a latched message is not kept. Once the publisher's quantum is used up (`over()`),
+    the remaining subscribers get the batch in the publisher's next turn, before more data is read.
     """
 
     def __init__(
@@ -155,17 +160,17 @@ class RelayedTopic:
         self._recorder = recorded
         self.over = over
         self._waits: tuple[Batch, tuple[TopicSubscriber, ...]] | None = (
-            None  # a batch, and who has yet to get it
+            None  # a batch, and the subscribers that still need it
         )
         self._recording: RingStream | ExcludedStream | None = None
         self._unkept: LatchRefused | None = None
         self._fresh_until = clock() + (APPEARED if fresh else -1)
         self._header: dict[str, str] | None = None
-        # There may be thousands, and all may end in one turn of the loop: so none is searched for.
+        # Dicts, not lists: thousands of subscribers may end in one turn, and each removal must be cheap.
         self._waiting: dict[TopicSubscriber, None] = {}
         self._served: dict[TopicSubscriber, None] = {}
         self._row: tuple[TopicSubscriber, ...] | None = (
-            None  # those that are served, once they are gone through
+            None  # the served subscribers as a tuple, made on demand
         )
         self._latched: Batch | None = None
         self._latching = False
@@ -212,7 +217,10 @@ class RelayedTopic:
         return self._header
 
     def tap(self, tap: Callable[[Batch], None], *, latched: bool) -> None:
-        """Call `tap` with everything that subscribers get, first with a `latched` message; it must not keep a batch."""
+        """Call `tap` with each batch for subscribers, first (if `latched`) with the latched message.
+
+        The tap must not keep a batch.
+        """
         self._taps += (tap,)
         if latched and self._latched is not None:
             tap(self._latched)
@@ -233,7 +241,10 @@ class RelayedTopic:
             self.upstream.release()
 
     def monitor(self, through: Through | None, *, wanted: bool) -> None:
-        """Pass messages `through` monitors from the next batch on (None: past them); `wanted`: they need messages."""
+        """Pass messages `through` monitors from the next batch on (None: bypass them).
+
+        With `wanted`, the topic stays connected for monitors even without a subscriber.
+        """
         self.through = through
         if wanted == self._wanted:
             return
@@ -266,11 +277,11 @@ class RelayedTopic:
 
     @property
     def lacks_latched(self) -> bool:
-        """Whether monitors have held back a latching publisher's message, and let nothing through since."""
+        """Whether monitors have held back messages of a latching publisher, and no message is latched now."""
         return self._latching and self._withheld and self._latched is None
 
     def upstream_closed(self) -> None:
-        """Keep the subscribers while there is no connection to the publisher (see above)."""
+        """Forget the upstream's state, but keep the subscribers (see the module docstring)."""
         self._end_recording()
         self.hand_out(divided=False)
         self._latch(None)
@@ -289,7 +300,7 @@ class RelayedTopic:
     def received(self, batch: Batch, since: float) -> Batch | None:
         """Pass frames of the publisher, received at `since`, through monitors to the subscribers.
 
-        Return those that monitors leave for the publisher's next turn (`go_on`).
+        Return the frames that monitors leave for the publisher's next turn (`go_on`).
         """
         self._messages += batch.messages
         self._bytes += len(batch.view)
@@ -306,11 +317,11 @@ class RelayedTopic:
         return self._take(rest, rest, since)
 
     def _take(self, batch: Batch, passing: Batch | None, since: float) -> Batch | None:
-        """Record a batch, of which `passing` goes on."""
+        """Record a batch, and pass its part `passing` on."""
         recording = self._recording
         if recording is None:
             return None if passing is None else self._admit(passing, since)
-        # Recorded after subscribers get it, to delay nothing; monitors may change it in place meanwhile.
+        # Record after subscribers got the batch, to delay nothing; copy it first: monitors may change it in place.
         whole = batch
         if self.through is not None and recording.keeps:
             whole = Batch(memoryview(bytes(batch.view)), batch.messages, batch.last, stride=batch.stride)
@@ -360,7 +371,7 @@ class RelayedTopic:
             now = self._clock()
             if self._startup_replay.over(now) or not self._startup_replay.add(batch, now):
                 self._forget_startup_replay()
-        self.hand_out(divided=False)  # the batch before
+        self.hand_out(divided=False)  # the previous batch
         self._waits = batch, self._each()
         self.hand_out(divided=divided)
 
@@ -370,7 +381,7 @@ class RelayedTopic:
         return 0 if self._waits is None else len(self._waits[0].view)
 
     def hand_out(self, *, divided: bool = True) -> None:
-        """Give subscribers the batch that waits for them; if `divided`, only for one quantum."""
+        """Send subscribers the waiting batch; if `divided`, stop when the quantum is used up."""
         if self._waits is None:
             return
         (batch, members), self._waits = self._waits, None
@@ -387,7 +398,7 @@ class RelayedTopic:
             self._pause_or_trim()
 
     def relieve(self) -> None:
-        """Read the publisher again."""
+        """Resume reading the publisher after a pause."""
         if self._paused:
             self._paused = False
             if self.upstream is not None:
@@ -400,9 +411,9 @@ class RelayedTopic:
             member.cut(reason)
 
     def tidy(self) -> None:
-        """Free temporary data, and trim queues beyond their bounds; called once a second.
+        """Free temporary data, and trim queues to their bounds; called once a second.
 
-        A latched message that a limit delayed is passed on when the limit permits it.
+        Also pass on a latched message that a rate limit delayed, as soon as the limit permits it.
         """
         now = self._clock()
         waiting = self.flow.later(now)
@@ -424,13 +435,13 @@ class RelayedTopic:
         return 0 if self._latched is None else len(self._latched.view)
 
     def give_up_latched(self) -> None:
-        """Drop the latched message for a host that holds less."""
+        """Drop the latched message in favour of a host that holds less memory."""
         size = self.latched
         self._latch(None)
         self._keep_not(size)
 
     def repeat(self) -> None:
-        """Tell a new control which latched message is not kept."""
+        """Report to a new control which latched message is not kept."""
         if self._unkept is not None:
             self._refused(self._unkept)
 
@@ -469,7 +480,7 @@ class RelayedTopic:
         self.relieve()
 
     def _listen(self) -> None:
-        """Begin to keep the first messages of a new publisher whose only subscriber is a monitor."""
+        """Begin to keep the first messages of a new publisher if only monitors subscribe to it."""
         now = self._clock()
         if (
             now <= self._fresh_until
@@ -491,7 +502,7 @@ class RelayedTopic:
             self._header = None
 
     def _announce(self) -> None:
-        """Tell the upstream which subscribers are served."""
+        """Announce the served subscribers to the upstream."""
         if self.upstream is not None and self._header is not None:
             self.upstream.announce(self._names, self._header.get("type", ""))
 
@@ -510,7 +521,7 @@ class RelayedTopic:
         return self._row
 
     def _latch(self, batch: Batch | None) -> None:
-        """Keep the last message of a batch, if its host has memory for it; with None, drop the kept one."""
+        """Keep the last message of a batch if its publisher's host has the memory; with None, drop the kept message."""
         if self._latched is not None:
             self._share.add(-len(self._latched.view))
             self._latched = None
@@ -553,8 +564,8 @@ def _identity(header: Mapping[str, str]) -> tuple[str | None, ...]:
 class DelayCounts:
     """Counts of messages by their delay in the relay, since the last `take`.
 
-    The delay is from receiving a batch to handing it to the subscribers' sockets, and counts for each message of the
-    batch. The time in the queue of a slow subscriber does not count.
+    The delay of a batch runs from its receipt until it is handed to the subscribers' sockets; each message of the batch
+    counts. Time in the queue of a slow subscriber does not count.
     """
 
     __slots__ = ("_counts", "_seconds")

@@ -1,11 +1,11 @@
 """The messages that wait for one slow subscriber: bounded, the oldest dropped first, never a torn frame.
 
-It is used only while the socket does not take everything. It holds batches, cut at frame boundaries and shared with
-other subscribers' queues, and the rest of a frame whose first bytes have been sent.
+The queue is used only while the socket does not accept everything. It holds the unsent rest of a partly sent frame, and
+batches, cut at frame boundaries, whose memory other subscribers' queues share.
 
 Invariants:
 - Bytes leave in the order they came; a frame whose first byte was sent is sent whole.
-- The rest of that frame is counted, and holds less than `LITTLE` times its size in memory.
+- The rest of that frame counts as memory of the host. The buffer behind it is less than `LITTLE` times its size.
 - After `trim`, at most `queue_messages` frames and `queue_bytes` wait besides the one being sent.
 """
 
@@ -47,7 +47,7 @@ class SendQueue:
 
     @property
     def behind(self) -> bool:
-        """Whether the queue is so long that the subscriber should catch up first, if that delays no other."""
+        """Whether the queue is so long that the publisher should wait, if all other subscribers are behind as well."""
         return self._size >= _BEHIND or self.full
 
     @property
@@ -57,7 +57,7 @@ class SendQueue:
 
     @property
     def short(self) -> bool:
-        """Whether the queue holds memory, and its host may have no more."""
+        """Whether the queue holds memory while the host's memory is exhausted."""
         return bool(self) and self._share.exhausted
 
     @property
@@ -70,7 +70,7 @@ class SendQueue:
         )
 
     def append(self, view: memoryview, messages: int, sent: int = 0, rest: memoryview | None = None) -> None:
-        """Queue a batch; its first `sent` bytes are sent. The batch, or its `rest`, must not change."""
+        """Queue a batch whose first `sent` bytes are already sent. The batch, or its `rest`, must not change."""
         if sent:
             rest = view[sent:] if rest is None else rest
             gone, end = boundary_at(view, sent)
@@ -83,12 +83,12 @@ class SendQueue:
             self._count(messages, len(view))
 
     def begin(self, rest: memoryview) -> None:
-        """Put the rest of a frame (or of the connection header) before everything else."""
+        """Put the rest of a frame (or of the connection header) at the head of the queue."""
         self._started = _apart(rest)
         self._share.add(len(rest))
 
     def vectors(self) -> list[memoryview]:
-        """Return what to send next, in order."""
+        """Return the views to send next, in order."""
         views = [] if self._started is None else [self._started]
         for index, (view, _messages) in enumerate(self._waiting):
             if index == _VECTORS:
@@ -120,7 +120,7 @@ class SendQueue:
             sent = 0
 
     def trim(self) -> int:
-        """Drop the oldest frames beyond the bounds, or all if the host has no memory left; return how many."""
+        """Drop the oldest frames beyond the bounds, or all if the host's memory is exhausted; return how many."""
         before = self._messages
         limit_messages, limit_size = self._limit_messages, self._limit_size
         if self._share.exhausted:

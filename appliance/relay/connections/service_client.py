@@ -1,10 +1,12 @@
-"""A service client's connection and the one to the service.
+"""The connection from a service client, and the matching connection to the service.
 
-The client's header has been checked against the grants. The service gets it written again (`headers`), and its answer
-goes back in the same way. Then requests and replies alternate (`exchange`).
+The client's header has already been compared with the grants. The relay writes a new header for the service
+(`headers`), and writes a new header for the client from the service's answer. Then requests and replies alternate
+(`exchange`).
 
-A service that never answers holds up only this client. If it cannot be reached, or dies before its header, the client
-gets an error header, as rospy and roscpp expect. If it dies later, the client's connection ends, as in plain ROS.
+A service that never answers delays only this client. If the service cannot be reached, or dies before its header, the
+client gets an error header, as rospy and roscpp expect. If the service dies later, the client's connection ends, as in
+plain ROS.
 """
 
 import errno
@@ -26,7 +28,7 @@ from appliance.relay.transport.sockets import BufferedSocket, begin_connect
 from roswire.errors import PeerError
 from roswire.tcpros import HeaderParser, encode_header
 
-_PATIENT = 1 << 20  # bytes that may wait for ever, while the host has memory
+_PATIENT = 1 << 20  # bytes that may wait without a time limit, while the host has memory
 
 
 class ServiceTraffic:
@@ -60,10 +62,10 @@ class ServiceTraffic:
 
 
 class ServiceClient:
-    """One client of one service; `caller_id` is the name it is bound to. With `own`, the appliance offers it.
+    """One client of one service; `caller_id` is its verified name. With `own`, the appliance offers the service.
 
-    Once, either `ended(self)` is called when both connections are closed, or `refuse(self, sock, reason)`, which takes
-    over the client's socket.
+    Exactly one of two callbacks is called, once: `ended(self)` after both connections are closed, or `refuse(self,
+    sock, reason)`, which takes over the client's socket.
     """
 
     def __init__(
@@ -141,7 +143,7 @@ class ServiceClient:
         self._weigh()
 
     def _reach(self) -> BufferedSocket | OwnServer:
-        """Return the connection to the service. Raises `OSError` and `OverflowError`."""
+        """Return a new connection to the service. Raises `OSError` and `OverflowError`."""
         loop, service = self._context.loop, self.service
         if self._own is not None:
             called = service.service, self.host, self.caller_id
@@ -171,7 +173,7 @@ class ServiceClient:
             self.cut(f"{held} bytes of a message wait, without progress for {seconds:g} s")
 
     def cut(self, reason: str) -> None:
-        """Close both connections; the reason is empty if the client ended."""
+        """Close both connections; the reason is empty if the client closed the connection."""
         if self._live:
             self._release()
             self._client.close()
@@ -179,7 +181,7 @@ class ServiceClient:
             self._ended(self)
 
     def _patience(self, seconds: float) -> None:
-        """Give the service this many seconds from now on."""
+        """Turn the client away unless the service answers within this many seconds."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self._context.loop.after(
@@ -248,7 +250,7 @@ class ServiceClient:
         self._advance()
 
     def _advance(self) -> None:
-        """Go on, if the client has taken everything that was written to it."""
+        """Send the next request, if the client has read everything that was written to it."""
         if not self._live or not self._greeted:
             return
         while self._live and not self._client.backlog:
@@ -263,7 +265,7 @@ class ServiceClient:
             self._weigh()
 
     def _weigh(self) -> None:
-        """Count the memory that this connection holds; end it if that is too much for a host."""
+        """Count the memory that this connection holds; close the connection if a host has no memory left for it."""
         waiting = self._client.backlog + (self._server.backlog if self._server else 0)
         of_service = self._exchange.held_replies + size_of(self._header)
         parts = (self._exchange.held, of_service, waiting)
@@ -317,5 +319,5 @@ class ServiceClient:
 
 
 def _why(error: Exception) -> str:
-    """Return the error without the address of the service's node, which the client must not learn."""
+    """Return the error without the address of the service's node: the client must not learn the address."""
     return errno.errorcode.get(getattr(error, "errno", None) or 0, "it has no usable address")

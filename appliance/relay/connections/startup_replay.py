@@ -1,14 +1,15 @@
-"""The first messages of a new publisher, for subscribers on their way.
+"""Keep the first messages of a new publisher for subscribers that are about to connect.
 
-A monitor on its topic connects to a publisher, and counts as a subscriber, before the real subscriber. A publisher that
-waits for a subscriber and then sends one message would send it to the monitor alone. So its first messages are kept for
-`SECONDS` and sent to each subscriber that comes in that time; in plain ROS it would have been connected.
+A monitored topic connects to its publisher before the first real subscriber does, and the publisher sees a subscriber.
+A publisher that waits for a subscriber and then sends one message would send it to the monitor alone. Therefore its
+first messages are kept for `SECONDS`, and each subscriber that connects in that time gets them. In plain ROS that
+subscriber would have been connected in time.
 
 Invariants:
-- Streams are not kept: a publisher that still sends `SPEECH` seconds after its first message continues, and a new
-  subscriber gets the next messages, as in plain ROS. A command must not be executed late.
+- Streams are not kept. If a publisher still sends `SPEECH` seconds after its first message, all kept messages are
+  dropped. New subscribers then get only later messages, as in plain ROS: a command must not be executed late.
 - The kept messages have no gap up to the latest one.
-- A subscriber that reconnects under the same name in that time does not get them again.
+- A subscriber that reconnects under the same name does not get the kept messages again.
 """
 
 from appliance.relay.transport.frames import Batch
@@ -24,7 +25,7 @@ _BYTES = 1 << 20
 
 
 class StartupReplay:
-    """The first messages of one topic; times are seconds of the relay's clock, from `began` on."""
+    """The first messages of one topic, kept from `began` on; times are seconds of the relay's clock."""
 
     def __init__(self, share: HostMemory, began: float) -> None:
         self._share = share
@@ -36,11 +37,11 @@ class StartupReplay:
         self._given: set[str] = set()
 
     def over(self, now: float) -> bool:
-        """Whether every subscriber that was on its way has had time to connect."""
+        """Whether the time for keeping messages has passed."""
         return now > self._until
 
     def add(self, batch: Batch, now: float) -> bool:
-        """Keep messages; return False if there are too many: from then on none is kept."""
+        """Keep messages; return False if there are too many, they come too late, or memory is short."""
         if self._first is None:
             self._first, self._until = now, now + SECONDS
         self._messages += batch.messages

@@ -1,7 +1,7 @@
 """A subscriber's connection: the publisher's header, then frames.
 
 Invariants:
-- No send blocks. Bytes that the socket does not take wait in the subscriber's `SendQueue`.
+- No send blocks. Bytes that the socket does not accept wait in the subscriber's `SendQueue`.
 - A subscriber that sends anything after its header is cut: its connection is for the one topic of its grant.
 """
 
@@ -24,8 +24,8 @@ _ANY = "*"
 class Subscriber:
     """One subscriber of one relayed topic.
 
-    Once, either `ended(self)` is called when its connection is closed, or, if the types differ, `refuse(self, sock,
-    reason)`, which takes over the socket.
+    Exactly one of two callbacks is called, once: `ended(self)` after the connection is closed, or, if the types differ,
+    `refuse(self, sock, reason)`, which takes over the socket.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Subscriber:
         self._ended = ended
         self._share = context.memory.queues.of(host)
         self._queue = SendQueue(context.limits, self._share)
-        self._writing = False  # whether the loop watches for room in the socket
+        self._writing = False  # whether the loop waits for space in the socket's buffer
         self._stall = StallDetector(context.limits.stall_seconds)
         self._number = 0
         self._live = True
@@ -62,11 +62,11 @@ class Subscriber:
 
     @property
     def grant(self) -> PeerGrant:
-        """Return the grant that it uses."""
+        """Return the grant that this subscriber uses."""
         return "topic", self.topic.key, self.topic.topic, self.host, self.caller_id
 
     def greet(self, header: Mapping[str, str]) -> bool:
-        """Answer with the publisher's header, or with an error header if type or md5sum do not fit."""
+        """Answer with the publisher's header, or refuse if the md5sums differ; return whether it is served now."""
         mismatch = describe_mismatch(self.fields, header)
         if mismatch:
             self._live = False
@@ -91,9 +91,9 @@ class Subscriber:
         return True
 
     def deliver(self, batch: Batch) -> int:
-        """Send the frames, or queue what the socket does not take; return how many messages are dropped.
+        """Send the frames, or queue the bytes that the socket does not accept; return how many messages are dropped.
 
-        Large frames are not begun while its host has no memory for the bytes that the socket may leave.
+        A large batch is dropped while the host's memory is exhausted, because its unsent rest could not be kept.
         """
         if self.flow is not None:
             passing = self._limited(self.flow, batch)
@@ -126,7 +126,7 @@ class Subscriber:
         return 0
 
     def _limited(self, flow: RateAllowance, batch: Batch) -> Batch | None:
-        """Return the first messages, as many as the limit allows, and report the others."""
+        """Return the first messages, up to the limit, and report the others as dropped."""
         count = flow.room(batch, batch.messages, self._loop.clock())
         self.missed = count < batch.messages
         if self.missed:
@@ -153,13 +153,13 @@ class Subscriber:
         return self._queue.trim()
 
     def check_stall(self) -> None:
-        """Cut a subscriber beyond its host's quota that takes nothing of a message; called once a second."""
+        """Cut a subscriber that stalls within a message while its host's memory is exhausted; called once a second."""
         begun = self._queue.begun if self._queue.short else 0
         if self._stall.seen(begun, self._loop.clock()):
             self.cut("its host has no memory left in the relay, and it does not accept the rest of a message")
 
     def cut(self, reason: str) -> None:
-        """Close the connection; the reason is empty if the subscriber ended."""
+        """Close the connection; the reason is empty if the subscriber closed it."""
         if self._live:
             self._live = False
             self._loop.discard(self._socket)
@@ -196,7 +196,7 @@ class Subscriber:
             self.topic.relieve()
 
     def _write(self, on: bool) -> None:
-        """Switch writing by the loop on or off."""
+        """Start or stop waiting for space in the socket's buffer."""
         self._writing = on
         self._loop.change(self._socket.fileno(), READ | WRITE if on else READ)
 

@@ -4,8 +4,9 @@
       ^               |                          |                        |                  |
       +---linger------+------ refused, failed, lost: wait (doubling), then ask again --------+
 
-A `PublisherConnection` tries again while the topic is wanted. A flow of more than `retry_longest` seconds resets the
-wait. The wait grows for a publisher that answers its header and then closes, or breaks the protocol.
+A `PublisherConnection` tries again while the topic is wanted. The wait doubles after each failure, including a
+publisher that sends its header and then closes the connection or breaks the protocol. A connection that flowed for more
+than `retry_longest` seconds resets the wait.
 """
 
 import socket
@@ -25,11 +26,11 @@ from roswire.errors import LimitExceededError, PeerError
 from roswire.tcpros import HeaderParser, encode_header
 
 _CALLER_ID = "/rosrv"
-_REASON = 1000  # reported characters; a publisher chooses the length of the error in its header
+_REASON = 1000  # most characters of a reported error; a publisher chooses the text in its header
 
 
 class PublisherConnection(Upstream):
-    """The upstream of one relayed topic; `objection(header)` returns why a publisher is refused (empty: it is not)."""
+    """The upstream of one relayed topic; `objection(header)` returns why a publisher is refused (empty: accepted)."""
 
     def __init__(
         self,
@@ -77,7 +78,7 @@ class PublisherConnection(Upstream):
         self._objected = ""
 
     def connect(self) -> None:
-        """Connect, unless that is done or under way."""
+        """Connect, unless a connection exists or is under way."""
         self._wanted = True
         if self._linger is not None:
             self._linger.cancel()
@@ -92,7 +93,7 @@ class PublisherConnection(Upstream):
             self._linger = self._loop.after(self._limits.linger, self._close_unwanted)
 
     def ask(self) -> None:
-        """Ask control for the publisher's address, and again if no answer comes."""
+        """Ask control for the publisher's address; repeat the question if no answer comes."""
         self._asked = True
         self._set_timer(self._limits.answer_seconds, self.ask)
         self._reporter.send(UpstreamWanted(self._topic.key, self._topic.topic))
@@ -142,7 +143,7 @@ class PublisherConnection(Upstream):
         self._drop_connection()
 
     def pause(self, seconds: float) -> None:
-        """Leave data in the kernel's buffer until `resume`, for at most `seconds`."""
+        """Stop reading the publisher until `resume`, for at most `seconds`; its data stays in the kernel's buffer."""
         if self._socket is not None and self._pause is None:
             self._loop.unwatch(self._socket.fileno())
             self._pause = self._loop.after(seconds, self._topic.relieve)
@@ -168,7 +169,7 @@ class PublisherConnection(Upstream):
             )
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
-        """Show new subscribers by name to the publishers of types that need it."""
+        """Show the names of new subscribers to a publisher whose type needs them."""
         if self._socket is not None and looks_for_names(type_name) and self._announcing is None:
             self._announcing = self._loop.after(0, lambda: self._show(names()))
 
@@ -219,13 +220,13 @@ class PublisherConnection(Upstream):
         return None
 
     def request_latched(self) -> None:
-        """Have a latching publisher give its message again, on a new connection."""
+        """Reconnect, so that a latching publisher sends its message again."""
         if self._socket is not None and self._wanted:
             self._drop_connection()
             self.ask()
 
     def recheck(self) -> None:
-        """Disconnect a publisher that the specifications now reject; retry one that they may accept now."""
+        """Disconnect a publisher that the specifications now reject; retry a rejected one that they may now accept."""
         if self._socket is not None:
             reason = self._objection(self._header)
             if reason:
@@ -235,7 +236,7 @@ class PublisherConnection(Upstream):
             self.ask()
 
     def _object(self, reason: str) -> None:
-        """Disconnect, and try again: the publisher may return with another definition."""
+        """Disconnect and retry: the publisher may return with another message definition."""
         if reason != self._objected:
             self._objected = reason
             self._reporter.send(PublicationRefused(self._topic.key, self._topic.topic, reason))
@@ -281,7 +282,7 @@ class PublisherConnection(Upstream):
                 self._continue(rest)
 
     def _continue(self, rest: Batch | None) -> None:
-        """Process received data while there is time; nothing else is read before."""
+        """Process received data until the quantum is used up; read from the publisher only when all is processed."""
         sock = self._socket
         while sock is not None and self._socket is sock:
             receiver = self._receiver
@@ -300,7 +301,7 @@ class PublisherConnection(Upstream):
             rest = None if batch is None else self._topic.received(batch, self._since)
 
     def _leave(self, rest: Batch | None) -> None:
-        """Leave these frames, and other received data, for the publisher's next turn."""
+        """Keep these frames, and all other received data, for the publisher's next turn."""
         self._rest = rest
         self._rest_weight.set(self._topic.undelivered + (0 if rest is None else len(rest.view)))
         self._receiver.set_aside()

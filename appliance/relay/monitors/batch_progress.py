@@ -1,7 +1,7 @@
 """The progress of one batch through the monitors.
 
-Messages that are neither dropped nor replaced leave in the buffer in which they came. `pieces` is the output so far,
-and `run` the start of the messages behind it that are not in `pieces` yet.
+Messages that are neither dropped nor replaced stay in the buffer in which they arrived. `pieces` is the output so far.
+`run` is the position of the first message that is not in `pieces` yet.
 """
 
 import struct
@@ -34,7 +34,7 @@ class BatchProgress:
         self._turns = 1
 
     def number_at(self, position: int) -> int:
-        """Return the number of the message at a position among those of its publication."""
+        """Return the number, within its publication, of the message at a position."""
         if self.stride:
             return self._batch.first + position // self.stride
         number, walked = self._batch.first, 0
@@ -44,13 +44,13 @@ class BatchProgress:
         return number
 
     def turns(self) -> int:
-        """Return how many messages to take one by one; the number doubles while none can be taken together."""
+        """Return how many messages to take one by one; the number doubles until some can be taken together."""
         turns = self._turns
         self._turns = min(2 * turns, _MOST_TURNS)
         return turns
 
     def walked(self, position: int, run: int, gone: int) -> None:
-        """Note messages up to `position`, of which `gone` were dropped, the last one before `run`."""
+        """Note the messages processed up to `position`; `gone` of them were dropped, the last one just before `run`."""
         if position > self.position:
             self._turns = 1
         self.position, self.run = position, run
@@ -64,20 +64,20 @@ class BatchProgress:
         self.run = following
 
     def replace(self, position: int, following: int, buffer: bytes | bytearray | memoryview) -> None:
-        """Put a message of another size between these positions."""
+        """Replace the message between these positions by one of another size."""
         if position > self.run:
             self.pieces.append(self.view[self.run : position])
         self.pieces += (_LENGTH.pack(len(buffer)), buffer)
         self.run = following
 
     def stop(self) -> None:
-        """Leave the messages that were not taken for later."""
+        """End the progress here, and leave the remaining messages for later."""
         batch, taken = self._batch, self.number_at(self.position) - self._batch.first
         batch.left = self.messages - taken
         self._batch, self.messages, self.end = batch.head(taken), taken, self.position
 
     def result(self) -> Batch | None:
-        """Return the messages that go on; None if none does."""
+        """Return the messages to pass on; None if there are none."""
         if not self.run:
             return self._batch
         left = self.messages - self._gone

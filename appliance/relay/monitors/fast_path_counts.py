@@ -1,4 +1,4 @@
-"""Counts of what the fast path did without a report, until the second is over."""
+"""Count the unreported actions of the fast path until the second is over."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 _Count = tuple[int, int]
-"""How often something happened, and when last (nanoseconds)."""
+"""The number of occurrences, and the time of the last one (nanoseconds)."""
 
 
 class FastPathCounts:
@@ -21,9 +21,9 @@ class FastPathCounts:
         self.lane = lane
         self.point = point
         self.begun = False
-        """Whether counting has begun, and that was reported."""
+        """Whether counting has begun and the observer collects these counts."""
         self.changed: dict[int, int] = {}
-        """Where walks add up what was changed (`BatchOptions`)."""
+        """The number of changed messages by writers, added up by walks (`BatchOptions`)."""
         self._clear()
 
     def add(self, walked: BatchResult, time: int) -> int:
@@ -37,9 +37,7 @@ class FastPathCounts:
         return sum(walked.dropped)
 
     def take(self) -> tuple[list[_Count], dict[tuple[str, ...], int], list[_Count]]:
-        """Return and reset the counts of drops by event, of changed messages by the events that changed them, and of
-        all verdicts.
-        """
+        """Return and reset three counts: drops by event, changed messages by the events that changed them, verdicts."""
         changed = {self.lane.writers(who): count for who, count in self.changed.items()}
         dropped, told = self._dropped, self._told
         self._clear()

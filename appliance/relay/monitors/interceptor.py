@@ -1,16 +1,17 @@
 """The monitors of one relay: the specifications in force, and their effects on messages, requests and replies.
 
-A topic without an enabled event bypasses monitors (`intercepts` is asked when something changes, not per message). The
-messages of other topics go through their pipelines (`topic_pipeline.py`).
+A topic without an enabled event bypasses monitors; `intercepts` decides this when something changes, not per message.
+The messages of other topics go through the topic's pipeline (`topic_pipeline.py`).
 
 Invariants:
-- A fault of a monitor, or a defect of this program, drops and reports only that message.
-- Refused specifications change nothing; a relay without any specifications then blocks everything.
+- A fault of a monitor, or a defect of this program, drops only the current message, and is reported.
+- Refused specifications change nothing. A relay whose first specifications are refused blocks all messages.
 - Specifications are replaced between two messages. Monitors do not get messages that monitors publish.
-- The clock of monitors never goes back or jumps: it is the time of day when the relay started, continued by the
-  monotonic clock. The messages of one batch have the same time.
-- A message may take `budget` seconds of processor time in its monitors; beyond, it is cut off, which is a fault.
-  Messages behind it wait for their publisher's next turn. Late ticks that take long are skipped.
+- The clock of monitors never goes back or jumps: it starts at the time of day when the relay started, and follows the
+  monotonic clock. All messages of a batch have the same time.
+- A message may take `budget` seconds of processor time in its monitors. Beyond that, its processing is cut off, which
+  is a fault. The messages behind it wait for their publisher's next turn. If late ticks take too long together, the
+  remaining late ticks are skipped.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ _NO_MEMORY = "the previous relay process exited, and the state of monitors is no
 
 @dataclass(frozen=True, slots=True)
 class ServiceVerdict:
-    """The body of a request or reply to pass on, or the reason for refusing it."""
+    """The body of a request or reply to pass on, or the reason why the message is refused."""
 
     body: bytes
     refused: str | None = None
@@ -60,10 +61,10 @@ class ServiceVerdict:
 class Interceptor:
     """The monitors of one relay.
 
-    `budget` is the most seconds of processor time that a message may take. `publish(published)` sends what a monitor
-    publishes; `changed(topics)` is called when other topics may be wanted, with those whose messages may be judged
-    differently now (None: all). `holder(host)` is charged for the slices that messages of this host make, `payer(host)`
-    for their processor time.
+    `budget` is the most seconds of processor time that a message may take. `publish(published)` sends a message that a
+    monitor publishes. `changed(topics)` is called when monitors may want other topics; `topics` are those whose
+    messages may now be judged differently (None: all). For messages of a host, `holder(host)` is charged for the slices
+    that they create, and `payer(host)` for their processor time.
     """
 
     def __init__(
@@ -89,9 +90,9 @@ class Interceptor:
         self._awaited: SpecificationsStated | None = None
         self.preparation = object()
         self._time_budgets: dict[ObservationPoint, TimeBudget] = {}
-        """The time budgets of points whose messages were cut off lately, and others."""
+        """The time budgets of points; `tick` removes those that have recovered."""
         self._prepared: dict[tuple[ObservationPoint, str], BatchOptions] = {}
-        """The options of walks of requests and replies, valid until the next `preparation`: at most a second."""
+        """The prepared options for requests and replies, valid until the next `preparation`: at most a second."""
         self._timer: LoopTimer | None = None
         self._due: int | None = None
         self._loader = Loader(loop, self.loaded, self.holder_of)
@@ -108,14 +109,14 @@ class Interceptor:
         self.shadow = ShadowMonitors(loop, self.now, self._shadow_observer)
 
     def remember(self, keeper: StateKeeper) -> None:
-        """Keep the monitors' state in `keeper`, and begin with its state; call this before anything is stated."""
+        """Keep the monitors' state in `keeper`, and start from the state in it; call this before any statement."""
         self._keeper = keeper
         self._offset = keeper.offset
 
-    # --- what control states ---
+    # --- control's statements ---
 
     def state(self, message: SpecificationsStated) -> None:
-        """Take these specifications, at once or when they are loaded; unchanged ones keep their state."""
+        """Apply these specifications, at once or when they are loaded; unchanged monitors keep their state."""
         self._switches = dict(message.enabled)
         if not self._loader.busy:
             if self._stated is not None and not self.blocked and _same(message, self._stated):
@@ -132,7 +133,7 @@ class Interceptor:
         self._loader.later(message)
 
     def loaded(self, message: SpecificationsStated, result: Result) -> None:
-        """Put a loaded set into force, or refuse it, and tell control."""
+        """Put a loaded set into force, or refuse it, and report the result to control."""
         if message is self._awaited:
             self._awaited = None
         self.invalidate_prepared()
@@ -155,7 +156,7 @@ class Interceptor:
                     monitor, "it moved to another relay process, and its state remained in the previous one"
                 )
             if monitor.why_held and monitor.name in began and not self._switches.get(monitor.name, True):
-                monitor.resume()  # a disabled monitor guarded nothing
+                monitor.resume()  # a disabled monitor guarded nothing, so it need not hold its topics
         if self._keeper is not None:
             self._keeper.take(result)
         self.observer.keep([monitor.name for monitor in result.monitors], began, now)
@@ -165,7 +166,7 @@ class Interceptor:
         self._taken(message, began, anew)
 
     def _start_outcome(self, monitors: MonitorSet, now: int, *, restarted: bool) -> Outcome:
-        """Start the first monitors of this process, with the state of an earlier process if there is one."""
+        """Start the first monitors of this process, with the state of an earlier process if any."""
         left = self._keeper.recovered() if self._keeper is not None else None
         if left is not None:
             return monitors.recover(left.groups, left.lost, now, restarted=restarted)
@@ -174,7 +175,7 @@ class Interceptor:
         return monitors.start(now, restarted=restarted)
 
     def holder_of(self, source: int) -> str:
-        """Return the host that is charged for the slices that messages of this source make."""
+        """Return the host that is charged for the slices created by messages of this source."""
         point = self.senders.point(source)
         return self._holder("" if point is None else point.host)
 
@@ -204,7 +205,7 @@ class Interceptor:
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
 
     def switch(self, name: str, enabled: bool) -> None:
-        """Enable or disable a monitor; an unknown name is ignored."""
+        """Enable or disable a monitor; ignore an unknown name."""
         self.invalidate_prepared()
         self._switches[name] = enabled
         if self.monitors is not None:
@@ -216,7 +217,7 @@ class Interceptor:
                 self._changed(_topics(switched))
 
     def resume(self, name: str) -> frozenset[str]:
-        """Have a monitor let its held topics go on; return the topics."""
+        """Make a monitor release its held topics; return the topics."""
         self.invalidate_prepared()
         if self.monitors is None:
             return frozenset()
@@ -226,11 +227,11 @@ class Interceptor:
         self.keep_all()
         return _topics(held)
 
-    # --- what is asked when something changes ---
+    # --- queries when something changes ---
 
     @property
     def preparing(self) -> bool:
-        """Whether specifications are being loaded that must be in force before anything else is carried out."""
+        """Whether specifications are being loaded that must be in force before any other message is carried out."""
         return self._awaited is not None
 
     def intercepts(self, topic: str) -> bool:
@@ -251,7 +252,7 @@ class Interceptor:
         return self._objection(topic, objection, monitors.type_of(topic) is None)
 
     def service_objection(self, service: str, header: Mapping[str, str]) -> str:
-        """Like `objection`, for a service, by the header that it answers with."""
+        """Like `objection`, for a service and the header with which it answers."""
         monitors = self.monitors
         name = monitors.service_type_of(service, shadowed=True) if monitors is not None else None
         if monitors is None or name is None:
@@ -260,12 +261,12 @@ class Interceptor:
         return self._objection(service, objection, monitors.service_type_of(service) is None)
 
     def _objection(self, resource: str, objection: str, only_tried: bool) -> str:
-        """Return the objection, unless only monitors in shadow mode have it: they just do not get these messages."""
+        """Return the objection; empty if it concerns only monitors in shadow mode, which just miss the messages."""
         self.shadow.understand(resource, objection)
         return "" if only_tried else objection
 
     def header_of(self, topic: str) -> dict[str, str] | None:
-        """Return the connection header, without names, for a topic that monitors publish; None if none does."""
+        """Return the connection header, without names, for a topic that monitors publish; None for other topics."""
         if self.monitors is None or topic not in self.monitors.publications:
             return None
         name = self.monitors.publications[topic]
@@ -276,10 +277,10 @@ class Interceptor:
             "latching": "0",
         }
 
-    # --- what is kept ---
+    # --- kept state ---
 
     def keep(self, way: str) -> None:
-        """Keep the state of the monitors that judge messages on a topic, before one of these is passed on."""
+        """Keep the state of the monitors on a channel (`way`); call this before passing its messages on."""
         if self._keeper is not None:
             self._keeper.keep(way)
 
@@ -295,7 +296,7 @@ class Interceptor:
     # --- messages ---
 
     def time_budget(self, point: ObservationPoint) -> TimeBudget:
-        """Return the time budget for messages of a point; hosts that pay as one share one."""
+        """Return the time budget for messages of a point; hosts with a common payer share one budget."""
         if self._payer(point.host) != point.host:
             return self._shared_pace
         if point not in self._time_budgets:
@@ -303,7 +304,7 @@ class Interceptor:
         return self._time_budgets[point]
 
     def invalidate_prepared(self) -> None:
-        """Invalidate what pipelines and services have prepared."""
+        """Invalidate all options that pipelines and services have prepared."""
         self.preparation = object()
         self._prepared.clear()
 
@@ -364,7 +365,7 @@ class Interceptor:
         if self._timer is not None:
             self._timer.cancel()
 
-    # --- inside ---
+    # --- internals ---
 
     def _rows(self) -> list[MonitorRow]:
         if self.monitors is None:
@@ -375,7 +376,7 @@ class Interceptor:
     def _walked(
         self, monitors: MonitorSet, point: ObservationPoint, way: str, body: bytes, now: int
     ) -> Outcome | None:
-        """Return the fast path's outcome, if it needs no report besides counts; else None."""
+        """Return the fast path's outcome if counts are enough to report it, else None."""
         observer = self.observer
 
         def prepare(lane: FastLane) -> BatchOptions:
@@ -403,7 +404,7 @@ class Interceptor:
         return self._offset + time.monotonic_ns()
 
     def schedule(self) -> None:
-        """Have `_advance` called when the next tick or deadline is due, or earlier."""
+        """Schedule `_advance` for the next tick or deadline, or earlier."""
         due = self.monitors.next_due if self.monitors is not None else None
         if due is None or (self._due is not None and self._due <= due):
             return
@@ -436,7 +437,7 @@ def _topics(monitors: Iterable[MonitorInstance]) -> frozenset[str]:
 
 
 def _replaced(before: MonitorSet | None, after: MonitorSet) -> list[MonitorInstance]:
-    """Return the monitors of both sets that do not continue unchanged."""
+    """Return the monitors, of either set, that do not continue unchanged."""
     earlier = before.monitors if before is not None else ()
     kept = {monitor.name for monitor in after.monitors} & {monitor.name for monitor in earlier} - set(
         after.began

@@ -1,6 +1,5 @@
-"""Load compiled specifications in a thread beside the loop, so that messages go on while a large set is loaded.
-
-Statements are loaded one at a time, in the order they came; the loop calls `done`.
+"""Load compiled specifications in a separate thread, so that messages continue while a large set is loaded. Statements
+are loaded one at a time, in the order of arrival. `done` is called in the loop's thread.
 """
 
 import os
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
     from rosmop.run.slice_quota import HolderOf
 
-_SWITCH_SECONDS = 0.0005  # the longest that the loop waits for the loading thread
+_SWITCH_SECONDS = 0.0005  # the longest time that the loop waits for the loading thread
 
 Result = Union["MonitorSet", list[str]]
 """The monitors, or the errors of the specifications."""
@@ -26,7 +25,7 @@ Result = Union["MonitorSet", list[str]]
 class Loader:
     """The thread that loads specifications and calls `done(statement, result)` for each.
 
-    `holder_of(source)` is charged for the slices that messages of a source make.
+    `holder_of(source)` returns the host that is charged for slices created by messages of a source.
     """
 
     def __init__(
@@ -41,7 +40,7 @@ class Loader:
         self._wake = -1
 
     def later(self, message: SpecificationsStated) -> None:
-        """Load the specifications of a message while the loop goes on."""
+        """Load the specifications of a message while the loop continues."""
         self._waiting.append(message)
         if self._thread is None:
             self._begin()
@@ -81,7 +80,7 @@ class Loader:
         self._close_wake()
         self._thread = None
         self._done(self._waiting.popleft(), self._result)
-        if self._waiting and self._thread is None:  # `done` may have added others and begun
+        if self._waiting and self._thread is None:  # `done` may have added another message and begun to load
             self._begin()
 
     @staticmethod

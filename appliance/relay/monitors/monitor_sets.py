@@ -1,4 +1,4 @@
-"""Make monitors from compiled specifications, in the thread of `Loader`."""
+"""Create monitors from compiled specifications; this runs in the thread of `Loader`."""
 
 import functools
 import gc
@@ -15,9 +15,9 @@ from rosmop.fast.wasm_runner import WasmFastPath
 from rosmop.run.engine import MonitorSet
 from rosmop.run.slice_quota import HolderOf
 
-_TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in one go
+_TICKS_SECONDS = 0.2  # seconds of processor time that ticks and deadlines may take at once
 _SHADOW_TICKS_SECONDS = 0.02
-_DEADLINES = 100  # deadlines of slices that pass in one go: some milliseconds
+_DEADLINES = 100  # deadlines of slices that are processed at once: some milliseconds
 
 
 def monitor_set(message: SpecificationsStated, holder_of: HolderOf) -> MonitorSet | list[str]:
@@ -41,7 +41,7 @@ def monitor_set(message: SpecificationsStated, holder_of: HolderOf) -> MonitorSe
 
 @functools.cache
 def prepare() -> None:
-    """Load the WebAssembly library, and exclude it from the garbage collector, which would delay messages."""
+    """Load the WebAssembly library, and exclude its objects from garbage collection, which would delay messages."""
     load()
     gc.freeze()
 

@@ -1,4 +1,4 @@
-"""The points at which monitors act: a publication or service, a sender, and one of the sender's messages."""
+"""The points where monitors act: a publication or service, with a sender, and one of the sender's messages."""
 
 import struct
 from collections import OrderedDict
@@ -29,7 +29,7 @@ NOWHERE = ObservationPoint("", "")
 
 
 class Senders:
-    """Numbers for observation points, to name the senders of earlier messages; the latest `_SENDERS` are known."""
+    """Numbers for observation points, which identify the senders of earlier messages; the last `_SENDERS` are known."""
 
     def __init__(self) -> None:
         self._points: OrderedDict[int, ObservationPoint] = OrderedDict()
@@ -54,9 +54,9 @@ class Senders:
 
 
 class ObservedMessage:
-    """One message of a publication: its position in its batch, and if it has a header, that as received.
+    """One message of a publication: its position in the batch, and the received start of its header if it has one.
 
-    When the progress is over (None), `position` is its number.
+    Without a progress (None), `position` is the number of the message in its publication.
     """
 
     __slots__ = ("_head", "_position", "_progress")
@@ -67,7 +67,7 @@ class ObservedMessage:
         self._head = head
 
     def at(self, number: int) -> "ObservedMessage":
-        """Return the same for use after the batch, with the number of the message."""
+        """Return a copy for use after the batch, with the message's number instead of its position."""
         return ObservedMessage(None, number, self._head)
 
     def sender(self, source: int) -> MessageSender:
@@ -77,7 +77,7 @@ class ObservedMessage:
         return MessageSender(source)
 
     def detail(self) -> Mapping[str, Any]:
-        """Return its number among those of its publication in this relay; seq and stamp if it has a header."""
+        """Return the message's number in its publication, and seq and stamp if it has a header."""
         progress, position = self._progress, self._position
         detail: dict[str, Any] = {
             "number": progress.number_at(position) if progress is not None else position

@@ -1,13 +1,13 @@
-"""The relay's reports about monitors to control: the first of each kind and second in full, the rest counted.
+"""Report monitors' actions to control: the first event of each kind in a second in full, the others as counts.
 
 Invariants:
 - For each monitor, kind and distinction (the category of a verdict, the text of a log line), one event a second is
-  reported in full. The others of that second are one event with a count, whose detail is what they have in common. The
-  counts include every event.
-- Each report has the sender of the message (caller id and host), and the message's number in its publication.
+  reported in full. The others of that second become one event with a count, whose detail holds what they have in
+  common. Counts are complete.
+- Each full report has the sender of the message (caller id and host), and the message's number in its publication.
 - The number of distinctions is bounded (`_DISTINCT`); beyond it, events are counted under the kind alone.
-- Counters follow the events that they count. Once a second, those without a reported event are sent.
-- While there is no control, at most `_KEPT` events wait; the number of further ones is reported.
+- Counters are sent after the events that they count. Once a second, counters without a reported event are sent as well.
+- Without control, at most `_KEPT` events wait; only the number of further events is reported.
 """
 
 from collections import deque
@@ -21,7 +21,7 @@ from appliance.relay.monitors.observation_points import ObservationPoint, Observ
 from appliance.relay.report import Reporter
 
 SHOWN = 1024
-"""The reported bytes of a message, before and after."""
+"""The most bytes reported of a message, before and after a change."""
 
 _TEXT = 4096
 _DISTINCT = 100
@@ -70,9 +70,9 @@ class Observations:
         size: int = 0,
         observed: ObservedMessage | None = None,
     ) -> None:
-        """Note that something happened at `point`, to the `observed` message.
+        """Note an event at `point`, concerning the `observed` message.
 
-        `shared` is the detail of the count of all events with this distinction.
+        `shared` is the detail for the count of further events with this distinction.
         """
         text = text[:_TEXT]
         key = self._known(kind, monitor, point, distinction, shared)
@@ -111,14 +111,14 @@ class Observations:
         distinction: str = "",
         shared: Mapping[str, Any] = _NOTHING,
     ) -> None:
-        """Count `count` more events, the last at this time, and report them as a count."""
+        """Add `count` events, the last of them at this time, and report only their number."""
         key = self._known(kind, monitor, point, distinction, shared)
         self._said(key, point)
         self._told[key] = self._told.get(key, 0) + count
         self._last[key] = max(time, self._last.get(key, 0))
 
     def was_reported(self, kind: str, monitor: str, point: ObservationPoint, distinction: str = "") -> bool:
-        """Whether such an event was reported in this second, so that the next one is only counted."""
+        """Whether such an event was already reported in this second, so the next one is only counted."""
         return self._key(kind, monitor, point, distinction) in self._told
 
     def tick(self) -> None:
@@ -134,7 +134,7 @@ class Observations:
         self.tell_counters()
 
     def repeat(self) -> None:
-        """Send everything that waits, and all counters, to a new control."""
+        """Send all waiting events, and all counters, to a new control."""
         self._counted = []
         self.flush()
 
@@ -154,7 +154,7 @@ class Observations:
         )
 
     def _said(self, key: _Key, point: ObservationPoint) -> None:
-        """Note the sender; a count of several clients of a host names none."""
+        """Note the sender; a count for several clients of a host names none of them."""
         if self._callers.setdefault(key, point.caller_id) != point.caller_id:
             self._callers[key] = ""
 
@@ -202,7 +202,7 @@ class Observations:
 
 
 def _plain(detail: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the detail with bounded values that a link can carry."""
+    """Return the detail with its values converted and bounded, so that a link can carry them."""
     return {str(name)[:200]: _value(value, 3) for name, value in list(detail.items())[:_VALUES]}
 
 

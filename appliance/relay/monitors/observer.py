@@ -1,8 +1,7 @@
-"""Count the actions of monitors and describe them to control: from outcomes to `observations`.
+"""Count the actions of monitors, and turn outcomes into reports to control (`observations`).
 
-A drop is reported for the monitor that dropped the message, a change for each monitor whose action changed its bytes.
-A change by several monitors is one record under the last of them, which names all. It counts once for each of them,
-and once for the topic.
+A drop is reported for the monitor that dropped the message. A change by several monitors is one record under the last
+of them, and names them all. The change counts once for each of these monitors, and once for the topic.
 """
 
 from __future__ import annotations
@@ -35,9 +34,9 @@ class _Counters:
 
 
 class Observer:
-    """The reporter of monitors' actions: counts all, and reports the first event of each kind and second in full.
+    """Counts all actions of monitors, and reports the first event of each kind in a second in full.
 
-    Actions that monitors in shadow mode would have taken are reported with `prefix` before their kind.
+    For monitors in shadow mode, reports the actions that they would have taken, with `prefix` before the kind.
     """
 
     def __init__(
@@ -59,7 +58,7 @@ class Observer:
         self._owed: list[FastPathCounts] = []
 
     def keep(self, names: list[str], began: list[str], time: int) -> None:
-        """Set the monitors in force; those that began count from zero."""
+        """Set the monitors in force; the counters of monitors that began start from zero."""
         self._sum_up(time)
         self._counters = {
             name: _Counters() if name in began else self._counters.get(name, _Counters()) for name in names
@@ -78,7 +77,7 @@ class Observer:
         return self._observations.was_reported("verdict", verdict.monitor, point, named(verdict))
 
     def asks(self, verdict: Verdict, source: int) -> bool:
-        """Whether a verdict is reported in full and so explained; at most `_EXPLAINED` in a second are."""
+        """Whether a verdict is reported in full and needs an explanation; at most `_EXPLAINED` a second do."""
         point = self.senders.point(source) or NOWHERE
         kind = f"{self._prefix}verdict"
         if (
@@ -90,14 +89,14 @@ class Observer:
         return True
 
     def collect_later(self, counts: FastPathCounts) -> None:
-        """Add counts that are taken when the second is over."""
+        """Add counts, to be collected when the second is over."""
         counts.begun = True
         self._owed.append(counts)
 
     def report(
         self, outcome: Outcome, point: ObservationPoint, observed: ObservedMessage | None = None
     ) -> None:
-        """Report an outcome, except its result, and publish its messages."""
+        """Report everything in an outcome except its result, and publish its messages."""
         for earlier in outcome.before:
             self.report(earlier, NOWHERE)
         if outcome.events:
@@ -144,7 +143,7 @@ class Observer:
         size: int,
         observed: ObservedMessage | None = None,
     ) -> None:
-        """Report a change with the bytes before and after; later changes in the same second are counted."""
+        """Report a change with the bytes before and after; only count later changes in the same second."""
         if point in self._shown:
             key = (tuple(outcome.changed_by), point)
             self._again[key] = self._again.get(key, 0) + 1
@@ -191,7 +190,7 @@ class Observer:
     def defect(
         self, error: Exception, point: ObservationPoint, time: int, observed: ObservedMessage | None = None
     ) -> str:
-        """Report an exception that no action of a monitor explains; return its text."""
+        """Report an exception that is not a monitor's fault; return its text."""
         text = f"a defect of rosrv, please report it: {type(error).__name__}: {error}"
         self._observations.note(
             f"{self._prefix}fault", "", point, time, text, distinction=type(error).__name__, observed=observed
@@ -244,14 +243,14 @@ class Observer:
         self._again.clear()
 
     def _count_change(self, events: Sequence[str], count: int) -> list[str]:
-        """Count messages that these events changed, once for each of their monitors; return these in order."""
+        """Count messages changed by these events, once for each of their monitors; return the monitors in order."""
         monitors = list(dict.fromkeys(_monitor(event) for event in events))
         for monitor in monitors:
             self._counter(monitor).changes += count
         return monitors
 
     def _settle(self) -> None:
-        """Take the counts of lanes: events, and drops and changes beyond the first."""
+        """Collect the counts of the fast path: events, verdicts, drops and changes that were not reported in full."""
         for owed in self._owed:
             lane, point = owed.lane, owed.point
             dropped, changed, told = owed.take()
@@ -343,7 +342,7 @@ class Observer:
 
 
 def dropped(body: memoryview, now: int, reason: str) -> Outcome:
-    """Return the outcome of a message that is dropped without having been judged."""
+    """Return the outcome for a message that is dropped without a judgement."""
     outcome = Outcome(body, now)
     outcome.result, outcome.reason = "dropped", reason
     return outcome
@@ -364,7 +363,7 @@ def _why(outcome: Outcome) -> str:
 
 
 def _said(outcome: Outcome) -> str:
-    """Return the last output of the monitor that dropped a message."""
+    """Return the last log line of the monitor that dropped a message, after a colon; empty if there is none."""
     said = [line.text for line in outcome.log if line.monitor == outcome.dropped_by]
     return f": {said[-1]}" if said else ""
 
@@ -374,7 +373,7 @@ def _monitor(event: str) -> str:
 
 
 def _together(events: Sequence[str]) -> list[str]:
-    """Return the events that changed a message, if they belong to several monitors."""
+    """Return the events that changed a message if they belong to several monitors, else an empty list."""
     return list(events) if _monitor(events[0]) != _monitor(events[-1]) else []
 
 

@@ -1,12 +1,13 @@
-"""Monitors in shadow mode, which get copies of messages that have been passed on.
+"""Run monitors in shadow mode on copies of messages that have already been passed on.
 
 Invariants:
 - Their actions reach no message, subscriber or monitor in force; they are only reported.
-- They take at most `SHARE` of the processor's time, in slices between which the loop continues, and at most
-  `_MOST_BYTES` wait for them.
-- Messages beyond that do not reach them; this is reported, and they count as incomplete. So is a monitor that exceeds
-  its instructions for a message or tick, or has a defect; it rests until the second is over.
-- Ticks and deadlines happen after the messages that came before them.
+- They take at most `SHARE` of the processor's time, in slices; the loop continues between slices. At most `_MOST_BYTES`
+  of messages wait for them.
+- Messages beyond these limits do not reach them. This is reported, and the monitors count as incomplete. A monitor that
+  exceeds its instructions for a message or tick, or has a defect, also counts as incomplete, and rests until the second
+  is over.
+- Ticks and deadlines are processed after the messages that arrived before them.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ SHARE = 0.2
 """Seconds of processor time in a second."""
 
 _SLICE = 0.002  # seconds of processor time
-_LAST_SLICE = 0.02  # before others take over their state
+_LAST_SLICE = 0.02  # seconds, before other monitors take over their state
 _MOST_WAITING = 2000  # messages
 _MOST_BYTES = 8 << 20
 
@@ -73,7 +74,7 @@ class ShadowMonitors:
         return self._observer.incomplete
 
     def take(self, monitors: MonitorSet, outcome: Outcome) -> None:
-        """Use these monitors from now on; `outcome` is that of their start."""
+        """Use these monitors from now on; `outcome` is the outcome of their start."""
         self._monitors = monitors
         self._observer.keep(
             [monitor.name for monitor in monitors.shadowed], list(monitors.began), self._now()
@@ -83,7 +84,7 @@ class ShadowMonitors:
         self.schedule()
 
     def understand(self, resource: str, objection: str) -> None:
-        """Note whether the messages of a topic or service can be read, and if not, why."""
+        """Note why the messages of a topic or service cannot be read; an empty objection means that they can."""
         if not objection:
             self._foreign.discard(resource)
             return
@@ -123,7 +124,7 @@ class ShadowMonitors:
             self._timer.cancel()
 
     def schedule(self) -> None:
-        """Schedule a turn when messages wait or something is due."""
+        """Schedule a turn if messages wait, or for the time when a tick or deadline is due."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -197,7 +198,7 @@ class ShadowMonitors:
                 self._miss(shadow, NOWHERE, _TOO_LONG)
 
     def _rests(self, shadow: MonitorSet) -> bool:
-        """Whether a set has used more than its share, and has to wait for the next second."""
+        """Whether a set has used more than its share; if so, let it rest until the next second."""
         spent = shadow.late or any(monitor.context.budget < 0 for monitor in shadow.monitors)
         if spent:
             self._resting.add(shadow)

@@ -1,11 +1,11 @@
-"""Keep the state of a relay's monitors in memory that outlives the process, and read that of earlier processes.
+"""Keep the state of a relay's monitors in memory that outlives the process, and read the state of earlier processes.
 
 Invariants:
-- The state after a batch is written before a message of the batch is passed on, and before a monitor's message is
-  published: no subscriber sees an effect of a lost state.
+- The state after a batch is written before any message of the batch is passed on, and before a monitor's message is
+  published. Therefore no subscriber sees an effect of a state that can be lost.
 - Unchanged state is not written.
-- A state is reused only if nothing can have happened since: it was written since the machine started, or before an
-  orderly end of the appliance, and the machine's clock was not set. Otherwise it is `lost`, with the reason.
+- A state is reused only if it was written since the machine started, or before an orderly end of the appliance. It is
+  not reused if the machine's clock was set meanwhile. A state that is not reused is `lost`, with the reason.
 """
 
 import time
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _UNREADABLE = "its saved state cannot be read"
 _NO_ROOM = "the states of all monitors together exceed the limit"
-_STEP = 1_000_000_000  # nanoseconds: a larger difference means that the clock was set
+_STEP = 1_000_000_000  # nanoseconds; a larger difference means that the clock was set
 
 
 class _GroupHead(msgspec.Struct, array_like=True):
@@ -44,12 +44,12 @@ class _Head(msgspec.Struct, array_like=True):
     written: int
     groups: list[_GroupHead]
     lost: str = ""
-    """Why no monitor's state is kept; empty if it is."""
+    """Why no monitor's state is kept; empty if states are kept."""
 
 
 @dataclass(slots=True)
 class RecoveredState:
-    """The states that earlier processes left, the newest last, and why others are lost (key "": all)."""
+    """The states that earlier processes left, newest last, and why states are lost (by monitor; key "": all)."""
 
     groups: "list[GroupSnapshot]" = field(default_factory=list)
     lost: dict[str, str] = field(default_factory=dict)
@@ -57,20 +57,20 @@ class RecoveredState:
 
 @dataclass(eq=False, slots=True)
 class _Entry:
-    """A group of monitors and its section; `base` and `cells` are as last written."""
+    """A group of monitors and its section; `base` and `cells` hold the bytes last written."""
 
     group: "MonitorGroup"
     section: int = 0
     base: bytes = b""
     cells: bytes | None = None
     refused: bool = False
-    """Whether there is no room for the state, so that it is lost when the process ends."""
+    """Whether the memory has no space for the state; the state is then lost when the process ends."""
     slices: "list[tuple[str, SliceParts, list[bytes]]]" = field(default_factory=list)
-    """For each parametric specification: its parts, which have the next sections, and their bytes as last written."""
+    """For each parametric specification: name, parts (stored in the next sections), and their bytes as last written."""
 
 
 class StateKeeper:
-    """The memory of one relay; `earlier` memories of the last appliance are read while `own` is empty."""
+    """Keeps the state of one relay in `own`; if `own` is empty at the start, reads the `earlier` memories instead."""
 
     def __init__(self, given: StateGiven, own: Memory, earlier: Sequence[Memory] = ()) -> None:
         self._given = given
@@ -85,7 +85,7 @@ class StateKeeper:
         """Return the difference between the clock of monitors and the machine's monotonic clock, in nanoseconds."""
         return self._given.offset
 
-    # --- what an earlier process left ---
+    # --- state that an earlier process left ---
 
     def recovered(self) -> RecoveredState | None:
         """Return the states that earlier processes left; None if nothing was kept."""
@@ -95,7 +95,7 @@ class StateKeeper:
             reason = self._distrust(head)
             if head.lost:
                 found.lost[""] = head.lost
-            lost = msgspec.msgpack.encode(reason), None  # replaces their states in older memories
+            lost = msgspec.msgpack.encode(reason), None  # replaces the groups' states in older memories
             for group, section in zip(head.groups, sections, strict=False):
                 found.groups.append((group.monitors, bytes(group.cells), *(lost if reason else section)))
         return found if heads or found.lost else None
@@ -123,7 +123,7 @@ class StateKeeper:
             return "the machine's clock was set back while the appliance was stopped"
         return ""
 
-    # --- what is kept ---
+    # --- kept state ---
 
     def take(self, monitors: "MonitorSet") -> None:
         """Keep the state of these monitors from now on."""
@@ -172,7 +172,7 @@ class StateKeeper:
                 self._lay_out()
 
     def _keep_slices(self, entry: _Entry) -> bool:
-        """Write the parts of slices that have changed; return False if one has no room."""
+        """Write the parts of slices that have changed; return False if one does not fit."""
         first, fits = entry.section + 1, True
         for _, parts, written in entry.slices:
             for number, data in parts.changed().items():
@@ -225,7 +225,7 @@ def _parts(monitors: "MonitorSet", group: "MonitorGroup") -> "list[tuple[str, Sl
 
 
 def _sections(entry: _Entry) -> list[tuple[bytes, int]]:
-    """Return the sections of a group: its state, with the bytes of its cells, and the parts of its slices."""
+    """Return the sections of a group: its state with the size of its cells, then the parts of its slices."""
     home = entry.group.home
     own = [(entry.base, 0 if home is None else home.size)]
     return own + [(data, 0) for _, _, written in entry.slices for data in written]

@@ -1,12 +1,12 @@
-"""The layout of a file of fixed size that keeps the state of monitors when a relay dies; the supervisor opens it.
+"""Lay out a file of fixed size that keeps monitors' state when a relay dies; the supervisor opens the file.
 
-It has a magic number, a byte that names the valid half (1, 2; 0: none), and two halves. A half has a `head` (the
-writer's data), a table and *sections*: two places for the `base` state of a group of monitors and two for its `cells`,
-with one byte that says which are valid. `lay_out` writes the invalid half and then the one byte; `write_base` and
-`write_cells` write the invalid place and then the byte of their section. So a process that is killed at any point
-leaves the state before or after a write: stores of one thread become visible in order, and a byte is stored as a whole.
-
-After a power cut the order is lost: the reader checks by the head whether the machine has restarted since.
+The file has a magic number, a byte with the valid half (1 or 2; 0: none), and two halves. A half has a `head` (the
+writer's data), a table, and *sections*. A section has two places for the `base` state of a group of monitors, two for
+its `cells`, and one byte that marks the valid places. `lay_out` writes the invalid half and then the file's byte.
+`write_base` and `write_cells` write the invalid place and then the section's byte. Stores of one thread become visible
+in order, and a byte is stored as a whole. Therefore a process killed at any point leaves the state either before or
+after a write. A power cut can lose this order, so the reader uses the head to check whether the machine has restarted
+since.
 """
 
 import mmap
@@ -21,18 +21,18 @@ MOST_SECTIONS = 100_000
 _START = 16
 _ROOT = len(MAGIC)
 _HEAD = struct.Struct("<II")  # length of the head, number of sections
-_ROW = struct.Struct("<III")  # of a section: its start in its half, room for `base`, bytes of `cells`
+_ROW = struct.Struct("<III")  # for a section: its start in its half, space for `base`, size of `cells`
 _LENGTH = struct.Struct("<I")
-_FLAGS = 16  # bytes before the places of a section: its byte, and the lengths of both bases from byte 8 on
+_FLAGS = 16  # bytes before the places of a section: the section's byte, and from byte 8 on the lengths of both bases
 _BASE, _CELLS, _HAS_CELLS = 1, 2, 4
 _LEAST_ROOM, _MOST_SPARE = 256, 8192
 
 Memory = Any
-"""The memory that slices read and write: a view of a mapped file."""
+"""A memory that slicing reads and writes: a view of a mapped file."""
 
 
 class StoredState(NamedTuple):
-    """The content of a memory: the head, and each section's base, with its cells if these are newer."""
+    """The content of a memory: the head, and each section's base, with its cells if they are newer than the base."""
 
     head: bytes
     sections: list[tuple[bytes, bytes | None]]
@@ -47,7 +47,7 @@ class StateMemory:
         self._sections: list[_Section] = []
 
     def lay_out(self, head: bytes, sections: Sequence[tuple[bytes, int]]) -> bool:
-        """Write a new half with these bases and room for their cells; return False if there is not enough room."""
+        """Write a new half with these bases and space for cells of these sizes; return False if they do not fit."""
         half = (len(self._memory) - _START) // 2
         rows, at = [], _HEAD.size + len(head) + _ROW.size * len(sections)
         for base, cells in sections:
@@ -71,7 +71,7 @@ class StateMemory:
         return True
 
     def write_base(self, section: int, base: bytes) -> bool:
-        """Keep a section's whole state; return False if the section has no room for it."""
+        """Keep a section's whole state; return False if the state does not fit in the section."""
         return self._sections[section].write_base(base)
 
     def write_cells(self, section: int, cells: bytes) -> None:
@@ -91,7 +91,7 @@ class _Section:
         self._size = cells
 
     def begin(self, base: bytes) -> None:
-        """Write the first base, before the half is valid."""
+        """Write the first base while the half is still invalid."""
         self._put(0, base)
         self._memory[self._at] = self._flags = 0
 

@@ -1,9 +1,9 @@
-"""The processor time of the next message of a publication, or of a service's client.
+"""The processor time that the next message of a publication, or of a service's client, may take.
 
-After a message that used up its budget and was cut off, the next ones have a tenth of it for four seconds, as their
-sender may send more like it. If another one is cut off soon after that, the time doubles, up to 16 seconds. Messages
-that are cut off within that time do not prolong it. Hosts that the policy does not name share one budget, because each
-of many addresses could send such a message.
+A message that uses up its budget is cut off. For the next four seconds, messages get a tenth of the budget, because
+their sender may send more such messages. If a message is cut off soon after that time, the next reduction lasts twice
+as long, up to 16 seconds. A message that is cut off during a reduction does not prolong it. Hosts that the policy does
+not name share one budget, because each of many addresses could send such a message.
 """
 
 from rosmop.runtime.action_context import FUEL_PER_SECOND
@@ -14,7 +14,7 @@ _REDUCED = 0.1
 
 
 class TimeBudget:
-    """The part of the time budget for messages of one point; times are nanoseconds of the monitors' clock."""
+    """The fraction of the time budget for messages of one point; times are nanoseconds of the monitors' clock."""
 
     __slots__ = ("_length", "_until")
 
@@ -23,11 +23,11 @@ class TimeBudget:
         self._until = 0
 
     def part(self, now: int) -> float:
-        """Return the part of the budget that a message has now."""
+        """Return the fraction of the budget that a message gets now."""
         return _REDUCED if now < self._until else 1.0
 
     def fuel(self, now: int, budget: float) -> int:
-        """Return the instructions that a module may use for a message now, for a budget in seconds."""
+        """Return the number of instructions that a module may use for a message now; `budget` is in seconds."""
         return int(FUEL_PER_SECOND * budget * self.part(now))
 
     def cut(self, now: int) -> None:
@@ -37,5 +37,5 @@ class TimeBudget:
             self._until = now + self._length
 
     def recovered(self, now: int) -> bool:
-        """Whether as much time has passed since the last reduction as it lasted."""
+        """Whether the time since the end of the last reduction is at least as long as the reduction."""
         return now >= self._until + self._length

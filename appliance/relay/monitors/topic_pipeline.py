@@ -1,10 +1,10 @@
 """The path of one publication's messages through the monitors.
 
-The fast path takes many messages of a batch together if none needs a report; the engine takes the others one by one.
-Unchanged messages leave in the buffer in which they came.
+The fast path takes many messages of a batch together if none needs a report. The engine takes the others one by one.
+Unchanged messages stay in the buffer in which they arrived.
 
-A message that comes alone loses most time to cold caches. So the options of batches are prepared once (`_prepare`),
-stay valid until something changes (`Interceptor.preparation`), and counts are added up for a second.
+A message that comes alone loses most time to cold caches. Therefore the options of batches are prepared once
+(`_prepare`) and stay valid until something changes (`Interceptor.preparation`). Counts are added up for a second.
 
 The rest of a batch that exceeds the publisher's quantum (`over`) waits for its next turn (`Batch.left`).
 """
@@ -45,7 +45,7 @@ class TopicPipeline:
         self._source = interceptor.senders.number(point)
 
     def through(self, batch: Batch) -> Batch | None:
-        """Keep the monitors' state, and return the frames that go on; None if none does."""
+        """Pass a batch through the monitors, keep their state, and return the frames to pass on (None: no frames)."""
         judged = self._judged(batch)
         self._interceptor.keep(self._point[1])
         return judged
@@ -103,7 +103,7 @@ class TopicPipeline:
         return progress.result()
 
     def _walk(self, monitors: MonitorSet, lane: FastLane, progress: BatchProgress) -> bool:
-        """Pass messages through the fast path for a quantum; return False if the engine has to take the next one."""
+        """Pass messages through the fast path for a quantum; return False if the engine must take the next message."""
         interceptor = self._interceptor
         if lane is self._defect or not monitors.lane_ready(lane, progress.time):
             return False
@@ -133,7 +133,7 @@ class TopicPipeline:
         return walked.paused or progress.position == progress.end
 
     def _report(self, walked: BatchResult, progress: BatchProgress) -> None:
-        """Report output."""
+        """Report the log lines of a walk."""
         interceptor, monitors = self._interceptor, self._interceptor.monitors
         assert monitors is not None  # noqa: S101  they have put it out
         head = HEAD if monitors.stamped(self._point[1]) else 0
@@ -170,7 +170,7 @@ class TopicPipeline:
         return prepared, counts
 
     def _one_by_one(self, monitors: MonitorSet, progress: BatchProgress, count: int) -> None:
-        """Give messages to the engine: `count`, or as many as there is time for."""
+        """Pass up to `count` messages to the engine, or fewer if the quantum is used up."""
         interceptor, point, now, observer = (
             self._interceptor,
             self._point,
@@ -202,7 +202,7 @@ class TopicPipeline:
             result = outcome.result
             if result == "dropped":
                 if outcome.overwritten:
-                    outcome.restore(body)  # the report has the message as received
+                    outcome.restore(body)  # the report contains the message as received
                 observer.dropped(outcome, point, body, observed)
                 progress.cut(position, following)
             elif result == "changed":

@@ -1,15 +1,15 @@
 """Find whole TCPROS frames in received bytes; every relayed message passes here.
 
-A frame is a 4-byte little-endian length and that many bytes. `FrameReceiver` provides the buffer to receive into, and
+A frame is a 4-byte little-endian length, followed by that many bytes. `FrameReceiver` provides the receive buffer, and
 returns all whole frames after each read as one `Batch`, without copying them:
 
-- A batch has at most `MOST` frames of unequal length, because its users visit each. The rest of a read follows
-  (`FrameReceiver.more`), at once or at the publisher's next turn.
-- Small frames are received into a scratch area that all receivers share, in the memory of the monitors' module if there
-  is one; only the incomplete frame at the end of a read is copied.
-- A frame beyond `LARGE` gets an area of its own. An area of up to 8 MiB is reused for the next large frame unless a
-  queue has kept it; a larger one is anonymous memory, so a declared length that is never sent costs only address space.
-  While memory is short, no area is kept.
+- A batch has at most `MOST` frames of unequal length, because its users visit each of them. `FrameReceiver.following`
+  returns the rest of a read, at once or at the publisher's next turn.
+- Small frames are received into a scratch area that all receivers share. If monitors run, this area is in the memory of
+  their module. Only the incomplete frame at the end of a read is copied.
+- A frame larger than `LARGE` gets its own area. An area of up to 8 MiB is reused for the next large frame, unless a
+  queue has kept it. A larger area is anonymous memory, so a declared length that is never sent costs only address
+  space. While memory is short, no area is reused.
 
 Frames are passed on whole: the data sent to subscribers always ends with a whole frame.
 """
@@ -23,17 +23,17 @@ from appliance.relay.transport.memory import HostMemory
 from roswire.errors import LimitExceededError
 
 SMALL = 4 << 10
-"""Bytes of unfinished data on a connection that are never refused."""
+"""Unfinished data up to this size (bytes) on a connection is never refused."""
 
 LARGE = 128 << 10
 SCRATCH = 512 << 10
-_KEEP_AREA = 8 << 20  # a camera's frame: new memory for each frame costs four times the rest
+_KEEP_AREA = 8 << 20  # a camera image fits; new memory for each image costs four times all other work
 
 LITTLE = 8
-"""Data below an eighth of its buffer is copied, so that the buffer can be freed."""
+"""Data is copied if its buffer is at least this many times larger, so that the buffer can be freed."""
 
 MOST = 4096
-"""Frames of unequal length in one batch."""
+"""The most frames of unequal length in one batch."""
 
 _MANY = 4  # frames
 _FAR = 4096  # bytes
@@ -47,10 +47,10 @@ _unpack_length = _LENGTH.unpack_from
 class Batch:
     """Consecutive whole frames in a buffer that is reused unless they are kept.
 
-    `last` is where the last of the `messages` frames begins (None: it must be searched for); `stride` is the bytes of
-    each frame if all are known to be equally long, else 0. `first` is the number of the first frame in its publication.
-    `judged` is when monitors got them, by their clock (0: they did not). `left` is the number of messages at the end
-    that monitors had no time for.
+    `last` is the offset of the last of the `messages` frames (None: not known yet). `stride` is the size of each frame
+    if all are known to be equally long, else 0. `first` is the number of the first frame in its publication. `judged`
+    is the time when monitors got the frames, by the monitors' clock (0: never). `left` is the number of messages at the
+    end that monitors had no time for.
     """
 
     __slots__ = ("_kept", "_owned", "first", "judged", "last", "left", "messages", "stride", "view")
@@ -74,13 +74,13 @@ class Batch:
         return self._kept is not None
 
     def keep(self) -> memoryview:
-        """Return the frames in memory that does not change; copied at most once."""
+        """Return the frames in memory that does not change; copy them at most once."""
         if self._kept is None:
             self._kept = self.view if self._owned else memoryview(bytes(self.view))
         return self._kept
 
     def rest(self, sent: int) -> memoryview:
-        """Return the bytes after the first `sent`, in memory that does not change; copied if they are few."""
+        """Return the bytes after the first `sent`, in memory that does not change; copy them if they are few."""
         if self._kept is None and LITTLE * (len(self.view) - sent) <= len(self.view):
             return memoryview(bytes(self.view[sent:]))
         return self.keep()[sent:]
@@ -108,7 +108,7 @@ class Batch:
         return head
 
     def tail(self, count: int) -> "Batch":
-        """Return the last frames, in memory of their own."""
+        """Return the last frames, in their own memory."""
         view = self.view[len(self.head(self.messages - count).view) :]
         tail = Batch(
             view if self._owned else memoryview(bytearray(view)), count, None, owned=True, stride=self.stride
@@ -143,11 +143,11 @@ class Scratch:
         self.move(None)
 
     def move(self, area: memoryview | None) -> None:
-        """Use this area from the next read on, or (None) a new one."""
+        """Use this area from the next read on; with None, use a new area."""
         self.area = memoryview(mmap.mmap(-1, SCRATCH)) if area is None else area
 
     def hold(self, batch: Batch) -> Batch:
-        """Return the batch copied into the area if that is large enough: monitors are faster there."""
+        """Return the batch, copied into the area if it fits, because monitors are faster there."""
         size = len(batch.view)
         if size > len(self.area):
             return batch
@@ -158,7 +158,7 @@ class Scratch:
 
 
 class FrameReceiver:
-    """A receiver of frames. Repeat: call `buffer()`, receive into it, call `received(count)`, deliver."""
+    """Receives frames. Repeat: call `buffer()`, receive into it, call `received(count)`, deliver the batch."""
 
     def __init__(self, scratch: Scratch, limit: int, share: HostMemory) -> None:
         self._scratch = scratch
@@ -189,10 +189,10 @@ class FrameReceiver:
         return scratch
 
     def received(self, count: int) -> Batch | None:
-        """Return the frames that are complete with `count` more bytes in the buffer.
+        """Take `count` received bytes in the buffer; return the frames that are now complete.
 
         The batch is valid until the next call of `buffer`. Raises `LimitExceededError` for a frame beyond the limit,
-        and when the publisher's host has no memory left for an unfinished one.
+        and if the publisher's host has no memory left for an unfinished frame.
         """
         self._idle = False
         if self._area is not None:
@@ -201,11 +201,11 @@ class FrameReceiver:
 
     @property
     def more(self) -> bool:
-        """Whether received frames are left: take them by `following` before calling `buffer`."""
+        """Whether received frames are left; take them with `following` before calling `buffer`."""
         return self._unwalked is not None
 
     def following(self) -> Batch | None:
-        """Return the next received frames; raises as `received`."""
+        """Return the next received frames. Raises the same errors as `received`."""
         unwalked, self._unwalked = self._unwalked, None
         if unwalked is None:
             return None
@@ -219,7 +219,7 @@ class FrameReceiver:
         return self._walk(area, size, owned=False)
 
     def set_aside(self) -> None:
-        """Copy the frames that `following` will take, because other connections are read before."""
+        """Copy the frames that `following` will return, because other connections use the buffer first."""
         if self._unwalked is not None and not self._aside:
             self._unwalked = memoryview(bytearray(self._unwalked))
             self._aside = len(self._unwalked)
@@ -231,7 +231,7 @@ class FrameReceiver:
         return self._filled
 
     def trim_buffer(self) -> None:
-        """Free an area without a large frame since the last call; called once a second."""
+        """Free the area if no data arrived since the last call; called once a second."""
         if self._idle and not self._filled and self._area is not None:
             self.abandon()
         self._idle = True
@@ -286,16 +286,16 @@ class FrameReceiver:
         return Batch(buffer[:position], messages, last, owned=owned, stride=stride)
 
     def _begin_area(self, need: int, start: memoryview) -> None:
-        """Go on in an area of its own with a frame of `need` bytes, of which `start` has come."""
+        """Continue a frame of `need` bytes in its own area; `start` is the part received so far."""
         area = _new_area(need)
         area[: len(start)] = start
         self._area, self._target, self._filled = area, need, len(start)
         self._count(len(start))
 
     def _received_in_area(self, area: memoryview, count: int) -> Batch | None:
-        """Receive one frame at a time: reads end where the frame ends, or where an equally long one would."""
+        """Receive one frame at a time: a read ends with the frame, or where a next frame of equal length would end."""
         self._filled += count
-        if self._filled > self._counted:  # memory that was filled once stays with the area
+        if self._filled > self._counted:  # memory that was once filled stays allocated with the area
             self._count(self._filled)
         if self._filled < 4:
             return None
@@ -320,9 +320,9 @@ class FrameReceiver:
 
 
 def equal_frames(buffer: memoryview, end: int) -> tuple[int, int]:
-    """Return the length and number of the frames in `buffer[:end]`, if they are many and all equally long.
+    """Return the size and number of the frames in `buffer[:end]` if they are many and equally long, else (0, 0).
 
-    (0, 0) if not. Comparing all lengths at once is cheaper than going from frame to frame.
+    Comparing all lengths at once is cheaper than going from frame to frame.
     """
     if end < 4:
         return 0, 0
@@ -332,10 +332,10 @@ def equal_frames(buffer: memoryview, end: int) -> tuple[int, int]:
         return 0, 0
     whole = count * stride
     if end - whole >= 4 and _unpack_length(buffer, whole)[0] + 4 <= end - whole:
-        return 0, 0  # a whole frame that is shorter follows
+        return 0, 0  # a shorter whole frame follows
     width = gcd(stride, 4)
     column, step = buffer[:whole].cast(_COLUMNS[width]), stride // width
-    for part in range(4 // width):  # of each length, compared with that of the frame before
+    for part in range(4 // width):  # parts of each length, compared with the length of the previous frame
         if column[part + step :: step] != column[part:-step:step]:
             return 0, 0
     return stride, count
@@ -367,7 +367,7 @@ def boundary_at(view: memoryview, offset: int) -> tuple[int, int]:
 
 
 def _new_area(size: int) -> memoryview:
-    """Return memory for one large frame: of the heap, or beyond `_KEEP_AREA` anonymous memory."""
+    """Return memory for one large frame: from the heap, or anonymous memory for more than `_KEEP_AREA` bytes."""
     return memoryview(bytearray(size) if size <= _KEEP_AREA else mmap.mmap(-1, size))
 
 

@@ -15,11 +15,11 @@ from appliance.relay.loop import READ, WRITE, EventLoop, LoopTimer
 class LoopLink:
     """One end of a lifeline or link. `ended(reason)` is called once, when the link fails.
 
-    A message of another link, or a backlog beyond its limit, ends it like the other end's death. A restatement of
-    thousands of messages is carried out a quantum at a time, so that it delays nothing else.
+    A message that belongs to another link, or a backlog beyond its limit, ends the link as if the other end had died. A
+    restatement of thousands of messages is carried out one quantum at a time, so that it delays nothing else.
 
-    When `received` returns True, that message and those behind it wait for `go_on`. Nothing more is read until then. So
-    waiting messages are bounded here by one `Channel.receive`, and at the other end by the limit of its backlog.
+    If `received` returns True, that message and the messages behind it wait for `go_on`, and nothing more is read until
+    then. Therefore at most one `Channel.receive` of messages waits here, and the other end's backlog has its own limit.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class LoopLink:
         loop.watch(channel.fileno(), READ, self._ready)
 
     def send(self, message: Message) -> None:
-        """Send now, or when the other end reads; nothing is sent after the end."""
+        """Send the message now, or when the other end reads; do nothing after the link has ended."""
         if not self._live:
             return
         try:
@@ -53,14 +53,14 @@ class LoopLink:
             self._watch()
 
     def catch_up(self) -> None:
-        """Carry out everything that the other end has sent, unless messages wait."""
+        """Carry out everything that the other end has sent, unless messages wait for `go_on`."""
         if self._live and not self._waits:
             if self._end_of_link is None:
                 self._take_in()
             self._finish()
 
     def go_on(self) -> None:
-        """Carry out the messages that wait, and those that have come since."""
+        """Carry out the waiting messages, and those that have arrived since."""
         if self._waits:
             self._waits = False
             self._watch()
@@ -92,7 +92,7 @@ class LoopLink:
             self._carry_out()
 
     def _take_in(self) -> None:
-        """Read the messages that have come; at the end of the link, carry them out first."""
+        """Read the arrived messages. If the link has ended, carry them out before reporting the end."""
         try:
             self._arrived += self._channel.receive()
         except (ChannelClosedError, msgspec.DecodeError) as error:
@@ -115,7 +115,7 @@ class LoopLink:
         self._slice = self._loop.after(0, self._carry_out) if more else None
 
     def _finish(self) -> None:
-        """Carry out everything that need not wait, then end a link that has nothing more."""
+        """Carry out all messages that need not wait; then report the end of a link that has ended."""
         while self._arrived and not self._waits:
             self._carry_out()
         if self._end_of_link is not None and not self._arrived:

@@ -1,15 +1,15 @@
-"""Divides the relay's memory among hosts.
+"""Divide the relay's memory among hosts.
 
 There are four pools: incomplete frames, requests and replies; queues for slow subscribers and clients; latched
-messages; connection headers. Frames count for the host that sends them, queues for the host that they wait for.
-Queues cannot use the memory of frames.
+messages; connection headers. A frame counts for the host that sends it, a queue for the host that is slow. The pools
+are separate: queues cannot use the memory for frames.
 
 Invariants, besides those of `Pool`:
 
-1. A host gets no more while it holds as much as is free. A single host can have half; each of *n* greedy hosts has one
-   part of *n* + 1, and one part stays free for the next host.
-2. Memory beyond a host's quota is freed when data of that host moves, or at the next check (once a second). Latched
-   messages are freed when a host with less wants to latch one.
+1. A host gets no more memory once it holds as much as is free. So a single host can have half of a pool. Each of *n*
+   greedy hosts gets 1/(*n* + 1) of the pool, and the same amount stays free for the next host.
+2. Memory beyond a host's quota is freed when data of that host moves, or at the next check (once a second). A latched
+   message is dropped when a host that holds less memory needs to latch one.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ class HostMemory:
         return self._pool.held(self._host)
 
     def add(self, size: int) -> None:
-        """Count `size` more bytes of this host (below 0: fewer)."""
+        """Count `size` more bytes for this host; a negative `size` counts fewer."""
         if size > 0:
             self._pool.charge(self._host, size)
         elif size:
@@ -107,13 +107,13 @@ class HeldBytes:
         self._size = 0
 
     def set(self, size: int) -> None:
-        """Set how many bytes there are now."""
+        """Set how many bytes the connection holds now."""
         self.share.add(size - self._size)
         self._size = size
 
 
 class StallDetector:
-    """A detector of unfinished transfers without progress for some seconds."""
+    """Detects unfinished transfers that make no progress for some seconds."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
@@ -121,7 +121,7 @@ class StallDetector:
         self._since = 0.0
 
     def seen(self, held: int, now: float) -> bool:
-        """Set the bytes held now (0: nothing is unfinished); return whether they have been the same for too long."""
+        """Set the bytes held now (0: nothing is unfinished); return whether the number has not changed for too long."""
         if not held or held != self._held:
             self._held, self._since = held, now
             return False

@@ -1,17 +1,18 @@
-"""Rate limits of the policy, in messages and bytes. No I/O; time is given.
+"""Apply the policy's rate limits, in messages and bytes per second. No I/O; callers pass the time.
 
-A limit allows a burst of `BURST` seconds. A message passes while neither unit is used up, even if it is larger than
-what is left; later messages make up for it. So a publisher within the limit loses nothing, large messages pass, and the
-average is kept. Messages beyond a limit are dropped.
+A limit allows a burst of `BURST` seconds. A message passes while neither unit is used up, even if the message is larger
+than the rest; later messages pay for the excess. So a publisher within the limit loses nothing, large messages pass,
+and the average holds. Messages beyond a limit are dropped.
 
-Several holders share a limit (`SharedRateLimit.of`): the hosts that publish a topic, the nodes of one host. Invariants:
+Several holders share a limit (`SharedRateLimit.of`), such as the hosts that publish a topic, or the nodes of one host.
+Invariants:
 
-1. Together they get what the limit allows: each an equal part, in its own store. The overflow of a full store goes in
-   equal parts to the others (max-min fairness), and when all are full to a common store.
-2. A holder takes from its own store first, then from the common one. So a holder within its equal part loses nothing
-   because of others, which can use what it does not.
-3. Only a holder that sent too large a message has a store below zero. If it leaves, its debt stays in the common store,
-   and the limit is kept until it is paid: reconnecting does not help.
+1. Together the holders get what the limit allows. Each gets an equal part, in its own store. When a store is full, its
+   overflow goes to the others in equal parts (max-min fairness); when all are full, it goes to a common store.
+2. A holder takes from its own store first, then from the common store. So a holder within its equal part loses nothing
+   because of others, and the others can use what it leaves.
+3. A store is below zero only after its holder sent a message that was too large. If that holder leaves, its debt stays
+   in the common store, and the limit is kept until the debt is paid, so reconnecting does not help.
 """
 
 from collections.abc import Callable, Iterator
@@ -29,23 +30,23 @@ Part = Literal["publisher", "subscriber", "topic"]
 BURST = 0.5
 """Seconds' worth of messages that may come at once."""
 
-_FILL_SECONDS = 20e-6  # for each holder: a limit with thousands of holders is filled less often
+_FILL_SECONDS = 20e-6  # between two fills, for each holder: a limit with many holders is filled less often
 _FEW_FLOWS = 64
 _MOST_OWING = 4096  # limits without holders whose debt is not paid
 
 
 class _Store:
-    """The rest of one unit of a limit (messages or bytes), for each holder and in common."""
+    """The unused amount of one unit (messages or bytes) of a limit, for each holder and in common."""
 
     def __init__(self, rate: float, least: float) -> None:
-        """`rate` is per second; each holder has room for at least `least`."""
+        """`rate` is per second; each holder's store has room for at least `least`."""
         self.rate = rate
         self._least = least
         self._own: dict[str, float] = {}
         self._common = self._most
 
     def set(self, rate: float) -> None:
-        """Set the limit; after no limit, it begins full."""
+        """Set the limit; after a rate of 0 (no limit), all stores start full."""
         before, self.rate = self.rate, rate
         if not before:
             self._own, self._common = dict.fromkeys(self._own, self._room), self._most
@@ -53,7 +54,7 @@ class _Store:
         self._common = min(self._common, self._most_common)
 
     def hold(self, names: "WeakValueDictionary[str, RateAllowance]") -> None:
-        """Set the holders; a new holder is filled from the common store, as far as that lasts."""
+        """Set the holders; fill the store of a new holder from the common store, as far as possible."""
         for name in [name for name in self._own if name not in names]:
             self._common += self._own.pop(name)
         new = [name for name in names if name not in self._own]
@@ -65,7 +66,7 @@ class _Store:
         self._common = min(self._common, self._most_common)
 
     def fill(self, seconds: float) -> None:
-        """Divide what the limit allows in `seconds`."""
+        """Divide the amount that the limit allows in `seconds` among the holders."""
         left, room = seconds * self.rate, self._room
         for rank, name in enumerate(sorted(self._own, key=self._own.__getitem__, reverse=True)):
             given = min(left / (len(self._own) - rank), room - self._own[name])
@@ -74,11 +75,11 @@ class _Store:
         self._common = min(self._common + left, self._most_common)
 
     def left(self, name: str) -> float:
-        """Return what this holder may use now."""
+        """Return the amount that this holder may use now."""
         return self._own[name] + max(self._common, 0.0)
 
     def take(self, name: str, amount: float) -> None:
-        """Charge this holder."""
+        """Charge an amount to this holder."""
         own = min(amount, max(self._own[name], 0.0))
         common = min(amount - own, max(self._common, 0.0))
         self._common -= common
@@ -104,7 +105,7 @@ class _Store:
         return self._most / 2 if self._own else self._most
 
     def _give_back(self) -> None:
-        """Move what exceeds a holder's room to the common store."""
+        """Move each holder's excess over its room to the common store."""
         room = self._room
         for name, own in self._own.items():
             if own > room:
@@ -123,7 +124,7 @@ class SharedRateLimit:
         self._holders = 0
 
     def set(self, limit: FlowLimit, now: float) -> None:
-        """Change the limit; what is left of the old one counts."""
+        """Change the limit; the unused amount of the old limit carries over."""
         if limit != self._limit:
             self._fill(now)
             self._limit = limit
@@ -131,7 +132,7 @@ class SharedRateLimit:
             self._bytes.set(limit.bytes)
 
     def of(self, name: str) -> "RateAllowance":
-        """Return the part of this holder, which counts as a holder while the part is referenced."""
+        """Return this holder's allowance; the name counts as a holder while the allowance is referenced."""
         share = self._shares.get(name)
         if share is None:
             share = self._shares[name] = RateAllowance(self, name)
@@ -139,7 +140,7 @@ class SharedRateLimit:
         return share
 
     def room(self, name: str, batch: Batch, most: int, now: float) -> int:
-        """Return how many of the first `most` messages of a batch of this holder may pass."""
+        """Return how many of the first `most` messages in this holder's batch may pass."""
         self._fill(now)
         if self._limit.messages:
             most = min(most, max(0, ceil(self._messages.left(name))))
@@ -158,7 +159,7 @@ class SharedRateLimit:
         return bool(self._shares)
 
     def paid(self, now: float) -> bool:
-        """Whether everything that was used has been refilled, so that a new limit would be the same."""
+        """Whether everything used has been refilled, so that a new limit would not differ."""
         self._fill(now)
         return self._messages.full and self._bytes.full
 
@@ -196,9 +197,9 @@ class RateAllowance:
 
 
 class RateLimits:
-    """The limits that several connections share, by name: of a topic, of a host's publishers, of a subscriber.
+    """The limits that several connections share, by name: for a topic, a host's publishers, or a subscriber.
 
-    Each is kept while a connection holds a part of it, and until everything that was used has been refilled.
+    A limit is kept while a connection holds an allowance, and until everything used has been refilled.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -207,7 +208,7 @@ class RateLimits:
         self._most = _FEW_FLOWS
 
     def of(self, limit: FlowLimit, *names: str, holder: str = "") -> RateAllowance | None:
-        """Return a holder's part in the limit of these names, which is set to `limit`; None without a limit."""
+        """Set the limit of these names to `limit`, and return the holder's allowance; None without a limit."""
         flow = self.flows.get(names)
         if limit == UNLIMITED:
             self.flows.pop(names, None)
@@ -221,7 +222,7 @@ class RateLimits:
         return flow.of(holder)
 
     def _forget(self) -> None:
-        """Forget refilled limits without a holder, each time the number of limits has doubled; then the oldest."""
+        """Forget unheld limits (refilled ones first, then the oldest) each time the number of limits has doubled."""
         if len(self.flows) < self._most:
             return
         now = self._clock()
@@ -233,10 +234,10 @@ class RateLimits:
 
 
 class PublicationRateLimit:
-    """The limits of one publication: its host's on this topic, and the topic's.
+    """The limits of one publication: the limit of its host on this topic, and the limit of the topic.
 
-    `dropped(part, messages, size)` is called with what they dropped. The last message of a latching publisher is not
-    lost: it waits (`later`) until it may pass or another one comes.
+    `dropped(part, messages, size)` is called with the number and bytes of dropped messages. The last message of a
+    latching publisher is not lost: it waits (`later`) until it may pass, or until the next message comes.
     """
 
     def __init__(self, share: HostMemory, dropped: Callable[[Part, int, int], None]) -> None:
@@ -249,13 +250,13 @@ class PublicationRateLimit:
         """Whether there are any limits."""
 
     def set(self, own: RateAllowance | None, together: RateAllowance | None) -> None:
-        """Set the limits: of its host, and of its topic."""
+        """Set the limit of the publication's host, and the limit of its topic."""
         self._own = own
         self._together = together
         self.limits = self._own is not None or together is not None
 
     def passing(self, batch: Batch, now: float, *, latching: bool) -> Batch | None:
-        """Return the first messages of a batch, as many as may pass; None if none may."""
+        """Return the messages at the start of a batch that may pass; None if none may."""
         self.forget()
         part = batch
         for name, flow in self._flows():

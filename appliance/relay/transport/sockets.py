@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from appliance.relay.loop import HANGUP, READ, WRITE, EventLoop
 
-# Not every process may choose cubic; every kernel allows reno to an unprivileged one. With bbr, the default of some
-# systems, large messages over loopback and a bridge are about half as fast as with either.
+# Not every process may choose cubic, but every kernel allows reno to unprivileged processes. With bbr, the default of
+# some systems, large messages over loopback and a bridge are about half as fast as with cubic or reno.
 _CONGESTION = (b"cubic", b"reno")
 _KEEPALIVE = ((socket.TCP_KEEPIDLE, 60), (socket.TCP_KEEPINTVL, 10), (socket.TCP_KEEPCNT, 9))
 _READ_SIZE = 64 << 10
@@ -35,7 +35,7 @@ def congestion_control() -> str:
 
 
 def begin_connect(host: str, port: int) -> socket.socket:
-    """Return a socket that is connecting to the address `host`. Raises `OSError` when it cannot."""
+    """Return a socket that is connecting to the IP address `host`. Raises `OSError` if that fails at once."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         socket.inet_pton(family, host)
@@ -56,9 +56,10 @@ def begin_connect(host: str, port: int) -> socket.socket:
 class BufferedSocket:
     """A connected (or connecting) socket with a write buffer, for everything except the fast path.
 
-    `received(data)` is called with what arrives and with b"" once at the end; `opened()` when a connecting socket is
-    connected; `drained()` whenever the kernel has taken the last waiting byte; `broken(reason)` once, when the socket
-    fails. After `close` or `take` nothing is called. `payer` is charged.
+    `received(data)` is called with arriving bytes, and once with b"" at the end of the connection. `opened()` is called
+    when a connecting socket is connected, and `drained()` whenever the kernel has accepted the last waiting byte.
+    `broken(reason)` is called once, when the socket fails. After `close` or `take`, no callback is called. The socket's
+    processor time is charged to `payer`.
     """
 
     def __init__(
@@ -85,11 +86,11 @@ class BufferedSocket:
 
     @property
     def backlog(self) -> int:
-        """Return the bytes that the kernel has not taken yet."""
+        """Return the number of bytes that the kernel has not accepted yet."""
         return len(self._outgoing)
 
     def send(self, data: bytes) -> None:
-        """Write now, or when the socket takes it."""
+        """Send the data now, or when the socket accepts it."""
         if not self._live:
             return
         if not self._outgoing and self._opened is None:
@@ -117,7 +118,7 @@ class BufferedSocket:
             self._socket.shutdown(socket.SHUT_WR)
 
     def take(self) -> socket.socket:
-        """Return the socket, which the caller owns from now on; no bytes may be waiting."""
+        """Return the socket, which the caller owns from now on; call this only when no bytes wait."""
         self._live = False
         self._loop.unwatch(self._socket.fileno())
         return self._socket
