@@ -1,10 +1,10 @@
 """Limit the bytes of audit records that each host causes over time, and more strictly on a nearly full disk. No I/O.
 
-Each record is charged to its host, and the debt shrinks by `RATE`. Only the calls of a host above its quota
-(`AUDIT_BYTES`) wait. While only the reserve of the disk is left (`AUDIT_RESERVE`), quotas and rates are smaller, and
-the last part is for hosts with a registration. Unknown hosts are not charged: their denials are folded.
+Each record is charged to its host, and the debt shrinks by `RATE` bytes a second. Only the calls of a host above its
+quota (`AUDIT_BYTES`) wait. While only the reserve of the disk is left (`AUDIT_RESERVE`), quotas and rates are smaller,
+and the last part of the reserve is kept for registered hosts. Unknown hosts are not charged: their denials are folded.
 
-For one thread, except `folded`, `summarised` and `room`.
+Use this module from one thread only; `folded`, `summarised` and `room` may be called from any thread.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ def weight(record: AuditRecord) -> int:
 
 
 class Budget:
-    """The debts of hosts. `quota_class` returns the class of a host, `clock` monotonic seconds.
+    """The debts of hosts. `quota_class` returns the class of a host; `clock` returns monotonic seconds.
 
     `reserve` has the bounds that apply while only the reserve of the disk is left.
     """
@@ -58,7 +58,7 @@ class Budget:
         self._left: int | None = None
 
     def charge(self, record: AuditRecord) -> None:
-        """Charge a record to its host; `folded` undoes that."""
+        """Charge a record to its host; `folded` undoes the charge."""
         if record.host is not None and not record.unknown:
             self.owed.charge(record.host, weight(record))
 

@@ -50,7 +50,7 @@ def content_hash(columns: tuple[object, ...]) -> bytes:
 
 def link(previous: bytes, content: bytes) -> bytes:
     """Return the hash of a record with the content hash `content` that follows the hash `previous`."""
-    # 65 bytes; version 0.1.0 hashed more.
+    # The input has 65 bytes, so it cannot equal an input of version 0.1.0, which was always longer.
     return hashlib.sha256(previous + b"2" + content).digest()
 
 

@@ -1,7 +1,7 @@
 """Export records with their proofs: their position in the chain, up to a signed checkpoint.
 
-Each exported record has the previous hash, its own hash, and the content hashes of the following records that the
-filter omits (`then`), up to the next exported record or the signed checkpoint that seals it (`checkpoint`).
+Each exported record has the previous hash and its own hash. `then` has the content hashes of the following records that
+the filter omits. It ends at the next exported record, or at the signed checkpoint that seals the record (`checkpoint`).
 `appliance/evidence` verifies this with the public key alone.
 """
 
@@ -57,7 +57,7 @@ def evidence_line(entry: LogEntry, chain: ChainProof) -> str:
 
 
 def _placed(path: Path, entries: list[LogEntry], *, whole: bool) -> Iterator[tuple[LogEntry, ChainProof]]:
-    """Yield records with their proofs; with `whole` also the last one, which no further page follows."""
+    """Yield records with their proofs. Omit the last record, unless these are the `whole` rest of the export."""
     following = [entry.sequence for entry in entries[1:]] + ([0] if whole else [])
     with reading(path) as connection:
         connection.execute("BEGIN")
@@ -85,7 +85,7 @@ class ChainReader:
         self._before: tuple[int, str] = (-1, "")
 
     def place(self, sequence: int, following: int) -> ChainProof | None:
-        """Return the proof of a record, up to the next exported one (`following`, 0: none); None if it was removed."""
+        """Return a record's proof up to the next exported record (`following`; 0: none); None for a removed record."""
         query = "SELECT hash FROM record WHERE sequence = ?"
         row = self._connection.execute(query, (sequence,)).fetchone()
         if row is None:

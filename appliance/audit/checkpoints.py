@@ -1,8 +1,9 @@
-"""Verify the checkpoints of a log by its chain, its key, and the signer's memory.
+"""Verify the checkpoints of a log, using the log's chain, the key, and the signer's memory.
 
-A checkpoint is valid if its text is well formed and of this log, it follows the previous checkpoint, and it has the
-chain's hash at its sequence. It is proven if the expected key signed it. If the signer remembers signing the last
-checkpoints (up to `ASKED_AT_ONCE`), their missing signatures are pending; any other missing signature was removed.
+A checkpoint is valid if its text is well formed and belongs to this log, it follows the previous checkpoint, and it has
+the chain's hash at its sequence. A checkpoint is proven if the expected key signed it. A signature that the signer
+remembers may be missing because it is pending, but only for the last `ASKED_AT_ONCE` checkpoints. Otherwise the
+signature was removed.
 """
 
 import sqlite3
@@ -53,7 +54,7 @@ def read_signer_memory(directory: Path, log: str) -> SignerMemory | None:
 
 
 class CheckpointVerifier:
-    """The verification of checkpoints, in order, by the hashes of the chain."""
+    """Verifies checkpoints, in order, against the hashes of the chain."""
 
     def __init__(self, log: str, key: bytes | None, remembered: SignerMemory | None) -> None:
         self._log = log
@@ -182,7 +183,7 @@ def _held_against_chain(
         )
         return LogFinding(FindingKind.TRUNCATED, last_sequence + 1, checkpoint.sequence, message)
     if checkpoint.sequence and checkpoint.sequence not in chain:
-        return None  # the record it seals is missing, which is reported for the record
+        return None  # the sealed record is missing; the finding about that record reports it
     if checkpoint.sequence and chain[checkpoint.sequence].hex() != checkpoint.hash:
         message = (
             f"the chain at record {checkpoint.sequence} has another hash than checkpoint {checkpoint.number}:"

@@ -1,7 +1,7 @@
 """Convert records to columns of the database and back.
 
-SQLite and JSON cannot store lone surrogates (undecodable bytes), integers beyond 64 bits, and arbitrary objects: these
-are escaped, limited or stored as their `repr`. A text longer than `LONGEST_TEXT` characters is cut and marked with its
+SQLite and JSON cannot store lone surrogates (undecodable bytes), integers beyond 64 bits, or arbitrary objects. These
+are escaped, limited, or stored as their `repr`. A text longer than `LONGEST_TEXT` characters is cut and marked with its
 length. If the details exceed `LARGEST_DETAIL` bytes, only the smallest are stored, with the names of the others.
 """
 

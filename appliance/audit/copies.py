@@ -1,13 +1,14 @@
-"""Export signed checkpoints to another machine, and verify the log by these copies.
+"""Export signed checkpoints to another machine, and compare the log with these copies.
 
-Root on the appliance has the signer's key and its memory, and can rewrite the whole history with valid signatures, but
-cannot change copies on another machine. Therefore:
+Root on the appliance has the signer's key and memory, and can rewrite the whole history with valid signatures. Copies
+on another machine are out of root's reach. Therefore:
 
 1. A copy has the complete signed text and the signature, so it can be verified anywhere.
 2. A log agrees with a copy if its chain has the copy's hash at the copy's sequence.
-3. A copy with an invalid signature is a finding. Copies of other logs are listed; if all copies are of other logs, this
-   log replaced theirs, which is a finding.
-4. If all copies are of removed records, that is a finding: they prove nothing about the remaining records.
+3. A copy with an invalid signature is a finding. Copies from other logs are listed. If all copies are from other logs,
+   this log replaced another one, which is a finding.
+4. If all copies seal records that were removed since, this is a finding: they prove nothing about the remaining
+   records.
 """
 
 import json
@@ -125,7 +126,7 @@ def _parse(line: str) -> SignedCheckpoint | None:
 
 
 class CopiesVerifier:
-    """The verification of copies by the chain of the log with the id `log`; `key` must have signed them."""
+    """Verifies copies against the chain of the log with the id `log`; `key` must have signed the copies."""
 
     def __init__(self, log: str, key: bytes | None, copies: Iterable[SignedCheckpoint]) -> None:
         copies = list(copies)
@@ -191,7 +192,7 @@ class CopiesVerifier:
                 return
             here = chain.get(copy.sequence)
             if here is None:
-                continue  # the record it seals is missing, which is reported for the record
+                continue  # the sealed record is missing; the finding about that record reports it
             if here.hex() != copy.hash:
                 yield self._rewritten(copy, proven)
                 return

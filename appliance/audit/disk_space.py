@@ -23,9 +23,9 @@ class DiskSpace:
         self.left: int | None = None
 
     def look(self) -> bool | None:
-        """Check the disk if a check is due; return True if space just became scarce, False if that just ended, or None.
+        """Check the disk if a check is due; return True if space just became scarce, False if scarcity just ended.
 
-        Raises `OSError`.
+        Return None if nothing changed. Raises `OSError`.
         """
         now = time.monotonic()
         if now - self._looked < _LOOK_SECONDS:

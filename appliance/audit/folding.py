@@ -4,13 +4,13 @@ Denials, errors of peers, allowed reads, and records of a host above its budget 
 
 1. The first record of a kind is written in full; every repetition counts in exactly one summary. A record with a
    `count` counts that many times.
-2. Memory is limited: the kinds of denials are a pool (`AUDIT_KINDS`), of which all unknown hosts together get a small
-   quota, so they cannot displace hosts that the policy names. Above a host's quota, its further denials are one kind;
-   those of all unknown hosts share one. The kinds of reads are another pool (`AUDIT_READ_KINDS`). Above it, decisions
-   are written in full, because policies are learned from them.
+2. Memory is limited: the kinds of denials are a pool (`AUDIT_KINDS`). All unknown hosts together have a small quota of
+   it, so they cannot displace hosts that the policy names. Above a host's quota, all its further denials are one kind.
+   Above the quota of unknown hosts, they all share one kind. The kinds of reads are another pool (`AUDIT_READ_KINDS`).
+   When that pool is full, decisions are written in full, because policies are learned from them.
 3. A kind without repetition for `seconds` is forgotten; its next record is written in full.
-4. An allow ends the denials of the same host, caller and request, and a denial ends the allows. Their summaries are
-   written first, then the record in full.
+4. An allow ends the denial kinds of the same host, caller and request, and a denial ends the allow kinds. Their
+   summaries are written first, then the new record in full.
 5. Counts are stored on disk, so the key of a kind has only storable texts (`storable`).
 6. A `would deny` of an audit-only policy is never folded.
 """
@@ -66,7 +66,7 @@ class _Kind:
 
 
 class RecordFolder:
-    """The decision whether each record is written in full or counted. `now` is in monotonic seconds."""
+    """Decides whether each record is written in full or only counted. `now` is in monotonic seconds."""
 
     def __init__(self, settings: FoldSettings, make_id: Callable[[], str], clock: Callable[[], int]) -> None:
         self._settings = settings
@@ -75,7 +75,7 @@ class RecordFolder:
         self._kinds: dict[Key, _Kind] = {}
         self._coming: dict[Key, AuditRecord] = {}
         """The first denial of each new kind, before the owner offers it."""
-        self._coming_as: dict[str, Key] = {}  # the keys, by id of the record
+        self._coming_as: dict[str, Key] = {}  # keys by record id
         self._due: dict[Key, float] = {}
         self._by_subject: dict[Key, set[Key]] = {}
         self._denials: Pool[_Holder] = Pool("kinds of denials", settings.kinds, _quota_class)
@@ -91,7 +91,7 @@ class RecordFolder:
         return kind.state if kind is not None and kind.state.count else None
 
     def in_full(self, record: AuditRecord) -> str:
-        """Return the id of the record that a denial repeats, else its own; empty if its kind is a collective one.
+        """Return the id of the record that a denial repeats, or else its own id; empty for a collective kind.
 
         The owner calls this before it offers the record. Denials that are not offered yet are stored, so that an
         immediate repetition finds them.
@@ -115,7 +115,7 @@ class RecordFolder:
         """Return the number of new, not yet offered kinds in the quota that a denial is charged to."""
         host, quota_class = _holder(record)
         unknown = quota_class is QuotaClass.UNKNOWN
-        waiting = list(self._coming.values())  # another thread takes from it
+        waiting = list(self._coming.values())  # another thread removes from `_coming`
         return sum(other.unknown if unknown else other.host == host for other in waiting)
 
     def offer(self, record: AuditRecord, now: float) -> Iterator[AuditRecord]:
@@ -134,7 +134,7 @@ class RecordFolder:
             yield record
         key = self._coming_as.pop(record.id, None)
         if key is not None:
-            del self._coming[key]  # now its kind, or its host's kind, exists
+            del self._coming[key]  # now the record's kind, or its host's kind, exists
 
     def _counted(self, record: AuditRecord, *, denial: bool, now: float) -> bool:
         key, scope = self._denial_key(record) if denial else self._passing_key(record)

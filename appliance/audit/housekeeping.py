@@ -68,8 +68,8 @@ class Housekeeping:
         self.writer: ChainWriter | None = None
         self.unsealed = 0  # records after the last checkpoint
         self._failing: str | None = None
-        self._waiting: list[Waiter] = []  # until the records written so far are sealed
-        self.unsigned: list[tuple[int, Waiter]] = []  # until the checkpoint with this number is signed
+        self._waiting: list[Waiter] = []  # waiters for a seal of the records written so far
+        self.unsigned: list[tuple[int, Waiter]] = []  # waiters for this checkpoint's signature
 
     @property
     def degraded(self) -> str | None:
@@ -112,7 +112,7 @@ class Housekeeping:
         self.attempt(self._index_backlog)
 
     def at_rest(self, *, quiet_since: float, busy: Callable[[], bool]) -> None:
-        """Index records and remove old ones while no record waits; the last one was written at `quiet_since`."""
+        """Index records and remove old ones while no record waits; the last one was written at time `quiet_since`."""
         if self.writer is not None and not busy():
             # Committing the index for a single record is too expensive: wait for more records or for a quiet period.
             quiet = time.monotonic() - quiet_since >= _IDLE_SECONDS / 2
@@ -134,7 +134,7 @@ class Housekeeping:
         self._waiting = [pending for pending in self._waiting if not pending.future.done()] + [waiter]
 
     def _answer_sealed(self) -> None:
-        """Move the waiters for a checkpoint to those for its signature; answer them if it is already signed."""
+        """Let waiters for a checkpoint now wait for its signature; answer them if the checkpoint is already signed."""
         if self.writer is None or self.unsealed:
             return
         number = self.writer.checkpoint_number

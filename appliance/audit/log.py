@@ -2,8 +2,8 @@
 
 1. `record` never blocks and never raises: it only appends to a queue.
 2. Records keep their order.
-3. No record is dropped silently. While the log cannot be written (`failed`), up to `queue_limit` records wait; further
-   ones are counted, and the count is recorded later.
+3. No record is dropped silently. While the log cannot be written (`failed`), up to `queue_limit` records wait. Further
+   records are only counted, and the count is recorded later.
 4. `wait_durable` returns when all earlier records are on disk (fsync), or returns why they are not. Folded denials are
    on disk as a count.
 """
@@ -85,8 +85,8 @@ class AuditLog:
     `durability`: `strict` writes at once (group commit), `batched` after 20 ms; both fsync. A checkpoint is made every
     `checkpoint_every` records or `checkpoint_seconds`. The log's thread then calls `signer(number, text)`, and the
     owner answers with `signed` or `refused`. Likewise, `removals(number, checkpoint, newest)` requests the signature of
-    a removal; the answer is `removal_approved` or `removal_refused`. `held_by` is called with the processes that lock
-    the log. `budget` has the debts of hosts, with smaller bounds below `reserve` free bytes.
+    a removal; the answer is `removal_approved` or `removal_refused`. `held_by` is called with the ids of processes that
+    lock the log. `budget` has the debts of hosts; its bounds are smaller while less than `reserve` bytes are free.
     """
 
     def __init__(
@@ -158,7 +158,7 @@ class AuditLog:
     # --- for the owner, from any thread ---------------------------------------------------------------------
 
     def record(self, record: AuditRecord) -> str:
-        """Queue a record; return its id, the id of the record that it repeats, or "" if it counts in a collective kind.
+        """Queue a record; return its id, the id of the record that it repeats, or "" if a collective kind counts it.
 
         The caller must not change `detail` afterwards.
         """
@@ -175,7 +175,7 @@ class AuditLog:
         return len(self._queue) + len(self._held) >= self._queue_limit
 
     async def wait_durable(self) -> str | None:
-        """Wait until all records so far are on disk; return the reason if they cannot be written."""
+        """Wait until all records so far are on disk; return None, or the reason why they cannot be written."""
         loop = asyncio.get_running_loop()
         future: asyncio.Future[str | None] = loop.create_future()
         self._put(Waiter(loop, future))
@@ -184,7 +184,7 @@ class AuditLog:
         return await future
 
     async def wait_signed(self) -> str | None:
-        """Wait until a signed checkpoint seals all records so far; return the reason if its signature is refused."""
+        """Wait until a signed checkpoint seals all records so far; return None, or why its signature is refused."""
         loop = asyncio.get_running_loop()
         future: asyncio.Future[str | None] = loop.create_future()
         self._put(partial(self.housekeeping.seal_now, Waiter(loop, future)))
@@ -222,7 +222,7 @@ class AuditLog:
         self._put(partial(self.housekeeping.attempt, remove))
 
     def removal_refused(self, number: int, reason: str, *, early: bool = False) -> None:
-        """Repeat the request later, because the signer refused a removal (`early`: for now)."""
+        """Request the removal again later, because the signer refused it (`early`: the records are too young)."""
         self._put(partial(self.housekeeping.remover.refused, number, reason, early=early))
 
     def request_signatures(self) -> None:
@@ -331,7 +331,7 @@ class AuditLog:
         return max(0.001, min(waits))
 
     def _drain(self) -> bool:
-        """Handle a batch of the queue; return whether more is left."""
+        """Process a batch of queued items; return whether more are left."""
         now = time.monotonic()
         queue, offer = self._queue, self._folder.offer
         for _ in range(_LARGEST_BATCH):
@@ -359,7 +359,7 @@ class AuditLog:
                 self._held.append(self._own(event, severity, self._room.scarce or "", {"left": left}))
 
     def _attempt(self, action: Callable[[], None]) -> bool:
-        """Run an action on the database; return whether it succeeded. A failure closes it until the next try."""
+        """Run an action on the database; return whether it succeeded. A failure closes the database until a retry."""
         try:
             if self._writer is None and action != self._open:
                 self._open()
@@ -372,7 +372,7 @@ class AuditLog:
     def _fail(self, error: Exception) -> None:
         reason = str(error)
         if isinstance(error, sqlite3.OperationalError) and "locked" in reason:
-            # Our own connection is still open, so this process is in the list.
+            # This process is in the list because its own connection is still open.
             others = [pid for pid in holders(self.path) if pid != os.getpid()]
             if others:
                 reason = f"{reason} by process {', '.join(map(str, others))}"
@@ -396,7 +396,7 @@ class AuditLog:
             self._held.insert(
                 0, self._own("log begun", Severity.ALARM if earlier else Severity.NOTICE, "", detail)
             )
-        # Recover only the counts of an earlier process; later the table has this process's counts.
+        # Recover counts only once: afterwards the table has the counts of this process.
         left = [] if self._counts_recovered else writer.open_folds()
         if left:
             writer.close_folds(

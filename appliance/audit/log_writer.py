@@ -24,8 +24,8 @@ from appliance.audit.repetition import FoldState
 from appliance.audit.retention import as_kept
 from appliance.signing.signed_statements import NO_CHECKPOINT, Checkpoint, checkpoint_hash, parse_checkpoint
 
-# Rows of one INSERT. Each statement releases and takes the GIL. Beside a busy event loop, taking it may need 5 ms (the
-# switch interval), so one row per statement would be 200 rows a second.
+# Rows of one INSERT. Each statement releases the GIL and takes it again. This may take 5 ms (the switch interval) while
+# an event loop is busy. With one row per statement, only 200 rows a second could be written.
 _ROWS_PER_INSERT = 64
 _WIDTH = len(StoredColumns._fields) + 1
 _ROW = "(" + ", ".join("?" * _WIDTH) + ")"
@@ -96,7 +96,7 @@ class ChainWriter:
         rows.reverse()
         self.sequence, self.hash, self.last_id = 0, genesis(self.log_id), ""
         for number, row in enumerate(rows):
-            known = number > 0 or row[0] == 1  # the previous hash is known
+            known = number > 0 or row[0] == 1  # the hash before this record is known
             if known and (row[0] != self.sequence + 1 or not follows(self.hash, row[:-1], row[-1])):
                 raise LogUnreadableError(
                     f"{self.path}: record {row[0]} does not fit the chain, so the log was changed; run"
@@ -229,8 +229,9 @@ class ChainWriter:
     ) -> RemovedRange | None:
         """Return the range of about `step` oldest records that ends at a (signed) checkpoint, or None.
 
-        With `between` (an age limit, and now) it ends at a checkpoint before the limit. Checkpoints later than now,
-        made while the clock was ahead, are removed with the following ones. The last checkpoint always stays.
+        `between` is an age limit and the present time; the range then ends at a checkpoint made before the limit.
+        Checkpoints with a later time than the present, made while the clock was ahead, are removed with the following
+        ones. The last checkpoint always stays.
         """
         first = self._first_sequence()
         condition = "AND signature IS NOT NULL" if signed else ""

@@ -47,7 +47,7 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 # Records with a damaged detail have no author.
 _WHO = "CASE WHEN json_valid(CAST(detail AS TEXT)) THEN json_extract(CAST(detail AS TEXT), '$.who') END"
-# A read has its method in its details, even if it was only counted. Quotes from a client are escaped there.
+# A record of a read has the method in its details, even if the read was only counted. The details escape quotes.
 _NO_LOOK = """NOT (
     category IS NOT NULL AND category = 'rest' AND decision IS NOT NULL AND decision = 'allow' AND (
         CAST(detail AS TEXT) LIKE '%"method":"GET"%' OR CAST(detail AS TEXT) LIKE '%"method":"HEAD"%'))"""

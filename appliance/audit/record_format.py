@@ -1,7 +1,7 @@
 """Format records as the documented JSON object, and untrusted text for a terminal.
 
-JSON is ASCII only. Text for people has all characters escaped that a terminal could interpret or that could disguise a
-name: control characters, escape sequences, bidirectional marks.
+JSON is ASCII only. In text for people, all characters are escaped that a terminal could interpret or that could
+disguise a name: control characters, escape sequences, bidirectional marks.
 """
 
 import json
@@ -25,7 +25,7 @@ _OF_THE_RECORD = (
 
 
 _CONTENTS = ("before", "after", "before_fields", "after_fields", "conditions", "values", "why", "binding")
-"""The fields of `detail` in a monitor's record that have contents of messages: bytes, fields, compared values."""
+"""The fields of `detail` in a monitor's record that contain parts of messages: bytes, fields, compared values."""
 _BOUND = re.compile(r"(property \d+ of \S+ \(\w+\)|: \d+ \w+) with \w+ = .*", re.DOTALL)
 
 
@@ -47,7 +47,7 @@ def rfc3339(time: int) -> str:
 
 
 def without_contents(entry: LogEntry) -> LogEntry:
-    """Return the record without contents of messages, for roles that may not read them, and list them in `withheld`."""
+    """Return the record without contents of messages, for roles that may not read them; `withheld` lists the fields."""
     detail = entry.record.detail
     if "monitor" not in detail:
         return entry

@@ -1,4 +1,4 @@
-"""Remove old records step by step; with a signer, the signer must sign the removal before each step.
+"""Remove old records step by step. If the log has a signer, the signer must sign each step first.
 
 Every removal is recorded in the same transaction. Records of a signed log are removed only with the signer's signature
 over exactly these records. A refused removal is tried again later (`unremoved` has the reason).
@@ -30,7 +30,7 @@ class _Wanted(NamedTuple):
 
 
 class Remover:
-    """The retention of a log, on the log's thread; `approve` requests a signature, `report` makes the record."""
+    """Applies a log's retention, on the log's thread; `approve` requests a signature, `report` makes the record."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class Remover:
         return True
 
     def refused(self, number: int, reason: str, *, early: bool = False) -> None:
-        """Try again later. `early`: by the signer's clock the records are not old enough yet, which is normal."""
+        """Try again later. `early`: by the signer's clock, the records are not old enough yet, which is normal."""
         wanted = self._wanted
         if wanted is not None and wanted.gone.last_checkpoint == number:
             self._wanted = None

@@ -18,7 +18,7 @@ from appliance.audit.record import AuditRecord, RuleReference, Severity
 
 Key = tuple[str | int | None, ...]
 KIND, UNKNOWN, HOST, ALL_UNKNOWN, ALL = "kind", "unknown host", "host", "unknown hosts", "all"
-"""The scopes of kinds; `ALL_UNKNOWN` and `ALL` are of many hosts."""
+"""The scopes of kinds; `ALL_UNKNOWN` and `ALL` cover many hosts."""
 
 _SCOPES_OF_0_1 = {"stranger": UNKNOWN, "strangers": ALL_UNKNOWN}
 

@@ -1,4 +1,4 @@
-"""Choose the old records to remove, and those of them to write again. No I/O.
+"""Choose which old records to remove, and which of these to write again. No I/O.
 
 The oldest records are removed first, in short steps, each up to a (signed) checkpoint. Every step is recorded as
 `records removed`, with the hash after which the chain continues.
@@ -24,7 +24,7 @@ _DAY = 86_400_000_000_000
 
 @dataclass(frozen=True)
 class Retention:
-    """The limits of a log: records are kept for `days` (None: always), and its size below `size` bytes (None: any)."""
+    """The limits of a log: `days` for which records are kept (None: always), and `size` in bytes (None: any)."""
 
     days: float | None = None
     size: int | None = None

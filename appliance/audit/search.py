@@ -168,7 +168,7 @@ def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: in
 
 
 def _most_selective(connection: sqlite3.Connection, found: list[Condition]) -> str | None:
-    """Return the index with the fewest candidates; None if all have at least `_SELECTIVE`: a scan is then quick."""
+    """Return the index with the fewest candidates; None if each has `_SELECTIVE` or more, as a scan is then quick."""
     best, fewest = None, _SELECTIVE
     for condition in found:
         if condition.answered_by is not None:

@@ -1,11 +1,12 @@
-"""Verify that a log is complete and unchanged, or report which records are not, and how.
+"""Verify that a log is complete and unchanged, or report which records are missing or changed, and how.
 
-The chain is walked once from the first record to the last. If a record does not follow from the previous one, the
-following records are tried in other positions, to distinguish a change, a removal, an insertion and a reordering. Then
-the checkpoints are checked by the chain, the key, and the signer's memory.
+The verifier walks the chain once, from the first record to the last. If a record does not follow from the previous one,
+the verifier tries the next records in other positions. This distinguishes a change, a removal, an insertion and a
+reordering. Then it checks the checkpoints against the chain, the key, and the signer's memory.
 
-The log alone cannot show that records after the last signed checkpoint were cut off or rewritten; `unsealed` is the
-number of these records. Root can rewrite both log and memory, which only checkpoints on another machine reveal.
+The log alone cannot show whether records after the last signed checkpoint were cut off or rewritten; `unsealed` is the
+number of records present there. Root can rewrite both the log and the signer's memory. Only checkpoints on another
+machine reveal this.
 """
 
 import re
@@ -201,8 +202,8 @@ class _Verifier:
     def _check_removal(self, removed: _Removal | None) -> str:
         """Return "signed", "unsigned", or "" without a removal.
 
-        A removal without a signature is unfounded, unless a version that did not sign removals made it: then no signed
-        statement has a smaller `removed`.
+        A removal without a signature is unfounded, unless it was made by a version that did not sign removals. In that
+        case, no signed statement has a smaller `removed`.
         """
         if removed is None:
             return ""
@@ -313,9 +314,10 @@ class _Verifier:
         return map(_row, rows)
 
     def _explain(self, row: _Row, previous: bytes) -> bytes:
-        """Find out why a record does not follow; return the hash to continue from.
+        """Find out why a record does not follow the previous one; return the hash to continue from.
 
-        Each search takes milliseconds. None is made after `_MOST_FINDINGS`, so that a forged log cannot take hours.
+        Each search takes milliseconds. After `_MOST_FINDINGS`, no search is made, so that a forged log cannot take
+        hours.
         """
         if len(self._findings) >= _MOST_FINDINGS:
             return self._changed(row, row.sequence - self._shift)
@@ -387,7 +389,8 @@ class _Verifier:
 def _original_order(rows: list[_Row], previous: bytes, place: int) -> list[_Row]:
     """Return the records of `rows` in their original order from sequence `place` on.
 
-    The result ends where these records fill the same positions (a reordering), or where no next record is found.
+    The result ends when the ordered records fill the same positions as before (a reordering), or when no next record is
+    found.
     """
     order: list[_Row] = []
     left = list(rows)
