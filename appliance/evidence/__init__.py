@@ -1,1 +1,1 @@
-"""Evidence bundles: the audit records of a span of time in one file that can be verified anywhere."""
+"""Evidence bundles: the audit records of a period in one file that can be verified anywhere."""

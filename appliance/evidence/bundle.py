@@ -1,13 +1,14 @@
-"""Make an evidence bundle: one ZIP file with the records of a span of time, the policies and monitors, and the proof.
+"""Make an evidence bundle: one ZIP file with the records of a period, the policies and monitors, and the proof.
 
 Invariants:
-1. The members that the manifest lists are generated twice, once for their hashes and once to be written. A difference
-   ends the export.
-2. The manifest has the hash of every member. The audit record of the export has the hash of the manifest, and a signed
-   checkpoint seals that record before the first byte is sent. The record is `proof.json`, which the manifest omits.
+1. The members in the manifest are generated twice: once for their hashes, and once to be written. If the two differ,
+   the export ends with an error.
+2. The manifest has the hash of every member except itself and `proof.json`. The audit record of the export has the hash
+   of the manifest. A signed checkpoint seals that record before the first byte is sent. The bundle contains that record
+   as `proof.json`.
 3. Records are exported as they are stored, so `verify.py` computes their hashes without the appliance's code.
-4. A run has every record between its ends. Records out of order by time (the clock was set back, or retention wrote
-   them again) become separate runs when they are far from the others.
+4. A run of records is complete between its ends. Records whose times are out of order (the clock was set back, or
+   retention wrote them again) become separate runs if they are far apart in the log.
 """
 
 import hashlib
@@ -49,7 +50,7 @@ VERIFIER = Path(__file__).with_name("bundle_verifier.py")
 Ask = Callable[[AdminRequest[Any]], AdminAnswer[Any]]
 Member = tuple[str, Iterable[bytes]]
 _PAGE = 500
-_APART = 1000  # records between two runs
+_APART = 1000  # a larger distance between two records begins a new run
 _MOMENT = (1980, 1, 1, 0, 0, 0)  # the time of every member: the earliest that a ZIP file can store
 _POLICY, _SPECIFICATIONS = "policy loaded", "specifications loaded"
 _LOAD = "SELECT event, revision, detail FROM record WHERE sequence = ?"
@@ -68,7 +69,7 @@ class BundleError(Exception):
 
 
 class TimeSpan(NamedTuple):
-    """A span from `since` up to, but not including, `until`, in nanoseconds since the epoch."""
+    """A period from `since` (inclusive) to `until` (exclusive), in nanoseconds since the epoch."""
 
     since: int
     until: int
@@ -82,9 +83,9 @@ class RecordingSelection(NamedTuple):
 
 
 def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask) -> Iterator[bytes]:
-    """Return the bytes of a bundle; its export is recorded and sealed when this returns. `ask` queries the appliance.
+    """Record and seal an export, then return the bytes of its bundle; `ask` queries the appliance.
 
-    The bundle of a recording has its messages and all records of its time. Raises `BundleError` and
+    The bundle of a recording has the recording's messages and all records of its period. Raises `BundleError` and
     `LogUnreadableError`, also during the iteration.
     """
     recording: Recording | None = None
@@ -116,7 +117,7 @@ class _Bundle:
         self.count = sum(last - first + 1 for first, last in self._runs)
 
     def _find(self, execute: Callable[..., sqlite3.Cursor]) -> None:
-        """Find the records, policies and specifications of the bundle."""
+        """Find the records, policies and specifications of the bundle. Raises `BundleError`."""
         (self._id,) = execute("SELECT id FROM log").fetchone()
         (sealed,) = execute("SELECT max(sequence) FROM checkpoint WHERE signature IS NOT NULL").fetchone()
         found = execute(
@@ -158,7 +159,7 @@ class _Bundle:
         self._alone = sorted(loads | there)
 
     def manifest(self) -> dict[str, Any]:
-        """Return the manifest: hashes and sizes of all members, and the names of the missing ones."""
+        """Return the manifest: hashes and sizes of all members, and the names of missing members."""
         manifest: dict[str, Any] = {
             "format": FORMAT, "log": self._id, "since": self._span.since, "until": self._span.until,
             "recording": self._recording.id if self._recording else "", "runs": self._runs, "missing": [],
@@ -173,7 +174,7 @@ class _Bundle:
         return manifest
 
     def checked(self, manifest: dict[str, Any]) -> Iterator[Member]:
-        """Yield the members again. Raises `BundleError` if they have changed."""
+        """Yield the members again. Raises `BundleError` if one has changed or disappeared."""
         left = dict(manifest["members"])
         for name, pieces in self.members({**manifest, "missing": []}):
             digest = hashlib.sha256()
@@ -291,7 +292,7 @@ def stored_line(columns: StoredColumns, chain: ChainProof) -> bytes:
 
 
 def _proof(log: Path, record: str) -> bytes:
-    """Return the line of the export's record; its chain leads to the checkpoint that seals it."""
+    """Return the line of the export's record, with its chain up to the checkpoint that seals the record."""
     with reading(log) as connection:
         (sequence,) = connection.execute(
             "SELECT max(sequence) FROM record WHERE id = ?", (record,)

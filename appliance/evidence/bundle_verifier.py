@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Verify an evidence bundle of a ROSRV appliance by the appliance's signatures, and list the differences.
+"""Verify an evidence bundle of a ROSRV appliance with the appliance's signatures, and list all differences.
 
     python3 verify.py [BUNDLE.zip, or its folder] [--key audit.pub] [--checkpoints copies.ndjson]
 
-It needs Python 3.8 or newer and the command `openssl` (3.0 or newer). Exit status 0: valid; 1: not valid; 2: not a
-bundle.
+This program needs Python 3.8 or newer and the command `openssl` (3.0 or newer). Exit status 0: valid; 1: not valid; 2:
+not a bundle.
 
 1. manifest.json has the SHA-256 of every other member except proof.json. The bundle has no further members, and a ZIP
    file has no bytes outside the members except those that the format requires.
@@ -13,9 +13,9 @@ bundle.
    records is complete, and the records next to it are outside the time of the bundle.
 4. Policies, specifications and the recording have the hashes that are stored in the log.
 
-All of it depends on the key: use --key with a copy that was kept elsewhere. Root on the appliance can sign anything;
-checkpoints that another machine received earlier (--checkpoints) reveal that. A bundle can contain a changed copy of
-this program: take it from an appliance (`rosrv evidence verifier`).
+Every check depends on the key: use --key with a copy that was kept elsewhere. Root on the appliance can sign anything;
+checkpoints that another machine received earlier (--checkpoints) reveal a rewritten log. A bundle can contain a changed
+copy of this program: take the program from an appliance (`rosrv evidence verifier`).
 """
 
 from __future__ import annotations
@@ -321,7 +321,7 @@ class Verifier:
             self.notes.append(f"record {last} as the last of this period: the log ended there")
 
     def note_hash(self, event: str, revision: int, detail: dict[str, Any]) -> None:
-        """Store the hash that a record has of a policy, of specifications or of the recording."""
+        """Store the hash that a record contains for a policy, for specifications or for the recording."""
         if event == "policy loaded":
             self.loads[f"policies/{revision}.ini"] = detail.get("sha256")
         elif event == "specifications loaded":
@@ -388,7 +388,7 @@ class Verifier:
             self.findings.append(f"{name}: no signed checkpoint seals the records from {begin} on")
 
     def look_at_checkpoint(self, checkpoint: dict[str, Any], sequence: int, digest: str) -> None:
-        """Check that the key signed it, that it seals these records, and that it equals the copy from elsewhere."""
+        """Check that the key signed a checkpoint that seals these records and equals the copy kept elsewhere."""
         number = checkpoint["number"]
         sealed = checkpoint["log"], checkpoint["sequence"], checkpoint["hash"]
         if sealed != (self.manifest["log"], sequence, digest):

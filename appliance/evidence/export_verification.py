@@ -1,4 +1,4 @@
-"""Verify an export of the audit log with the verifier of bundles (`rosrv audit verify --export`, deprecated)."""
+"""Verify an export of the audit log with the bundle verifier (`rosrv audit verify --export`, deprecated)."""
 
 import json
 import tempfile
@@ -70,7 +70,7 @@ def verify_export(file: Path, key: bytes) -> ExportVerification:
 
 
 def _store(file: Path, stored: IO[bytes], result: ExportVerification) -> int:
-    """Write the records in the form of a bundle, up to the last signed checkpoint; return their number."""
+    """Write the records in the format of a bundle, up to the last signed checkpoint; return their number."""
     sealed = end = 0
     for number, line in enumerate(lines_given(file, _LONGEST_LINE), 1):
         if not line.strip():

@@ -1,4 +1,4 @@
-"""The HTML page of a bundle: contents, events, how to verify it. The same input gives the same page."""
+"""Make the HTML page of a bundle: contents, events, and how to verify it. The same input gives the same page."""
 
 import html
 import json
@@ -42,7 +42,7 @@ bundle can also change the copies inside it. The command lists the changed and m
 
 
 class Page:
-    """The page of a bundle; it collects its rows while the records are written."""
+    """The page of a bundle, which collects its rows while the records are written."""
 
     def __init__(self, recording: Recording | None) -> None:
         self._recording = recording
