@@ -1,1 +1,1 @@
-"""The flight recorder: the latest messages, in memory that outlives the relays, and recordings of them."""
+"""The flight recorder: keeps the latest messages in memory that outlives the relays, and makes recordings of them."""

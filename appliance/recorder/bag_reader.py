@@ -1,4 +1,4 @@
-"""Read bags of the recorder by their index, so that only the needed parts of a large bag are read.
+"""Read the recorder's bags by their index, so that only the needed parts of a large bag are read.
 
 Times are nanoseconds since the epoch. Messages are ordered by time, then by their position in the file. A file that is
 not a complete bag of the recorder raises `ValueError`.
@@ -25,7 +25,7 @@ from appliance.recorder.bag_writer import (
 )
 
 _SECOND = 1_000_000_000
-_PLACE = re.compile(r"\d{6,20}-\d{1,12}-\d{1,12}", re.ASCII)  # cannot be mistaken for a date
+_PLACE = re.compile(r"\d{6,20}-\d{1,12}-\d{1,12}", re.ASCII)  # does not match any date
 _U32, _U64, _STAMP = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<II")
 
 
@@ -81,7 +81,7 @@ class BagReader:
     @classmethod
     @contextmanager
     def of(cls, path: Path) -> Iterator[Self]:
-        """Open a bag. Raises `OSError` and `ValueError`, also in the block, while the bag is read."""
+        """Open a bag in a `with` block. Raises `OSError` and `ValueError`, also while the bag is read in the block."""
         with path.open("rb") as file:
             try:
                 yield cls(file)

@@ -1,8 +1,8 @@
-"""Write ROS 1 bags (format 2.0) in pieces; after a crash another writer can finish the bag.
+"""Write ROS 1 bags (format 2.0) in pieces; after a crash, another writer can finish the bag.
 
 `rosbags` can neither write an extra field (the host) into a connection's header nor continue a bag. Chunks are not
-compressed, and their indexes follow them. `close` reads the rest from the file, so a writer keeps only the file's
-length and its connections. Format: http://wiki.ros.org/Bags/Format/2.0.
+compressed, and each is followed by its indexes. `close` reads the data for the final index from the file, so a writer
+keeps only the file's length and its connections. Format: http://wiki.ros.org/Bags/Format/2.0.
 """
 
 import os
@@ -31,7 +31,7 @@ class BagMessage(NamedTuple):
 
 
 class BagWriter:
-    """A writer of the bag at `path`, after its first `size` bytes (0: a new bag)."""
+    """Writes the bag at `path`, behind its first `size` bytes (0: a new bag)."""
 
     def __init__(self, path: Path, connections: Mapping[int, Mapping[str, str]], size: int = 0) -> None:
         """Open the bag, and cut it after `size` bytes. `connections` are the headers of the connections so far."""
@@ -100,7 +100,7 @@ class BagWriter:
         )
 
     def _whole(self, size: int) -> int:
-        """Return how many of the first `size` bytes are chunks with all their indexes."""
+        """Return how many of the first `size` bytes hold complete chunks with all their indexes."""
         whole, at, there = 0, _FIRST, self._file.seek(0, os.SEEK_END)
         try:
             for place, fields, length in self._records(min(size, there)):
@@ -112,7 +112,7 @@ class BagWriter:
         return size if at == size <= there else whole
 
     def _records(self, end: int) -> Iterator[tuple[int, dict[str, bytes], int]]:
-        """Yield the position of each record, its fields, and the length of its data, which follows."""
+        """Yield each record's position, fields and length of data; the file's position is then at the data."""
         at = _FIRST
         while at < end:
             self._file.seek(at)
@@ -152,7 +152,7 @@ class BagWriter:
 
 
 def read_fields(file: BinaryIO) -> dict[str, bytes]:
-    """Read the fields of the record at the file's position; the length of its data follows there."""
+    """Read the fields of the record at the file's position; afterwards the position is at the length of its data."""
     data = file.read(_U32.unpack(file.read(4))[0])
     return fields_of(data)
 

@@ -1,8 +1,8 @@
-"""Exclude topics from recordings by the globs of topics and types in `recorder.never`.
+"""Exclude topics from recordings: `recorder.never` has globs for names of topics and types.
 
-The policy checks a topic's name, but its type is a claim of the publisher. If the type's definition is known and the
-md5sum in the publisher's header differs, the topic is recorded. A matching claim may still be false, so a recording
-lists which topics were left out because of a publisher's claim.
+The policy checks a topic's name, but its type is only a claim of the publisher. If the type's definition is known and
+the md5sum in the publisher's header differs from it, the topic is recorded anyway. A claim with the right md5sum may
+still be false, so each recording lists the topics that it left out because of a publisher's claim.
 """
 
 from collections.abc import Collection, Iterable, Mapping

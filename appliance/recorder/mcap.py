@@ -1,7 +1,7 @@
 """Convert a bag to MCAP, piece by piece, for tools that cannot read bags. Format: https://mcap.dev/spec.
 
-`rosbags` writes MCAP for ROS 2 only. Messages are copied unchanged (profile `ros1`), ordered by time, in uncompressed
-chunks with indexes; the summary at the end lists all chunks.
+`rosbags` writes MCAP for ROS 2 only. Messages are copied unchanged (profile `ros1`), in order of time, to uncompressed
+chunks with indexes. The summary at the end lists all chunks.
 """
 
 import struct
@@ -21,9 +21,9 @@ _OF_SENDER = ("md5sum", "callerid", "host", "latching")
 
 
 def as_mcap(bag: Path) -> Iterator[bytes]:
-    """Yield the pieces of an MCAP file with a bag's messages; the bag may be removed meanwhile.
+    """Yield the pieces of an MCAP file with a bag's messages; the bag may be removed during the iteration.
 
-    Raises `OSError`, and `ValueError` for an invalid bag, both also during the iteration.
+    Raises `OSError`, and `ValueError` for an invalid bag; either may also come during the iteration.
     """
     opened = ExitStack()
     return _pieces(opened, opened.enter_context(BagReader.of(bag)))
@@ -44,7 +44,7 @@ def _pieces(opened: ExitStack, reader: BagReader) -> Iterator[bytes]:
 
 
 class _Writer:
-    """A buffer for the present chunk and the summary; `position` is the offset of the next piece."""
+    """A buffer for the current chunk and the summary; `position` is the offset of the next piece."""
 
     def __init__(self, connections: Mapping[int, Mapping[str, str]]) -> None:
         self._connections = connections
@@ -59,7 +59,7 @@ class _Writer:
         self._times: tuple[int, int] = (0, 0)
 
     def add(self, connection: int, time: int, data: bytes) -> None:
-        """Add a message; the first of a connection follows the description of the connection."""
+        """Add a message; before the first message of a connection, add the connection's description."""
         channel = self._numbers.get(connection) or self._describe(connection)
         self._index.setdefault(channel, []).append((time, len(self.chunk)))
         head = struct.pack("<HIQQ", channel, self._counts[channel] & 0xFFFFFFFF, time, time)

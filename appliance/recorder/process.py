@@ -1,7 +1,7 @@
 """Run the recorder process: its lifeline, its link to control, and a thread that does the work.
 
-It has no network, reads the memory of the relays and the audit log, and writes recordings. It outlives control: its
-reports wait in the recording store.
+The process has no network. It reads the relays' memory and the audit log, and writes recordings. The recorder outlives
+control: meanwhile, its reports wait in the recording store.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class _Process:
-    """The parts of the process and their connections."""
+    """Connects the supervisor, control and the recorder's work."""
 
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
         self._settings = settings

@@ -1,14 +1,14 @@
-"""Follow the audit log, and record the relays' memory when a record is a trigger.
+"""Follow the audit log, and make a recording of the relays' memory when a record is a trigger.
 
-`step` does all that is due and returns the messages for control; nothing here waits or uses a socket.
+`step` does all work that is due and returns the messages for control. This module never waits and uses no socket.
 
 Invariants:
 
-1. Each host has one recording at a time (`recording_plan`). A trigger within its time extends it, up to `longest`; a
-   later trigger begins another. Control plans the recording, and the trigger's audit record names it.
-2. Recordings never exceed their part of the disk or use space that is reserved for the audit log.
-3. After a crash, the next recorder finishes a recording: completely if the memory still exists, otherwise as far as it
-   was written. Its description reports that.
+1. Each host has one recording at a time (`recording_plan`). A trigger during the recording extends it, up to `longest`;
+   a later trigger begins another recording. Control plans the recording, and the trigger's audit record names it.
+2. Recordings never exceed their part of the disk, and never use space that is reserved for the audit log.
+3. After a crash, the next recorder finishes each recording: completely if the memory still exists, otherwise as far as
+   it was written. The recording's description reports what is missing.
 """
 
 import shutil
@@ -37,8 +37,8 @@ SETTLE_SECONDS = 0.5
 """The wait after a recording's end for messages and audit records that arrive late."""
 
 _IDLE_SECONDS, _BUSY_SECONDS = 0.5, 0.25
-_PAGES = 20  # of the log in one step
-_MOST_RECORDS = 200_000  # of the log in one recording
+_PAGES = 20  # pages of the log in one step
+_MOST_RECORDS = 200_000  # records of the log in one recording
 _SECOND = 1_000_000_000
 _TELL_AGAIN = 600 * _SECOND
 _MOST_TOLD = 4096
@@ -46,7 +46,7 @@ _log = structlog.get_logger()
 
 
 class Recorder:
-    """The flight recorder: it records `rings`, created at the time `memory`, when the audit log at `log` has a trigger.
+    """The flight recorder: records `rings` (created at the time `memory`) when the audit log at `log` has a trigger.
 
     Times are nanoseconds since the epoch; `reserve` bytes of the disk stay free.
     """
@@ -74,7 +74,7 @@ class Recorder:
         self._follower: Follower | None = None
         self._making: list[RecordingInProgress] = []
         self._revisions = messages.RevisionsStated(0, 0)
-        self._asked_for: set[str] = set()  # recordings that wait for the revisions in force at their end
+        self._asked_for: set[str] = set()  # ids of recordings that wait for the revisions in force
         self._told: dict[tuple[str, str], int] = {}  # when a trigger without a recording was last reported
         self._answers: list[messages.Message] = []
         self._take_up()
@@ -192,7 +192,7 @@ class Recorder:
     # --- triggers -----------------------------------------------------------------------------------------
 
     def _new_triggers(self) -> list[tuple[Trigger, str]]:
-        """Return the new triggers, each with the recording that control has planned for it (empty: none)."""
+        """Return the new triggers, each with the id of the recording that control has planned (empty: none)."""
         follower = self._follower or self._begin_to_follow()
         found: list[tuple[Trigger, str]] = []
         for _page in range(_PAGES):
@@ -210,7 +210,7 @@ class Recorder:
         return found
 
     def _begin_to_follow(self) -> Follower:
-        """Follow the log from the start of the memory: an earlier recorder may not have read all of it."""
+        """Follow the log from the start of the memory: an earlier recorder may not have read the log since then."""
         since = max(self._memory, self._clock() - int(self._rules.before * _SECOND))
         first = search(self._log, Filter(since=since), "0", 1, newest_first=False).entries
         self._follower = Follower(self._log, Filter(), first[0].sequence - 1 if first else None)
@@ -235,11 +235,11 @@ class Recorder:
             self._missed(trigger, why_not, planned)
 
     def _missed(self, trigger: Trigger, why: str, planned: str = "") -> None:
-        """Report that a trigger began no recording; unless one was planned, repetitions only every ten minutes."""
+        """Report that a trigger made no recording; if none was planned, repeat the report only every ten minutes."""
         now, kind = self._clock(), (trigger.charged_to, trigger.what)
         if (
             planned or abs(now - self._told.get(kind, -_TELL_AGAIN)) >= _TELL_AGAIN
-        ):  # or the clock was set back
+        ):  # `abs`, because the clock may have been set back
             if len(self._told) > _MOST_TOLD:
                 self._told.clear()
             self._told[kind] = now
@@ -280,7 +280,7 @@ class Recorder:
         times = span(self._rules, now, ended, before, after)
         began = (
             max(self._memory, times.began) if self._memory <= now else times.began
-        )  # the clock was set back since
+        )  # otherwise the clock was set back since
         latest = began + int(self._rules.longest * _SECOND)
         progress = Progress(
             planned or self._ids.next(), self._memory, began, min(times.ends, latest), [trigger],
@@ -339,7 +339,7 @@ class Recorder:
         _log.info("a recording is closed", recording=recording.id, size=recording.size)
 
     def _give_up(self, making: RecordingInProgress, error: OSError) -> None:
-        """Discard a recording that cannot be written, and report that."""
+        """Discard a recording that cannot be written, and report the failure."""
         _log.error("a recording cannot be written", reason=str(error))
         making.leave()
         progress = making.progress
@@ -379,7 +379,7 @@ class Recorder:
             _log.error("a recording cannot be removed", reason=str(error))
 
     def _make_room(self, charged_to: str) -> str:
-        """Remove recordings until a new one of this host has room; return why it has none, or an empty string."""
+        """Remove recordings until a new one of this host fits; return the reason if it cannot, else an empty string."""
         while True:
             try:
                 found, why = self._store.in_the_way(
@@ -397,11 +397,11 @@ class Recorder:
 
 
 def _prolong(progress: Progress, trigger: Trigger, after: float | None) -> None:
-    """Add a trigger within the time of a recording."""
+    """Add a trigger to a recording in progress, and extend the recording."""
     hold = progress.hold if after is None else int(after * _SECOND)
     progress.ends = max(progress.ends, min(trigger.time + hold, progress.latest))
     if trigger.charged_to in KEPT and progress.charged_to not in KEPT:
-        progress.charged_to = trigger.charged_to  # it is no longer removed for a host's recording
+        progress.charged_to = trigger.charged_to  # from now on not removed in favour of a host's recording
     known = any(trigger.record == other.record for other in progress.triggers)
     if not known and len(progress.triggers) < MOST_TRIGGERS:
         progress.triggers.append(trigger)

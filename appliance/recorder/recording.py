@@ -1,10 +1,10 @@
 """Write a recording from the memory of the relays to a bag, step by step.
 
-1. After each step the bag's length and all that is needed to continue are in `progress`, which is replaced atomically.
-   A new recorder cuts the bag there and continues: the memory still has what was not written.
-2. Missing messages are reported: by topic if the numbers of messages have a gap, else in words.
+1. After each step, the file `progress` has the bag's length and all data needed to continue; the file is replaced
+   atomically. A new recorder cuts the bag at that length and continues: the memory still has the unwritten messages.
+2. Missing messages are reported: as a count by topic if the numbers of messages have a gap, otherwise in words.
 3. A bag has at most `largest` bytes, not counting the audit records.
-4. The headers of its connections have at most `_MOST_HEADERS` bytes, since publishers choose them.
+4. The headers of its connections have at most `_MOST_HEADERS` bytes, because publishers choose their content.
 """
 
 import hashlib
@@ -45,7 +45,7 @@ _LEVELS = {Severity.WARNING: WARN, Severity.ALARM: ERROR}
 
 
 class TopicCount(msgspec.Struct):
-    """The messages of one topic with one type: written and missed ones."""
+    """The numbers of written and missed messages of one topic with one type."""
 
     topic: str
     type: str
@@ -59,8 +59,8 @@ class Progress(msgspec.Struct):
     """The progress of a recording; times are nanoseconds since the epoch.
 
     `memory` is the time when the rings were created. `size` is the length of the bag, `connections` are the headers in
-    it. For each ring, `places` has the position in each stream, `following` the number of its next message, and
-    `not_there` the counts of messages and streams that the ring had lost when the recording began.
+    it. For each ring, `places` has the position in each stream, and `following` the number of each stream's next
+    message. `not_there` has the counts of messages and streams that the ring had lost when the recording began.
     """
 
     id: str
@@ -76,14 +76,14 @@ class Progress(msgspec.Struct):
     topics: list[TopicCount] = []
     torn: list[str] = []
     unconnected: int = 0
-    """Messages of connections beyond `_MOST_HEADERS`."""
+    """The number of messages left out because their connections' headers exceed `_MOST_HEADERS`."""
     why_not: str = ""
     """Why the recording ended early, or is incomplete."""
     charged_to: str = OPERATORS
     hold: int = 0
-    """The time after a trigger (nanoseconds) to which it extends the recording."""
+    """Nanoseconds by which the recording continues after a trigger."""
     latest: int = 0
-    """The latest possible end."""
+    """The latest time at which the recording may end."""
     left_out: list[LeftOutTopic] = []
     claims: int = 0
     """The number of topics that were left out because of their publishers' claims."""
@@ -95,7 +95,7 @@ def load_progress(folder: Path) -> Progress:
 
 
 class RecordingInProgress:
-    """A recording of `rings` that is written to `folder` and continues at `progress`."""
+    """A recording of `rings` that is written to `folder` and continues from `progress`."""
 
     def __init__(
         self, folder: Path, progress: Progress, rings: Sequence[memoryview], *, largest: int
@@ -168,7 +168,7 @@ class RecordingInProgress:
         row.bytes += size
 
     def _leave_out(self, header: dict[str, str], *, seen: bool) -> None:
-        """Note once that a publisher's messages are not recorded, if it sent any."""
+        """Note, once, a publisher whose messages are not recorded, if it sent any."""
         progress = self.progress
         row = LeftOutTopic(header["topic"], header["type"], header.get("host", ""), header[LEFT_OUT])
         if seen and row not in self._left_out:

@@ -1,17 +1,20 @@
-"""Plan which recording an act begins or extends, and who is charged. No I/O; times are nanoseconds since the epoch.
+"""Plan which recording an act begins or extends, and which host is charged. No I/O.
 
-Control plans when it makes the audit record of the act, so the record names the recording or the reason for none. The
-recorder reads the log and carries out the plan. A recording is charged to the cause of its first trigger: `ROBOT`, a
-host or network as the policy names it, `UNKNOWN` for all other hosts together, `OPERATORS` for orders, `APPLIANCE` for
-an act without a host (a timer of a monitor).
+Times are nanoseconds since the epoch.
+
+Control plans when it makes the audit record of the act. So the record names the recording, or the reason why there is
+none. The recorder reads the log and carries out the plan. A recording is charged to the cause of its first trigger:
+`ROBOT`, a host or network as the policy names it, `UNKNOWN` for all other hosts together, `OPERATORS` for orders, or
+`APPLIANCE` for an act without a host (such as a monitor's timer).
 
 Invariants:
 
 1. Each host has at most one open recording; the robot, operators and the appliance share one (`recording_owner`). An
-   act in its time extends it, up to `longest`.
-2. Each host may begin `per_hour` recordings an hour by each kind of trigger.
-3. Recordings of one host do not overlap, except for an order's. A recording that would overlap begins at the end of the
-   last one and lasts for the length of the memory after an act, so recurring acts after the first share one recording.
+   act during a recording extends it, up to `longest`.
+2. Each host may begin `per_hour` recordings an hour for each kind of trigger.
+3. Recordings of one host do not overlap, unless an order requests one. A recording that would overlap begins at the end
+   of the previous one, and lasts for the length of the memory after an act. Therefore recurring acts after the first
+   one share a recording.
 4. All other hosts together have at most `_MOST_AT_ONCE` open recordings.
 """
 
@@ -31,7 +34,7 @@ _OURS = KEPT | {APPLIANCE}
 _MOST_AT_ONCE = 2
 _SECOND = 1_000_000_000
 _HOUR = 3600 * _SECOND
-_MOST_HOSTS = 4096  # whose last recording's end is remembered
+_MOST_HOSTS = 4096  # hosts whose last recording's end is remembered
 
 
 def recording_owner(charged_to: str) -> str:
@@ -41,7 +44,7 @@ def recording_owner(charged_to: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSpan:
-    """The period of a recording; an act extends it to `hold` after the act, never beyond `latest`."""
+    """The period of a recording; an act extends it to `hold` nanoseconds after the act, but never beyond `latest`."""
 
     began: int
     ends: int
@@ -85,7 +88,7 @@ class HourlyLimit:
             if begun[-1] + _HOUR <= now:
                 del self._begun[key]
         begun = self._begun.setdefault((charged_to, what), deque())
-        while begun and not begun[0] <= now < begun[0] + _HOUR:  # or the clock was set back
+        while begun and not begun[0] <= now < begun[0] + _HOUR:  # drops later times: the clock was set back
             begun.popleft()
         if len(begun) >= self._most:
             return False
@@ -100,9 +103,9 @@ class HourlyLimit:
 
 
 class RecordingPlan:
-    """The plan: for each audit record that is a trigger, its recording or the reason for none.
+    """The plan: for each audit record that is a trigger, the recording, or the reason why there is none.
 
-    `charged_to(host)` returns who is charged for a host's acts; `new_id` returns an id for a recording.
+    `charged_to(host)` returns the name that is charged for a host's acts; `new_id` returns an id for a recording.
     """
 
     def __init__(
@@ -179,7 +182,7 @@ class RecordingPlan:
             del self._ended[next(iter(self._ended))]
 
     def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:
-        """Note a recording that the recorder could not make; acts of the next minute get the same reason."""
+        """Note a recording that the recorder could not make; for the next minute, acts get the same reason."""
         self._close(recording_owner(charged_to), recording_id)
         self._obstacle = why, now + 60 * _SECOND
 

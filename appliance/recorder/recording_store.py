@@ -1,21 +1,24 @@
 """Keep recordings (`ID/recording.bag` and `ID/recording.json`) and unfinished ones (`.ID.part/`).
 
-A removed recording is `.ID.gone/`, without its bag, until the audit log has its removal; `.ID.rest/` is garbage.
+A removed recording stays as `.ID.gone/`, without its bag, until its removal is in the audit log. `.ID.rest/` is
+garbage.
 
 Invariants:
 
-1. A folder is renamed to the id of its recording when everything in it is on disk, so such a folder is complete.
-2. All recordings together never exceed `disk` bytes: before one begins, room for the largest is made. Hosts other than
-   the robot have at most a quarter of the disk each, and three quarters together. Their recordings never replace those
-   of the robot or of operators, for whom half of the disk is always available. The oldest recording of the kind of
-   trigger with the most bytes is removed first. The number of recordings, and the bytes of their descriptions
-   (`_MOST_DESCRIBED`), are also limited, because control gets all descriptions in one message.
-3. `noted` in a folder marks a recording that is in the audit log; others are reported again.
-4. `lent` in a folder marks a temporary recording, which does not count in `disk`. There are at most `MOST_TEMPORARY`,
-   each for up to `TEMPORARY_SECONDS`; another one replaces the oldest, unless that is so new that its reader may not
-   have opened it yet (`_OPENING_SECONDS`). A new recorder removes all of them.
-5. Whenever the recorder dies, a recording either exists, or its removal is reported: the folder is renamed atomically
-   before anything in it is removed.
+1. A folder is renamed to its recording's id only when its whole content is on disk, so a folder with that name is
+   complete.
+2. All recordings together never exceed `disk` bytes: before a recording begins, room for the largest possible one is
+   made. Each host other than the robot has at most a quarter of `disk`, and all of them together three quarters. Their
+   recordings never replace recordings of the robot or of operators, for whom half of `disk` is always available. The
+   first to be removed is the oldest recording of the kind of trigger that uses the most bytes. The number of
+   recordings, and the bytes of their descriptions (`_MOST_DESCRIBED`), are also limited, because control gets all
+   descriptions in one message.
+3. The file `noted` in a folder marks a recording that is in the audit log. Other recordings are reported again.
+4. The file `lent` in a folder marks a temporary recording, which does not count in `disk`. At most `MOST_TEMPORARY` of
+   them exist, each for up to `TEMPORARY_SECONDS`. A further one replaces the oldest, unless the oldest is so new that
+   its reader may not have opened it yet (`_OPENING_SECONDS`). A new recorder removes all temporary recordings.
+5. Whenever the recorder dies, a recording either still exists, or its removal is reported: the folder is renamed
+   atomically before anything in it is removed.
 """
 
 import re
@@ -40,7 +43,7 @@ _MOST_DESCRIBED = 32 << 20
 _NOTED, _TEMPORARY, _REMOVED, _SINCE = "noted", "lent", "removed", "since"
 _ID = re.compile(r"[0-9a-f]{20}")
 _PART, _GONE, _REST = (re.compile(rf"\.([0-9a-f]{{20}})\.{kind}") for kind in ("part", "gone", "rest"))
-_LARGEST = 8  # the part of `disk` that one recording may have
+_LARGEST = 8  # one recording may have this fraction of `disk`: an eighth
 _SECOND = 1_000_000_000
 _log = structlog.get_logger()
 
@@ -73,7 +76,7 @@ class RecordingStore:
                     _log.error("a recording cannot be read", recording=path.name, error=str(error))
 
     def _kept_since(self, recording: Recording) -> int:
-        """Return when a recording was stored, by the age clock; if unknown, its end."""
+        """Return when a recording was stored, by the age clock; if that is unknown, return the recording's end."""
         with suppress(OSError, ValueError):
             return int((self._folder / recording.id / _SINCE).read_bytes())
         return recording.ended
@@ -92,7 +95,7 @@ class RecordingStore:
         return shutil.disk_usage(self._folder).free
 
     def part(self, recording_id: str) -> Path:
-        """Return the folder in which a recording is made."""
+        """Return the folder of a recording while it is being made."""
         return self._folder / f".{recording_id}.part"
 
     def parts(self) -> list[Path]:
@@ -103,7 +106,7 @@ class RecordingStore:
         return sorted(path for path in self._folder.iterdir() if kind.fullmatch(path.name))
 
     def _discard(self, folder: Path) -> None:
-        """Remove a folder without a trace in the log. Raises `OSError`."""
+        """Remove a folder without a record in the audit log. Raises `OSError`."""
         rest = self._folder / f".{folder.name.strip('.')[:20]}.rest"
         folder.rename(rest)
         shutil.rmtree(rest)
@@ -116,7 +119,7 @@ class RecordingStore:
     def keep(self, recording: Recording) -> None:
         """Store a finished recording, which is completely on disk."""
         kept = self._folder / recording.id
-        with suppress(OSError):  # a full disk: its age then counts from its end
+        with suppress(OSError):  # the disk is full: the recording's age then counts from its end
             (self.part(recording.id) / _SINCE).write_bytes(b"%d" % self._clock())
         self.part(recording.id).rename(kept)
         (kept / PROGRESS).unlink(missing_ok=True)
@@ -158,7 +161,7 @@ class RecordingStore:
     def remove(self, recording: Recording, who: str, reason: str) -> None:
         """Remove a recording; `who` and `reason` are stored for the audit log. Raises `OSError`."""
         kept, gone = self._folder / recording.id, self._gone(recording.id)
-        with suppress(OSError):  # a full disk, which is when recordings have to go
+        with suppress(OSError):  # the disk may be full, since recordings are then removed
             (kept / _REMOVED).write_bytes(msgspec.json.encode((who, reason)))
         kept.rename(gone)
         self.recordings.remove(recording)
@@ -169,7 +172,7 @@ class RecordingStore:
         return self._folder / f".{recording_id}.gone"
 
     def removed(self) -> Iterator[tuple[Recording, str, str]]:
-        """Yield recordings whose removal may not be in the audit log yet, with who removed them and why."""
+        """Yield recordings whose removal may not be in the audit log yet, each with the removal's author and reason."""
         for folder in self._named(_GONE):
             try:
                 recording = msgspec.json.decode((folder / ABOUT).read_bytes(), type=Recording)
@@ -192,7 +195,9 @@ class RecordingStore:
         return [found for found in self.recordings if not (self._folder / found.id / _NOTED).exists()]
 
     def outdated(self, now: int) -> Iterator[tuple[Recording, str]]:
-        """Yield recordings that are too old, and the reason; the caller removes each. Remove old temporary ones.
+        """Remove old temporary recordings; yield other recordings that are too old, with the reason.
+
+        The caller must remove each yielded recording before continuing.
 
         `now` is nanoseconds since the epoch. Raises `OSError`.
         """
@@ -204,10 +209,10 @@ class RecordingStore:
             yield oldest, "it is older than recorder.days"
 
     def in_the_way(self, charged_to: str, making: Sequence[str] = ()) -> tuple[Recording | None, str]:
-        """Return the next recording to remove for a new one of this host, and the reason.
+        """Return the next recording to remove in favour of a new one of this host, and the reason.
 
-        None with a reason: no recording may be removed; None without one: there is room. `making` are the hosts of the
-        recordings in progress.
+        None with a reason means that no recording may be removed; None without a reason means that there is room.
+        `making` has the hosts of the recordings in progress.
         """
         held = self._sizes(lambda found: found.charged_to)
         held.update({name: number * self.largest for name, number in Counter((*making, charged_to)).items()})
@@ -231,7 +236,7 @@ class RecordingStore:
         return (self._oldest(own), why) if own and charged_to in KEPT else (None, why)
 
     def _oldest(self, charged_to: Collection[str]) -> Recording:
-        """Return these hosts' oldest recording of the kind of trigger with the most bytes."""
+        """Return the oldest recording of these hosts, of the kind of trigger that uses the most bytes."""
         kinds = self._sizes(lambda found: _kind(found) if found.charged_to in charged_to else "")
         del kinds[""]
         fullest = max(kinds, key=lambda kind: kinds[kind])

@@ -1,28 +1,30 @@
-"""Share memory with the latest messages of a relay; it survives the relay, and the recorder reads it.
+"""Keep the latest messages of a relay in shared memory, which survives the relay and is read by the recorder.
 
-The supervisor holds the memory; one relay writes (`RingWriter`), one recorder reads (`RingReader`). It consists of
-blocks of one size. The connection to a publisher is a *stream*: a chain of header blocks (its TCPROS header, with the
-definition of the type) and a chain of data blocks, each numbered from 0. The data chain is a sequence of records, which
-may span blocks: number of frames, their bytes, time, number of the first frame, and the frames.
+The supervisor holds the memory, one relay writes it (`RingWriter`), and one recorder reads it (`RingReader`). The
+memory consists of blocks of one size. Each connection to a publisher is a *stream*: a chain of header blocks (the
+connection's TCPROS header, with the definition of the type) and a chain of data blocks. The blocks of each chain are
+numbered from 0. The data chain is a sequence of records, which may span blocks. A record has the number of frames,
+their size in bytes, the time, the number of the first frame, and the frames.
 
 Invariants:
 
-1. A block is valid up to `used` in its row of the table, a word that is stored after the data. A row is valid while
-   `birth`, another word, is not 0; it is stored last. So a writer that is killed at any instruction leaves complete
-   records, and at most one torn record at the end of a chain, which is not read.
-2. A block that is reused first gets `birth` 0. A reader copies the block, then reads `birth` again; if it has changed,
-   the copy is discarded.
-3. While blocks are free, every stream may take them. When none is free, this block is reused: the oldest, if it is too
-   old; else the oldest of the writing topic or host, if that has its quota; else the oldest of a topic or host that
-   exceeds its quota; else the oldest of all. So a flood replaces itself. The block that an active stream is filling
-   counts as new.
-4. The reader trusts nothing: it derives all sizes from the memory's own size, and bounds every number by it.
-5. Header blocks stay while their stream is open or has data. They take at most a quarter of the memory, and those of a
-   host a quarter of its quota. Closed streams make room, the oldest first. A stream whose header has no room is counted
-   (`REFUSED`) and not recorded. Messages of a record larger than its topic's quota are counted (`MISSED`).
+1. A block is valid up to `used`, a word in the block's row of the table that is stored after the data. A row is valid
+   while its word `birth` is not 0; this word is stored last. So a writer that is killed at any instruction leaves
+   complete records, and at most one torn record at the end of a chain. The reader ignores a torn record.
+2. Before a block is reused, its `birth` is set to 0. The reader copies a block and then reads `birth` again. If `birth`
+   has changed, the reader discards the copy.
+3. While blocks are free, every stream may take them. When none is free, the first of these is reused: the oldest block,
+   if it is too old; the oldest of the writing topic or host, if that topic or host has used its quota; the oldest of a
+   topic or host above its quota; the oldest of all. So a flood replaces its own data. A block that an active stream is
+   filling counts as new.
+4. The reader trusts no content: it derives all sizes from the memory's own size, and bounds every number by that size.
+5. Header blocks stay while their stream is open or has data. They take at most a quarter of the memory, and the header
+   blocks of one host at most a quarter of its quota. If a new header has no room, closed streams are removed, the
+   oldest first. A stream whose header still has no room is counted (`REFUSED`) and not recorded. Messages in a record
+   larger than its topic's quota are counted (`MISSED`) and not recorded.
 
-`used` and `birth` are aligned words of 64 bits. If the processor reorders stores (ARM), a reader sees a record's data
-at its next check at the latest; it reads data that is some milliseconds old.
+`used` and `birth` are aligned words of 64 bits. If the processor reorders stores (ARM), the reader may see a record's
+data only at its next check. This is harmless: the reader reads data that is some milliseconds old.
 """
 
 import struct
@@ -48,13 +50,13 @@ NONE_BEGINS = (1 << 32) - 1
 
 _BLOCKS = 4096
 _SMALLEST_BLOCK, _LARGEST_BLOCK = 4 << 10, 256 << 10
-_COUNTERS = 4096  # bytes before the table
-_WORDS = 8  # of a row
+_COUNTERS = 4096  # size in bytes of the counters, which precede the table
+_WORDS = 8  # 64-bit words of a row
 _ROW = struct.Struct("=QQQIIQ24x")  # birth, stream, number, kind, begins, used
-MISSED, REFUSED = 0, 1  # words of the counters
-_LONG = 4  # blocks; a longer record begins with a new block, so that it does not depend on a much older one
+MISSED, REFUSED = 0, 1  # indexes of the counters' words
+_LONG = 4  # blocks; a longer record begins in a new block, so that it does not depend on a much older block
 _MOST_NUMBER = 1 << 62
-_MOST_HEADERS = 4  # a quarter
+_MOST_HEADERS = 4  # headers may take a quarter
 
 
 class Geometry(NamedTuple):
@@ -88,7 +90,7 @@ class BlockRow(NamedTuple):
 
     @property
     def sound(self) -> bool:
-        """Whether the row is in use and plausible: a compromised writer's numbers must not exceed a word."""
+        """Whether the row is in use and plausible; numbers of a compromised writer must not overflow a word."""
         return (
             0 < self.birth < _MOST_NUMBER
             and 0 < self.stream < _MOST_NUMBER
@@ -99,7 +101,7 @@ class BlockRow(NamedTuple):
 
 @dataclass(eq=False, slots=True)
 class _Share:
-    """The data blocks of a topic or host, the oldest first, and its numbers of header blocks and streams."""
+    """The data blocks of a topic or host, oldest first, and the numbers of its header blocks and streams."""
 
     most: int
     blocks: OrderedDict[int, None] = field(default_factory=OrderedDict)
@@ -143,7 +145,7 @@ class RingStream:
     """The open stream of one connection to a publisher."""
 
     keeps = True
-    """Whether it stores what is written to it."""
+    """Whether the stream stores the messages written to it."""
 
     __slots__ = ("_chain", "_end", "_number", "_place", "_ring", "_stream", "_used", "block", "written")
 
@@ -153,12 +155,12 @@ class RingStream:
         self._chain = chain
         self._number = 0
         self.block = -1
-        self.written = 0  # the time
+        self.written = 0  # time of the last record
         self._place = self._end = 0  # offsets in the memory
         self._used = 0  # the index of the block's word
 
     def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
-        """Append frames; `first` is the number of the first one, `judged` the time when monitors got them, or 0."""
+        """Append frames; `first` is the first frame's number, `judged` the time when monitors got the frames, or 0."""
         ring = self._ring
         size = len(frames)
         now = self.written = ring.clock(judged)
@@ -179,11 +181,11 @@ class RingStream:
         self._ring.close_chain(self._stream, self._chain)
 
     def lose_block(self) -> None:
-        """Begin a new block with the next record, because the present one is reused."""
+        """Begin a new block with the next record, because another stream reuses the current block."""
         self.block, self._place, self._end = -1, 0, 0
 
     def _append(self, head: memoryview, frames: memoryview) -> None:
-        """Append a record that does not fit into the present block."""
+        """Append a record that does not fit in the current block."""
         ring = self._ring
         left = len(head) + len(frames)
         if left > _LONG * ring.block and self._place + _PAD.size <= self._end:
@@ -216,7 +218,7 @@ class RingStream:
 
 
 class RingWriter:
-    """The writer of `memory` (shared, writable); it keeps the data of earlier writers.
+    """Writes `memory` (shared, writable), and keeps the data of earlier writers.
 
     `topic_share` and `host_share` are the parts of the memory that one topic and one host may keep when others need it.
     Blocks older than `seconds` are reused first.
@@ -285,7 +287,7 @@ class RingWriter:
         self.words[counter] = (self.words[counter] + by) % (1 << 64)
 
     def take(self, stream: int, number: int, kind: int, begins: int, chain: _Chain, *, now: int) -> int:
-        """Give a stream a block, reused if none is free (invariant 3), and return it."""
+        """Assign a block to a stream and return it; if none is free, reuse one (invariant 3)."""
         if not self._free:
             self._give_up(chain, now - self._keep)
         block = self._free.pop()
@@ -312,7 +314,7 @@ class RingWriter:
             self._forget(stream, chain)
 
     def _give_up(self, chain: _Chain, old: int) -> None:
-        """Free a block for this stream by invariant 3; blocks from before `old` are too old."""
+        """Free a block for this stream by invariant 3; blocks written before the time `old` are too old."""
         oldest = self._oldest(old)
         if self._order[oldest][1] >= old or self._in_use(oldest, old):
             full = (share for share in chain.shares if len(share.blocks) >= share.most)
@@ -321,7 +323,7 @@ class RingWriter:
         self._push_out(oldest)
 
     def _in_use(self, block: int, old: int) -> bool:
-        """Whether a stream is filling this block and has written lately: a slow stream may have all its data there."""
+        """Whether a stream is filling this block and has written lately; a slow stream may have all its data in it."""
         writer = self._chains[self._order[block][0]].writer
         return writer is not None and writer.block == block and writer.written >= old
 
@@ -349,7 +351,7 @@ class RingWriter:
             loser.writer.lose_block()
 
     def _room_for_header(self, needed: int, host: _Share) -> bool:
-        """Whether a header has room in the ring and in the host's part; frees closed streams if needed."""
+        """Whether a header has room in the ring and in the host's part; remove closed streams if needed."""
 
         def crowded(*, of_host: bool) -> bool:
             has, whole = (
@@ -387,7 +389,7 @@ class RingWriter:
         self._free.append(block)
 
     def _inherit(self) -> None:
-        """Take over an earlier writer's blocks as the oldest, and its streams as closed."""
+        """Take over an earlier writer's blocks as the oldest ones, and its streams as closed ones."""
         left = sorted((row, block) for block, row in rows(self.memory) if row.sound)
         with_data = {row.stream for row, _block in left if row.kind == DATA}
         for row, block in left:

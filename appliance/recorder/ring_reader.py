@@ -28,7 +28,7 @@ _LONGEST_HEADER = 256 << 10
 _NEEDED = frozenset({"topic", "type", "md5sum", "message_definition", "callerid", "host"})
 _LONGEST_TYPE = 256
 MOST_MESSAGES = 1 << 53
-"""More messages than any stream has."""
+"""An upper bound for the number of messages in a stream."""
 
 _Blocks = dict[int, tuple[int, BlockRow]]
 """The blocks of a chain by their number, each with its row."""
@@ -42,7 +42,7 @@ class ReadPosition(NamedTuple):
 
 
 class RecordedFrames(NamedTuple):
-    """Frames of one batch, without their lengths; `time` is nanoseconds since the epoch, `first` from 1."""
+    """Frames of one batch, without their lengths; `time` is nanoseconds since the epoch, and `first` counts from 1."""
 
     time: int
     first: int
@@ -65,7 +65,7 @@ class _Run:
     number: int
     begins: int
     data: bytearray
-    broken: bool  # data before it is missing
+    broken: bool  # whether data before this run is missing
 
 
 class RingReader:
@@ -79,14 +79,14 @@ class RingReader:
 
     @property
     def not_there(self) -> tuple[int, int]:
-        """Return the numbers of messages that were too long, and of streams without room, since the ring exists."""
+        """Return how many messages were too long, and how many streams had no room, since the ring was created."""
         return self._words[MISSED], self._words[REFUSED]
 
     def read(self, since: int, until: int) -> Iterator[StreamFrames]:
         """Yield the messages since the last call that were received from `since` to `until`.
 
-        Times are nanoseconds since the epoch. Later messages are left to a later call, because they may arrive during
-        this one. A later message that an earlier one follows is left out: the clock was set back.
+        Times are nanoseconds since the epoch. Messages after `until` are left for a later call. Such a message is
+        skipped if the stream continues with an earlier one, because then the clock was set back.
         """
         headers: dict[int, _Blocks] = {}
         data: dict[int, _Blocks] = {}
@@ -118,8 +118,8 @@ class RingReader:
     def _copy(self, block: int, row: BlockRow) -> bytes | None:
         """Return the used part of a block; None if the block was reused.
 
-        The present `used` counts, not the one in the copied table: the block may have been filled, and the next one
-        begun, while the table was copied.
+        Use the current `used`, not the one in the copied table: while the table was copied, the block may have been
+        filled and the next one begun.
         """
         start = self._geometry.data + block * self._geometry.block
         part = bytes(self._memory[start : start + min(self._words[used_at(block)], self._geometry.block)])
@@ -155,7 +155,7 @@ class RingReader:
         place, torn = self.places.get(stream), False
         for run in self._runs(blocks, place):
             at = done = run.begins if run.broken else 0 if place is None else place.offset
-            # Only the first record's time shows whether the missing data is of the requested period.
+            # The first record's time alone shows whether the missing data belongs to the requested period.
             in_doubt = run.broken
             view = memoryview(bytes(run.data))
             while at + _LENGTH.size <= len(view):
@@ -189,7 +189,7 @@ class RingReader:
 
 
 def _readable(header: dict[str, str]) -> dict[str, str]:
-    """Return the header with its bytes replaced by text that tools can read."""
+    """Return the header with undecodable bytes replaced and long fields cut, so that tools can read it."""
     definition = header["message_definition"].encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     plain = {name: header[name][:_LONGEST_TYPE] for name in ("type", "md5sum")}
     if "latching" in header:

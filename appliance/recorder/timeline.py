@@ -1,10 +1,10 @@
-"""Compute a recording's time line, and its messages around a time, for the analysis of an incident.
+"""Compute a recording's timeline, and find its messages around a time, for the analysis of an incident.
 
-Columns, topics, events and messages are limited in number, however large the recording is. Omissions are reported.
-Messages are read within the bounds of `roswire/message_view.py`.
+The numbers of columns, topics, events and messages are limited, however large the recording is. Omissions are reported.
+`roswire/message_view.py` bounds the values shown of a message.
 
-Events come from the audit records in the bag: retention may have removed them from the log since. A publisher's header
-has a host; the recorder's own has none.
+Events come from the audit records in the bag, because retention may have removed them from the log since. In the bag, a
+publisher's header has a host, and the recorder's own header has none.
 """
 
 from collections import defaultdict
@@ -38,7 +38,7 @@ COLUMNS, MOST_COLUMNS = 200, 1000
 NEIGHBOURS, MOST_NEIGHBOURS = 5, 25
 MOST_TOPICS = 300
 MOST_EVENTS = 500
-_MOST_BYTES = 1 << 20  # of a message; people are shown much less
+_MOST_BYTES = 1 << 20  # bytes read of a message; people are shown far fewer
 _LONGEST_RECORD = 1 << 22
 _SECOND = 1_000_000_000
 _NOTABLE = (Severity.NOTICE, Severity.WARNING, Severity.ALARM)
@@ -59,7 +59,7 @@ class _Said(msgspec.Struct):
 
 
 class _Columns:
-    """Equal parts of the time from `since` to `until`, both included."""
+    """Columns of equal length that divide the time from `since` to `until` (both inclusive)."""
 
     def __init__(self, since: int, until: int, number: int) -> None:
         self.since, self.until, self.number = since, until, number
@@ -72,7 +72,7 @@ class _Columns:
                 counts[(time - self.since) // self._width] += 1
 
     def only(self, first: int, last: int) -> int | None:
-        """Return the column that contains both `first` and `last`; None if there is none."""
+        """Return the column that contains both times; None if no column does."""
         if first < self.since or last > self.until:
             return None
         column = (first - self.since) // self._width
@@ -86,7 +86,7 @@ def timeline(
     until: int | None = None,
     columns: int = COLUMNS,
 ) -> Timeline:
-    """Return the time line from `since` to `until` (nanoseconds since the epoch; None: the recording's ends).
+    """Return the timeline from `since` to `until` (nanoseconds since the epoch; None: the recording's start or end).
 
     Raises `OSError`, and `ValueError` if the recording has no such time or the bag is invalid.
     """
@@ -171,7 +171,7 @@ def _events(reader: BagReader, since: int, until: int) -> Iterator[RecordedEvent
 
 
 def _kind(said: _Said) -> EventKind | None:
-    """Return the kind of a record on the time line; None if it is not shown."""
+    """Return the kind of event that the timeline shows for a record; None if the record is not shown."""
     kinds = kinds_of(said.event, said.decision, said.severity)
     if kinds:
         return kinds[0]  # type: ignore[return-value]  # a record's kinds of trigger are kinds of event
@@ -187,9 +187,9 @@ def messages_around(
     topics: Collection[str] = (),
     neighbours: int = NEIGHBOURS,
 ) -> RecordedMessages:
-    """Return at most `neighbours` messages before a time or position, and one more than that from it on.
+    """Return at most `neighbours` messages before a time or position, and at most one more from it on.
 
-    `topics`: only these; empty: all. Raises `OSError`, and `ValueError` if the bag is invalid.
+    `topics` limits the result to these topics (empty: all). Raises `OSError`, and `ValueError` if the bag is invalid.
     """
     place = at if isinstance(at, MessagePosition) else MessagePosition(at, 0, 0)
     with BagReader.of(bag) as reader:
@@ -224,7 +224,7 @@ def messages_around(
 
 
 def _of_nodes(reader: BagReader) -> Iterator[int]:
-    """Yield the connections of publishers, without those of the recorder itself."""
+    """Yield the connections of publishers; omit those of the recorder itself."""
     for number, header in reader.connections.items():
         if header["topic"] not in (RECORDS, LOG) or "host" in header:
             yield number
