@@ -1,16 +1,16 @@
-"""The relay process of each topic, service and file of specifications.
+"""Assign topics, services and files of specifications to relay processes.
 
-Files whose specifications share topics, services or variables, or publish on each other's topics, are a *group*. A
-group and everything it uses are on one relay, so every message meets all its monitors there. The relay of a topic or
-service without a specification depends on its name.
+Files whose specifications share topics, services or variables, or publish on each other's topics, form a *group*. A
+group and everything that it uses are on one relay, so every message meets all its monitors there. A topic or service
+without a specification is assigned by a hash of its name.
 
 Invariants:
 
-1. A topic (a service) is carried by exactly one relay at any time, for all its publishers.
+1. At any time, exactly one relay carries a topic or service, for all its publishers.
 2. A plan moves as few running monitors as possible, then as few carried topics and services, and then balances loads.
-3. In a plan no relay both gives up and gets monitored topics: a relay has the monitors before it carries the topics,
-   and keeps them until it carries them no longer.
-4. The allocation survives the death of control, as connections in the relays do.
+3. In a plan, no relay both loses and gains monitored topics. A relay gets monitors before it carries their topics, and
+   keeps the monitors until it no longer carries these topics.
+4. The allocation survives the death of control, as do connections in the relays.
 """
 
 import json
@@ -28,7 +28,7 @@ Resource = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class FileGroup:
-    """Files that stay together, the number of specifications in each, and what they use."""
+    """Files that stay together, the number of specifications in each, and the topics and services that they use."""
 
     files: Mapping[str, int]
     resources: frozenset[Resource]
@@ -51,7 +51,7 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class AllocationPlan:
-    """A possible allocation: files and resources by relay, what moves, and the monitors that move."""
+    """A possible allocation: the relays of files and resources, and the resources and files that move."""
 
     files: Mapping[str, int] = field(default_factory=dict)
     resources: Mapping[Resource, int] = field(default_factory=dict)
@@ -79,7 +79,7 @@ class Allocation:
 
     @property
     def resources(self) -> set[Resource]:
-        """Return the topics and services that are placed explicitly, and not by their name."""
+        """Return the topics and services that are placed explicitly, not by their name."""
         return set(self._plan.resources)
 
     def restore(self, text: str) -> bool:
@@ -124,7 +124,7 @@ class Allocation:
     def _one_way(
         self, groups: Sequence[FileGroup], homes: Sequence[int], carried: Collection[Resource]
     ) -> list[int]:
-        """Return the relays with all moving groups on one relay, so that nothing leaves it."""
+        """Return each group's relay, with all moving groups on one relay, so that nothing leaves that relay."""
         moving = [
             self._cost(group, home, carried) != (0, 0) for group, home in zip(groups, homes, strict=True)
         ]
@@ -150,7 +150,7 @@ class Allocation:
         for group, relay in zip(groups, homes, strict=True):
             files.update(dict.fromkeys(group.files, relay))
             resources.update(dict.fromkeys(group.resources, relay))
-        for resource in carried:  # resources that no specification touches stay
+        for resource in carried:  # resources without a specification stay on their relay
             here = self._of(before.resources, resource)
             if resource not in resources and here != self._by_name(resource):
                 resources[resource] = here
@@ -175,7 +175,7 @@ class Allocation:
         self._save(json.dumps(kept))
 
     def _cost(self, group: FileGroup, relay: int, carried: Collection[Resource]) -> tuple[int, int]:
-        """Return how many monitors, and how many carried topics and services, would move to a relay."""
+        """Return how many monitors of a group, and how many carried topics and services, would move to a relay."""
         here = self._plan.files
         return sum(count for name, count in group.files.items() if here.get(name, relay) != relay), sum(
             resource in carried and self._of(self._plan.resources, resource) != relay
@@ -191,7 +191,7 @@ class Allocation:
 
 
 def groups_of(checked: CheckedSpecifications) -> list[FileGroup]:
-    """Return the groups, the largest first; equally large ones in the order of their files' names."""
+    """Return the groups, largest first; groups of equal size are in the order of their files' names."""
     touched: dict[str, set[Resource]] = {file: set() for file in checked.monitors.values()}
     for name, file in checked.monitors.items():
         touched[file] |= {(TOPIC, topic) for topic in checked.topics[name]}
@@ -210,7 +210,7 @@ def groups_of(checked: CheckedSpecifications) -> list[FileGroup]:
 
 
 def _join(touched: Mapping[str, Iterable[Resource]], checked: CheckedSpecifications) -> list[set[str]]:
-    """Return the sets of files that a topic, a service or a variable connects, also indirectly."""
+    """Return the sets of files that topics, services or variables connect, directly or indirectly."""
     group = {file: {file} for file in touched}
 
     def join(one: str, other: str) -> None:

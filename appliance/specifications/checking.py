@@ -1,4 +1,4 @@
-"""Compile whole sets of specifications: for control in the process `compiler`, by `check` in the caller's process."""
+"""Compile whole sets of specifications; for control, this runs in the process `compiler`."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -22,13 +22,13 @@ from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
 
-_LONGEST = 32 << 20  # bytes: half of what a channel takes
+_LONGEST = 32 << 20  # bytes: half of what a channel carries
 
 
 def check(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    """Compile everything in this process. Raises `SpecificationsRefusedError` with all errors.
+    """Compile everything in the caller's process. Raises `SpecificationsRefusedError` with all errors.
 
-    With `site_keys`, each text must be signed with one of them.
+    With `site_keys`, each text must be signed with one of these keys.
     """
     if not sources.files:
         return CheckedSpecifications()
@@ -77,7 +77,7 @@ def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
 
 
 def _places(monitors: MonitorSet) -> dict[str, str]:
-    """Return where each topic is first named."""
+    """Return the position where each topic is first named, as text."""
     named = [
         (event.position, event.topic) for monitor in monitors.monitors for event in monitor.code.events
     ] + [(publication.position, publication.topic) for publication in monitors.compiled.publications]
@@ -89,7 +89,7 @@ def _places(monitors: MonitorSet) -> dict[str, str]:
 
 
 def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
-    """Return the parts of a set (`Contents.compiled`) that these relays run. Raises `SpecificationsRefusedError`."""
+    """Return the parts of a set (`Contents.compiled`) for these relays. Raises `SpecificationsRefusedError`."""
     whole = decoded(compiled)
     try:
         return [_bounded(encoded_part(part_of(whole, names.monitors, names.shadows))) for names in wanted]

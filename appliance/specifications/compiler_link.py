@@ -1,9 +1,10 @@
 """Control's link to the compiler process, which parses specifications for it.
 
-The process is started on demand and ends when it is idle. Specifications that exceed its limits end it and are refused;
-those in force stay.
+The process is started on demand and ends when it is idle. Specifications that exceed its limits are refused and end the
+process; the specifications in force stay in force.
 
-Orders precede dry runs: one dry run at a time begins while no order is compiled, and an order ends it.
+Orders take precedence over dry runs. A dry run begins only while no order is compiled and no other dry run is under
+way; a new order ends it.
 """
 
 import asyncio
@@ -25,28 +26,28 @@ from appliance.specifications.specification_files import (
 
 _START_SECONDS = 60.0  # on a machine that is busy starting
 _WORK_SECONDS = 180.0  # on a busy machine; the compiler bounds its processor time
-_LOOK_SECONDS = 1.0  # between two checks whether the client of the order still waits
+_LOOK_SECONDS = 1.0  # between two checks that the client of the order still waits
 _ENDED = "the compiler exited while it read them, possibly at its limit of memory or time; check the log"
 _ENDED_BY_ORDER = "the dry run was stopped, because a change needed the compiler: try again"
-_TRIES = 2  # an idle compiler may end just when it is asked
+_TRIES = 2  # an idle compiler may end just when a question is sent
 
 
 class SpecificationCompiler:
-    """Control's end of the link; `wanted()` has the compiler process started."""
+    """Control's end of the link; `wanted()` requests the start of the compiler process."""
 
     def __init__(self, wanted: Callable[[], None]) -> None:
         self._wanted = wanted
         self._link = Link(self._heard)
         self._there = asyncio.Event()
         self._called = False
-        self._orders = 0  # that are being compiled
+        self._orders = 0  # number of orders that are being compiled
         self._no_order = asyncio.Event()
         self._no_order.set()
         self._one_dry_run = asyncio.Lock()
-        self._dry_run = False  # whether one is being compiled
+        self._dry_run = False  # whether a dry run is being compiled
 
     def call(self) -> None:
-        """Start the compiler, because there will soon be something to compile."""
+        """Start the compiler early, because a compilation will soon be requested."""
         if self._link.channel is None and not self._called:
             self._there.clear()
             self._called = True
@@ -59,7 +60,7 @@ class SpecificationCompiler:
         self._there.set()
 
     async def check(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-        """Compile for an order. Raises `SpecificationsRefusedError`, also when the compiler does not answer."""
+        """Compile for an order. Raises `SpecificationsRefusedError`, also if the compiler does not answer."""
         if not sources.files:
             return CheckedSpecifications()
         require_bounded(sources)
@@ -70,7 +71,7 @@ class SpecificationCompiler:
         return checked(answer.contents, sources, site_keys)
 
     async def try_out(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-        """Compile for a dry run. Raises as `check`, also when an order ended it."""
+        """Compile for a dry run. Raises the errors of `check`, also if an order ended the dry run."""
         if not sources.files:
             return CheckedSpecifications()
         require_bounded(sources)
@@ -89,7 +90,7 @@ class SpecificationCompiler:
         return checked(answer.contents, sources, site_keys)
 
     async def parts(self, compiled: bytes, wanted: list[messages.PartNames]) -> list[bytes]:
-        """Compile the parts of relays. Raises `SpecificationsRefusedError`, also when the compiler does not answer."""
+        """Compile the relays' parts. Raises `SpecificationsRefusedError`, also if the compiler does not answer."""
         with self._order():
             answer: messages.PartsMade = await self._asked(
                 lambda number: messages.PartsWanted(number, compiled, wanted)
@@ -98,11 +99,11 @@ class SpecificationCompiler:
 
     @contextlib.contextmanager
     def _order(self) -> Iterator[None]:
-        """End a dry run, and let no other begin while an order is compiled."""
+        """End a dry run in progress, and let no dry run begin while an order is compiled."""
         self._orders += 1
         self._no_order.clear()
         if self._dry_run:
-            self._link.close()  # the compiler ends with the work that it has
+            self._link.close()  # without its link, the compiler ends together with its work
         try:
             yield
         finally:
@@ -113,7 +114,10 @@ class SpecificationCompiler:
     async def _asked(
         self, question: Callable[[int], messages.Message], *, goes_on: Callable[[], bool] = lambda: True
     ) -> Any:
-        """Return the answer, while `goes_on()`; if the compiler has just ended, ask the next one."""
+        """Return the answer; if the compiler has just ended, ask its successor.
+
+        Raises `SpecificationsRefusedError`, also if `goes_on()` returns False.
+        """
         for _ in range(_TRIES):
             try:
                 self.call()
@@ -137,7 +141,7 @@ class SpecificationCompiler:
         raise SpecificationsRefusedError([_ENDED])
 
     async def _answer(self, question: Callable[[int], messages.Message]) -> Any:
-        """Ask, and end the compiler if the order is withdrawn meanwhile. Raises as `Link.ask`."""
+        """Ask, and end the compiler if the order is withdrawn meanwhile. Raises the errors of `Link.ask`."""
         asking = asyncio.ensure_future(self._link.ask(question, _WORK_SECONDS))
         try:
             while not (await asyncio.wait((asking,), timeout=_LOOK_SECONDS))[0]:

@@ -1,7 +1,7 @@
 """Compare specifications with the topics that are published now. No I/O.
 
-A specification with another type than the publisher's would cut the topic, since the relay cannot read its messages. A
-topic that no node publishes may be misspelled. A change is checked for both before it comes into force.
+If a specification has another type than the publisher, loading it would cut the topic, because the relay cannot read
+the messages. A topic that no node publishes may be misspelled. Both are checked before a change comes into force.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -12,20 +12,20 @@ from appliance.specifications.specification_files import CheckedSpecifications
 
 
 class LiveType(NamedTuple):
-    """The type that a node registered, and the md5sum in its header; empty if no relay has seen the header."""
+    """The type that a node registered, and the md5sum in its header (empty if no relay has seen the header)."""
 
     name: str
     md5sum: str = ""
 
 
 Published = Mapping[str, Mapping[str, LiveType]]
-"""The nodes that publish a topic, and the type that each publishes."""
+"""For each topic, its publishers with the type that each publishes."""
 
 _ANY = "*"
 
 
 class TopicFindings(NamedTuple):
-    """`conflicts` are topics that would be cut, `warnings` the rest; both as `file:line:column: severity: text`."""
+    """`conflicts` are topics that would be cut, `warnings` all others; both as `file:line:column: severity: text`."""
 
     conflicts: list[str]
     warnings: list[str]
@@ -40,10 +40,10 @@ def judge_topics(
     forced: bool,
     promoted: Collection[str] = (),
 ) -> TopicFindings:
-    """Compare topics that specifications add, or give another type, with what nodes publish.
+    """Compare topics that specifications add, or give another type, with the topics that nodes publish.
 
-    Monitors in `shadow` mode cut nothing: they do not get messages that they cannot read. With `forced`, conflicts are
-    warnings. Monitors that are `promoted` from shadow mode are judged again.
+    Monitors in `shadow` mode cut nothing: they just do not get messages that they cannot read. With `forced`, conflicts
+    are warnings. Monitors that are `promoted` from shadow mode are judged again.
     """
     found = TopicFindings([], [])
     acting = [name for name in coming.monitors if name not in shadow]
@@ -78,7 +78,7 @@ _UNREAD = "monitors in shadow mode do not see its messages"
 
 
 def _difference(theirs: LiveType, ours: LiveType) -> str:
-    """Return how the types differ, or an empty string. As in ROS, `*` fits all, and the md5sum decides."""
+    """Return how the types differ, or an empty string. As in ROS, `*` fits any type, and the md5sum decides."""
     if theirs.name not in (_ANY, ours.name):
         return f"{theirs.name}, not as {ours.name}"
     if {theirs.md5sum, ours.md5sum} & {"", _ANY} or theirs.md5sum == ours.md5sum:
@@ -90,5 +90,5 @@ _DEFINITION = "add the robot's definition to the specifications: in msg/ beside 
 
 
 def _heard(checked: CheckedSpecifications, names: Iterable[str]) -> set[str]:
-    """Return the topics that these monitors have events on."""
+    """Return the topics on which these monitors have events."""
     return {topic for name in names for topic in checked.topics[name]}

@@ -1,4 +1,4 @@
-"""Audit records and counts of the relays' reports about monitors."""
+"""Make audit records and counts from the relays' reports about monitors."""
 
 import datetime
 from collections import Counter
@@ -26,11 +26,11 @@ _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severit
 
 @dataclass(frozen=True, slots=True)
 class MonitorRecords:
-    """The maker of records from reports; `fields(topic, data)` reads a message.
+    """Makes audit records from reports; `fields(topic, data)` parses a message.
 
-    `counts` has the number of events of each kind, by monitor; a change by several monitors counts for each. `at` has
-    the number of dropped or changed messages of each topic. Actions that monitors in shadow mode would have taken are
-    kinds of their own. Each of `told` is called for every event.
+    `counts` has the number of events by kind and monitor; a change by several monitors counts for each of them. `at`
+    has the number of dropped or changed messages by topic. Actions that monitors in shadow mode would have taken are
+    separate kinds. Each callback in `told` gets every event.
     """
 
     trail: AuditTrail

@@ -1,10 +1,10 @@
-"""Have all relays take new specifications, each its own files, or none.
+"""Roll out new specifications to all relays, each with its own files, or to none.
 
-First, relays that give nothing up get their new specifications. When all have taken them, topics that move are
-withdrawn from their relay, the allocation changes, and they are placed on the relay that has their monitors: no message
-bypasses its monitors. Then the relays that gave something up get their specifications; the load is complete when these
-have answered (`all_taken`). A monitor whose file moves loses its state, which stays with the former relay; if its
-actions depend on its state, it holds its topics.
+First, relays that give nothing up get their new specifications. When all of these have taken them, moving topics are
+withdrawn from their old relay, and the allocation changes. The topics are then placed on the relay that has their
+monitors, so no message bypasses its monitors. Then the relays that gave something up get their specifications; the load
+is complete when they have answered (`all_taken`). A monitor whose file moves loses its state, which stays with the
+former relay. If the monitor's actions depend on its state, the monitor holds its topics.
 """
 
 import asyncio
@@ -31,15 +31,15 @@ Switch = bool | Literal["shadow"]
 """Whether the actions of a monitor take effect; in shadow mode they are only reported."""
 
 _RELAY_SECONDS = 15.0
-_TRIES = 5  # while affected nodes come and go
+_TRIES = 5  # attempts, because affected nodes may come and go meanwhile
 _SILENT = f"a relay does not answer within {_RELAY_SECONDS:g} s"
 
 
 class Relays(Protocol):
-    """The relays, as the specifications use them."""
+    """The interface to the relays that the specifications need."""
 
     def send(self, message: Message, relay: int) -> bool:
-        """Send to a relay; return False if it is not connected."""
+        """Send a message to a relay; return False if the relay is not connected."""
 
     async def carried_out(self) -> None:
         """Wait until every relay has carried out its messages."""
@@ -48,10 +48,10 @@ class Relays(Protocol):
         """Return the topics and services of live nodes."""
 
     def withdraw(self, moves: Sequence[Move]) -> None:
-        """Stop carrying these, before the new allocation is adopted."""
+        """Stop carrying these topics and services; called before the new allocation is adopted."""
 
     def place(self, moves: Sequence[Move]) -> None:
-        """Carry these on their new relays, after the allocation was adopted."""
+        """Carry these topics and services on their new relays; called after the allocation was adopted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,16 +66,15 @@ class Revision:
 
 
 Parts = Callable[[bytes, list[messages.PartNames]], Awaitable[list[bytes]]]
-"""Returns the parts of a compiled set that some relays run. Raises `SpecificationsRefusedError`."""
+"""Returns the parts of a compiled set for the named monitors. Raises `SpecificationsRefusedError`."""
 
 
 @dataclass(slots=True)
 class Rollout:
-    """The specifications that the relays got and their answers; `states(checked)` maps each monitor to whether it is
-    in force.
+    """The specifications that the relays got, and their answers; `states(checked)` returns each monitor's switch.
 
-    Each relay gets only its own part of the compiled set (`parts`), before the specifications are stated. `rows` has
-    state and counters of the monitors, as far as their relays have reported.
+    Each relay gets only its own part of the compiled set; `parts` makes the parts before the specifications are stated.
+    `rows` has the state and counters of monitors that their relays have reported.
     """
 
     allocation: Allocation
@@ -87,11 +86,11 @@ class Rollout:
     parts: Parts
     rows: dict[str, messages.MonitorRow] = field(default_factory=dict)
     _now: Revision = field(default_factory=Revision)
-    # The parts that relays run of the specifications in force, and of those being tried.
+    # The relays' parts of the specifications in force, and of specifications being tried.
     compiled_parts: dict[tuple[bytes, messages.PartNames], bytes] = field(default_factory=dict)
-    _known: set[int] = field(default_factory=set)  # relays that had specifications before
+    _known: set[int] = field(default_factory=set)  # relays that have had specifications
     _fresh: set[int] = field(default_factory=set)  # relays that have not answered since they connected
-    _coming: tuple[Revision, AllocationPlan] | None = None  # being tried
+    _coming: tuple[Revision, AllocationPlan] | None = None  # the specifications being tried
     # Answers awaited from relays that gave something up.
     _answers: dict[int, asyncio.Future[list[str]]] = field(default_factory=dict)
     # Answers by relay and statement.
@@ -99,13 +98,13 @@ class Rollout:
     # Relays may outlive control, so no number may be repeated.
     _numbers: Iterator[int] = field(default_factory=lambda: itertools.count(time.monotonic_ns()))
     _refusals: dict[int, list[str]] = field(default_factory=dict)
-    _began: set[str] = field(default_factory=set)  # by the present change
+    _began: set[str] = field(default_factory=set)  # monitors that began again by the present change
     _held: dict[int, dict[str, str]] = field(default_factory=dict)
     _rows: dict[int, list[messages.MonitorRow]] = field(default_factory=dict)
 
     @property
     def refused(self) -> list[str]:
-        """Return why relays refuse the specifications in force; empty if none does."""
+        """Return why relays refuse the specifications in force; empty if no relay does."""
         return [finding for findings in self._refusals.values() for finding in findings]
 
     @property
@@ -115,11 +114,11 @@ class Rollout:
 
     @property
     def why_held(self) -> dict[str, str]:
-        """Return the monitors that hold their topics, and why their state was lost (empty: it was not)."""
+        """Return the monitors that hold their topics, each with the reason why its state was lost (empty: not lost)."""
         return {name: why for names in self._held.values() for name, why in names.items()}
 
     async def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
-        """Begin with these in force; after a crash of control (`restarted`), relays keep their specifications.
+        """Begin with these specifications; after a crash of control (`restarted`), relays keep the ones that they have.
 
         Raises `SpecificationsRefusedError`.
         """
@@ -127,7 +126,7 @@ class Rollout:
         if restarted:
             self._known = set(range(self.allocation.relays))
         carried = self.allocation.resources if restarted and self.allocation.restore(kept) else ()
-        # the stored allocation may be from a change that control did not survive: adapt it as little as possible
+        # control may have died during a change after storing its allocation: adapt the allocation as little as possible
         self.allocation.adopt(self.allocation.plan(now.checked, carried))
         await self._make(now, self.allocation.of_file)
 
@@ -148,27 +147,29 @@ class Rollout:
         return self.allocation.of_file(self._now.checked.monitors[monitor])
 
     def tell(self, monitor: str, message: messages.Message) -> bool:
-        """Send to the relay of a monitor; return False if it is not connected."""
+        """Send a message to the relay of a monitor; return False if that relay is not connected."""
         return self.relays.send(message, self.relay_of(monitor))
 
     async def carried_out(self) -> None:
-        """Wait until the relays have carried out their orders, so that these apply to later messages."""
+        """Wait until the relays have carried out their orders, which then apply to all later messages."""
         await self.relays.carried_out()
 
     def resumed(self, monitor: str) -> None:
-        """Note that a monitor holds its topics no longer."""
+        """Note that a monitor no longer holds its topics."""
         for names in self._held.values():
             names.pop(monitor, None)
 
     # --- a change ---
 
     def began(self, names: Iterable[str]) -> list[str]:
-        """Return which of these monitors have begun again at the last change, including moved ones."""
+        """Return which of these monitors began again at the last change, including moved monitors."""
         return [name for name in names if name in self._began]
 
     async def take(self, coming: Revision) -> list[str]:
-        """Have every relay take these specifications; return the monitors that began again because they moved. Absent
-        relays get them when they return. After `SpecificationsRefusedError` nothing has changed.
+        """Roll out these specifications to every relay; return the monitors that began again because they moved.
+
+        A disconnected relay gets them when it returns. If this raises `SpecificationsRefusedError`, nothing has
+        changed.
         """
         plan = self.allocation.plan(coming.checked, self.relays.live_resources())
         self._began = set()
@@ -183,7 +184,7 @@ class Rollout:
         raise SpecificationsRefusedError(["topics that must move changed during the rollout; try again"])
 
     async def all_taken(self) -> None:
-        """Wait until the relays that gave something up have the new specifications, or one refuses them (`refused`)."""
+        """Wait until the relays that gave something up have taken or refused (`refused`) the new specifications."""
         answers, self._answers = self._answers, {}
         if answers:
             await asyncio.wait(answers.values(), timeout=_RELAY_SECONDS)
@@ -195,7 +196,7 @@ class Rollout:
     async def _try(self, coming: Revision, plan: AllocationPlan) -> None:
         await self._make(coming, _of(plan))
         try:
-            take_effect()  # relays that give nothing up use the new ones from now on
+            take_effect()  # from here on, relays that give nothing up use the new specifications
         except WithdrawnError:
             self._forget()
             raise
@@ -203,7 +204,7 @@ class Rollout:
         self._coming = (coming, plan)
         for relay in range(self.allocation.relays):
             if relay in plan.losing:
-                continue  # it continues with its specifications until its topics are withdrawn
+                continue  # this relay keeps its specifications until its topics are withdrawn
             statement = self._statement(coming, relay, _of(plan), plan.moved_files)
             self._ask(relay, statement, answers)
         try:
@@ -222,7 +223,7 @@ class Rollout:
         statement: messages.SpecificationsStated,
         answers: dict[int, asyncio.Future[list[str]]],
     ) -> None:
-        """Send to a relay that is connected, and add its awaited answer."""
+        """Send a statement to a connected relay, and add a future for its answer."""
         if self.relays.send(statement, relay):
             answers[relay] = asyncio.get_running_loop().create_future()
             self._waiting[relay, statement.statement] = answers[relay]
@@ -235,9 +236,9 @@ class Rollout:
         return [finding for findings in said for finding in findings]
 
     def _settle(self, coming: Revision, plan: AllocationPlan) -> list[str]:
-        """Put the revision into force between two messages of every relay's link, so without an `await`.
+        """Put the revision into force without an `await`, so that no message of a relay is processed in between.
 
-        Relays that have it already confirm it again.
+        Relays that already have the revision confirm it again.
         """
         self._now = coming
         self.relays.withdraw(plan.moves)
@@ -249,7 +250,7 @@ class Rollout:
                 self._ask(relay, statement, self._answers)
             else:
                 self.relays.send(statement, relay)
-        self.relays.place(plan.moves)  # nothing to a relay that has just been asked: the plan goes one way
+        self.relays.place(plan.moves)  # in a plan, no relay both loses and gains topics
         self._merge_rows()
         moved = [name for name, file in coming.checked.monitors.items() if file in plan.moved_files]
         if plan.moves:
@@ -257,7 +258,7 @@ class Rollout:
         return moved
 
     def _merge_rows(self) -> None:
-        """Take each monitor's state and counters from the relay that has the monitor."""
+        """Set `rows` from the relay that has each monitor."""
         self.rows = {
             row.name: row
             for relay, rows in self._rows.items()
@@ -284,7 +285,7 @@ class Rollout:
             self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
 
     async def _make(self, revision: Revision, of_file: Callable[[str], int]) -> None:
-        """Have the compiler make the missing parts of these specifications that the relays run."""
+        """Let the compiler make the parts of these specifications that are still missing for the relays."""
         compiled = revision.checked.compiled
         wanted = {_names(revision, relay, of_file) for relay in range(self.allocation.relays)}
         missing = [
@@ -327,7 +328,7 @@ class Rollout:
             self.slices,
         )
 
-    # --- what the relays say ---
+    # --- messages of the relays ---
 
     def received(self, message: messages.Message, relay: int) -> None:
         """Process a message of a relay about its monitors."""
@@ -341,7 +342,7 @@ class Rollout:
                 self._merge_rows()
 
     def lost(self, relay: int) -> None:
-        """Refuse the specifications that a lost relay has not answered, since they may have killed it."""
+        """Refuse the specifications that a lost relay has not answered, because they may have killed it."""
         for at, statement in [entry for entry in self._waiting if entry[0] == relay]:
             self._answer(at, statement, ["a relay process exited during the load: try again"])
 
@@ -367,7 +368,7 @@ class Rollout:
         self._answer(relay, statement, [])
 
     def _say_held(self, relay: int, taken: messages.SpecificationsTaken) -> None:
-        """Record monitors that hold their topics because their state is lost, and the command that resumes them."""
+        """Record each monitor that holds its topics because its state is lost, with the command that resumes it."""
         before = self._held.get(relay, {})
         for name, why in taken.because.items():
             if before.get(name) != why:
@@ -402,7 +403,7 @@ class Rollout:
 
 
 def _names(revision: Revision, relay: int, of_file: Callable[[str], int]) -> messages.PartNames:
-    """Return the monitors of a relay."""
+    """Return the monitors of a relay, and those of them in shadow mode."""
     mine = tuple(name for name, file in revision.checked.monitors.items() if of_file(file) == relay)
     return messages.PartNames(mine, tuple(name for name in mine if name in revision.shadows))
 

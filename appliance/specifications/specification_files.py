@@ -18,11 +18,11 @@ _MOST_FILES = 1000
 _LONGEST_FILE = 1 << 20
 _LONGEST = (
     3 << 20
-)  # characters of all, with definitions: the compiler has a minute, and takes 14 s for each MiB
+)  # characters of all files and definitions: the compiler has a minute, and takes 14 s for each MiB
 
 
 class SpecificationsRefusedError(Exception):
-    """Specifications are refused; `findings` has every reason, as `file:line:column: error: text`."""
+    """The specifications are refused; `findings` has every reason, as `file:line:column: error: text`."""
 
     def __init__(self, findings: list[str]) -> None:
         super().__init__("\n".join(findings))
@@ -30,9 +30,9 @@ class SpecificationsRefusedError(Exception):
 
 
 class Sources(msgspec.Struct, frozen=True):
-    """Texts of specifications by file name, and of message definitions by `package/Type.msg` (or `.srv`).
+    """Texts of specifications by file name, and texts of message definitions by `package/Type.msg` (or `.srv`).
 
-    `signatures` are the site's, by the same names.
+    `signatures` are the signatures of the site, by the same names.
     """
 
     files: dict[str, str] = {}
@@ -59,9 +59,9 @@ class Sources(msgspec.Struct, frozen=True):
         return Sources(left, self.definitions, signatures)
 
     def signers(self, site_keys: Sequence[str]) -> list[str]:
-        """Return the keys that signed the sources; none without site keys.
+        """Return the keys that signed the sources; empty without site keys.
 
-        Raises `SpecificationsRefusedError` with every file and definition that none of them signed.
+        Raises `SpecificationsRefusedError` with every file and definition that no site key signed.
         """
         found: set[str] = set()
         findings = []
@@ -76,7 +76,7 @@ class Sources(msgspec.Struct, frozen=True):
         return sorted(found)
 
     def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
-        """Return the names of added, changed and removed files; definitions as `msg/package/Type.msg`."""
+        """Return the names of added, changed and removed files; the name of a definition is `msg/package/Type.msg`."""
         old, new = before.named(), self.named()
         return (
             [name for name in new if name not in old],
@@ -85,7 +85,7 @@ class Sources(msgspec.Struct, frozen=True):
         )
 
     def named(self) -> dict[str, str]:
-        """Return all texts by their names below the folder; those of definitions begin with `msg/`."""
+        """Return all texts by their names below the folder; names of definitions begin with `msg/`."""
         return self.files | {f"msg/{name}": text for name, text in self.definitions.items()}
 
 
@@ -95,7 +95,7 @@ class CheckedSpecifications(messages.Contents, frozen=True):
     signed_by: list[str] = []  # noqa: RUF012  each struct gets one of its own
 
     def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
-        """Parse a message of a topic (its first bytes); None if its type is not known."""
+        """Parse a message of a topic from its first bytes; return None if the topic's type is not known."""
         name = self.types.get(topic)
         definitions = _definitions(name, self.texts.get(name, "")) if name is not None else None
         return read_fields(definitions, name, data) if name is not None and definitions is not None else None
@@ -124,12 +124,12 @@ def _definitions(name: str, text: str) -> Definitions | None:
 
 
 def checked(contents: messages.Contents, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    """Return the compiler's result if the texts are signed. Raises `SpecificationsRefusedError`."""
+    """Return the compiler's result with the keys that signed the texts. Raises `SpecificationsRefusedError`."""
     return CheckedSpecifications(**msgspec.structs.asdict(contents), signed_by=sources.signers(site_keys))
 
 
 def require_bounded(sources: Sources) -> None:
-    """Raise `SpecificationsRefusedError` if there are too many sources, or too long ones."""
+    """Raise `SpecificationsRefusedError` if the sources are too many or too long."""
     if len(sources.files) > _MOST_FILES:
         raise SpecificationsRefusedError(
             [f"{len(sources.files)} specification files; the limit is {_MOST_FILES}"]
@@ -194,7 +194,8 @@ _Stamp = tuple[str, int, int, int, int]
 class SpecificationFolder:
     """The content of a folder; empty without a folder.
 
-    It is read only if a file has changed, because each status and list compares it with the specifications in force.
+    Each status and list request compares the folder with the specifications in force. Therefore the files are read only
+    if one has changed.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -207,7 +208,7 @@ class SpecificationFolder:
         return read_folder(self.path) if self.path is not None else Sources()
 
     def looked_at(self) -> Sources | None:
-        """Return the present content; None if it cannot be used. Unchanged files are not read again."""
+        """Return the present content; None if it is not valid. Do not read unchanged files again."""
         if self.path is None:
             return Sources()
         stamps = _stamps(self.path)
@@ -221,7 +222,7 @@ class SpecificationFolder:
 
 
 def _stamps(folder: Path) -> list[_Stamp] | None:
-    """Return stamps that change when a file changes; None if they cannot be read."""
+    """Return stamps that change when a file changes; None if the folder cannot be read."""
     try:
         paths = [folder, *folder.glob("*.rv*"), *(folder / "msg").rglob("*")]
         return sorted(_stamp(path) for path in paths)

@@ -4,18 +4,18 @@ This file is long because each of its short methods changes the same state, one 
 
 Invariants:
 
-1. The folder is the baseline and only read. Changes while the robot runs are revisions in the store
-   (`specification_revisions.py`) and, like switches (`switches.py`), survive a restart.
-2. New specifications are compiled before anything changes, by the compiler process; with errors nothing changes, and
+1. The folder is the baseline, and is never written. Changes while the robot runs are revisions in the store
+   (`specification_revisions.py`). Revisions and switches (`switches.py`) survive a restart.
+2. The compiler process compiles new specifications before anything changes. If there are errors, nothing changes, and
    all errors are returned. The relays get the compiled form, and may refuse it.
-3. A loaded monitor that shares variables with monitors in shadow mode is also in shadow mode; no load and no switch
-   takes a monitor out of force because of others.
-4. A reload takes the files of the folder, and leaves others in force unless it prunes: a missing file ends no
+3. A monitor that is loaded and shares variables with monitors in shadow mode is also in shadow mode. A load or switch
+   of other monitors never takes an existing monitor out of force.
+4. A reload loads the folder's files. Other files stay in force unless the reload prunes, so a missing file ends no
    protection.
 5. Every change can have a time limit for confirmation (`store/revisions.py`). Each revision is stored with its last
    switches, so a rollback restores its monitors as they were.
-6. A tag names the state that operators have seen. Each revision, switch and resumption changes it; tags never repeat. A
-   change for another tag is refused.
+6. A tag names the state that operators have seen. Each revision, switch and resumption changes the tag; tags never
+   repeat. A change that expects another tag is refused.
 """
 
 import asyncio
@@ -87,7 +87,7 @@ class DryRunUnderWayError(Exception):
 
 
 class MonitorsChangedError(Exception):
-    """The monitors have changed since a change to them was prepared; `tag` is the present one."""
+    """The monitors changed after a change to them was prepared; `tag` is the present tag."""
 
     def __init__(self, expected: str, tag: str) -> None:
         super().__init__(
@@ -98,10 +98,11 @@ class MonitorsChangedError(Exception):
 
 
 class SpecificationManager(Revisions[MonitorRevisionRow]):
-    """The keeper of specifications and switches, which answers operators' requests about them.
+    """Manages specifications and switches, and answers operators' requests about them.
 
-    `published()` is called when monitors may publish other topics; each of `told` is called for every event that a
-    relay reports. With `site_keys`, everything in force is signed with one of them. Changes are made one at a time.
+    `published()` is called when monitors may publish other topics. Each callback in `told` gets every event that a
+    relay reports. With `site_keys`, everything in force is signed with one of these keys. Changes are made one at a
+    time.
     """
 
     refusal = SpecificationsRefusedError
@@ -126,7 +127,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         parts: Parts,
         live: Callable[[], Published],
     ) -> None:
-        """`check` compiles for an order, `try_out` for a dry run; `live()` returns what nodes publish now."""
+        """`check` compiles for an order, `try_out` for a dry run; `live()` returns the topics published now."""
         super().__init__(
             store, store.monitor_revisions, store.save_monitor_revision, NOTHING, "confirm monitors"
         )
@@ -141,7 +142,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self.rollout = Rollout(
             allocation, trail, on_fault, self.switches.states_of, relays, slices=slices, parts=parts
         )
-        self._acts = 0  # switches and resumptions, ever
+        self._acts = 0  # number of all switches and resumptions so far
         self._attempting: set[str] = set()  # clients with a dry run under way
         self.returns = TimedDisables(store, self._come_back)
         self.sources = Sources()
@@ -154,8 +155,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def start(self, *, restarted: bool) -> None:
         """Bring specifications into force at start. Raises `SpecificationsRefusedError`.
 
-        As with the policy: after a crash of control those that were in force; at the appliance's start the folder's,
-        unless an operator's own revision was in force when it stopped.
+        As with the policy, after a crash of control, use the specifications that were in force. At the start of the
+        appliance, use the folder's, unless an operator's own revision was in force when the appliance stopped.
         """
         settings = self.store.settings()
         self.switches.said = json.loads(settings.get(_SWITCHES, "{}"))
@@ -180,14 +181,14 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         unknown = sorted(self.switches.named - self.checked.monitors.keys())
         if unknown and self.in_force.who == DISK and not restarted:
             raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
-        if unknown:  # removed while the robot ran
+        if unknown:  # the monitors were removed while the robot ran
             _log.warning("--enable names monitors that are not loaded", monitors=unknown)
 
     # --- queries ---
 
     @property
     def tag(self) -> str:
-        """Return the name of the present state, which changes expect (`expected`)."""
+        """Return the tag of the present state; a request repeats it as `expected`."""
         return f"{self.revision}.{self._acts}"
 
     @property
@@ -196,11 +197,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return self.folder is not None and self._folder.looked_at() != self.sources
 
     def names(self) -> list[str]:
-        """Return all monitors, in the order in which they get messages."""
+        """Return the names of all monitors, in the order in which they get messages."""
         return list(self.checked.monitors)
 
     def file_of(self, name: str) -> str:
-        """Return the file of this name, or of this monitor. Raises `UnknownMonitorError`."""
+        """Return the file with this name, or the file of the monitor with this name. Raises `UnknownMonitorError`."""
         if name in self.sources.files:
             return name
         if name not in self.checked.monitors:
@@ -230,9 +231,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @admin.answers(admin.MonitorLoad, who=True)
     async def load(self, request: admin.MonitorLoad, who: str) -> Replacement:
-        """Add these files, or replace those of the same name. Raises `SpecificationsRefusedError`.
+        """Add these files, replacing files of the same names. Raises `SpecificationsRefusedError`.
 
-        This and every change of the specifications is rolled back automatically after `confirm_within` seconds unless
+        With `confirm_within`, this change, like any other, is rolled back automatically after that many seconds unless
         confirmed.
         """
         async with self._changing(request.expected):
@@ -246,7 +247,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @admin.answers(admin.MonitorTry, who=True)
     async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
-        """Return what a load would do. Raises as `load`, and `DryRunUnderWayError`."""
+        """Return the effects that a load would have. Raises the errors of `load`, and `DryRunUnderWayError`."""
         if who in self._attempting:
             raise DryRunUnderWayError(
                 "your previous dry run is still running: wait for its answer, then try again"
@@ -267,7 +268,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @admin.answers(admin.MonitorReplace, who=True)
     async def replace(self, request: admin.MonitorReplace, who: str) -> Replacement:
-        """Replace the file of a monitor by a text. Raises `UnknownMonitorError`, and as `load`."""
+        """Replace the file of a monitor by a text. Raises `UnknownMonitorError`, and the errors of `load`."""
         file = self.file_of(request.name)
         load = admin.MonitorLoad(
             {file: request.text},
@@ -283,7 +284,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @admin.answers(admin.MonitorReload, who=True)
     async def reload(self, request: admin.MonitorReload, who: str) -> Replacement:
-        """Load the folder's files; files that it does not have stay in force, unless `prune`.
+        """Load the folder's files; other files stay in force, unless `prune` is set.
 
         Raises `SpecificationsRefusedError`, also without a folder.
         """
@@ -294,7 +295,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             kept = [] if request.prune else sorted(self.sources.files.keys() - sources.files.keys())
             if kept:
                 sources = self.sources.with_files(sources)
-            keeper = who if kept else DISK  # otherwise the next start would read only the folder
+            keeper = who if kept else DISK  # with `DISK`, the next start would read only the folder
             added, changed, _removed = sources.difference(self.sources)
             shadow = frozenset([*added, *changed]) if request.shadow else frozenset()
             within, note = request.confirm_within, "reloaded from disk"
@@ -304,10 +305,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @admin.answers(admin.MonitorRemove, who=True)
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
-        """Remove files, by their names or those of their monitors.
+        """Remove files, given by their names or the names of their monitors.
 
-        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` if others use their variables, or a file has
-        other monitors.
+        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` if other monitors use variables of these
+        files, or if a file has further monitors that are not named.
         """
         async with self._changing(request.expected):
             names, owners = request.names, self.checked.monitors
@@ -329,9 +330,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @admin.answers(admin.MonitorRollback, who=True)
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
-        """Bring a kept revision into force again (None: the one before this; 0: nothing).
+        """Bring a kept revision into force again (None: the previous revision; 0: no specifications).
 
-        A monitor that comes back is switched as it was when it was removed. Raises `SpecificationsRefusedError`.
+        A monitor that returns gets the switch that it had when it was removed. Raises `SpecificationsRefusedError`.
         """
         async with self._changing(request.expected):
             row = NOTHING if request.revision == 0 else await self._wanted(request.revision)
@@ -357,10 +358,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @admin.answers(admin.MonitorSwitch, who=True)
     async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
-        """Enable or disable monitors, for `for_seconds` or until further notice; return those that changed.
+        """Enable or disable monitors, for `for_seconds` or until further notice; return the monitors that changed.
 
-        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for a monitor that is to be enabled but is in
-        shadow mode, or shares variables with one that is.
+        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` if a monitor to enable is in shadow mode, or
+        shares variables with a monitor in shadow mode.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
@@ -376,9 +377,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @admin.answers(admin.MonitorShadow, who=True)
     async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
-        """Put monitors into shadow mode, or from there into force; return those that changed.
+        """Put monitors into shadow mode, or from shadow mode into force; return the monitors that changed.
 
-        Raises like `switch`, for a disabled monitor that shall be in force, and for one that would cut a topic.
+        Raises the errors of `switch`. Raises `SpecificationsRefusedError` also for a disabled monitor that should come
+        into force, and for a monitor that would cut a topic.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
@@ -394,11 +396,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @admin.answers(admin.MonitorTrial, who=True)
     async def trial(self, request: admin.MonitorTrial, who: str) -> Switched:
-        """Do the same as `shadow`, under its name in earlier versions."""
+        """Do the same as `shadow`; earlier versions used this name."""
         return await self.shadow(admin.MonitorShadow(request.names, request.trial, request.expected), who)
 
     async def _come_back(self, back: Mapping[str, Switch]) -> None:
-        """Switch monitors back when their time is over. Raises `SpecificationsRefusedError`."""
+        """Switch monitors back when their disabled period is over. Raises `SpecificationsRefusedError`."""
         async with self._one_change:
             for to in (True, SHADOW):
                 names = [name for name in self._disabled() if back.get(name) == to]
@@ -463,10 +465,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @admin.answers(admin.MonitorResume, who=True)
     async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
-        """Let the topics of these monitors go on; return the monitors that held theirs.
+        """Release the topics that these monitors hold; return the monitors that held their topics.
 
-        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for monitors whose relay process is away: the
-        next one will hold them.
+        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` for monitors whose relay process is not
+        running, because the next process will hold the topics again.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
@@ -506,7 +508,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         """Note that a relay is gone."""
         self.rollout.lost(relay)
 
-    # --- inside ---
+    # --- internals ---
 
     def _revision(self, number: int, sources: Sources, checked: CheckedSpecifications) -> Revision:
         """Return these specifications as a revision, with the present switches."""
@@ -531,7 +533,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             raise UnknownMonitorError(self._unknown(unknown))
 
     async def _count(self) -> None:
-        """Change the tag; it is stored first, so that no crash restores an old tag."""
+        """Change the tag; store the new tag first, so that no crash restores an old one."""
         self.store.save_setting(_ACTS, str(self._acts + 1))
         await self.store.settled()
         self._acts += 1
@@ -552,9 +554,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         shadow: Collection[str] = (),
         forced: bool = False,
     ) -> Replacement:
-        """`switches` are for monitors that are not in force yet; those of the files `shadow` come in shadow mode.
+        """Compile sources and put them into force; `kept` are files that are not in the folder.
 
-        `forced`: topics whose publishers have another type are cut.
+        `switches` are for monitors that are not in force yet; monitors in the files `shadow` start in shadow mode. With
+        `forced`, topics whose publishers have another type are cut.
         """
         before, previous, switched = self.revision, self.sources, self.switches.said
         self.switches.said = {
@@ -599,12 +602,12 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         await self.store.settled()
         await self.rollout.all_taken()
         self._published()
-        began = self.rollout.began(checked.monitors)  # also at relays that have only now taken it
+        began = self.rollout.began(checked.monitors)  # also on relays that took them only now
         done = self._replaced(before, sources.difference(previous), moved, began, kept)
         return msgspec.structs.replace(done, warnings=[*done.warnings, *warnings])
 
     def _in_shadow(self, checked: CheckedSpecifications, files: Collection[str] = ()) -> set[str]:
-        """Return which of these monitors are, or would be, in shadow mode, including those of the `files`."""
+        """Return which of these monitors are, or would be, in shadow mode, including all monitors in `files`."""
         states = self.switches.states_of(checked)
         return {name for name, file in checked.monitors.items() if states[name] == SHADOW or file in files}
 
@@ -632,7 +635,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         began: Sequence[str] = (),
         kept: Sequence[str] = (),
     ) -> Replacement:
-        """Describe a change; `files` are those added, changed and removed."""
+        """Describe a change; `files` are the added, changed and removed files."""
         warnings = list(self.checked.warnings)
         return Replacement(
             self.revision, self.tag, before, *files, warnings, [*moved], [*began], [*kept], self.confirm_by

@@ -1,4 +1,4 @@
-"""Stored revisions of the specifications, with the last switches of their monitors."""
+"""Encode and decode stored revisions of the specifications, with the last switches of their monitors."""
 
 from collections.abc import Awaitable, Callable, Sequence
 
@@ -17,17 +17,17 @@ Check = Callable[[Sources, Sequence[str]], Awaitable[CheckedSpecifications]]
 """Checks these sources with the keys of the site. Raises `SpecificationsRefusedError`."""
 
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
-"""Stands for the revision before the first."""
+"""The revision before the first."""
 
 
 class StoredSpecifications(Sources, frozen=True):
-    """A stored revision; `switches` are those of its monitors when it was replaced."""
+    """A stored revision; `switches` are the switches of its monitors at the time when the revision was replaced."""
 
     switches: dict[str, Switch] = {}  # noqa: RUF012  each struct gets one of its own
 
 
 def text_of(sources: Sources) -> str:
-    """Return the stored form."""
+    """Return the sources in the form that is stored."""
     return msgspec.json.encode(sources).decode()
 
 
@@ -44,7 +44,7 @@ def sources_of(row: MonitorRevisionRow) -> Sources:
 async def check_kept(
     check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]
 ) -> CheckedSpecifications:
-    """Compile a stored revision; if a newer version refuses it, the error names the way back."""
+    """Compile a stored revision; if it is refused (by a newer version), the error has the command that discards it."""
     try:
         return await check(sources_of(row), site_keys)
     except SpecificationsRefusedError as error:
@@ -56,9 +56,9 @@ async def check_kept(
 
 
 def forget_revision(store: StateStore, now: float) -> int | None:
-    """Have the next start take the folder; return the revision that is given up, None if it was the folder's already.
+    """Make the next start use the folder; return the discarded revision, or None if the folder's was in use.
 
-    Only for an appliance that is not running.
+    Call this only while the appliance is not running.
     """
     last = next(iter(store.monitor_revisions(1)), NOTHING)
     if last.who == DISK:

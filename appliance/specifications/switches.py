@@ -1,8 +1,9 @@
-"""Which monitors are enabled, disabled or in shadow mode (`SHADOW`). No I/O.
+"""Track which monitors are enabled, disabled or in shadow mode (`SHADOW`). No I/O.
 
-`--enable` sets the monitors that no operator has switched: it enables `all`, `none` or the named ones, or puts all into
-shadow mode (`shadow`). A switch ends with its monitor; a monitor that is loaded later under the same name has none.
-Monitors that share variables are in shadow mode together (except disabled ones).
+`--enable` applies to monitors that no operator has switched: it enables `all`, `none` or the named monitors, or puts
+all into shadow mode (`shadow`). An operator's switch is dropped when its monitor is removed; a monitor that is loaded
+later under the same name starts without a switch. Monitors that share variables are in shadow mode together (except
+disabled ones).
 """
 
 from collections.abc import Mapping
@@ -27,7 +28,7 @@ class Switches:
         return self.states.get(name) is True
 
     def in_shadow(self, name: str) -> bool:
-        """Whether a monitor is in shadow mode: it gets copies, and what it would have done is recorded."""
+        """Whether a monitor is in shadow mode: it gets copies of messages, and its actions are only recorded."""
         return self.states.get(name) == SHADOW
 
     def shadowed(self) -> list[str]:
@@ -39,7 +40,7 @@ class Switches:
         return {name: to for name, to in self.said.items() if to is not True and self.states.get(name) == to}
 
     def states_of(self, checked: CheckedSpecifications) -> dict[str, Switch]:
-        """Return the states of these monitors: one in shadow mode takes those that share its variables with it."""
+        """Return the states of these monitors; shadow mode extends to monitors that share variables with one in it."""
         states = {name: self._own(name) for name in checked.monitors}
         if SHADOW in states.values():
             for group in sharing(checked.uses):
@@ -48,11 +49,11 @@ class Switches:
         return states
 
     def _own(self, name: str) -> Switch:
-        """Return how a monitor is switched, apart from those that it shares variables with."""
+        """Return a monitor's own switch, ignoring the monitors with which it shares variables."""
         return self.said.get(name, self._all or name in self.named)
 
     def enforce(self, checked: CheckedSpecifications) -> list[str]:
-        """Put these into force; return the monitors that are in shadow mode only because of others."""
+        """Put these specifications into force; return the monitors that are in shadow mode only because of others."""
         self.said = {name: to for name, to in self.said.items() if name in checked.monitors}
         self.states = self.states_of(checked)
         drawn_in = [name for name, to in self.states.items() if to == SHADOW and self._own(name) != SHADOW]

@@ -1,12 +1,12 @@
-"""Monitors that are disabled for a limited time.
+"""Disable monitors for a limited time.
 
 Invariants:
 
 1. The time is stored before its monitor is disabled, and survives restarts of control and of the appliance.
-2. A monitor is off for at most the ordered time plus the time for which the appliance did not run, even if the clock
-   was set back.
-3. If enabling is refused (the monitor shares variables with others that are in shadow mode now), it is tried again
-   until it succeeds, or an operator switches the monitor.
+2. A monitor is disabled for at most the ordered time plus the time for which the appliance did not run, even if the
+   clock was set back.
+3. Enabling can be refused, because the monitor now shares variables with monitors in shadow mode. It is then tried
+   again until it succeeds or an operator switches the monitor.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 
 LONGEST = 30 * 86_400.0
-"""Most seconds for which a monitor may be disabled with a time limit."""
+"""The most seconds for which a monitor may be disabled with a time limit."""
 
 _SETTING = "monitor returns"
 _AGAIN_SECONDS = 5.0
@@ -39,7 +39,7 @@ class _Return(msgspec.Struct, frozen=True):
 
 
 class TimedDisables:
-    """The time limits. At their end they call `come_back(names)`, which calls `end` as every switch does."""
+    """The time limits of monitors; when one ends, `come_back(back)` is called, which calls `end` like every switch."""
 
     def __init__(
         self, store: StateStore, come_back: Callable[[Mapping[str, Switch]], Awaitable[None]]
@@ -54,7 +54,7 @@ class TimedDisables:
         return name in self._kept
 
     def until(self, name: str) -> float | None:
-        """Return when a monitor comes back, in seconds since the epoch; None if it does not."""
+        """Return when a monitor's time limit ends, in seconds since the epoch; None without a limit."""
         found = self._kept.get(name)
         return found.until if found is not None else None
 
