@@ -1,12 +1,13 @@
-"""The compiler as a process of the appliance: lifeline, link to control, and a thread that works.
+"""The compiler as a process of the appliance: lifeline, link to control, and a worker thread.
 
 Invariants:
 
-1. It has no network and no files, only its lifeline and its link to control.
-2. Texts that exceed its memory or processor time end only this process.
-3. It ends with exit status 0 after `_IDLE_SECONDS` without work.
-4. Work ends with an answer when its budget of processor time is used up, or without one when control closes the link. A
-   thread cannot be stopped, so the process ends too (status 0), and the supervisor starts the next one on demand.
+1. The process has no network and no files, only its lifeline and its link to control.
+2. Specifications that exceed the limits of memory or processor time end only this process.
+3. The process ends with exit status 0 after `_IDLE_SECONDS` without work.
+4. When the work's budget of processor time is used up, the compiler answers with a refusal; when control closes the
+   link, it does not answer. In both cases the process ends (status 0), because a thread cannot be stopped. The
+   supervisor starts the next process on demand.
 """
 
 import asyncio
@@ -21,10 +22,10 @@ from appliance.channel.child_process import Child
 from appliance.quotas.table import DRY_RUNS
 from appliance.specifications.specification_files import SpecificationsRefusedError
 
-_MEMORY = 1 << 30  # bytes of address space; its own libraries take 50 MiB
-_WORK_SECONDS = 60  # of processor time, for one question of an order
-_DRY_RUN_SECONDS = DRY_RUNS.bounds.host  # the same, for a dry run
-_SPARE_SECONDS = 5  # after which the kernel kills a process that has not answered
+_MEMORY = 1 << 30  # bytes of address space, of which the compiler's own libraries take 50 MiB
+_WORK_SECONDS = 60  # seconds of processor time for one question of an order to load
+_DRY_RUN_SECONDS = DRY_RUNS.bounds.host  # seconds of processor time for a dry run
+_SPARE_SECONDS = 5  # seconds of processor time beyond the budget; then the kernel kills the process
 _IDLE_SECONDS = 60.0
 
 
@@ -86,18 +87,18 @@ class CompilerProcess:
 
 
 def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | messages.CompilationRefused:
-    """Return the contents of these texts, all their errors, or the parts that relays run."""
+    """Return the contents of these files, all their errors, or the parts that relays run."""
     ends = int(_used()) + _budget(wanted) + _SPARE_SECONDS
     resource.setrlimit(resource.RLIMIT_CPU, (ends, resource.RLIM_INFINITY))
     try:
-        from appliance.specifications import checking  # noqa: PLC0415  within the bounds of the question
+        from appliance.specifications import checking  # noqa: PLC0415  after the limits are set
 
         if isinstance(wanted, messages.PartsWanted):
             return messages.PartsMade(wanted.number, checking.parts(wanted.compiled, wanted.parts))
         return messages.ContentsFound(wanted.number, checking.contents(wanted.files, wanted.definitions))
     except SpecificationsRefusedError as error:
         return messages.CompilationRefused(wanted.number, error.findings)
-    except (MemoryError, SystemError):  # as which Python 3.11 reports some lack of memory
+    except (MemoryError, SystemError):  # Python 3.11 reports some lack of memory as `SystemError`
         text = f"they take more than the {_MEMORY >> 20} MiB of memory available to compile them"
     except Exception as error:  # noqa: BLE001  a defect of the compiler is a reason to refuse, no more
         text = f"a defect of rosrv, please report it: {type(error).__name__}: {error}"
