@@ -2,9 +2,10 @@
 
 Invariants:
 
-1. The whole file is read and its checksum compared before any entry is used, so a damaged archive is rejected.
-2. It unpacks to at most the free space and has at most `MOST_FILES` entries, all of them regular files. Headers that
-   modify the next entry (sparse, pax, long names) are rejected, so exactly the checked entries are extracted.
+1. The whole file is read and its checksum checked before any entry is used, so a damaged archive is rejected.
+2. An archive must unpack to no more than the free space, and have at most `MOST_FILES` entries, all of them regular
+   files. Headers that modify the next entry (sparse, pax, long names) are rejected, so exactly the checked entries are
+   extracted.
 3. Every name is valid for a backup and occurs once.
 """
 
@@ -39,7 +40,7 @@ class _PlainEntry(tarfile.TarInfo):
 
 @contextmanager
 def checked_archive(file: Path, room: int) -> Iterator[tuple[tarfile.TarFile, list[tarfile.TarInfo]]]:
-    """Check an archive, limited to `room` unpacked bytes; yield it, open, with its entries.
+    """Check an archive, limited to `room` unpacked bytes; yield the open archive and its entries.
 
     Raises `BackupError`, also for read errors inside the `with` block.
     """

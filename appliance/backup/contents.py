@@ -1,7 +1,7 @@
-"""Decide by name and size which files a backup has: one rule for making and restoring it.
+"""Decide, by name and size, which files a backup contains; making and restoring a backup use the same rule.
 
-A part of the state directory belongs to a process that may be compromised. File names with control characters and
-oversized files are therefore reported and not backed up.
+Each part of the state directory belongs to a process that may be compromised. Therefore file names with control
+characters and oversized files are errors, and are not backed up.
 """
 
 from pathlib import PurePosixPath
@@ -13,8 +13,8 @@ LARGEST = 1 << 30  # bytes of a file that is not a database
 MOST_FILES = 10_000  # a usual backup has about twenty
 _LONGEST_NAME = 100  # bytes that fit into a tar header without an extension
 _DATABASES = "control/"  # the only part with databases
-# Files that exist only while the appliance runs, or that the next start makes again. `.ahead`: statements that the
-# copied database does not have yet.
+# Files that exist only while the appliance runs, or that the next start makes again. `.ahead` files are also left out:
+# the copied database does not have their statements yet.
 _PASSING = ("-wal", "-shm", ".lock", ".ahead", ".new", ".sock", ".pid", "strongswan.conf")
 _LEFT_OUT = {"rosmaster", "rosout", "recordings"}  # logs of ROS, recorded messages
 KEPT_PARTS = frozenset(role.part for role in ROLES) - _LEFT_OUT

@@ -1,13 +1,14 @@
-"""Write the state directory to one file, whether or not the appliance runs (`restore.py` restores it).
+"""Write the state directory to one file, even while the appliance runs; `restore.py` restores the file.
 
 Invariants:
 
 1. SQLite copies each database as a consistent snapshot; a running appliance need not stop or wait.
-2. The log is copied first. The signer's memory is then cut to the checkpoints in that copy, so that a restored log can
+2. The log is copied first. Then the signer's memory is cut to the checkpoints in that copy, so that a restored log can
    be continued.
-3. The file contains keys: only its owner may read it. Existing files are not overwritten; an unfinished one is removed.
-4. Root reads in folders of users whose processes may be compromised. With root's rights, links are not followed, and a
-   file that belongs to another user is an error.
+3. The file contains keys, so only its owner may read it. An existing file is not overwritten; an unfinished backup is
+   removed.
+4. Root reads folders of users whose processes may be compromised. Therefore links are not followed with root's rights,
+   and a file that belongs to another user is an error.
 """
 
 import errno
@@ -38,7 +39,7 @@ from appliance.supervisor.restore_mark import refuse_half_restored
 
 _PIECE = 1 << 20
 _HEADER, _HASH = 8, 32  # bytes, of the signer's memory
-_FORMAT = tarfile.GNU_FORMAT  # its single header also has room for the size of a large database
+_FORMAT = tarfile.GNU_FORMAT  # this format stores even the size of a large database in a single header
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # opening a pipe does not block
 _ADVICE = "run this as root with the capability DAC_OVERRIDE (in a container: docs/operating.md)"
@@ -115,9 +116,9 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
 
 
 def _files(state: Path) -> Iterator[tuple[str, int]]:
-    """Yield name and open descriptor of each file to back up: the log first, because the signer's memory is cut to it.
+    """Yield the name and open descriptor of each file; the log first, because the signer's memory is cut to it.
 
-    The others are listed after the log is copied: the key that its signatures need exists by then.
+    The other files are listed after the log is copied, so the key for the log's signatures exists by then.
     """
     log = opened(state, AUDIT_LOG) if (state / AUDIT_LOG).exists() else None
     if log is not None:
@@ -125,7 +126,7 @@ def _files(state: Path) -> Iterator[tuple[str, int]]:
     names = [
         name
         for part in sorted(KEPT_PARTS)
-        if (state / part).exists()  # else a role that never ran here
+        if (state / part).exists()  # a role that never ran here has no part
         for name in _names(state, part)
     ]
     if len(names) > MOST_FILES:
@@ -160,7 +161,7 @@ def opened(state: Path, name: str) -> int | None:
             os.close(outer)
         descriptor = os.open(last, _FILE, dir_fd=here)
     except OSError as error:
-        if error.errno in (errno.ELOOP, errno.ENXIO):  # a link, a socket
+        if error.errno in (errno.ELOOP, errno.ENXIO):  # the file is a link or a socket
             return None
         raise
     finally:
@@ -184,7 +185,7 @@ def _copy_file(name: str, file: BinaryIO, copy: Path, last: dict[str, int]) -> N
     with copy.open("wb") as written:
         while piece := file.read(_PIECE):
             written.write(piece)
-            if written.tell() > LARGEST:  # it grows while it is read
+            if written.tell() > LARGEST:  # the file grew while it was read
                 raise BackupError(f"{name} has more than {LARGEST} bytes: find out its origin, and remove it")
 
 
@@ -200,7 +201,7 @@ def _last_checkpoint(log: Path) -> dict[str, int]:
 
 
 def _as_far_as(memory: bytes, number: int | None) -> bytes:
-    """Return the signer's memory up to checkpoint `number`; all of it if that is None (another log)."""
+    """Return the signer's memory up to checkpoint `number`; all of it if `number` is None (another log)."""
     if number is None or len(memory) < _HEADER:
         return memory
     first = int.from_bytes(memory[:_HEADER], "big")
@@ -211,10 +212,10 @@ _BUSY_SECONDS = 30
 
 
 def copy_database(path: Path, owner: os.stat_result, copy: Path) -> None:
-    """Copy the database at `path` to the new file `copy`; `owner` is the status of the database file, read just before.
+    """Copy the database at `path` to the new file `copy`; `owner` is the file status of the database.
 
-    SQLite opens the database and its write-ahead log by name. The owner of the folder could put a link there, so root
-    reads with only the owner's rights.
+    SQLite opens the database and its write-ahead log by name. The folder's owner could replace either by a link, so
+    root reads them with only the owner's rights.
 
     Raises `BackupError`, `OSError`, `sqlite3.Error`.
     """

@@ -1,6 +1,6 @@
-"""Remove a state directory; small files (keys, tokens, certificates) are overwritten first.
+"""Remove a state directory, and overwrite small files (keys, tokens, certificates) first.
 
-Copies of an overwritten file in a journal or in spare blocks of flash memory remain. Where that matters, encrypt the
+Copies of an overwritten file may remain in a journal, or in spare blocks of flash memory. If that matters, encrypt the
 disk and destroy its key.
 """
 
@@ -18,9 +18,9 @@ _SMALL = 64 << 10
 
 
 def purge(state: Path) -> tuple[int, int]:
-    """Remove an unused state directory; return the numbers of all files and of overwritten files.
+    """Remove an unused state directory; return the number of files and the number of overwritten files.
 
-    Raises `BackupError` if it does not exist, if an appliance uses it, or if a file cannot be removed.
+    Raises `BackupError` if the directory does not exist or is in use, or if a file cannot be removed.
     """
     state = state.absolute()
     try:
@@ -54,7 +54,7 @@ def purge(state: Path) -> tuple[int, int]:
 
 
 def _write_over(state: Path) -> tuple[int, int]:
-    """Overwrite all small files except symbolic and hard links; return the numbers of all and of overwritten files."""
+    """Overwrite small files except links; return the numbers of all files and of overwritten files."""
     files = written = 0
     for _folder, _folders, names, at in os.fwalk(state, follow_symlinks=False):
         for name in names:

@@ -3,9 +3,9 @@
 Invariants:
 
 1. Existing files are not overwritten, and writing starts only after the whole archive was checked (`archive.py`).
-2. An incomplete restore never becomes an appliance's state: its files are removed. After a kill or a power cut its mark
-   remains, and `rosrv up` rejects the directory. The mark is removed when everything is on the disk.
-3. The files in a folder get their owner before the folder does; otherwise that user could replace them by links.
+2. An incomplete restore never becomes an appliance's state: its files are removed. After a kill or a power cut, a mark
+   remains, and `rosrv up` rejects the directory. The mark is removed once everything is on the disk.
+3. The files in a folder get their owner before the folder does. Otherwise that user could replace files by links.
 """
 
 import os
@@ -21,7 +21,7 @@ from appliance.supervisor.restore_mark import set_mark
 from appliance.supervisor.roles import ROLES
 from appliance.supervisor.users import account_of
 
-_LOCK = "lock"  # identifies the directory to `StateDirectory`, also where root cannot read its parts
+_LOCK = "lock"  # `StateDirectory` recognizes the directory by this file, even if root cannot read the parts
 _OF_THE_DISK = "lost+found"
 _SPARE = 64 << 20  # bytes of the disk that stay free
 
@@ -41,7 +41,7 @@ def restore(file: Path, state: Path) -> list[str]:
 
 
 def _room_in(state: Path) -> int:
-    """Return the bytes that may be restored to an empty folder, or to one that does not exist yet.
+    """Return how many bytes may be restored to an empty or new folder.
 
     Raises `BackupError`, also for a folder that is not empty.
     """
@@ -59,7 +59,7 @@ def _room_in(state: Path) -> int:
 
 @contextmanager
 def _marked(state: Path) -> Iterator[None]:
-    """Make the folder, and keep a mark in it during the restore; on any error remove everything that was made."""
+    """Create the folder, and keep a mark in it during the restore; on any error, remove everything that was created."""
     is_new = not state.exists()
     state.mkdir(mode=0o711, parents=True, exist_ok=True)
     state.chmod(0o711)
