@@ -1,4 +1,5 @@
 """Durable state of control in SQLite: registry, parameters, policy revisions, settings.
 
-`Database` is the one writer thread; the modules of the tables list what is stored. The audit log has its own file.
+`Database` has the only writer thread. The modules `state_file` and `host_tables` define the tables. The audit log has
+its own file.
 """

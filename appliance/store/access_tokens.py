@@ -1,8 +1,9 @@
 """Make and verify the access tokens of REST. No I/O.
 
-A token is `rosrv_<id>_<secret>`: the id (48 bits) finds the row, the secret (256 random bits) proves it. Invariants:
+A token is `rosrv_<id>_<secret>`: the id (48 bits) selects the row, and the secret (256 random bits) proves possession.
+Invariants:
 
-1. The secret is never stored: only its salted scrypt hash, and the data to verify its keys (`request_signing.py`).
+1. The secret is never stored, only its salted scrypt hash and the data to verify its keys (`request_signing.py`).
 2. The comparison takes constant time.
 """
 
@@ -16,18 +17,18 @@ from appliance.signing.request_signing import TokenKeys, keys_of
 
 _FORM = re.compile(r"rosrv_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,62}")
-# Other values of `who` in a revision or a record.
+# `who` has these values in revisions and records that no token made.
 _RESERVED = frozenset({"disk", "operator"})
 # 2**14 * 8 * 128 bytes = 16 MiB and some 40 ms for one check.
 _COST, _BLOCK, _PARALLEL, _LENGTH = 1 << 14, 8, 1, 32
 
 
 class BadTokenNameError(ValueError):
-    """A name that a token cannot have; the text describes valid names."""
+    """The name is not valid for a token; the text describes valid names."""
 
 
 class TokenRow(NamedTuple):
-    """A stored token. Times are seconds since the epoch; `revoked` is None unless it is revoked."""
+    """A stored token. Times are seconds since the epoch; `revoked` is None unless the token was revoked."""
 
     id: str
     name: str
@@ -45,7 +46,7 @@ class TokenRow(NamedTuple):
 
 
 def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[TokenRow, str]:
-    """Return a new token that ends after `seconds`: its row, and its text, which is stored nowhere.
+    """Return a new token that expires after `seconds`: its row, and its text, which is stored nowhere.
 
     Raises `BadTokenNameError`.
     """
@@ -68,7 +69,7 @@ def parse_token(text: str) -> tuple[str, str] | None:
 
 
 def hash_secret(secret: str, salt: bytes) -> bytes:
-    """Return the hash of a secret, which is stored."""
+    """Return the hash of a secret; the hash is stored, the secret is not."""
     return hashlib.scrypt(
         secret.encode("ascii"), salt=salt, n=_COST, r=_BLOCK, p=_PARALLEL, dklen=_LENGTH, maxmem=64 << 20
     )

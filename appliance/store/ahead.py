@@ -1,13 +1,13 @@
-"""Write-ahead file: statements on their way to the database, so that a killed process loses none.
+"""Keep statements in a write-ahead file until the database has them, so that a killed process loses none.
 
 A statement is appended before any answer that depends on it. The append is one small write to the page cache: it takes
-microseconds and waits for no disk. When the database has all statements, the file is emptied. After a crash the
-statements in it are executed again: each is idempotent, and their order is kept.
+microseconds and does not wait for the disk. When the database has all statements, the file is emptied. After a crash,
+the statements in the file are executed again, in order; each of them is idempotent.
 
-Measured against a commit of each statement (`python -m benchmarks.state_writes`), a registration blocks the thread
-that answers nodes for half as long (20 µs, not 45). SQLite's one writer never blocks it; that writer takes a third of
-a second for a tree of parameters of 16 MiB. With commits beside a tree, one registration in a hundred would wait 3 to
-17 ms if both cores are busy; with this file, 0.06 ms.
+The alternative is to commit each statement (`python -m benchmarks.state_writes` compares both). With this file, a
+registration blocks the thread that answers nodes for 20 µs instead of 45 µs. That thread never waits for SQLite's one
+writer, which needs a third of a second for a parameter tree of 16 MiB. With commits while a tree is written and both
+cores are busy, one registration in a hundred would wait 3 to 17 ms. With this file, the wait is 0.06 ms.
 
 The file survives the death of the process and, after `sync`, a power failure, as the database's own WAL does.
 """
@@ -35,10 +35,10 @@ class WriteAheadClosedError(OSError):
 
 
 class WriteAhead:
-    """The file at `path`. Raises `OSError` when it cannot be opened.
+    """The write-ahead file at `path`. Raises `OSError` if the file cannot be opened.
 
-    Any thread may use it. Its descriptor's number is read only under the lock: `close` waits for a write that is under
-    way, and every later use raises `WriteAheadClosedError`. So no write goes to another file that reuses the number.
+    Any thread may use this class. The descriptor's number is read only under the lock. So `close` waits for a write in
+    progress, every later use raises `WriteAheadClosedError`, and no write goes to another file that reuses the number.
     """
 
     def __init__(self, path: Path) -> None:
@@ -56,7 +56,7 @@ class WriteAhead:
             yield self._open_descriptor
 
     def left(self) -> list[Statement]:
-        """Return the statements that an earlier process did not write to the database, without a torn last one."""
+        """Return the statements that an earlier process did not write to the database; omit a torn last statement."""
         with self._descriptor() as descriptor:
             data = os.pread(descriptor, os.fstat(descriptor).st_size, 0)
         decoder = msgspec.msgpack.Decoder(tuple[str, list[Any]])
@@ -95,7 +95,7 @@ class WriteAhead:
             os.ftruncate(descriptor, 0)
 
     def sync(self) -> None:
-        """Flush the file to the disk; others may append meanwhile. Raises `OSError`."""
+        """Flush the file to the disk; other threads may append meanwhile. Raises `OSError`."""
         with self._descriptor() as descriptor:
             own = os.dup(descriptor)
         try:
@@ -104,7 +104,7 @@ class WriteAhead:
             os.close(own)
 
     def close(self) -> None:
-        """Close the file once nothing uses it; closing it again does nothing."""
+        """Close the file after any use in progress; do nothing if it is already closed."""
         with self._lock:
             if self._open_descriptor >= 0:
                 os.close(self._open_descriptor)

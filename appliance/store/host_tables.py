@@ -1,4 +1,4 @@
-"""The tables of hosts that come through tunnels: enrolled hosts, their certificates, awaited hosts."""
+"""The tables of hosts that connect through tunnels: enrolled hosts, their certificates, awaited hosts."""
 
 import json
 from typing import NamedTuple
@@ -30,9 +30,9 @@ _LONGEST_SECONDS = 398 * 86_400.0  # the longest life of a certificate that the 
 
 
 class HostRow(NamedTuple):
-    """An enrolled host: its virtual address, its certificate's serial number (hexadecimal) and end.
+    """An enrolled host: its virtual address, and its certificate's serial number (hexadecimal) and expiry.
 
-    Times are seconds since the epoch; `revoked` is None while the host may come. The name keeps its address.
+    Times are seconds since the epoch; `revoked` is None while the host may connect. A name always keeps its address.
     """
 
     name: str
@@ -52,7 +52,7 @@ class NextCertificate(NamedTuple):
 
 
 class CertificateRow(NamedTuple):
-    """The certificate (PEM) of a host, when it was made, and its successor."""
+    """The certificate (PEM) of a host, the time when it was made, and its successor."""
 
     name: str
     made: float
@@ -61,7 +61,7 @@ class CertificateRow(NamedTuple):
 
 
 class PortsRow(NamedTuple):
-    """The check of a machine's ROS ports from outside; `name` is a host's, or an address."""
+    """The check of a machine's ROS ports from outside; `name` is the name of a host, or an address."""
 
     name: str
     state: str
@@ -71,7 +71,7 @@ class PortsRow(NamedTuple):
 
 
 class EnrolmentTokenRow(NamedTuple):
-    """An awaited host and the hash of its one-time token. There is one for each name."""
+    """An awaited host and the hash of its one-time token; each name has at most one token."""
 
     name: str
     id: str
@@ -85,7 +85,7 @@ class EnrolmentTokenRow(NamedTuple):
 
 
 class RevokedCertificateRow(NamedTuple):
-    """A revoked certificate: when it was revoked, and when it ends. `name` is empty if not known."""
+    """A revoked certificate: the times of its revocation (`moment`) and expiry. `name` is empty if not known."""
 
     serial: str
     name: str
@@ -104,7 +104,7 @@ class HostTables:
         self._database.put("host", *row)
 
     def hosts(self) -> list[HostRow]:
-        """Return all hosts that were ever enrolled, by name."""
+        """Return all hosts that were ever enrolled, sorted by name."""
         return [HostRow(*row) for row in self._database.query("SELECT * FROM host ORDER BY name")]
 
     def save_certificate(self, row: CertificateRow) -> None:
@@ -130,11 +130,11 @@ class HostTables:
         return [PortsRow(name, state, json.loads(opened), *told) for name, state, opened, *told in rows]
 
     def save_awaited(self, row: EnrolmentTokenRow) -> None:
-        """Store a one-time token; it replaces an earlier one of the same name."""
+        """Store a one-time token, replacing an earlier token for the same name."""
         self._database.put("enrolment_token", *row[:-2], json.dumps(row.kit), row.who)
 
     def forget_awaited(self, name: str) -> None:
-        """Remove a token that was used or has ended."""
+        """Remove a token that was used or has expired."""
         self._database.delete("enrolment_token", name=name)
 
     def awaited(self) -> list[EnrolmentTokenRow]:
@@ -147,7 +147,7 @@ class HostTables:
         self._database.submit("INSERT OR IGNORE INTO revocation VALUES (?, ?, ?, ?)", row)
 
     def forget_revoked(self, before: float) -> None:
-        """Remove certificates that ended before this time: they are invalid without a revocation."""
+        """Remove certificates that expired before this time: they are invalid even without a revocation."""
         self._database.submit("DELETE FROM revocation WHERE expires < ?", (before,))
         self._database.submit(
             "DELETE FROM revoked_certificate WHERE moment < ?", (before - _LONGEST_SECONDS,)
@@ -155,7 +155,7 @@ class HostTables:
 
     def revoked(self) -> list[RevokedCertificateRow]:
         """Return all revoked certificates, the earliest revocation first."""
-        # Rows from before the table `revocation` have no end; it comes within the longest life.
+        # Rows of the older table `revoked_certificate` have no expiry: assume the longest life of a certificate.
         rows = self._database.query(
             "SELECT serial, name, moment, expires FROM revocation UNION ALL"
             " SELECT serial, '', moment, moment + ? FROM revoked_certificate"

@@ -1,4 +1,4 @@
-"""Store revisions, list them, roll back to one, and roll back changes that are not confirmed in time."""
+"""Store and list revisions, roll back to a revision, and roll back changes that are not confirmed in time."""
 
 import asyncio
 import contextlib
@@ -25,11 +25,11 @@ class Row(Protocol):
 
     @property
     def revision(self) -> int:
-        """Return its number; 0 before the first."""
+        """Return the revision's number; 0 before the first revision."""
 
     @property
     def who(self) -> str:
-        """Return the operator who brought it into force, or `DISK`."""
+        """Return the operator who brought the revision into force, or `DISK`."""
 
     def _asdict(self) -> dict[str, Any]: ...
 
@@ -38,17 +38,17 @@ R = TypeVar("R", bound=Row)
 
 
 class Revisions(ABC, Generic[R]):
-    """The revisions of one thing, which are changed one at a time.
+    """The revisions of the policy or of the specifications; only one change is made at a time.
 
-    A change can have a time limit: it is rolled back automatically unless confirmed, also after restarts of control and
-    of the appliance. A rollback that raises `refusal` or `StoreError` changes nothing and is tried again after
-    `_AGAIN_SECONDS`, because no person may be there to do it.
+    A change can have a time limit: unless confirmed, it is rolled back automatically, even if control or the appliance
+    restarts meanwhile. A rollback that raises `refusal` or `StoreError` changes nothing, and is tried again after
+    `_AGAIN_SECONDS`, because no person may be present to do it.
     """
 
     refusal: ClassVar[type[Exception]]
     """The error for a revision that cannot come into force; it takes findings."""
     outdated: ClassVar[type[Exception]]
-    """The error for a change that was meant for another tag; it takes that tag and the present one."""
+    """The error for a change that expected another tag; it takes the expected tag and the present one."""
 
     def __init__(
         self,
@@ -58,9 +58,9 @@ class Revisions(ABC, Generic[R]):
         nothing: R,
         setting: str,
     ) -> None:
-        """Read revisions with `rows(limit)`, the newest first, and write them with `save`.
+        """`rows(limit)` returns revisions, newest first; `save` writes one.
 
-        `nothing` is in force until the start. The store keeps the time limit under the name `setting`.
+        The revision `nothing` is in force until the start. The store keeps the time limit under the name `setting`.
         """
         self.store = store
         self._rows = rows
@@ -79,7 +79,7 @@ class Revisions(ABC, Generic[R]):
 
     @property
     def tag(self) -> int | str:
-        """Return the name of the present state, which a request gives as `expected`."""
+        """Return the tag of the present state; a request repeats it as `expected`."""
         return self.revision
 
     @abstractmethod
@@ -89,10 +89,10 @@ class Revisions(ABC, Generic[R]):
     # --- start ---
 
     def _find_last(self, *, restarted: bool) -> bool:
-        """Set the last revision in force; return whether the start uses it whatever the disk has.
+        """Put the last stored revision in force; return whether it takes precedence over the files on disk.
 
-        It does after a crash of control (`restarted`). At the appliance's start it does so only for an operator's own
-        revision (a rollback, REST).
+        It does after a crash of control (`restarted`). At the start of the appliance, only a revision made by an
+        operator (a rollback, REST) does.
         """
         self.in_force = next(iter(self._rows(1)), self.in_force)
         return self.revision > 0 and (restarted or self.in_force.who != DISK)
@@ -101,9 +101,9 @@ class Revisions(ABC, Generic[R]):
         """Resume the time limit after a start."""
         kept = self.store.settings().get(self._setting, "")
         if kept:
-            back_to, deadline, length = (*kept.split(), "inf")[:3]  # up to 0.1.0 the length was not kept
+            back_to, deadline, length = (*kept.split(), "inf")[:3]  # version 0.1.0 did not store the length
             within = float(length)
-            # The whole length at most: the clock may have been set back since.
+            # Wait at most the whole length: the clock may have been set back since.
             self._limit(int(back_to), min(float(deadline), time.time() + within), within)
 
     # --- reading ---
@@ -120,9 +120,9 @@ class Revisions(ABC, Generic[R]):
         return next((row for row in await self._kept() if row.revision == revision), None)
 
     async def _wanted(self, revision: int | None) -> R:
-        """Return the stored revision to roll back to (None: the one before the present).
+        """Return the stored revision to roll back to (None: the one before the present revision).
 
-        Raises `refusal` if there is none, and `outdated` if another came into force while they were read.
+        Raises `refusal` if it does not exist, and `outdated` if another revision came into force during the read.
         """
         before = self.revision
         known = {row.revision: row for row in await self._kept()}
@@ -140,7 +140,7 @@ class Revisions(ABC, Generic[R]):
 
     @contextlib.asynccontextmanager
     async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
-        """Hold the lock for one change. Raise `outdated` unless `expected` is the present tag or None."""
+        """Hold the lock for one change. Raises `outdated` unless `expected` is None or the present tag."""
         async with self._one_change:
             require_awaited()
             if expected not in (None, self.tag):
@@ -148,8 +148,8 @@ class Revisions(ABC, Generic[R]):
             yield
 
     def _put_in_force(self, row: R, within: float | None = None) -> None:
-        """Store a revision that comes into force; unless confirmed, it is rolled back after `within` seconds."""
-        if within is not None:  # first, because control may die while the change is made
+        """Store a revision and put it in force; unless confirmed, roll it back after `within` seconds."""
+        if within is not None:  # set the limit first, because control may die during the change
             back_to = self.revision if self.confirm_by is None else self._back_to
             self._limit(back_to, time.time() + within, within)
         self._save(row)
@@ -158,7 +158,7 @@ class Revisions(ABC, Generic[R]):
             self._end_limit()
 
     def _end_limit(self) -> None:
-        """Leave the revision in force for good."""
+        """Keep the revision in force permanently."""
         self._stop_waiting()
         self.store.save_setting(self._setting, "")
 
@@ -179,7 +179,7 @@ class Revisions(ABC, Generic[R]):
             try:
                 await self._go_back(back_to)
             except (self.refusal, StoreError) as error:
-                if self.confirm_by is None:  # it was rolled back before the error
+                if self.confirm_by is None:  # the rollback was complete before the error
                     _log.error(
                         "an unconfirmed change was rolled back, but this is not saved", reason=str(error)
                     )

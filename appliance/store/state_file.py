@@ -54,9 +54,9 @@ LARGEST_CHANGE = 64 << 10  # bytes of one parameter whose change is stored at on
 
 
 class IncarnationRow(NamedTuple):
-    """A stored incarnation; `changed` is monotonic seconds, for the order only.
+    """A stored incarnation; `changed` is in monotonic seconds, and used only for the order.
 
-    `relay_port` is its port on the first relay process, `more_relay_ports` are those on the others.
+    `relay_port` is the incarnation's port on the first relay process, `more_relay_ports` are its ports on the others.
     """
 
     key: str
@@ -83,7 +83,7 @@ class RegistrationRow(NamedTuple):
 
 
 class PermissionRow(NamedTuple):
-    """One grant of the relay (`kind` "topic" or "service")."""
+    """A grant for the relay; `kind` is "topic" or "service"."""
 
     key: str
     kind: str
@@ -93,9 +93,9 @@ class PermissionRow(NamedTuple):
 
 
 class RevisionRow(NamedTuple):
-    """One policy that was in force; `loaded` is seconds since the epoch, `who` is who loaded it from where.
+    """A policy that was in force; `loaded` is seconds since the epoch, `who` names its author.
 
-    `signature` is the site's; empty if unsigned.
+    `signature` is the signature of the site; empty if the policy is unsigned.
     """
 
     revision: int
@@ -123,14 +123,14 @@ class StateStore:
     def __init__(self, directory: Path, *, failed: Callable[[str], None]) -> None:
         self.database = Database(directory / "state.db", _SCHEMA + host_tables.SCHEMA, failed=failed)
         self.hosts = host_tables.HostTables(self.database)
-        self._parameter_changes = 0  # the number of the last one
+        self._parameter_changes = 0  # the number of the last change
 
     async def settled(self) -> None:
         """Wait until everything saved so far is on the disk. Raises `StoreError` if it cannot be written."""
         await self.database.settled()
 
     def close(self, seconds: float | None = None) -> None:
-        """Write the rest within `seconds` (None: without a limit), and close."""
+        """Write the queued statements within `seconds` (None: no limit), and close the file."""
         self.database.close(seconds)
 
     # --- registry ---
@@ -188,17 +188,17 @@ class StateStore:
     # --- parameters ---
 
     def save_parameters(self, tree: dict[str, Any]) -> None:
-        """Store the whole parameter tree; it replaces the changes before it."""
+        """Store the whole parameter tree, and remove the single changes that it contains."""
         self.database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
-        # After a crash, changes that the tree has may stay: made again in order, they give the same tree.
+        # After a crash, changes that the tree contains may remain: repeated in order, they give the same tree.
         self.database.submit(
             "DELETE FROM parameter_change WHERE number <= ?", (self._parameter_changes,), ahead=False
         )
 
     def note_parameter(self, key: str, value: Any) -> None:
-        """Store one change until the tree is stored: the parameter has this value (None: it is gone).
+        """Store one change until the next tree is stored: the parameter has this value (None: it was deleted).
 
-        From then on the change outlasts the process. A large value does not: it is only stored with the tree.
+        The change then survives the process. A value larger than `LARGEST_CHANGE` is stored only with the tree.
         """
         data = None if value is None else msgspec.msgpack.encode(value)
         if data is not None and len(data) > LARGEST_CHANGE:
@@ -207,7 +207,7 @@ class StateStore:
         self.database.put("parameter_change", self._parameter_changes, key, data)
 
     def parameter_changes(self) -> list[tuple[str, Any]]:
-        """Return the changes since the tree was stored, in order; None for a parameter that is gone."""
+        """Return the changes since the tree was stored, in order; the value is None for a deleted parameter."""
         query = "SELECT number, key, value FROM parameter_change ORDER BY number"
         rows = self.database.query(query)
         self._parameter_changes = rows[-1][0] if rows else 0
@@ -218,7 +218,7 @@ class StateStore:
         self.database.put("parameter_owner", key, host)
 
     def parameters_disowned(self, key: str) -> None:
-        """Remove the owners of this key and of those below it."""
+        """Remove the owners of this key and of all keys below it."""
         above = key.rstrip("/")  # '0' follows '/'
         self.database.submit(
             "DELETE FROM parameter_owner WHERE key = ? OR (key > ? AND key < ?)",
@@ -226,7 +226,7 @@ class StateStore:
         )
 
     def parameter_owners(self) -> list[tuple[str, str]]:
-        """Return each key at which another owner begins, and the host that owns it and the keys below."""
+        """Return each key with a stored owner, and the host that owns this key and the keys below it."""
         return [(key, host) for key, host in self.database.query("SELECT key, host FROM parameter_owner")]
 
     def load_parameters(self) -> dict[str, Any]:
@@ -238,7 +238,7 @@ class StateStore:
 
     def save_revision(self, row: RevisionRow) -> None:
         """Store a policy that comes into force."""
-        # The signature first: a start in between would reject a revision without it.
+        # Store the signature first: a start in between would reject a revision without its signature.
         self.database.put("policy_signature", row.revision, row.signature)
         self.database.put("policy_revision", *row[:-1])
 

@@ -1,8 +1,8 @@
-"""One SQLite file with one writer thread: statements are queued, written in groups, and can be awaited.
+"""Write one SQLite file in one thread: statements are queued, written in groups, and can be awaited.
 
-Waiting statements are committed together (group commit). A killed process loses nothing: queued statements are in a
-separate file until the database has them (`ahead`). A power failure loses nothing that was awaited (`settled`), so a
-change that was reported to an operator as done stays done.
+Waiting statements are committed together (group commit). A killed process loses no statement: a separate file holds
+queued statements until the database has them (`ahead`). A power failure loses no statement that was awaited
+(`settled`). So a change that was reported to an operator as done stays done.
 """
 
 import asyncio
@@ -24,11 +24,11 @@ from appliance.store.ahead import Parameter, Parameters, WriteAhead
 _GROUP = 2_000
 _GATHER_SECONDS = 0.02  # time to gather statements that are not awaited: they are safe in `ahead`
 
-_ROWS = 64  # of one statement
+_ROWS = 64  # rows in one statement
 
 _CATCH_UP_SECONDS = 1.0
 _SETTLE_SECONDS = 5.0
-_ROOM = 4 << 20  # bytes: SQLite's log grows to this, and few texts are longer
+_ROOM = 4 << 20  # bytes; SQLite's write-ahead log grows to this size, and few texts are longer
 
 _LEFT = "changes in the file state.ahead are applied at the next start; other changes are lost"
 
@@ -62,7 +62,7 @@ class Database:
         self._failed = failed
         self._failing = ""
         self._told: set[str] = set()
-        # The file beside it is made once it has its tables. SQLite takes an empty one for new: nothing is revoked then.
+        # `.ahead` exists once the database has tables. SQLite would take an empty file for new, and lose revocations.
         if path.exists() and not path.stat().st_size and path.with_suffix(".ahead").exists():
             raise StoreError(
                 f"{path}: is empty, but was not when the appliance last ran: restore a backup (rosrv restore), or"
@@ -81,7 +81,7 @@ class Database:
             raise StoreError(f"{path.with_suffix('.ahead')}: {error}") from error
         self._gathered: _Gathered | None = None
         self._queue: queue.SimpleQueue[_Queued | Callable[[], None] | None] = queue.SimpleQueue()
-        self._order = threading.Lock()  # statements have the same order in the file ahead and in the queue
+        self._order = threading.Lock()  # for equal order in the write-ahead file and the queue
         self._closed = False
         self._closing = threading.Event()
         self._hurry = threading.Event()
@@ -89,10 +89,10 @@ class Database:
         self._thread.start()
 
     def query(self, sql: str, parameters: Parameters = ()) -> list[tuple[Any, ...]]:
-        """Read rows, including those queued before. After start-up, call it in a thread: it waits while the disk is
-        slow.
+        """Read rows, including those queued before; after start-up, call this in a thread, because it may wait.
 
-        Statements that are not written within `_CATCH_UP_SECONDS` are missing; on a full disk it does not wait.
+        The result lacks statements that are not written within `_CATCH_UP_SECONDS`. If writing fails (a full disk), the
+        call does not wait.
         """
         if self._thread.is_alive() and not self._failing:
             written = threading.Event()
@@ -106,7 +106,7 @@ class Database:
             raise StoreError(f"{self._path}: {error}") from error
 
     def submit(self, sql: str, parameters: Parameters = (), *, ahead: bool = True) -> None:
-        """Queue one statement. With `ahead` it survives the process from then on; large values go without.
+        """Queue one statement; with `ahead`, it survives the process from then on (large values do without).
 
         An INSERT must end with its row. Raises `StoreError` after `close`, like all methods that submit.
         """
@@ -119,7 +119,7 @@ class Database:
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """Gather what this thread submits inside into one write at the end; before it, nothing outlasts the process."""
+        """Gather this thread's statements in the block into one write at its end; none survives the process before."""
         if self._gathered is not None:
             yield
             return
@@ -161,7 +161,7 @@ class Database:
         self.submit(f"DELETE FROM {table} WHERE {wanted}", tuple(where.values()))  # noqa: S608  fixed names
 
     def require_room(self) -> None:
-        """Raise `StoreError` if the disk is too full for the changes of an order: nothing may be changed then."""
+        """Raise `StoreError` if the disk is too full for an order's changes; the order must then change nothing."""
         disk = os.statvfs(self._path.parent)
         free = disk.f_bavail * disk.f_frsize
         if self._failing or free < _ROOM:
@@ -169,7 +169,7 @@ class Database:
             raise StoreError(f"{why}; nothing was changed: free space and try again")
 
     async def settled(self) -> None:
-        """Wait until everything queued so far is on the disk. Raises `StoreError` when it cannot be written."""
+        """Wait until all statements queued so far are on the disk. Raises `StoreError` if they cannot be written."""
         loop = asyncio.get_running_loop()
         done = loop.create_future()
 
@@ -179,7 +179,7 @@ class Database:
 
         def call_back() -> None:
             self._sync()
-            with contextlib.suppress(RuntimeError):  # the loop has ended, and with it all waiting callers
+            with contextlib.suppress(RuntimeError):  # the loop has ended, so no caller waits
                 loop.call_soon_threadsafe(tell)
 
         with self._order:
@@ -191,9 +191,9 @@ class Database:
                 raise StoreError(f"{self._failing}; free space: until then a restart undoes recent changes")
 
     def close(self, seconds: float | None = None) -> None:
-        """Write the queue within `seconds` (None: without a limit), and close the file.
+        """Write the queue within `seconds` (None: no limit), and close the file.
 
-        Nothing is taken any more from the beginning of this on.
+        Statements submitted after this call begins raise `StoreError`.
         """
         with self._order:
             self._closed = True
@@ -249,7 +249,7 @@ class Database:
         try:
             with self._path.with_name(f"{self._path.name}-wal").open("rb") as log:
                 os.fsync(log.fileno())
-            self._ahead.sync()  # else it could come back with what the database has had long since
+            self._ahead.sync()  # else a power failure could restore statements that the database has long had
         except OSError as error:
             self._fail(f"{self._path}: {error}")
 
@@ -259,7 +259,7 @@ class Database:
             self._failed(reason)
 
     def _catch_up(self) -> None:
-        """Carry out what a killed process left, before anything is read."""
+        """Execute the statements that a killed process left, before anything is read."""
         left = self._ahead.left()
         if left:
             self._connection.execute("BEGIN")
@@ -270,7 +270,7 @@ class Database:
 
 
 def _joined(statements: list[_Queued]) -> Iterator[_Queued]:
-    """Yield the statements, consecutive rows of one table as one: each costs the loop a turn of its thread."""
+    """Yield the statements, joining consecutive rows of a table: each statement delays the loop's thread."""
     for (sql, ahead), same in itertools.groupby(
         statements, lambda statement: (statement.sql, statement.ahead)
     ):
@@ -283,7 +283,7 @@ def _joined(statements: list[_Queued]) -> Iterator[_Queued]:
 
 
 def _advice(error: sqlite3.Error) -> str:
-    # Subclasses report the environment (a full disk, a lock, rights); the class itself, wrong content.
+    # Subclasses report the environment (a full disk, a lock, rights); the class itself reports wrong content.
     if type(error) is sqlite3.DatabaseError:
         return "move the file away to start with an empty state"
     return "free space there and make it writable, or name another directory with --state DIR"
