@@ -16,7 +16,7 @@ NOT_RECORDED = "the audit log cannot be written; nothing is granted until it can
 
 
 class Asker(NamedTuple):
-    """A caller: its host, claimed `caller_id`, the arrival of the call (monotonic ns), and the target node."""
+    """A caller: its host, its claimed `caller_id`, the arrival time of its call (monotonic ns), and the target node."""
 
     host: str
     caller_id: str
@@ -25,15 +25,15 @@ class Asker(NamedTuple):
 
 
 Recordings = Callable[[str, str | None, Severity, str | None, int], dict[str, str]]
-"""Returns the details that an event's record has about its recording, as `RecordingPlan.detail` does."""
+"""A function that returns the recording details of an event's record, such as `RecordingPlan.detail`."""
 
 
 class AuditTrail:
     """The writer of decisions and events under the running policy revision.
 
     `strict`: an answer waits until its record is on disk. `deny_when_failed`: every request is denied while the log
-    cannot be written. Denials of unknown hosts have `detail.unknown_host`. If a host is over its quota of the log, the
-    events it causes without a decision are only counted.
+    cannot be written. Denials of unknown hosts have `detail.unknown_host`. While a host exceeds its log quota, its
+    events without a decision are only counted, not recorded one by one.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class AuditTrail:
         return self._log.budget.owing(host)
 
     async def still_owing(self, host: str) -> str:
-        """Return `owing`, checked again after the log has caught up, when repetitions no longer count."""
+        """Return `owing`; if the host must wait, let the log catch up first and check again."""
         if self.owing(host):
             await self._log.wait_durable()
         return self.owing(host)
@@ -88,10 +88,10 @@ class AuditTrail:
         reads: bool = False,
         **asked_of: str,
     ) -> str:
-        """Record a decision and return the id of its record. A decision that is only counted has no such record.
+        """Record a decision and return the record's id. If the decision is only counted, no record has this id.
 
-        `asked_of` is the object of a command: a parameter, a node. `reads`: the call changes nothing, so repetitions
-        of an allowed call are only counted.
+        `asked_of` names the object of a command, such as a parameter or a node. `reads`: the call changes nothing, so
+        repetitions of an allowed call are only counted.
         """
         word = decision.word
         detail: dict[str, Any] = {"call": method, **asked_of}
@@ -139,9 +139,9 @@ class AuditTrail:
         reads: bool = False,
         **detail: Any,
     ) -> str:
-        """Record an event that is not a decision; return the id like `decided`. `more` has further details.
+        """Record an event that is not a decision; return the record's id, as `decided` does. `more` adds details.
 
-        `severity` overrides the event's own (`audit/events.py`).
+        `severity` overrides the default severity of the event (`audit/events.py`).
         `reads`: the event changed nothing, so repetitions are only counted.
         """
         now, severity = time.time_ns(), severity or SEVERITIES.get(event, Severity.INFO)
@@ -168,10 +168,10 @@ class AuditTrail:
         )
 
     def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
-        """Whether this denies an unknown host; if so, mark it in `detail`."""
+        """Whether an unknown host is denied; if so, set the mark in `detail`."""
         if host is None or decision != "deny" or self._log.budget.quota_class(host) is not QuotaClass.UNKNOWN:
             return False
-        detail["unknown_host"] = detail["stranger"] = True  # the second is its name of 0.1.0; deprecated
+        detail["unknown_host"] = detail["stranger"] = True  # `stranger` is the deprecated key of 0.1.0
         return True
 
 

@@ -1,8 +1,8 @@
 """Define every metric by name, and keep the counters of RVMaster.
 
 `/metrics` and docs/reference/metrics.md are both generated from `METRICS` (`python -m appliance.telemetry.metrics`).
-Counting costs a few additions per request and no formatting. Labels have few values: calls, categories and roles are
-fixed; topics and services are those on a relay, limited in number by `appliance.control.measurements`.
+Counting costs a few additions per request and no formatting. Labels have few values. Calls, categories and roles are
+fixed sets. Only topics and services on a relay are labels; `appliance.control.measurements` limits their number.
 """
 
 import bisect
@@ -137,7 +137,7 @@ METRICS = (
 
 @dataclass(slots=True)
 class Histogram:
-    """A histogram of durations by upper bound; the last of `counts` is for durations above all `BOUNDS`."""
+    """A histogram of durations by upper bound; the last entry of `counts` is for durations above all `BOUNDS`."""
 
     counts: list[int] = field(default_factory=lambda: [0] * (len(BOUNDS) + 1))
     sum: float = 0.0
