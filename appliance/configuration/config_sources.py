@@ -5,8 +5,8 @@
     3. the environment: `ROSRV_LISTEN`, and `ROSRV_LIMITS__BODY_BYTES` for the key `body_bytes` under `limits`
     4. flags
 
-All mistakes are reported at once, each with its location; for an unknown key also the nearest known key. Relative paths
-in the file are relative to the file's folder, all others to the working directory.
+All mistakes are reported at once, each with its location. For an unknown key, the nearest known key is also suggested.
+Relative paths in the file are relative to the file's folder; all other paths, to the working directory.
 """
 
 import dataclasses
@@ -79,7 +79,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def read(values: Mapping[str, Any]) -> Settings:
-    """Return the settings with these values. Raises `pydantic.ValidationError`."""
+    """Return the settings with these values, checked. Raises `pydantic.ValidationError`."""
     return _reader().validate_python(values)
 
 
@@ -95,7 +95,7 @@ def _reader() -> TypeAdapter[Settings]:
 
 
 def resolve(file: Path | None, environment: Mapping[str, str], flags: Mapping[str, Any]) -> Settings:
-    """Return the resulting settings; flags that are None were not given. Raises `ConfigError`."""
+    """Return the settings from all sources. A flag whose value is None was not given. Raises `ConfigError`."""
     gathered = _Gathered()
     chosen = _choose_file(file, environment)
     if chosen is not None:
@@ -186,7 +186,7 @@ class _Gathered:
                 table[key] = {}
             table = table[key]
         table[path[-1]] = value
-        # Locations below this key are outdated.
+        # The new value replaces the whole subtree, so known locations inside it are outdated.
         for older in [known for known in self._places if known[: len(path)] == path]:
             del self._places[older]
         self._places[path] = place
@@ -241,7 +241,7 @@ class _Gathered:
 
 
 def _about(path: KeyPath, place: str) -> str:
-    """Return the key of a mistake as a prefix; empty if the location is the flag of that name."""
+    """Return the key of a mistake as a prefix; empty if the location is the key's own flag."""
     return "" if not path or (place.startswith("--") and len(path) == 1) else f"{_dotted(path)}: "
 
 
@@ -253,7 +253,7 @@ def _unknown_key(path: KeyPath) -> str:
     known = sorted(_keys_at(Settings, path[:-1]))
     nearest = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)
     if not nearest:
-        # Another common mistake is a key on the wrong level.
+        # The key may exist on another level of the file.
         elsewhere = [_dotted(key) for key in _all_keys(Settings, ()) if key[-1] == path[-1]]
         nearest = elsewhere[:1]
     advice = f"did you mean {nearest[0]}?" if nearest else f"known here: {', '.join(known)}"
@@ -261,7 +261,7 @@ def _unknown_key(path: KeyPath) -> str:
 
 
 def _with_absolute_paths(section: _Section) -> _Section:
-    """Return a copy with absolute paths."""
+    """Return the section with all paths absolute, also in its subsections."""
     changes: dict[str, Any] = {}
     for key in (field.name for field in dataclasses.fields(section)):
         value = getattr(section, key)
@@ -277,7 +277,7 @@ def _with_absolute_paths(section: _Section) -> _Section:
 
 
 def _resolve_path(values: dict[str, Any], path: tuple[str, ...], folder: Path) -> None:
-    """Prefix the path at a key with `folder`, if the key has a path."""
+    """Prefix the string at a key with `folder`, if the key has one."""
     *sections, key = path
     for section in sections:
         below = values.get(section)

@@ -16,7 +16,7 @@ import appliance
 from appliance.base.shipped import DPKG, SHIPPED
 from appliance.channel.answers.inventory_answers import Inventory, Part
 
-# The packages of packages.txt whose programs run on the robot's machine.
+# The packages of packages.txt whose programs run on the robot's computer.
 RUNS = (
     "python3-rosmaster", "rosout", "iproute2", "iptables", "nftables", "charon-systemd",
     "libstrongswan-standard-plugins", "libcharon-extra-plugins", "strongswan-swanctl", "libseccomp2",
@@ -73,7 +73,7 @@ def _python() -> Iterator[Part]:
 
 
 def _debian() -> Iterator[Part]:
-    """Yield the Debian packages that the program uses; none on a system without dpkg."""
+    """Yield the Debian packages that the program uses; yield nothing on a system without dpkg."""
     try:
         status = (DPKG / "status").read_text(errors="replace")
     except FileNotFoundError:

@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 def key(*, description: str = "", default: Any = dataclasses.MISSING, **rules: Any) -> Any:
-    """Define a key with its default (or `default_factory`), description, and rules of pydantic's `Field`."""
+    """Define a key with a default (or `default_factory`), a description, and rules for pydantic's `Field`."""
     metadata = {"description": description or None, **rules}
     if isinstance(default, list):
         metadata["json_schema_extra"] = {"default": default}
@@ -45,11 +45,11 @@ def key(*, description: str = "", default: Any = dataclasses.MISSING, **rules: A
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(key,))
 def _section(cls: type[T]) -> type[T]:
     """Define a table of keys; unknown keys are rejected."""
-    cls.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]  # pydantic reads it there
+    cls.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]  # pydantic reads this attribute
     return dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
 
-# msgspec and users of a setting see the annotated type; pydantic reads these.
+# pydantic reads the metadata of these types; msgspec and the users of a setting see only the plain type.
 _BYTES = GetPydanticSchema(lambda _source, handler: handler(ByteSize))
 _NETWORK = GetPydanticSchema(lambda _source, handler: handler(IPvAnyNetwork))
 _ADDRESS = GetPydanticSchema(lambda _source, handler: handler(IPvAnyAddress))
@@ -62,7 +62,7 @@ WithinAnHour = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
 
 
 class Unasked(str):
-    """A string default, which shows that the user did not configure the value."""
+    """A default string. Its class distinguishes it from a string that the user configured."""
 
     __slots__ = ()
 
@@ -149,7 +149,7 @@ def _checked_api(text: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a configured host is this machine only."""
+    """Whether a configured host is a loopback address, which only this machine reaches."""
     if host == "localhost":
         return True
     try:
@@ -474,7 +474,7 @@ class Settings:
         default="0.0.0.0:11311", description="address where nodes find their master"
     )
     rosmaster_port: int = key(
-        # Not 11411, where rosserial's TCP server listens, and below the ports the kernel gives to clients.
+        # 11411 is rosserial's TCP port; the kernel's ephemeral ports start above this one.
         default=12311,
         ge=0,
         le=65_535,
@@ -560,7 +560,7 @@ class Settings:
 
     @property
     def own_services(self) -> list[str]:
-        """Return the appliance's own services for nodes: the one that starts a recording."""
+        """Return the name of the service with which nodes start a recording; empty if it is not enabled."""
         offered = self.recorder.enabled and "service" in self.recorder.triggers
         return [f"{self.publish_as}/record_now"] if offered else []
 
