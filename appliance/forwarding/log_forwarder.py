@@ -6,7 +6,7 @@ Invariants:
 2. Memory is bounded: at most `_BATCH` records and `_BATCH` checkpoints at a time.
 3. The position advances only when the receiver has the batch; failures are retried forever, with growing pauses.
 4. Records that retention removed before they were sent are counted and reported (`missed`).
-5. If the log was restored from a copy, records that reuse the sequence of a sent record are sent as well.
+5. If the log was restored from a copy, new records that reuse sequence numbers of sent records are also sent.
 """
 
 import time
@@ -38,10 +38,10 @@ _log = structlog.get_logger()
 
 
 class ForwardingPosition(msgspec.Struct, frozen=True):
-    """The last record (its sequence) and the last checkpoint (its number) of log `log` that the receiver has.
+    """The sequence of the last record and the number of the last checkpoint that the receiver has of log `log`.
 
-    It is stored after the receiver has them, so after a crash some are sent again. `record` is the id of that record;
-    if the log was restored from a copy, another record may have its sequence.
+    The position is stored after the receiver has both, so after a crash some records are sent again. `record` is the
+    id of the last record: if the log was restored from a copy, another record may have the same sequence.
     """
 
     log: str
@@ -67,7 +67,7 @@ def save_position(path: Path, position: ForwardingPosition) -> None:
 
 @dataclass(slots=True)
 class LogForwarder:
-    """A forwarder of the database `log` to `receiver`, with its position in the file `kept`. For one thread."""
+    """A forwarder of the database `log` to `receiver`; it stores its position in the file `kept`. Not thread-safe."""
 
     log: Path
     kept: Path
@@ -112,7 +112,7 @@ class LogForwarder:
         return self._position
 
     def _forward(self, position: ForwardingPosition) -> bool:
-        """Forward a batch; return whether there is more."""
+        """Forward a batch; return whether more records are waiting."""
         _first, head, log_id = _extent(self.log)
         if log_id != position.log or head < position.sequence:
             self._position = None
@@ -176,7 +176,7 @@ class LogForwarder:
 
 
 def _extent(path: Path) -> tuple[int, int, str]:
-    """Return first and last sequence, and the log's id. Raises `LogUnreadableError`."""
+    """Return the log's first and last sequence and its id. Raises `LogUnreadableError`."""
     with reading(path, advice="") as connection:
         query = "SELECT coalesce(min(sequence), 1), coalesce(max(sequence), 0) FROM record"
         first, last = connection.execute(query).fetchone()
@@ -187,8 +187,8 @@ def _extent(path: Path) -> tuple[int, int, str]:
 def _in_log(path: Path, position: ForwardingPosition) -> ForwardingPosition:
     """Return the position, moved back if the log was restored from a copy. Raises `LogUnreadableError`.
 
-    A restored log continues with sequences that were already used. Ids are in order of time, so every record with a
-    later id than the last sent record is new, whatever its sequence.
+    A restored log continues with sequences that were already used. Ids are ordered by time, so every record with a
+    later id than the last sent record is new, even if its sequence is not.
     """
     with reading(path, advice="") as connection:
 

@@ -1,7 +1,7 @@
 """Run the forwarder as a process of the appliance: lifeline, link to control, and a thread that forwards.
 
-Its user may read the audit log and write only the position. The firewall lets it reach only the receiver. It outlives
-control and sends the records that control has committed.
+The process runs as a user that may read the audit log and write only the stored position. The firewall lets the process
+reach only the receiver. It outlives control and sends the records that control has committed.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class _Process:
-    """The parts of the process and their connections."""
+    """The process: it connects the lifeline, the reports to control and the forwarding thread."""
 
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
         lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
@@ -47,7 +47,7 @@ class _Process:
     async def run(self) -> None:
         """Forward until the supervisor stops the process."""
         # A daemon thread: shutdown does not wait for a hanging receiver; its batch is sent again at the next start.
-        said_with_logs = contextvars.copy_context()  # the name of this process
+        said_with_logs = contextvars.copy_context()  # keeps the process name in the thread's log lines
         thread = threading.Thread(
             target=said_with_logs.run, args=(self._forward,), name="forward", daemon=True
         )
@@ -59,7 +59,7 @@ class _Process:
                 await asyncio.wait_for(self._child.ended.wait(), _REPORT_SECONDS)
             except TimeoutError:
                 if not thread.is_alive():
-                    break  # a defect, which is logged: the supervisor restarts the process
+                    break  # the exception is a logged defect; the supervisor restarts the process
         self._ending.set()
         await asyncio.to_thread(thread.join, _LAST_SECONDS)
 
@@ -72,8 +72,8 @@ class _Process:
 class ProgressReports:
     """The reporter of progress to control; `send` returns whether control was connected.
 
-    A new control process first gets the last report again. It compares the report with the records of its predecessor,
-    and so detects missed changes.
+    A new control process first gets the last report again. By comparing it with its predecessor's records, the new
+    process detects changes that were missed.
     """
 
     def __init__(self, send: Callable[[messages.ForwardingReported], bool]) -> None:
@@ -92,7 +92,7 @@ class ProgressReports:
 
 
 def make_forwarder(settings: Settings, kept: Path) -> LogForwarder:
-    """Return the forwarder for these settings, in which a receiver must be configured."""
+    """Return the forwarder for these settings; they must configure a receiver."""
     wanted = settings.audit.syslog
     longest = LONGEST_DATAGRAM if wanted.destination[0] == "udp" else LONGEST_IN_STREAM
     return LogForwarder(
@@ -109,7 +109,7 @@ def make_forwarder(settings: Settings, kept: Path) -> LogForwarder:
 
 
 def receiver_of(wanted: Syslog) -> Receiver:
-    """Return the receiver that the configuration names."""
+    """Return the configured receiver."""
     protocol, host, port = wanted.destination
     if protocol == "udp":
         return DatagramReceiver(host, port)

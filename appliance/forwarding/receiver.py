@@ -7,8 +7,8 @@ Invariants:
 2. Data from the receiver is discarded; a closed connection is detected before more is sent.
 3. TLS requires that the configured authority certifies the receiver's configured name or address.
 
-Syslog has no acknowledgements. Messages that a receiver accepted but had not processed when it died are lost, and so
-are UDP packets that the network drops. The log itself has everything, and checkpoints reveal a gap.
+Syslog has no acknowledgements. If a receiver dies, messages that it accepted but did not process are lost; so are UDP
+packets that the network drops. The log itself keeps everything, and checkpoints reveal the gap.
 """
 
 import fcntl
@@ -26,21 +26,21 @@ from typing import Protocol
 _CONNECT_SECONDS = 5.0
 _SEND_SECONDS = 10.0
 _OBJECTION_SECONDS = 1.0
-_LOOK_SECONDS = (0.001, 0.02)  # between two checks for acknowledgement: first, longest
+_LOOK_SECONDS = (0.001, 0.02)  # first and longest interval between two checks for acknowledgement
 
 
 class Receiver(Protocol):
     """A receiver of messages."""
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Send all of them, in order; see the invariants above. Raises `OSError`."""
+        """Send all messages in order, as the module's invariants say. Raises `OSError`."""
 
     def close(self) -> None:
         """Close the connection, if there is one."""
 
 
 class DatagramReceiver:
-    """A UDP receiver: one datagram per message. The other side does not always report that nothing listens."""
+    """A UDP receiver: one datagram per message. A closed port is not always reported, so messages may be lost."""
 
     def __init__(self, host: str, port: int) -> None:
         self._place = (host, port)
@@ -64,7 +64,7 @@ class DatagramReceiver:
 
 
 class StreamReceiver:
-    """A TCP receiver with a lasting connection; `context` returns the TLS context of each (None: clear text)."""
+    """A TCP receiver with a lasting connection; `context` returns a new connection's TLS context (None: clear text)."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class StreamReceiver:
 
 
 def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> ssl.SSLContext:
-    """Return a context that verifies the receiver by `ca` (None: the system's) and presents our certificate.
+    """Return a TLS context that verifies the receiver with `ca` (None: the system's CAs) and presents our certificate.
 
     Raises `OSError`, which names the unreadable file.
     """
@@ -129,7 +129,7 @@ def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> 
 
 
 def _await_objection(connection: socket.socket) -> None:
-    """Raise `OSError` if the server rejects our certificate: with TLS 1.3 that happens after our handshake."""
+    """Raise `OSError` if the server rejects our certificate; with TLS 1.3 the rejection arrives after our handshake."""
     select.select([connection], [], [], _OBJECTION_SECONDS)
     _require_open(connection)
 

@@ -4,8 +4,8 @@ Invariants:
 
 1. A message is printable ASCII, and `"`, `\` and `]` are escaped (RFC 5424, 6.3.3). A name chosen by a host can neither
    control a receiver or a terminal, nor end its parameter, element or message.
-2. A message has at most `longest` bytes: first its details are left out, then its text is cut, both with a mark. The
-   sequence and id of the record are always included.
+2. A message has at most `longest` bytes. To fit, first the details are left out, then the text is cut; each leaves a
+   mark. The sequence and id of the record are always included.
 3. The same record gives the same message; a receiver detects duplicates by `sequence`.
 """
 
@@ -31,7 +31,8 @@ _SEVERITIES = {
 _LONGEST_MESSAGE_ID = 32
 _LONGEST_HOST_NAME = 255
 _LONGEST_VALUE = 512
-_FIXED, _OPEN = 700, 5  # bytes of header and own parameters; number of parameters that callers choose
+# Bytes of the header and our own parameters; number of parameters with values that callers choose.
+_FIXED, _OPEN = 700, 5
 _CUT = "..."
 
 
