@@ -13,7 +13,7 @@ M = TypeVar("M", messages.AuthorityStated, messages.CertificateMade, messages.Re
 
 
 class AuthorityError(Exception):
-    """Report a request without a result: `refused` if the authority rejected it, else it did not answer."""
+    """Report a request without a result. `refused`: the authority rejected the request; otherwise it did not answer."""
 
     def __init__(self, reason: str, *, refused: bool = False) -> None:
         super().__init__(reason)
@@ -35,7 +35,8 @@ class Authority:
     ) -> messages.CertificateMade:
         """Return a certificate in this name for the key of a signing request.
 
-        If `former` (a certificate in PEM) is given, `proof` must be the request's signature by its key.
+        If `former` (a certificate in PEM) is given, `proof` must be a signature over the request by that
+        certificate's key.
         """
         return await self._ask(
             lambda number: messages.CertificateWanted(number, request, name, days, proof, former),

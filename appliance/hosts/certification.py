@@ -1,8 +1,8 @@
-"""Request certificates of hosts from the signer, store them, pass them to charon, and return the parts of kits.
+"""Request hosts' certificates from the signer, store them, pass them to charon, and return the parts of kits.
 
 Invariants:
 
-1. An enrolment or renewal in progress fails if its name is revoked meanwhile, whether an operator or the host began it.
+1. An enrolment or renewal fails if its name is revoked meanwhile, whether an operator or the host started it.
 2. Every certificate that is issued or revoked is recorded.
 """
 
@@ -30,9 +30,9 @@ _SERVED_SECONDS = 10.0
 
 
 class Certification:
-    """The common part of enrolment by an operator and by a host itself.
+    """The steps shared by enrolment by an operator and enrolment by the host itself.
 
-    `changed()` is called after a change of the enrolled hosts; it returns the number of rights revoked for that.
+    `changed()` is called after a change of the enrolled hosts; it returns the number of rights that the change revoked.
     """
 
     def __init__(
@@ -57,8 +57,8 @@ class Certification:
         self.changed = changed
         self._authority = authority
         self._master_port = master_port
-        self._revocations: Counter[str] = Counter()  # of each name, since this process started
-        self._warned: set[str] = set()  # serials
+        self._revocations: Counter[str] = Counter()  # revocations by name, since this process started
+        self._warned: set[str] = set()  # serial numbers of certificates whose end was announced
         self.pin = ""
         self._served = asyncio.Event()
 
@@ -68,12 +68,12 @@ class Certification:
         self._served.set()
 
     def revoked(self, name: str) -> None:
-        """Note that a name is revoked, so that its orders in progress fail."""
+        """Note that a name is revoked, so that its enrolments and renewals in progress fail."""
         self._revocations[name] += 1
 
     @contextlib.contextmanager
     def unless_revoked(self, name: str) -> Iterator[None]:
-        """Raise at the end of the block if the name was revoked meanwhile."""
+        """Raise `HostForbiddenError` at the end of the block if the name was revoked during the block."""
         before = self._revocations[name]
         yield
         if self._revocations[name] != before:
@@ -90,7 +90,7 @@ class Certification:
             raise HostRefusedError(str(error), ours=not error.refused) from error
 
     def enrolled(self, name: str, address: str, made: CertificateMade, who: str, **more: Any) -> None:
-        """Store and record a host's first certificate, or its first one after a revocation."""
+        """Store and record a host's first certificate, or its first certificate after a revocation."""
         self.awaited.forget(name)
         self.keep(name, address, made)
         self.trail.happened(
@@ -117,15 +117,16 @@ class Certification:
         )
 
     def keep(self, name: str, address: str, made: CertificateMade) -> None:
-        """Make this the host's certificate, for charon and the policy as well."""
+        """Make this certificate the host's only one, and update charon and the policy."""
         self.table.keep(name, address, made)
         self.tunnels.state_anew()
         self.changed()
 
     async def finish(self, name: str, kept: dict[str, str] | None = None) -> KitParts:
-        """Wait until an enrolment is on disk and charon has it; return the kit's parts, with a warning without charon.
+        """Wait until an enrolment is on disk and charon has confirmed it; return the kit's parts.
 
-        `kept` are the options stored with the host's token. Raises `HostRefusedError`, `StoreError`.
+        If charon does not confirm in time, the kit has a warning. `kept` are the options stored with the host's token.
+        Raises `HostRefusedError`, `StoreError`.
         """
         try:
             await self.store.settled()
@@ -192,7 +193,7 @@ class Certification:
         return True
 
     def each_hour(self) -> None:
-        """Replace ended certificates by their stored next ones; record each that ends soon, once."""
+        """Replace ended certificates by their stored successors; record once each certificate that ends soon."""
         now = time.time()
         self.table.revoked.forget_ended()
         for row in self.table.enrolled():

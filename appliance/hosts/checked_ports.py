@@ -1,4 +1,4 @@
-"""Keep the results of checks from outside: whether a machine's ROS ports are closed to all but the appliance."""
+"""Keep the results of port checks from other machines: are a machine's ROS ports closed to all but the appliance?"""
 
 import ipaddress
 import time

@@ -1,10 +1,10 @@
 """Carry out operators' requests about hosts with a tunnel: enrol, issue kits and one-time tokens, revoke.
 
-A method here, of `itself`, of `ports` or of `Certification` answers each request.
+Each request is answered by a method of `HostEnrolment`, its `itself` or `ports`, or of `Certification`.
 
 Invariants:
 
-1. A revocation removes the host from the policy, and its registrations, before it awaits anything.
+1. Before its first `await`, a revocation removes the host from the policy, and removes its registrations.
 2. Only the answer to `token` contains a token, and no answer contains a private key.
 """
 
@@ -38,8 +38,8 @@ class HostEnrolment:
     """The operators' requests about hosts; `itself` serves the requests of hosts.
 
     `expel(address, reason)` removes a host's registrations and grants and returns their number. `find_endpoint()`
-    returns where hosts reach the appliance; `machines()` returns the number of nodes by address. `carried_out()` waits
-    for the relays, so that the connections of an expelled host are closed when the operator gets the answer.
+    returns the address at which hosts reach the appliance; `machines()` returns the number of nodes by address.
+    `carried_out()` waits for the relays: the operator's answer comes after the connections of an expelled host close.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class HostEnrolment:
         self._expel = expel
         self._carried_out = carried_out
 
-    # --- what others ask ---
+    # --- queries ---
 
     @admin.answers(admin.HostList)
     async def listed(self, _request: admin.HostList) -> answers.Hosts:
@@ -97,11 +97,11 @@ class HostEnrolment:
         self._table.enrolled_row(request.name)
         return await self._certification.kit(request.name, None)
 
-    # --- what operators do ---
+    # --- changes by operators ---
 
     @admin.answers(admin.HostAdd, who=True)
     async def add(self, request: admin.HostAdd, who: str) -> answers.KitParts:
-        """Enrol a host; return the parts of its kit. Raises `HostRefusedError`, `HostsChangedError`."""
+        """Enrol a host; return its kit's parts. Raises `HostRefusedError`, `HostsChangedError`, `StoreError`."""
         name = request.name
         async with self._certification.changing:
             self._table.require(request.expected)
@@ -177,8 +177,8 @@ class HostEnrolment:
             await self._store.settled()
             place = f"[{found.endpoint}]" if ":" in found.endpoint else found.endpoint
             url = f"https://{place}:{self._certification.rest.port}"
-            # The script contains no token and makes the key on the host, which the key never leaves. It checks the pin
-            # of REST's key and the fingerprint of the authority, so a host in between learns nothing.
+            # The script contains no token. It makes the key on the host, and the key never leaves that host. It checks
+            # the pin of REST's key and the authority's fingerprint, so a man in the middle learns nothing.
             known = {"url": url, "pin": self._certification.pin, "authority": _fingerprint(authority)}
             return answers.EnrolmentToken(
                 revision=self._table.revision,
@@ -241,7 +241,7 @@ class HostEnrolment:
             taken += self._expel(address, f"hosts.yaml no longer wants the tunnel of {name}")
         meant = self._tunnels.addresses
         await self._tunnels.start()
-        if self._tunnels.addresses != meant:  # the first tunnel: only now does the firewall block clear text
+        if self._tunnels.addresses != meant:  # `start` opened the first tunnel and blocked clear text
             taken += self._certification.changed()
         divergence = [f"{row.name}: {row.divergence}" for row in self._view.rows() if row.divergence]
         self._trail.happened(
@@ -294,9 +294,9 @@ _ENDPOINT_SECONDS = 20.0
 
 
 async def find_endpoint(settings: Settings, look: Callable[[], Awaitable[EndpointFound]]) -> Endpoint:
-    """Return the configured address at which hosts reach the appliance, else the one that the supervisor found.
+    """Return the configured address at which hosts reach the appliance; without one, the supervisor finds the address.
 
-    Raises `HostRefusedError` with the options that set the address.
+    Raises `HostRefusedError`; if no address is found, its text lists the options that set the address.
     """
     if settings.isolation == "none":
         raise HostRefusedError(NO_TUNNELS)

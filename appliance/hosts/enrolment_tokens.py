@@ -1,10 +1,11 @@
-"""Keep the one-time tokens with which awaited hosts enrol themselves.
+"""Keep the one-time tokens with which hosts enrol themselves. A host with an unused token is *awaited*.
 
 Invariants:
 
-1. A token's text is in one answer; only the hash of its secret is stored (256 random bits need no slow hash).
-2. A token is valid once, for one name, until it expires or a newer token of the name replaces it. It is used up before
-   the certificate is requested, so two hosts that send it at once get one certificate.
+1. Only one answer contains a token's text, and only the hash of its secret is stored. The secret has 256 random bits,
+   so a fast hash is enough.
+2. A token is valid once, for one name, until it expires or a newer token for the name replaces it. It is used up before
+   the certificate is requested, so if two hosts send the same token, only one gets a certificate.
 """
 
 import hashlib
@@ -21,11 +22,11 @@ MOST = 1000
 
 
 class BadEnrolmentTokenError(Exception):
-    """Report an invalid token; the text does not tell its bearer which reason applies."""
+    """Report an invalid token; the text does not reveal why the token is invalid."""
 
 
 class EnrolmentTokens:
-    """The unused tokens; expired ones are removed."""
+    """The unused tokens; expired tokens are removed."""
 
     def __init__(self, tables: HostTables) -> None:
         self._tables = tables
@@ -45,7 +46,7 @@ class EnrolmentTokens:
     def add(
         self, name: str, *, seconds: float, address: str, days: float, kit: dict[str, str], who: str
     ) -> tuple[EnrolmentTokenRow, str]:
-        """Make a token; return its row, and its text for the only time."""
+        """Make a token; return its row and its text. The text cannot be read again."""
         token_id, now = secrets.token_hex(6), time.time()
         secret = secrets.token_urlsafe(32)
         row = EnrolmentTokenRow(name, token_id, _hash(secret), now, now + seconds, address, days, kit, who)
@@ -66,7 +67,7 @@ class EnrolmentTokens:
         return row
 
     def give_back(self, row: EnrolmentTokenRow) -> None:
-        """Make a used token valid again after no certificate was issued, unless its name has a newer one."""
+        """Make a used token valid again if no certificate was issued, unless its name has a newer token."""
         if row.name not in self._rows:
             self._rows[row.name] = row
             self._tables.save_awaited(row)

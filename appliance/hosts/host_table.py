@@ -1,7 +1,7 @@
 """The table of hosts with a tunnel: names, addresses, certificates. It only keeps state.
 
-1. A name keeps its virtual address for good: no other host gets it, even after a revocation. An address promised with a
-   token is also reserved; one that hosts.yaml declares goes to another host only on request.
+1. A name keeps its virtual address for good: no other host gets the address, even after a revocation. An address
+   promised with a token is also reserved. An address declared in hosts.yaml goes to another host only on request.
 2. A replaced or revoked certificate is on the list of revoked certificates at once.
 3. `revision` grows with every change by an operator or a host, also across restarts.
 """
@@ -27,12 +27,12 @@ from appliance.store.state_file import StateStore
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
 _REVISION = "hosts.revision"
 MOST_HOSTS = 4096
-LONGEST_DAYS = 398  # of a certificate, as the authority has it
+LONGEST_DAYS = 398  # longest life of a certificate; the authority has the same limit
 MOST_MACHINES = 1024
 
 
 class HostRefusedError(Exception):
-    """Report a rejected request, with the reason. `ours`: the appliance cannot carry it out now."""
+    """Report a rejected request, with the reason. `ours`: the appliance, not the request, is the cause."""
 
     def __init__(self, reason: str, *, ours: bool = False) -> None:
         super().__init__(reason)
@@ -48,7 +48,7 @@ class HostForbiddenError(HostRefusedError):
 
 
 class HostsChangedError(Exception):
-    """Report a change that was meant for another revision of the table."""
+    """Report a change that expects another revision of the table."""
 
 
 class HostTable:
@@ -71,7 +71,7 @@ class HostTable:
         return str(self.pool.network_address + 1)
 
     def require(self, expected: int | None) -> None:
-        """Raise `HostsChangedError` if a change is meant for another revision."""
+        """Raise `HostsChangedError` if a change expects another revision of the table."""
         if expected not in (None, self.revision):
             raise HostsChangedError(f"the table of hosts has revision {self.revision}, not {expected}")
 
@@ -87,7 +87,7 @@ class HostTable:
         return [row for row in self.rows.values() if row.revoked is None]
 
     def admitted(self) -> list[HostRow]:
-        """Return the enrolled hosts, without those whose tunnel hosts.yaml closes."""
+        """Return the enrolled hosts, except hosts whose tunnel hosts.yaml closes."""
         return [row for row in self.enrolled() if self.declared.wants(row.name)]
 
     def enrolled_row(self, name: str) -> HostRow:
@@ -107,11 +107,11 @@ class HostTable:
         return self.revoked.listed(self._enrolled_names())
 
     def missing_as_revoked(self) -> int:
-        """Return the number of enrolled hosts' revoked certificates that the full list leaves out."""
+        """Return the number of enrolled hosts' revoked certificates that do not fit on the list."""
         return self.revoked.missing(self._enrolled_names())
 
     def require_room(self, name: str) -> None:
-        """Raise `HostRefusedError` if the list of revoked certificates has no room for another one of this name."""
+        """Raise `HostRefusedError` if the list of revoked certificates has no room for another entry of this name."""
         if name not in self.rows:
             return
         until = self.revoked.wait_for_room(self._enrolled_names() | {name})
@@ -141,7 +141,7 @@ class HostTable:
             raise HostRefusedError(f"the table is full: {MOST_HOSTS} hosts, including revoked ones")
 
     def address_for(self, name: str, wanted: str | None, awaited: dict[str, str]) -> str:
-        """Return the address for a host; `awaited` has the addresses reserved for others, with their names.
+        """Return the address for a host; `awaited` maps addresses that tokens reserve to the names of their hosts.
 
         Raises `HostRefusedError`.
         """

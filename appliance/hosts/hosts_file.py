@@ -1,4 +1,4 @@
-"""Read `ipsec/hosts.yaml`, the hosts that are meant to be enrolled, at start and on reload. It is never written.
+"""Read `ipsec/hosts.yaml`, which declares the hosts to enrol, at start and on reload. The file is never written.
 
 hosts:
   - name: ocu-1
@@ -6,7 +6,7 @@ hosts:
     groups: [operators]     # optional
     tunnel: true            # false: enrolled or not, its tunnel stays closed
 
-An invalid file changes nothing: the hosts that were read before stay declared, and the status reports the error.
+An invalid file changes nothing: the previously read hosts stay declared, and the status reports the error.
 """
 
 import re
@@ -30,12 +30,12 @@ _GROUP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
 class DeclaredHostsError(Exception):
-    """Report an invalid file; the text says where, why, and what to write."""
+    """Report an invalid file; the text has each location, its mistake, and a valid value to write."""
 
 
 @dataclass(frozen=True)
 class DeclaredHost:
-    """A host that is meant to be enrolled; `wanted`: its tunnel may be open."""
+    """A declared host; `wanted`: its tunnel may be open."""
 
     name: str
     address: str | None
@@ -44,7 +44,7 @@ class DeclaredHost:
 
 
 class DeclaredHosts:
-    """The content of the file when it was last valid; `error` is the reason if it is invalid now."""
+    """The file's last valid content; `error` is the reason if the file is invalid now."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -57,7 +57,7 @@ class DeclaredHosts:
 
     @property
     def there(self) -> bool:
-        """Whether any host is declared; otherwise no host can diverge from the file."""
+        """Whether any host is declared. Without declared hosts, none can diverge from the file."""
         return bool(self.hosts)
 
     def reload(self) -> None:

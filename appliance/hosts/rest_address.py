@@ -1,4 +1,4 @@
-"""Derive from the configuration where other machines, and hosts in tunnels, reach REST. No I/O."""
+"""Derive from the configuration the ports at which other machines, and hosts in tunnels, reach REST. No I/O."""
 
 from dataclasses import dataclass
 
@@ -12,9 +12,10 @@ NO_TUNNELS = (
 
 @dataclass(frozen=True)
 class RestAddress:
-    """The ports of REST: `port` for other machines, or None, and `trouble` says what to do.
+    """The ports of REST.
 
-    `inner_port` is for hosts in tunnels, at the appliance's own address there; None if they cannot reach REST.
+    `port` is for other machines; if it is None, `trouble` has the reason and the remedy. `inner_port` is for hosts in
+    tunnels, at the appliance's tunnel address; None if these hosts cannot reach REST.
     """
 
     port: int | None
@@ -23,7 +24,7 @@ class RestAddress:
 
 
 def rest_address(settings: Settings) -> RestAddress:
-    """Return the ports of REST by the configuration."""
+    """Return the ports of REST that the configuration implies."""
     if settings.isolation == "none":
         return RestAddress(None, NO_TUNNELS, None)
     if settings.api_address is None:

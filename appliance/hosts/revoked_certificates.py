@@ -2,11 +2,11 @@
 
 Invariants:
 
-1. A revoked certificate is on the list until a day after its own end. It is deleted more than a year later, so that it
-   stays revoked if a clock that was ahead for a while is set back.
-2. The list fits into one value of vici (65,535 bytes in DER), because charon and swanctl reject a longer one. A list
-   that would be longer leaves out certificates of hosts that are not enrolled: charon has no connection that matches
-   them. Before the others need more room, `require_room` rejects the replacement of certificates.
+1. A revoked certificate stays on the list until a day after its expiry, and is deleted more than a year later. So the
+   certificate stays revoked even if the clock was ahead for a while and is then set back.
+2. The list fits into one value of vici (65,535 bytes in DER), because charon and swanctl reject a longer list. If the
+   list would be longer, certificates of hosts that are not enrolled are left out: charon has no connection that matches
+   them. Before certificates of enrolled hosts exceed the limit, `require_room` rejects further replacements.
 """
 
 import time
@@ -14,11 +14,11 @@ from collections.abc import Iterable, Set
 
 from appliance.store.host_tables import HostTables, RevokedCertificateRow
 
-AFTER_END_SECONDS = 86_400.0  # the difference of clocks that is tolerated
-_KEPT_SECONDS = 400 * 86_400.0  # after the end
+AFTER_END_SECONDS = 86_400.0  # tolerated difference between clocks
+_KEPT_SECONDS = 400 * 86_400.0  # after a certificate's end
 ENTRIES_BYTES = 64_000  # of 65,535: names, extensions and the signature take less than 1,000
-_ENTRY_BYTES = 21  # besides the serial number
-_AT_ONCE_BYTES = 2 * (_ENTRY_BYTES + 20)  # a certificate, and the one that was to follow it
+_ENTRY_BYTES = 21  # of an entry, without its serial number
+_AT_ONCE_BYTES = 2 * (_ENTRY_BYTES + 20)  # two entries: a certificate and its stored successor
 
 
 class RevokedCertificates:
@@ -37,7 +37,7 @@ class RevokedCertificates:
             self._kept.save_revoked(row)
 
     def forget_ended(self) -> None:
-        """Delete certificates that ended so long ago that no wrong clock could accept them."""
+        """Delete certificates that ended so long ago that even a wrong clock would not accept them."""
         before = time.time() - _KEPT_SECONDS
         ended = [row.serial for row in self._rows.values() if row.expires < before]
         for serial in ended:
@@ -46,7 +46,7 @@ class RevokedCertificates:
             self._kept.forget_revoked(before)
 
     def listed(self, enrolled: Set[str]) -> list[RevokedCertificateRow]:
-        """Return the rows of the list, the last revoked first."""
+        """Return the rows of the list, the most recently revoked first."""
         rows = self._not_ended()
         if _bytes_of(rows) > ENTRIES_BYTES:
             rows = [row for row in rows if _matters(row, enrolled)]
@@ -59,7 +59,7 @@ class RevokedCertificates:
         return kept
 
     def missing(self, enrolled: Set[str]) -> int:
-        """Return the number of certificates of enrolled names that the list has no room for."""
+        """Return the number of enrolled hosts' certificates that do not fit on the list."""
         rows = self._not_ended()
         if _bytes_of(rows) <= ENTRIES_BYTES:
             return 0
@@ -67,7 +67,7 @@ class RevokedCertificates:
         return sum(_matters(row, enrolled) and row.serial not in on_it for row in rows)
 
     def wait_for_room(self, enrolled: Set[str]) -> float:
-        """Return 0 if another certificate of these names may be replaced, else the time when the list next has room."""
+        """Return 0 if the list has room for another replaced certificate, else the epoch time when it next has room."""
         rows = [row for row in self._not_ended() if _matters(row, enrolled)]
         if _bytes_of(rows) + _AT_ONCE_BYTES <= ENTRIES_BYTES:
             return 0.0

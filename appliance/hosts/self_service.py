@@ -1,13 +1,13 @@
 """Serve a host's own requests: enrol with a one-time token, renew its certificate through its tunnel.
 
-1. A token is used up before the authority is asked. If no certificate was issued, it is valid again, so that its bearer
-   can correct the request, unless its name was revoked meanwhile.
-2. A host that renews must have the virtual address of its name, which the firewall accepts through IPsec only, and the
-   name's present key.
-3. The present certificate is valid until the host reports that the next one is installed. So a host that is cut off in
-   between can use either.
-4. A host can renew once in a twentieth of its certificate's life, also across restarts, because each renewal makes the
-   list of revoked certificates longer.
+1. A token is used up before the authority is asked. If no certificate is issued, the token becomes valid again, so that
+   its bearer can correct the request. It stays used if its name was revoked meanwhile.
+2. A host that renews must send from the virtual address of its name and prove that it has the name's present key. The
+   firewall accepts that address through IPsec only.
+3. The present certificate stays valid until the host reports that it has installed the next one. If the host loses its
+   connection in between, it can use either certificate.
+4. A host can renew once in a twentieth of its certificate's life, because each renewal makes the list of revoked
+   certificates longer. A restart does not reset this limit.
 """
 
 import asyncio
@@ -23,8 +23,8 @@ from appliance.hosts.host_table import HostForbiddenError, HostRefusedError
 from appliance.hosts.view import span
 from appliance.store.host_tables import HostRow
 
-_ANSWER_SECONDS = 1.0  # until the answer to a host has left through its tunnel
-_RENEWALS = 20  # in the life of a certificate: each adds one to the list of revoked certificates
+_ANSWER_SECONDS = 1.0  # time for the answer to leave through the host's tunnel
+_RENEWALS = 20  # most renewals in a certificate's life; each lengthens the list of revoked certificates
 _RENEWED = "hosts.renewed."
 
 
@@ -37,7 +37,7 @@ class HostSelfService:
         self._tunnels = certification.tunnels
         self._trail = certification.trail
         kept = certification.store.settings()
-        self._renewals = {  # by name, seconds since the epoch
+        self._renewals = {  # time of the last renewal by name, in seconds since the epoch
             name.removeprefix(_RENEWED): float(moment)
             for name, moment in kept.items()
             if name.startswith(_RENEWED)
@@ -70,7 +70,7 @@ class HostSelfService:
 
     @admin.answers(admin.HostRenewItself)
     async def renew(self, request: admin.HostRenewItself) -> NewCertificate:
-        """Issue the next certificate to a host that asks through its tunnel. Raises `HostRefusedError`."""
+        """Issue the next certificate to a host that requests it through its tunnel. Raises `HostRefusedError`."""
         name = request.name
         async with self._certification.changing:
             row = self._in_its_tunnel(name, request.peer)
@@ -98,7 +98,7 @@ class HostSelfService:
 
     @admin.answers(admin.HostRenewed)
     async def renewed(self, request: admin.HostRenewed) -> Renewed:
-        """Put a host's next certificate in force, once the host has installed it. Raises `HostRefusedError`."""
+        """Replace a host's certificate by the next one, which the host has installed. Raises `HostRefusedError`."""
         name = request.name
         before = self._in_its_tunnel(name, request.peer).serial
         row = self._table.take_next(name)
@@ -123,7 +123,7 @@ class HostSelfService:
     def _require_patience(self, name: str, life: float) -> None:
         wait = life / _RENEWALS
         since = time.time() - self._renewals.get(name, -wait)
-        if 0 <= since < wait:  # a clock that was set back delays no request
+        if 0 <= since < wait:  # `since` is negative after the clock was set back; the host then need not wait
             raise HostRefusedError(f"{name} renewed {span(since)} ago: try again in {span(wait - since)}")
 
     def _note_renewal(self, name: str) -> None:

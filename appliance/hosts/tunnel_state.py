@@ -2,9 +2,9 @@
 
 Invariants:
 
-1. `open` first makes the supervisor accept the pool's addresses through IPsec only. Before that, `enclosed` is False
-   and `addresses` is empty: an address that also works in clear text does not identify a host.
-2. charon gets the complete wanted state each time, in the order of the changes.
+1. `open` makes the supervisor accept the pool's addresses through IPsec only. Until then, `enclosed` is False and
+   `addresses` is empty, because an address that also works in clear text does not identify a host.
+2. Every update sends charon the complete wanted state; updates keep the order of the changes.
 3. Every tunnel that comes up, moves, goes down or is rejected is recorded; packets that charon dropped are counted.
 4. A tunnel is closed when its certificate ends.
 """
@@ -36,7 +36,10 @@ _SIGNED_SECONDS = 60.0
 
 
 class SignedRevocations:
-    """The signed list of revoked certificates; it is signed again after a change of the table of hosts, or a minute."""
+    """The signed list of revoked certificates.
+
+    It is signed again when it is requested and the table of hosts has changed or a new minute has begun.
+    """
 
     def __init__(self, table: HostTable, authority: Authority) -> None:
         self._table = table
@@ -83,12 +86,12 @@ class Tunnels:
         self._link = Link(self._received, self._lost)
         self._certificate: bytes | None = None
         self._dirty = asyncio.Event()
-        # The number of the last statement. A clock's value does not repeat numbers of an earlier process, which may
-        # still be reported.
+        # The number of the last statement. Reports may still have numbers of an earlier process; a start from the clock
+        # avoids the same numbers.
         self._number = time.time_ns()
         self._wake = asyncio.Event()
-        self._changes = 0  # for charon
-        self._stated: dict[int, int] = {}  # unconfirmed statements: the last change that each includes
+        self._changes = 0  # number of changes that charon must get
+        self._stated: dict[int, int] = {}  # by unconfirmed statement: the last change that it includes
         self._taken_changes = 0
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -117,7 +120,7 @@ class Tunnels:
         return {row.name: ipaddress.ip_address(row.address) for row in self._table.admitted()}
 
     async def start(self) -> None:
-        """Open tunnels, if hosts are enrolled, before nodes are served; log a failure."""
+        """Open tunnels if hosts are enrolled; log a failure. Call this before nodes are served."""
         if not self._table.admitted():
             return
         try:
@@ -131,7 +134,7 @@ class Tunnels:
         self._answered.set()
 
     async def open(self) -> None:
-        """Make the supervisor close the pool to clear text, unless that is done. Raises `HostRefusedError`."""
+        """Make the supervisor block clear text for the pool, unless it does already. Raises `HostRefusedError`."""
         async with self._opening:
             if self.enclosed:
                 return
@@ -153,7 +156,7 @@ class Tunnels:
     # --- the process that runs charon ---
 
     def attach(self, link: Channel) -> None:
-        """Serve a new process for charon; it asks for its certificate first."""
+        """Serve a new process for charon; the process first requests its certificate."""
         self._certificate = self.charon = None
         self._link.attach(link)
 
@@ -165,7 +168,7 @@ class Tunnels:
     async def run(self, each_hour: Callable[[], None]) -> None:
         """Send charon its configuration: after a change, when a certificate ends, and every hour with a new list.
 
-        `each_hour()` is called before each time.
+        `each_hour()` is called before each update.
         """
         while True:
             with contextlib.suppress(TimeoutError):
@@ -179,7 +182,7 @@ class Tunnels:
                 asyncio.get_running_loop().call_later(_AGAIN_SECONDS, self._dirty.set)
 
     def _until_it_changes(self) -> float:
-        """Return the seconds until the next certificate ends, at most an hour: charon would keep its tunnel."""
+        """Return the seconds until the next certificate ends, at most an hour. charon does not close its tunnel."""
         now = time.time()
         ends = [row.expires - now for row in self._table.admitted() if row.expires > now]
         return min([_RESTATE_SECONDS, *(end + _JUST_AFTER_SECONDS for end in ends)])
@@ -229,7 +232,7 @@ class Tunnels:
                 self._trail.happened("tunnel refused", reason, decision="deny", host=remote)
             case messages.TunnelsReported(taken, rows):
                 self._reported(rows)
-                # After the clock was set back, a greater number may be of an earlier process.
+                # An unknown number is of an earlier process; if the clock was set back, it may be the greater one.
                 if taken in self._stated:
                     for number in [statement for statement in self._stated if statement <= taken]:
                         self._taken_changes = self._stated.pop(number)
@@ -286,7 +289,7 @@ class Tunnels:
             self.seen[name] = row
 
     def _look_where(self, row: messages.TunnelSeen) -> None:
-        """Record a host whose outer address changes. Its tunnel stays open, but a stolen kit would look the same."""
+        """Record a host whose outer address changed. The tunnel stays open, but a stolen kit would look the same."""
         before = self.seen[row.name].remote
         if row.remote != before:
             self._trail.happened(

@@ -17,14 +17,14 @@ _NEVER = PortsSeen("unknown", None, [], "")
 
 
 def soon(table: HostTable, row: HostRow, now: float) -> bool:
-    """Whether a certificate ends within 14 days, or a third of its life if that is shorter."""
+    """Whether a certificate ends within 14 days, or within a third of its life if a third is shorter."""
     certificate = table.certificates.get(row.name)
     life = row.expires - certificate.made if certificate is not None else SOON_SECONDS * 3
     return row.expires - now < min(SOON_SECONDS, life / 3)
 
 
 class HostView:
-    """The operators' view of table, tokens and tunnels; `machines` are numbers of nodes by address, without tunnels."""
+    """The operators' view of table, tokens and tunnels. `machines` counts, by address, nodes that use no tunnel."""
 
     def __init__(self, table: HostTable, awaited: EnrolmentTokens, tunnels: Tunnels) -> None:
         self._table = table
@@ -67,7 +67,7 @@ class HostView:
         )
 
     def divergence(self, name: str) -> str | None:
-        """Return a host's difference from hosts.yaml; None without a difference, or if hosts.yaml declares no host."""
+        """Return a host's difference from hosts.yaml; None if there is none, or if hosts.yaml declares no hosts."""
         if not self._table.declared.there:
             return None
         declared, row = self._table.declared.hosts.get(name), self._table.rows.get(name)
