@@ -1,7 +1,7 @@
 """Make, store and load the authority's private key, encrypted if there is a passphrase.
 
-An unencrypted key is encrypted in place when a passphrase is added. An invalid key or passphrase raises an error that
-says what to do; no file is replaced.
+When a passphrase is added, an unencrypted key is encrypted in place. An invalid key or passphrase raises an error with
+the remedy; the file is not replaced.
 """
 
 import os
@@ -51,13 +51,13 @@ def read_passphrase(descriptor: int) -> bytes:
 
 
 def write_key(path: Path, key: Key, passphrase: bytes | None) -> None:
-    """Write a key, readable by its owner only."""
+    """Write a key to a file that only its owner can read."""
     encryption = NoEncryption() if passphrase is None else BestAvailableEncryption(passphrase)
     write_whole(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption), 0o600)
 
 
 def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | None) -> Key:
-    """Load the key. Raises `SignerKeyError`, also for a key of another kind, and `OSError`."""
+    """Load the key. Raises `OSError`, and `SignerKeyError` for an invalid key or a key of another kind."""
     if not path.exists():
         raise SignerKeyError(
             f"{path}: missing, but its certificate is there; restore it from a backup, or remove"

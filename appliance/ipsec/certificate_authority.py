@@ -1,14 +1,14 @@
 """Run the certificate authority of an appliance: issue certificates of hosts, and sign the revocation list.
 
-1. The key (ECDSA on P-384, or Ed25519) is made at the first use in the signer's own directory, mode 0600, encrypted if
-   there is a passphrase, and never leaves the process. A key without its certificate, a certificate of another key, or
-   a key that others may read is an error; nothing is replaced.
+1. The key (ECDSA on P-384, or Ed25519) is made at the first use and never leaves the process. Its file is in the
+   signer's own directory, mode 0600, encrypted if there is a passphrase. A key without its certificate, a certificate
+   of another key, or a key that others may read is an error; nothing is replaced.
 2. Only the public key of a request is used: this module sets the names, times and usages of a certificate. The request
    must be signed by its own key, which must be ECDSA on P-384 or Ed25519.
-3. No certificate outlives the authority's own, or `LONGEST_DAYS`.
+3. A certificate is valid for at most `LONGEST_DAYS`, and never longer than the authority's own.
 4. With a proof, the request must also be signed by the key of a valid certificate of this authority in the same name.
-5. A revocation list has all given serial numbers. Its own number always grows, also after restarts and with the clock
-   set back, because charon ignores a list with a lower number.
+5. A revocation list has all given serial numbers. charon ignores a list with a lower number, so the list's number
+   always grows, even after a restart or after the clock is set back.
 """
 
 import contextlib
@@ -41,13 +41,13 @@ REVOCATIONS_DAYS = 30
 LONGEST_REQUEST = 16 << 10  # bytes
 
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
-_SERIAL_BITS = 70  # random; with the permitted 160 the revocation list would be a third longer
+_SERIAL_BITS = 70  # random bits; with the permitted 160 bits, the revocation list would be a third longer
 _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
 
 @dataclass(frozen=True)
 class IssuedCertificate:
-    """A certificate: PEM, serial number in hexadecimal, end in seconds since the epoch."""
+    """A certificate: its PEM, its serial number in hexadecimal, and its end in seconds since the epoch."""
 
     certificate: bytes
     serial: str
@@ -89,9 +89,9 @@ class CertificateAuthority:
     def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> IssuedCertificate:
-        """Issue a certificate for the key of a signing request (PEM), in this name. Raises `RequestRefusedError`.
+        """Issue a certificate in this name for the key of a signing request (PEM). Raises `RequestRefusedError`.
 
-        `proof`: the signature over the request by the key of the certificate `former` (PEM).
+        `proof` is the signature over the request by the key of the certificate `former` (PEM).
         """
         if not _NAME.fullmatch(name):
             raise RequestRefusedError(
@@ -130,7 +130,7 @@ class CertificateAuthority:
         )
 
     def revocations(self, serials: Iterable[tuple[str, float]]) -> bytes:
-        """Return the signed revocation list (PEM) for serial numbers (hexadecimal) and times (epoch)."""
+        """Return the signed revocation list (PEM) of serial numbers (hexadecimal) and revocation times (epoch)."""
         now = datetime.datetime.now(datetime.UTC)
         builder = (
             x509.CertificateRevocationListBuilder()
@@ -199,7 +199,7 @@ def _create(key_path: Path, certificate_path: Path, kind: Kind, passphrase: byte
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
         .sign(key, hashes.SHA384() if kind == "ecdsa" else None)
     )
-    # The certificate first: the error for a certificate without its key, after a crash in between, has a remedy.
+    # Write the certificate first: after a crash in between, the error for a certificate without its key has a remedy.
     write_whole(certificate_path, certificate.public_bytes(Encoding.PEM), 0o644)
     write_key(key_path, key, passphrase)
 

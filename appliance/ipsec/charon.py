@@ -1,8 +1,8 @@
 """Provision and watch charon over vici, with blocking calls, one at a time.
 
-Only differences are applied: new hosts are loaded, removed hosts are unloaded and their tunnels closed. The tunnel of a
-host with a replaced certificate is also closed, and opened again with the new one. charon's confirmation is not
-trusted: each check closes the remains of a closed tunnel again.
+Only differences are applied: new hosts are loaded, removed hosts are unloaded and their tunnels closed. When a host's
+certificate is replaced, its tunnel is also closed, and opens again with the new certificate. charon's confirmation is
+not trusted: each check closes again whatever remains of a closed tunnel.
 """
 
 import base64
@@ -21,14 +21,14 @@ from appliance.ipsec.strongswan import connection, connection_name, host_of, poo
 
 PROGRAM = Path("/usr/sbin/charon-systemd")
 _SECONDS = 10.0
-# vici's own errors, and those for a value that is too long for it.
+# vici's own errors, and the errors that its packing raises for a value that is too long.
 _FAULTS = (
     CommandException, SessionException, EventUnknownException, DeserializationException, struct.error, OSError,
 )  # fmt: skip
 
 
 class CharonError(Exception):
-    """Report that charon cannot be used; the message says why and what to do."""
+    """Report that charon cannot be used; the message has the reason and the remedy."""
 
 
 class ViciClient:
@@ -38,7 +38,7 @@ class ViciClient:
         self._path = path
         self._session = self._connect()
         self._loaded: dict[str, TunnelHost] = {}
-        self._former: dict[str, set[bytes]] = {}  # by host: the ids of its tunnel with an earlier certificate
+        self._former: dict[str, set[bytes]] = {}  # by host: the ids of its tunnels with earlier certificates
         self._stated: TunnelsStated | None = None
         self.proposals = proposals_of(self._key_exchanges())
 
@@ -52,7 +52,7 @@ class ViciClient:
             self._session.load_key({"type": "any", "data": key})
 
     def provision(self, stated: TunnelsStated) -> None:
-        """Make charon's tunnels exactly these. Revoked tunnels are closed before new ones are loaded."""
+        """Make charon's tunnels exactly those in `stated`. Revoked tunnels are closed before new ones are loaded."""
         before = self._stated
         if before is None or before.authority != stated.authority:
             with self._said("the authority's certificate"):
@@ -60,7 +60,7 @@ class ViciClient:
         if before is None or before.revocations != stated.revocations:
             with self._said("the list of revoked certificates"):
                 self._session.load_cert({"type": "x509crl", "data": _der_of(stated.revocations)})
-                # charon uses the first valid list that it finds, which may be the old one in its cache.
+                # charon uses the first valid list that it finds; flush the cache, which may have the old list.
                 self._session.flush_certs()
         earlier = dict(self._loaded)
         for name in earlier.keys() - {host.name for host in stated.hosts}:
@@ -82,8 +82,8 @@ class ViciClient:
     def seen(self) -> list[TunnelSeen]:
         """Return the tunnels that are up.
 
-        A tunnel of a removed host, or with a replaced certificate, is closed again, because a rekeying while it was
-        closed can keep it open.
+        Tunnels of removed hosts, or with a replaced certificate, are closed again: a rekeying during the first close
+        can keep such a tunnel open.
         """
         found = self._standing()
         standing = {host for name, _ in found if (host := host_of(name)) is not None}
@@ -112,7 +112,7 @@ class ViciClient:
         return [str(name) for group in ("ke", "dh") for name in found.get(group, {})]
 
     def listen(self) -> Iterator[tuple[str, bool, str]]:
-        """Yield changes of tunnels from a separate connection: host, up, real address. Ends with charon."""
+        """Yield changes of tunnels (host, up, real address) until charon ends; uses a separate connection."""
         session = self._connect(timeout=None)
         try:
             for _kind, event in session.listen(["child-updown"]):
@@ -136,7 +136,7 @@ class ViciClient:
         with self._said(f"the end of the tunnel of {name}"):
             self._session.unload_conn({"name": connection_name(name)})
             self._close(name)
-            with contextlib.suppress(CommandException):  # its address is in use until the tunnel is closed
+            with contextlib.suppress(CommandException):  # the address is in use until the tunnel is closed
                 self._session.unload_pool({"name": connection_name(name)})
         del self._loaded[name]
         self._former.pop(name, None)
@@ -168,7 +168,7 @@ class ViciClient:
 
 
 def _der_of(pem: bytes) -> bytes:
-    """Return a list in DER: a quarter shorter, for vici's limit of 65,535 bytes."""
+    """Return a list in DER, which is a quarter shorter than PEM, because vici's limit is 65,535 bytes."""
     return base64.b64decode(b"".join(pem.split(b"-----")[2:3]))
 
 
@@ -189,7 +189,7 @@ def _seen(name: str, row: Any) -> TunnelSeen | None:
 
 
 def _parts(row: Any) -> set[bytes]:
-    """Return charon's unique ids of a tunnel and its children; a rekeying changes one or the other."""
+    """Return charon's unique ids of a tunnel and its children. A rekeying changes only one of the two kinds."""
     carried = row.get("child-sas", {}).values()
     return {b"ike " + row["uniqueid"], *(b"child " + child["uniqueid"] for child in carried)}
 

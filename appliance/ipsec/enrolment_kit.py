@@ -23,8 +23,8 @@ _SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")
 class Kit:
     """The parts of a kit.
 
-    `endpoint` is the address or name by which the host reaches the appliance, `protect` an nftables file. `key` is None
-    if the host made its own.
+    `endpoint` is the address or name by which the host reaches the appliance; `protect` is an nftables file. `key` is
+    None if the host made its own key.
     """
 
     host: KitParts

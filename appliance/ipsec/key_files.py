@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 class SignerKeyError(Exception):
-    """Report an unusable key file; the message says which, why, and what to do."""
+    """Report an unusable key file; the message has its path, the reason and the remedy."""
 
 
 def require_private(path: Path) -> None:

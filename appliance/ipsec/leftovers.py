@@ -1,8 +1,8 @@
 """Remove IPsec states and policies, with their keys, that a killed charon left in the kernel.
 
-With them the kernel still accepts packets, even from a host that was revoked meanwhile. So they are removed before
-charon starts again, and when the appliance ends. Only the appliance's own are removed: the states of ESP in UDP on port
-4500, which only charon uses, and the policies from and to the appliance's address in the tunnels.
+With these leftovers the kernel still accepts packets, even from a host that was revoked meanwhile. So they are removed
+before charon starts again, and when the appliance ends. Only the appliance's own leftovers are removed: the states of
+ESP in UDP on port 4500, which only charon uses, and the policies from and to the appliance's tunnel address.
 """
 
 import itertools
@@ -17,11 +17,11 @@ _PORT = "4500"
 
 
 class LeftoversError(Exception):
-    """Report states or policies that stay in the kernel."""
+    """Report states or policies that could not be removed from the kernel."""
 
 
 def clear_leftovers(own: str) -> int:
-    """Remove the leftovers in the namespace of the calling thread; return their number. No charon may run there.
+    """Remove the leftovers in the calling thread's network namespace, where charon must not run; return their number.
 
     `own` is the appliance's address in the tunnels. Raises `LeftoversError`.
     """
@@ -66,7 +66,7 @@ def _ip(*arguments: str, text: str = "") -> str:
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise LeftoversError(f"the kernel's state of an earlier charon is unknown: {error}") from error
-    # A kernel without IPsec rejects the protocol; it has nothing to list.
+    # A kernel without IPsec rejects the query; it has no states or policies.
     if done.returncode and not text and "not supported" not in done.stderr:
         raise LeftoversError(
             f"the kernel's state of an earlier charon is unknown: {done.stderr.strip()[:200]}"

@@ -1,14 +1,14 @@
 """Run charon: the only process that talks to it, with the appliance's own key for the tunnels.
 
-It makes a key (once), requests a certificate from control, and gets the complete wanted state (`TunnelsStated`) each
-time; charon starts with the first one. If charon dies, this process also ends, and the supervisor starts both again
-without anything from the earlier run.
+This process makes a key once and requests a certificate from control. Control sends the complete wanted state
+(`TunnelsStated`) after each change; charon starts with the first one. If charon dies, this process also ends, and the
+supervisor starts both again without any state of the earlier run.
 
 1. The private key stays in this process's own directory (mode 0600) and in charon.
 2. charon has the privileges of this process: its own user, and the capabilities to change the network and to bind the
    ports 500 and 4500. It dies with this process.
 3. The only untrusted input parsed here is charon's log, as lines of text; at most `REFUSALS_PER_SECOND` are passed on.
-4. One call to charon is made at a time: two on one session would read each other's answers.
+4. Calls to charon are made one at a time: two calls on one session would read each other's answers.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ from appliance.ipsec.strongswan import configuration
 KEY_FILE = "appliance.key"
 TUN = Path("/dev/net/tun")
 REFUSALS_PER_SECOND = 20
-REFUSED_SOURCES = 20  # of dropped packets, in one report
+REFUSED_SOURCES = 20  # most sources of dropped packets in one report
 REPORT_SECONDS = 2.0
 RENEW_SECONDS = 30 * 86_400.0
 _START_SECONDS = 15.0
@@ -67,14 +67,14 @@ class TunnelProcess:
         self._one_at_a_time = asyncio.Lock()
         self._version = ""
         self._refusals = RefusalParser()
-        self._packets: Counter[Refusal] = Counter()  # dropped by ESP since the last report
+        self._packets: Counter[Refusal] = Counter()  # packets that ESP dropped since the last report
         self._second = (0, 0)  # the last second with refusals, and their number
         self._tasks: set[asyncio.Future[Any]] = set()
         self._output: deque[str] = deque(maxlen=_OUTPUT_LINES)  # charon's last lines
         self.failed = False
 
     async def run(self) -> None:
-        """Serve until the end; afterwards `failed` is set unless the end was orderly."""
+        """Serve until the process is stopped or charon dies; set `failed` unless the end was orderly."""
         self._loop = asyncio.get_running_loop()
         self._child.attach(messages.Ready())
         self._spawn(self._provision())
@@ -234,7 +234,7 @@ def main(lifeline_fd: int, directory: Path) -> None:
         sys.exit(1)
     process = TunnelProcess(lifeline, directory, key)
     asyncio.run(process.run())
-    # Do not wait for a thread that still waits for charon's answer: nothing is left to write.
+    # Do not join a thread that still waits for charon's answer; nothing is left to write.
     sys.stderr.flush()
     os._exit(1 if process.failed else 0)
 

@@ -1,8 +1,8 @@
 """Parse refusals in charon's log. No I/O.
 
-charon reports refused tunnels only in its log. A worker thread handles one packet from its arrival to its answer, so
-the lines of one thread in between belong together. If ESP runs in charon, the log also has packets that a tunnel
-dropped: replays, and packets with an address that the tunnel does not permit.
+charon reports refused tunnels only in its log. One worker thread handles a packet from arrival to answer, so the lines
+of that thread in between belong to the packet. If ESP runs in charon, the log also has packets that a tunnel dropped:
+replays, and packets with an address that the tunnel does not permit.
 """
 
 import re
@@ -43,7 +43,7 @@ _LONGEST = 400
 
 @dataclass(frozen=True)
 class Refusal:
-    """A refused host: its address, and charon's reasons. `packet`: a packet of a tunnel, not a request."""
+    """A refused host: its address and charon's reasons. `packet`: a tunnel's packet was dropped, not a request."""
 
     remote: str
     reason: str
@@ -60,7 +60,7 @@ class RefusalParser:
     """A parser of the log, line by line."""
 
     def __init__(self) -> None:
-        self._packets: dict[str, _Packet] = {}  # by worker thread: charon has 16
+        self._packets: dict[str, _Packet] = {}  # by worker thread; charon has 16 threads
 
     def read(self, line: str) -> Refusal | None:
         """Return the refusal that this line completes, or None."""

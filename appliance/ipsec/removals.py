@@ -1,12 +1,12 @@
 """Approve removals of old audit records that follow from the settings and the signer's own memory.
 
-Otherwise a process that can write the log could remove recent records as old ones. So the signer uses its settings and
-its memory, and trusts neither the log nor control:
+Without approval, a process that can write the log could remove recent records and call them old. So the signer uses its
+own settings and memory, and trusts neither the log nor control:
 
 1. Records are removed up to a checkpoint that the signer signed.
-2. By age (`retention_days`): it signed that checkpoint long enough ago, by the age clock.
-3. By size (`retention_bytes`): at `LARGEST_RECORD` bytes each, the records sealed since then fill that size. The signer
-   does not know their real sizes, so this is only a bound.
+2. By age (`retention_days`): the signer signed that checkpoint long enough ago, by the age clock.
+3. By size (`retention_bytes`): the records sealed since that checkpoint would fill the size if each had
+   `LARGEST_RECORD` bytes. The signer does not know their real sizes, so this is only a bound.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ _DAY = 86_400_000_000_000
 
 
 class RemovalRefusedError(Exception):
-    """Report a removal that does not follow from the settings. `early`: it will later."""
+    """Report a removal that does not follow from the settings. `early`: it may be permitted later."""
 
     def __init__(self, reason: str, *, early: bool = False) -> None:
         super().__init__(reason)
@@ -31,14 +31,14 @@ class RemovalRefusedError(Exception):
 
 @dataclass(frozen=True)
 class RetentionLimits:
-    """The configured limits of age and size; None: no limit."""
+    """The configured limits of age (days) and size (bytes); None: no limit."""
 
     days: float | None = None
     size: int | None = None
 
 
 class RemovalApprover:
-    """The approval of removals by the memory `signed` and the settings `kept`."""
+    """Approves removals by the memory of signatures `signed` and the limits `kept`."""
 
     def __init__(self, signed: CheckpointMemory, kept: RetentionLimits, clock: Callable[[], int]) -> None:
         self._signed = signed
@@ -46,9 +46,10 @@ class RemovalApprover:
         self._clock = clock
 
     def approve(self, checkpoint: bytes, newest: bytes) -> bytes:
-        """Return the text to sign for the removal of all records up to a checkpoint; `newest` is the last signed one.
+        """Return the text to sign for the removal of all records up to `checkpoint`.
 
-        Both are texts of checkpoints. Raises `RemovalRefusedError`, `CheckpointRefusedError`, `OSError`.
+        `checkpoint` and `newest`, the last signed checkpoint, are checkpoint texts. Raises `RemovalRefusedError`,
+        `CheckpointRefusedError`, `OSError`.
         """
         upto, last = read_checkpoint(checkpoint), read_checkpoint(newest)
         signed_at = self._signed.signed_at(upto)

@@ -1,11 +1,12 @@
 """Remember the audit checkpoints that the signer signed, so that it never signs a second history.
 
-1. For each log `<log>.signed` has the hashes of its signed checkpoints by number, and `<log>.times` the times of
-   signing by the age clock. Both only grow.
-2. A checkpoint is approved if it follows the last one (number and hash), or is exactly the one approved under its
-   number before (control lost the answer). An unknown log may begin with any number.
-3. A checkpoint has the number of removed records; it is approved if the signer approved that removal (`<log>.removed`,
-   see `removals.py`), or if it is the first one with this field in a log from an older version. Later ones need it.
+1. For each log, `<log>.signed` has the hashes of its signed checkpoints by number, and `<log>.times` has the times of
+   signing by the age clock. Both files only grow.
+2. A checkpoint is approved if its number and hash follow the last one. A repeated checkpoint is approved if it equals
+   the one signed under its number (control lost the answer). An unknown log may begin with any number.
+3. A checkpoint has the sequence of the last removed record. The signer must have approved that removal
+   (`<log>.removed`, see `removals.py`). The first checkpoint with this field in a log from an older version is trusted;
+   every later checkpoint of the log needs the field.
 4. At most `MOST_LOGS` logs are remembered, so control cannot fill the signer's disk.
 """
 
@@ -35,7 +36,7 @@ def read_checkpoint(text: bytes) -> Checkpoint:
 
 
 def newest_signing(directory: Path) -> int | None:
-    """Return the time of the last signature, or None."""
+    """Return the time of the last signature (ns since the epoch), or None."""
     times = (path.read_bytes() for path in directory.glob("*.times"))
     return max(
         (int.from_bytes(kept[-_NUMBER:], "big") for kept in times if len(kept) > _NUMBER), default=None
@@ -72,7 +73,7 @@ class CheckpointMemory:
             os.close(descriptor)
 
     def signed_at(self, checkpoint: Checkpoint) -> int | None:
-        """Return when this checkpoint was signed, or None. Without a stored time, return its own time."""
+        """Return the time of this checkpoint's signing, or None. Without a stored time, return the checkpoint's own."""
         path = self._path(checkpoint.log, "signed")
         if not path.exists():
             return None
@@ -87,12 +88,12 @@ class CheckpointMemory:
         return int.from_bytes(moment, "big") if len(moment) == _NUMBER else checkpoint.time
 
     def removed(self, log: str) -> int | None:
-        """Return the last record whose removal was approved; None for a log without this field."""
+        """Return the sequence of the last record whose removal was approved; None if none is stored for the log."""
         path = self._path(log, "removed")
         return int.from_bytes(path.read_bytes(), "big") if path.exists() else None
 
     def remember_removed(self, log: str, sequence: int) -> None:
-        """Store that the removal of the records up to this one was approved."""
+        """Store that the removal of the records up to `sequence` was approved."""
         write_whole(self._path(log, "removed"), sequence.to_bytes(_NUMBER, "big"), 0o600)
 
     def _may_be_removed(self, wanted: Checkpoint) -> None:
@@ -145,7 +146,7 @@ def _digest(checkpoint: Checkpoint) -> bytes:
 
 
 def _extent(descriptor: int) -> tuple[int, int]:
-    """Return the number of the first remembered checkpoint, and how many are remembered."""
+    """Return the number of the first remembered checkpoint, and the count of remembered checkpoints."""
     first = int.from_bytes(os.pread(descriptor, _NUMBER, 0), "big")
     # A partial hash from a crash was not approved.
     return first, (os.fstat(descriptor).st_size - _NUMBER) // _HASH

@@ -1,12 +1,12 @@
 """Run the signer: the process with the audit key and the authority's key. It has no network.
 
-1. The private key is made at the first start in the signer's own directory (mode 0600) and never leaves the process. A
+1. The audit key is made at the first start in the signer's own directory (mode 0600) and never leaves the process. A
    damaged key file, or one that others may read, is an error; it is never replaced.
-2. It parses only the messages of its lifeline and its link to control, and the signing requests in them. It signs only
-   audit checkpoints, removals of old records (`removals.py`), certificates and the revocation list.
-3. It remembers what it signed (`signed_checkpoints.py`) and never signs a second history. `rosrv audit verify` compares
-   the log with this memory, so a cut end or a removed signature is found.
-4. Every signing request is answered, whatever it does to the parser, so later messages are served.
+2. The signer parses only the messages of its lifeline and its link to control, and the signing requests in them. It
+   signs only audit checkpoints, removals of old records (`removals.py`), certificates and the revocation list.
+3. It remembers its signatures (`signed_checkpoints.py`) and never signs a second history. `rosrv audit verify` compares
+   the log with this memory, and so detects a truncated log or a removed signature.
+4. Every signing request is answered, even if parsing it raises an unexpected error, so later messages are served.
 """
 
 import asyncio
@@ -163,7 +163,7 @@ class Signer:
 
 
 def main(lifeline_fd: int, config: Path, passphrase: int | None) -> None:
-    """Run the signer: `lifeline_fd` is the lifeline's descriptor, `passphrase` that of the passphrase file."""
+    """Run the signer; `lifeline_fd` and `passphrase` are the descriptors of the lifeline and the passphrase file."""
     settings = msgspec.json.decode(config.read_bytes(), type=_Settings)
     kept = RetentionLimits(settings.audit.retention_days, settings.audit.retention_bytes)
     serve(lifeline_fd, Path(settings.state, "signer"), settings.ipsec.ca, passphrase, kept)

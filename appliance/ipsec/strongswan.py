@@ -1,10 +1,10 @@
 """Make charon's configuration: its file, and the tunnels of the enrolled hosts for vici. No I/O.
 
-1. The only proposals are AES-256-GCM and SHA-384 with Curve25519 or ECP-384, and with ML-KEM-768 besides Curve25519 if
-   charon has it.
-2. A host needs a certificate of the appliance's own authority that is not revoked; without a valid revocation list no
-   host is accepted. The name in the certificate determines its only address, and it reaches only the appliance's. No
-   connection matches a host that is not enrolled.
+1. The only proposals are AES-256-GCM and SHA-384 with Curve25519 or ECP-384. If charon has ML-KEM-768, it is added to
+   Curve25519.
+2. A host needs an unrevoked certificate of the appliance's own authority; without a valid revocation list, no host is
+   accepted. The name in the certificate determines the host's only address. The host reaches only the appliance's
+   address, and no connection matches a host that is not enrolled.
 3. charon loads only the plugins listed here. None of them runs programs or requests lists from the network.
 """
 
@@ -19,7 +19,7 @@ from appliance.quotas.table import IKE_HANDSHAKES
 USER_SPACE_INTERFACE = "ipsec0"
 IKE_PROPOSALS = ("aes256gcm16-prfsha384-x25519", "aes256gcm16-prfsha384-ecp384")
 ESP_PROPOSALS = ("aes256gcm16-x25519", "aes256gcm16-ecp384")
-ML_KEM = "ke1_mlkem768"  # an additional key exchange (RFC 9370); beside the first proposal of each list
+ML_KEM = "ke1_mlkem768"  # an additional key exchange (RFC 9370), added to the first proposal of each list
 _ML_KEM_ALGORITHM = "ML_KEM_768"
 CHILD = "ros"
 _PLUGINS = ("random", "nonce", "openssl", "pem", "x509", "revocation", "constraints", "pubkey", "kdf")
@@ -90,7 +90,7 @@ def connection_name(host: str) -> str:
 
 
 def host_of(connection: str) -> str | None:
-    """Return the host of a connection; None for others (a handshake before its host is known)."""
+    """Return the host of a connection; None for other connections, such as a handshake before its host is known."""
     return connection.removeprefix(_PREFIX) if connection.startswith(_PREFIX) else None
 
 
