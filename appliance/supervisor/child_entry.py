@@ -1,8 +1,8 @@
 """Start a child process: `python -m appliance.supervisor.child_entry ROLE PLAN`.
 
-It drops the privileges that the role must not have, checks that the role's user can reach the needed files, and then
-calls the role's entry point or executes its external program. It reports a failure to the supervisor over the lifeline
-as `Failed`, with a text for operators.
+The child drops the privileges that the role must not have, and checks that the role's user can reach the needed files.
+It then calls the role's entry point or executes its external program. A failure is reported to the supervisor over the
+lifeline as `Failed`, with a text for operators.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from appliance.supervisor.users import Account
 
 
 class LaunchPlan(msgspec.Struct, frozen=True):
-    """How to start a child: JSON in its arguments (without secrets)."""
+    """The plan to start a child: JSON in the child's arguments, without secrets."""
 
     parent: int
     lifeline: int
@@ -48,7 +48,7 @@ class LaunchPlan(msgspec.Struct, frozen=True):
 
 
 def title_of(role: str, index: int | None) -> str:
-    """Return the title of a process: its role, and a number unless it is the first one."""
+    """Return the title of a process: its role, with a number unless the process is the role's first."""
     return role if not index else f"{role}-{index + 1}"
 
 
@@ -57,7 +57,7 @@ class UnreachableError(Exception):
 
 
 def main() -> None:
-    """Become the role that the arguments name."""
+    """Start the role that the command-line arguments name, in this process."""
     role, text = sys.argv[1:3]
     plan = msgspec.json.decode(text, type=LaunchPlan)
     setproctitle.setproctitle(f"rosrv: {title_of(role, plan.index)}")
@@ -95,9 +95,10 @@ def _leave_network_if_allowed() -> None:
 
 
 def _enter_sandbox(plan: LaunchPlan) -> None:
-    """Enter the sandbox, and report to the supervisor the limits that this kernel lacks; the process runs without them.
+    """Enter the sandbox; report to the supervisor the limits that this kernel lacks.
 
-    Raises `SeccompError` only for a role without network, which must not make a socket.
+    The process runs without the lacking limits. Raises `SeccompError` only for a role without network: such a role must
+    not be able to make a socket.
     """
     lacks = []
     abi = 0
@@ -136,7 +137,7 @@ def _call(role: str, plan: LaunchPlan, secret: int | None) -> None:
 
     configure_logs(role)
     entry = getattr(importlib.import_module(module), function)
-    gc.freeze()  # imported modules stay
+    gc.freeze()  # imported modules live as long as the process, so the collector can skip them
     arguments: list[int | Path | None] = [plan.lifeline]
     if plan.index is not None:
         arguments.append(plan.index)
@@ -151,7 +152,7 @@ def _call(role: str, plan: LaunchPlan, secret: int | None) -> None:
 def _execute(plan: LaunchPlan) -> None:
     _require(plan.account, plan.argv[0], os.R_OK | os.X_OK)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    os.set_inheritable(plan.lifeline, False)  # its end shows the supervisor that the program runs
+    os.set_inheritable(plan.lifeline, False)  # exec closes it: the supervisor sees that the program runs
     os.execve(plan.argv[0], plan.argv, plan.environment)  # noqa: S606  a fixed list, no shell
 
 

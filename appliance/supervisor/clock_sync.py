@@ -1,6 +1,6 @@
-"""Ask the kernel whether a time service keeps the clock (adjtimex(2); nothing is set).
+"""Query the kernel whether a time service keeps the clock synchronised (adjtimex(2); nothing is set).
 
-The supervisor asks, because the sandboxes of other processes deny the call.
+The supervisor makes the query, because the sandboxes of other processes deny the system call.
 """
 
 import ctypes

@@ -2,4 +2,4 @@
 
 
 class StartError(Exception):
-    """Report that the appliance cannot start or go on; the message says what, where and what to do."""
+    """Report that the appliance cannot start or go on; the message has the cause, the place and the remedy."""

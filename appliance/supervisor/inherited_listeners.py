@@ -1,8 +1,8 @@
 """Keep listening sockets open while control restarts.
 
 Control opens the ports that nodes use and sends each socket to the supervisor under a name. When control dies, the
-ports stay open, connections wait in the kernel's queue, and the next control gets all sockets back. Nothing is accepted
-or read here. Names are checked and counted, so a faulty control cannot fill the supervisor's memory.
+ports stay open and connections wait in the kernel's queue. The next control process gets all sockets back. This module
+accepts no connection and reads no data. Names are checked and counted, so a faulty control cannot fill the memory.
 """
 
 import os
@@ -31,9 +31,9 @@ class InheritedListeners:
         return iter(list(self._sockets.items()))
 
     def keep(self, name: str, descriptor: int) -> None:
-        """Keep `descriptor` under `name`, in place of an earlier one; close it if it is rejected.
+        """Keep `descriptor` under `name` and close the name's earlier socket; close `descriptor` if it is rejected.
 
-        Raises `ListenerRejectedError` for an invalid name, a socket that does not listen, or one too many.
+        Raises `ListenerRejectedError` for an invalid name, a socket that does not listen, or too many sockets.
         """
         try:
             self._check(name, descriptor)

@@ -1,12 +1,13 @@
 """Build, check and remove the isolation of the processes: their network namespace and the firewall.
 
-It is built before the first process starts and removed after the last one has ended. All calls block (tens of
-milliseconds, the probe some seconds), so a running supervisor makes them in a thread, one at a time.
+The isolation is built before the first process starts and removed after the last process has ended. All calls block
+(tens of milliseconds, the probe some seconds), so a running supervisor makes them in a thread, one at a time.
 
 1. No process starts before the firewall is in force.
-2. A hidden port counts as open if another local user can reach it or it cannot be probed; `probe` returns the reason.
-3. Missing rules are installed again and logged, also rules that the kernel rejected before.
-4. After `remove` nothing is installed again: it waits for a running call, and later calls fail.
+2. A hidden port counts as open if another local user can reach it, or if it cannot be probed; `probe` returns the
+   reason.
+3. Missing rules are installed again and logged, including rules that the kernel rejected before.
+4. After `remove`, no rule is installed again: `remove` waits for a running call, and later calls fail.
 """
 
 import contextlib
@@ -47,14 +48,14 @@ from appliance.supervisor.errors import StartError
 from appliance.supervisor.users import account_of
 
 _TUNNELS = "rosrv-ipsec"  # the user of charon
-_PATIENCE_SECONDS = 5.0  # of `remove` with a call that hangs
+_PATIENCE_SECONDS = 5.0  # longest wait of `remove` for a call that hangs
 
 log = structlog.get_logger()
 
 
 @dataclass(frozen=True)
 class AppliancePorts:
-    """The ports that the firewall handles; `inner` and `own` are known when control is ready."""
+    """The ports that the firewall handles; `inner` and `own` are known only when control is ready."""
 
     master: int
     rosmaster: int
@@ -62,8 +63,8 @@ class AppliancePorts:
     own_node: range  # for messages of the appliance's own node
     inner: int | None = None
     api: int | None = None  # None: there is no REST
-    api_networks: tuple[str, ...] = ()  # who may connect to it besides this machine
-    own: int | None = None  # the master of the own node
+    api_networks: tuple[str, ...] = ()  # networks that may connect to REST; this machine always may
+    own: int | None = None  # the port of the own node's master
     syslog: tuple[str, str, int] | None = None  # protocol, address and port of the audit log's receiver
 
 
@@ -79,7 +80,7 @@ class NoIsolation:
         yield
 
     def build(self) -> None:
-        """Build the isolation. Raises `StartError`; nothing is left then."""
+        """Build the isolation. Raises `StartError` after removing everything that was built."""
 
     def remove(self) -> None:
         """Remove the isolation."""
@@ -101,11 +102,11 @@ class NoIsolation:
         )
 
     def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
-        """Return the machine's address by which `host` reaches the appliance; None: the address that it used."""
+        """Return the machine's address by which `host` reaches the appliance; None: the address that `host` used."""
         return None
 
     def endpoint(self) -> PublicAddress:
-        """Return where hosts of other networks reach the appliance. Raises `NetworkError` if that is not known."""
+        """Return the address at which other networks' hosts reach the appliance. Raises `NetworkError` if unknown."""
         raise NetworkError(f"isolation {self.kind} has no tunnels: use isolation netns or container")
 
     def report(self) -> FirewallState:
@@ -135,7 +136,7 @@ class ContainerIsolation(NoIsolation):
         self.firewall: Firewall | None = None
         self._tunnels: tuple[str, Esp] | None = None  # the pool, and where ESP runs
         self._own: str | None = None  # the appliance's address in the tunnels
-        self._owed = False  # the kernel rejected the last rules
+        self._owed = False  # whether the kernel rejected the last rules, so they must be installed again
         self._changing = threading.RLock()
         self._ending = False
 
@@ -152,7 +153,7 @@ class ContainerIsolation(NoIsolation):
 
     @contextlib.contextmanager
     def _taking_away(self) -> Iterator[None]:
-        """Lock the rules for the last time; wait a limited time for a call that hangs."""
+        """Lock the rules for their removal; wait at most `_PATIENCE_SECONDS` for a call that hangs."""
         self._ending = True
         held = self._changing.acquire(timeout=_PATIENCE_SECONDS)
         if not held:
@@ -182,7 +183,7 @@ class ContainerIsolation(NoIsolation):
             )
 
     def remove(self) -> None:
-        """Remove every rule, and the address of the tunnels."""
+        """Remove every rule and the tunnels' address."""
         if self.firewall is None:
             return
         with self._taking_away():
@@ -194,7 +195,7 @@ class ContainerIsolation(NoIsolation):
                 log.error("firewall rules may remain", error=str(error))
 
     def _end_tunnels(self, own: str) -> None:
-        """Remove the tunnels' address, and what a killed charon left in the kernel."""
+        """Remove the tunnels' address, and the IPsec states and policies that a killed charon left in the kernel."""
         try:
             self._namespace.run(lambda: clear_leftovers(own.partition("/")[0]))
             interfaces.delete_address(self._namespace, "lo", own)
@@ -202,7 +203,7 @@ class ContainerIsolation(NoIsolation):
             log.error("tunnel state may remain", error=str(error))
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
-        """Close both ports to all users but those of rosmaster and rosout."""
+        """Close both ports to all users except the users of rosmaster and rosout."""
         with self._standing():
             if self.firewall is not None and (inner_port, own_port) != (self._ports.inner, self._ports.own):
                 self._ports = replace(self._ports, inner=inner_port, own=own_port)
@@ -233,7 +234,7 @@ class ContainerIsolation(NoIsolation):
             return esp
 
     def endpoint(self) -> PublicAddress:
-        """Return the container's only address. With several, it is unknown which one outside hosts reach."""
+        """Return the container's only address. Among several, it is unknown which address outside hosts reach."""
         found = only_address(self._namespace, without=("lo", USER_SPACE_INTERFACE))
         if is_contained() and not lives_on_the_machines_network():
             reason = f"{found.reason}, in a container: outside the machine the address may differ"
@@ -241,7 +242,7 @@ class ContainerIsolation(NoIsolation):
         return found
 
     def report(self) -> FirewallState:
-        """Return back end and rules with counters; install missing rules first."""
+        """Install missing rules; return the back end and the rules with their counters."""
         with self._standing():
             if self.firewall is None:
                 return FirewallState()
@@ -304,11 +305,11 @@ class ContainerIsolation(NoIsolation):
         )
 
     def _api_networks(self) -> tuple[str, ...]:
-        """Return the configured networks and the pool of the tunnels, where hosts renew their certificates."""
+        """Return the networks that may reach REST: the configured ones, and the tunnels' pool for renewals."""
         return (*self._ports.api_networks, *([self._tunnels[0]] if self._tunnels else []))
 
     def _neighbours(self) -> tuple[str, ...]:
-        """Return the addresses that only the machine itself may have on its link to the appliance."""
+        """Return the addresses that on the link to the appliance only the machine itself may use."""
         return ()
 
     def _forwarder(self) -> ForwarderAccess | None:
@@ -336,7 +337,7 @@ class NetnsIsolation(ContainerIsolation):
             forwarded.append(PortRange.one(ports.api))
         self._isolation = isolation or Isolation(Namespace.own(), IsolationSettings(ports=tuple(forwarded)))
         self._namespace = self._isolation.namespace
-        self._others: dict[str, list[str]] = {}  # logged last
+        self._others: dict[str, list[str]] = {}  # the last logged rules of other programs
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
@@ -345,7 +346,7 @@ class NetnsIsolation(ContainerIsolation):
             yield
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """Do as in a container, then forward IKE and ESP to the namespace."""
+        """Close the pool to clear text as in a container, then forward IKE and ESP to the namespace."""
         with self._standing():
             esp = super().open_tunnels(pool, address)
             self._isolation.forward_tunnels()
@@ -369,7 +370,7 @@ class NetnsIsolation(ContainerIsolation):
                 log.error("the namespace may remain; the next start removes it", error=str(error))
 
     def _api_networks(self) -> tuple[str, ...]:
-        # Connections from the host's loopback arrive under the address of its end of the link.
+        # Connections from the host's loopback arrive with the address of the host's end of the link.
         return (*self._neighbours(), *super()._api_networks())
 
     def _neighbours(self) -> tuple[str, ...]:
@@ -377,18 +378,18 @@ class NetnsIsolation(ContainerIsolation):
 
     def route_to(self, host: str) -> str | None:
         """Return the host's address by which `host` reaches the appliance; None for a host in a tunnel."""
-        # `host` comes from control: accept an address only.
+        # `host` comes from control, which is not trusted: accept only an address.
         address = ipaddress.ip_address(host)
         if self._tunnels is not None and address in ipaddress.ip_network(self._tunnels[0]):
             return None
         return self._isolation.host_address_for(host)
 
     def endpoint(self) -> PublicAddress:
-        """Return the machine's address towards its default route, else its only one."""
+        """Return the machine's address towards its default route; without a default route, its only address."""
         return self._isolation.endpoint()
 
     def report(self) -> FirewallState:
-        """Report as in a container, with the rules on the host; install missing ones again."""
+        """Report as in a container, with the rules on the host; install missing host rules again."""
         with self._standing():
             rules = self._isolation.rules()
             gone = [rule.purpose for rule in rules if not rule.in_force]
@@ -400,7 +401,7 @@ class NetnsIsolation(ContainerIsolation):
             return msgspec.structs.replace(super().report(), forwarding=list(rules), **self._look_at_others())
 
     def _look_at_others(self) -> dict[str, list[str]]:
-        """Return the rules of programs such as Docker for forwarded packets, and log changes of them."""
+        """Return other programs' rules (such as Docker's) for forwarded packets, and log changes of these rules."""
         try:
             found = {
                 "translations": list(self._isolation.translations()),
@@ -430,7 +431,7 @@ def isolation_for(
 
 
 def _require_own_network() -> None:
-    """Raise `StartError` in a container with the machine's network: the firewall would be the machine's."""
+    """Raise `StartError` in a container with the machine's network: the firewall would affect the whole machine."""
     shared = lives_on_the_machines_network()
     if is_contained() and (shared or bridges()):
         raise StartError(

@@ -1,10 +1,10 @@
 """Check the isolation while the appliance runs, and report to control.
 
-Calls of the isolation take time, so each runs in a daemon thread, one after the other (for routes a few at once). A
-thread that hangs does not keep the appliance from ending.
+Calls of the isolation take time, so each runs in a daemon thread. Calls run one after the other; only a few route
+queries run at once. A thread that hangs does not keep the appliance from ending.
 
 Every exception (a missing file or process, no memory, an unreadable answer) becomes a finding with its reason. So the
-checks never stop, and control never keeps an outdated better finding.
+checks never stop, and an outdated good finding never hides a failure from control.
 """
 
 import asyncio
@@ -48,7 +48,7 @@ class IsolationWatchdog:
         self._report = messages.FirewallReported(isolation=isolation.kind, report=FirewallState())
 
     def news(self) -> list[messages.Message]:
-        """Return the messages for a new control."""
+        """Return the messages for a new control process."""
         return [self._report] if self._probe is None else [self._report, self._probe]
 
     async def look(self) -> str | None:
@@ -69,7 +69,7 @@ class IsolationWatchdog:
             self._tell(message)
 
     async def control_ready(self, inner_port: int, own_port: int) -> str | None:
-        """Close control's inner ports to other users, and check that; return the reason of a failure, or None."""
+        """Close control's inner ports to other users, and verify that; return the reason of a failure, or None."""
         try:
             async with self._one_at_a_time:
                 await in_thread(lambda: self.isolation.control_ready(inner_port, own_port))
@@ -80,7 +80,7 @@ class IsolationWatchdog:
         return await self.look()
 
     async def open_tunnels(self, pool: str, address: str) -> messages.TunnelsEnclosed:
-        """Close a pool of addresses to clear text; return where ESP runs, or why there can be no tunnels."""
+        """Block clear text for a pool of addresses; return where ESP runs, or why no tunnels are possible."""
         try:
             async with self._one_at_a_time:
                 esp = await in_thread(lambda: self.isolation.open_tunnels(pool, address))
@@ -93,7 +93,7 @@ class IsolationWatchdog:
         return messages.TunnelsEnclosed(esp)
 
     async def route_to(self, host: str) -> str | None:
-        """Return the machine's address by which `host` reaches the appliance; None: the address that it used."""
+        """Return the machine's address by which `host` reaches the appliance; None: the address that `host` used."""
         try:
             async with self._few_at_a_time:
                 return await in_thread(lambda: self.isolation.route_to(host))
@@ -102,7 +102,7 @@ class IsolationWatchdog:
             return None
 
     async def endpoint(self) -> messages.EndpointFound:
-        """Return where hosts of other networks reach the appliance, or why that is not known."""
+        """Return the address at which other networks' hosts reach the appliance, or why it is unknown."""
         try:
             found = await in_thread(self.isolation.endpoint)
         except Exception as error:  # noqa: BLE001  see the invariant
@@ -125,7 +125,7 @@ class IsolationWatchdog:
 
 
 def _words(error: Exception) -> str:
-    """Return the text for an operator; log an unexpected exception with its traceback."""
+    """Return an error's text for operators; log an unexpected exception with its traceback."""
     if isinstance(error, NetworkError | ValueError):
         return str(error)
     log.error("fault while checking the environment", exc_info=error)
@@ -145,7 +145,7 @@ async def in_thread(function: Callable[[], T]) -> T:
         signals.block()
         try:
             result = function()
-        except BaseException as error:  # noqa: BLE001  handed to the caller, who waits for it
+        except BaseException as error:  # noqa: BLE001  handed to the caller, which waits for it
             answer = partial(outcome.set_exception, error)
         else:
             answer = partial(outcome.set_result, result)

@@ -1,6 +1,6 @@
 """Configure the logs of all processes: on standard error, readable on a terminal, otherwise JSON.
 
-Messages of the standard library's `logging` have the same form.
+Messages from the standard library's `logging` have the same format.
 """
 
 import logging
@@ -8,14 +8,14 @@ import sys
 from typing import Any, cast
 
 _rich = sys.modules.pop("rich", None)
-sys.modules["rich"] = cast(Any, None)  # otherwise structlog loads it for tracebacks, which are not wanted
+sys.modules["rich"] = cast(Any, None)  # otherwise structlog would load rich for its tracebacks
 import structlog  # noqa: E402  see above
 
 del sys.modules["rich"]
 if _rich is not None:
     sys.modules["rich"] = _rich
 
-# Never the values of local variables: a token or a key might be among them.
+# Tracebacks never show values of local variables, because a token or a key might be among them.
 _transform = structlog.tracebacks.ExceptionDictTransformer(show_locals=False)
 
 

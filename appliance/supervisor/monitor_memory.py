@@ -1,11 +1,11 @@
 """Provide the files in which relays keep the state of their monitors (`relay/monitors/state_memory.py`).
 
-Each run of the appliance has a folder with one file per relay; the kernel keeps their content when all processes die.
-This module reads only whether a file has content. Every relay may read the files of earlier runs, because a monitor may
-now be on another relay. Earlier folders are removed when each relay of a later run has written its file, so an
-appliance that is killed during its start loses nothing.
+Each run of the appliance has a folder with one file per relay. The kernel keeps the files' content when all processes
+die. This module reads only whether a file has content. Every relay may read the files of earlier runs, because a
+monitor may have moved to another relay. Earlier folders are removed only when each relay of a later run has written its
+file. So an appliance that is killed during its start loses no state.
 
-An orderly end writes everything to disk, and then a file with the time. After a reboot the state is used only if this
+An orderly end writes all state to disk, and then a file with the time. After a reboot, the state is used only if this
 file exists.
 """
 
@@ -27,9 +27,9 @@ SIZE = 32 << 20
 """Bytes of each file."""
 
 _ENDED = "ended"
-_MOST_LIVES = 4  # kept if none is complete
+_MOST_LIVES = 4  # folders kept while no run is complete
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
-_HEAD = 9  # bytes: the magic, and whether content follows
+_HEAD = 9  # bytes: the magic number, then a flag that content follows
 
 log = structlog.get_logger()
 
@@ -42,7 +42,7 @@ class _Ended(msgspec.Struct):
 
 
 class MonitorMemory:
-    """The files of this run, one for each relay, and those of earlier runs."""
+    """The files of this run, one for each relay, and the files of earlier runs."""
 
     def __init__(self, state: Path, relays: int) -> None:
         self._folder = state / FOLDER
@@ -72,7 +72,7 @@ class MonitorMemory:
                 os.ftruncate(self._own[-1], SIZE)
 
     def messages_for(self, role: str, index: int) -> Iterator[tuple[StateGiven, int]]:
-        """Yield the messages and descriptors for a process that starts."""
+        """Yield the messages and descriptors that a starting process gets."""
         if role != "relay":
             return
         ended = self._ended
@@ -106,7 +106,7 @@ class MonitorMemory:
         return ended
 
     def _lives(self) -> list[Path]:
-        """Remove folders that are no longer needed; return the others, the oldest first."""
+        """Remove folders that are no longer needed; return the remaining folders, the oldest first."""
         kept: list[Path] = []
         runs = [path for path in self._folder.iterdir() if path.is_dir() and path.name.isdecimal()]
         for life in sorted(runs, reverse=True):
@@ -123,7 +123,7 @@ def _is_complete(life: Path) -> bool:
 
 
 def _this_boot() -> str:
-    """Return the id of this boot; a random one if the kernel has none."""
+    """Return the id of this boot; a random id if the kernel has none."""
     try:
         return _BOOT.read_text("ascii").strip()
     except OSError:

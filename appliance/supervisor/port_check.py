@@ -1,4 +1,4 @@
-"""Check whether a port is free, and find the process that has it."""
+"""Check whether a port is free, and find the process that uses it."""
 
 import errno
 import socket
@@ -19,7 +19,7 @@ def free_port() -> int:
 
 
 def first_free(ports: range) -> int:
-    """Return the first of these loopback ports without a listener or an old connection. Raises `OSError`."""
+    """Return the first of these loopback ports that has neither a listener nor an old connection. Raises `OSError`."""
     for port in ports:
         with socket.socket() as sock:
             try:
@@ -46,7 +46,7 @@ def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
 
 
 def require_free(host: str, port: int) -> None:
-    """Raise `StartError` if the address cannot be listened on; it names the process that has the port, if known."""
+    """Raise `StartError` if the address cannot be listened on; its text names the process on the port, if known."""
     if port == 0:
         return
     try:

@@ -2,12 +2,12 @@
 
 After `drop_privileges`:
 
-1. The child dies with the supervisor (`PR_SET_PDEATHSIG`), also if that died earlier.
-2. It has no supplementary groups, only the role's capabilities (ambient, so its children have them too), and cannot
-   gain others (`no_new_privs`).
-3. Only its user can read the files that it makes (`umask 077`).
+1. The child dies with the supervisor (`PR_SET_PDEATHSIG`), even if the supervisor died before the call.
+2. The child has no supplementary groups and only the role's capabilities. They are ambient, so its own children inherit
+   them. It cannot gain further privileges (`no_new_privs`).
+3. Only the child's user can read the files that the child makes (`umask 077`).
 
-Without root only 1, 3 and `no_new_privs` apply.
+Without root, only 1, 3 and `no_new_privs` apply.
 """
 
 import contextlib
@@ -33,9 +33,9 @@ _CAPABILITY_VERSION_3 = 0x20080522
 
 
 def die_with_parent(parent: int) -> None:
-    """Make the kernel kill this process when its parent `parent` dies; exit if it died already.
+    """Make the kernel kill this process when its parent `parent` dies; exit if the parent is already dead.
 
-    Call this after the change of user, which clears the setting.
+    Call this after the change of user: a change clears the setting.
     """
     prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
@@ -43,7 +43,7 @@ def die_with_parent(parent: int) -> None:
 
 
 def raise_file_limit(wanted: int) -> int:
-    """Raise the limit on open files to `wanted`, or as far as permitted; return the new limit."""
+    """Raise the limit on open files to `wanted`, or as close as permitted; return the new limit."""
     _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard == resource.RLIM_INFINITY or hard >= wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
@@ -59,7 +59,8 @@ def raise_file_limit(wanted: int) -> int:
 def raise_oom_score(score: int) -> None:
     """Raise `oom_score_adj`, so the kernel kills this process earlier if memory is short; never lower it.
 
-    Call this before the change of user, which then may not write the file. With a read-only /proc nothing changes.
+    Call this before the change of user: the role's user may not write the file. With a read-only /proc, nothing
+    changes.
     """
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "r+") as file:  # noqa: PTH123  as below
         if score > int(file.read()):
@@ -71,21 +72,21 @@ def leave_network() -> None:
     _call("unshare(CLONE_NEWNET)", _CLONE_NEWNET)
 
 
-# The supervisor's use of each; it drops all others before it starts anything.
+# The supervisor needs each capability for the use in its comment, and drops all others before it starts any process.
 SUPERVISOR_CAPABILITIES = {
     "CHOWN": 0,  # give each role its part of the state directory
-    "DAC_OVERRIDE": 1,  # and look into it
+    "DAC_OVERRIDE": 1,  # read the roles' parts
     "FOWNER": 3,
     "KILL": 5,  # end the children
-    "SETGID": 6,  # start them as their users
+    "SETGID": 6,  # start the children as their users (with SETUID)
     "SETUID": 7,
-    "SETPCAP": 8,  # without any capability
-    "NET_BIND_SERVICE": 10,  # give it to charon: ports 500 and 4500
+    "SETPCAP": 8,  # start the children without capabilities
+    "NET_BIND_SERVICE": 10,  # passed on to charon, for ports 500 and 4500
     "NET_ADMIN": 12,  # firewall
-    "NET_RAW": 13,  # its iptables back end
-    "SYS_PTRACE": 19,  # find the process that has a port, and processes that a crash left in the namespace
-    "SYS_ADMIN": 21,  # namespaces
-    "SYS_RESOURCE": 24,  # limit on open files
+    "NET_RAW": 13,  # the firewall's iptables back end
+    "SYS_PTRACE": 19,  # find the process that uses a port, and processes that a crash left in the namespace
+    "SYS_ADMIN": 21,  # make and enter namespaces
+    "SYS_RESOURCE": 24,  # raise the limit on open files
 }
 
 
@@ -96,7 +97,7 @@ def drop_unused_capabilities() -> None:
     kept = sum(1 << number for number in SUPERVISOR_CAPABILITIES.values())
     _empty_bounding_set(but=kept)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
-    sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; then the same of the upper 32 numbers
+    sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; again for capabilities from 32
     _call("capget", header, sets)
     for index, word in ((0, kept), (1, kept), (2, 0), (3, kept >> 32), (4, kept >> 32), (5, 0)):
         sets[index] &= word & 0xFFFFFFFF
@@ -104,7 +105,7 @@ def drop_unused_capabilities() -> None:
 
 
 def drop_privileges(account: Account, *, parent: int, capabilities: Sequence[str] = ()) -> None:
-    """Become `account` for good, with these of `SUPERVISOR_CAPABILITIES`. Raises `OSError`."""
+    """Become `account` for good and keep only `capabilities` (of `SUPERVISOR_CAPABILITIES`). Raises `OSError`."""
     os.umask(0o077)
     if os.geteuid() == 0:
         kept = sum(1 << SUPERVISOR_CAPABILITIES[name] for name in capabilities)
@@ -120,8 +121,8 @@ def drop_privileges(account: Account, *, parent: int, capabilities: Sequence[str
 
 
 def _empty_bounding_set(*, but: int = 0) -> None:
-    # Without CAP_SETPCAP (in some containers) the bounding set stays. With no_new_privs it has no effect: it only
-    # limits what an execve may add.
+    # Without CAP_SETPCAP (in some containers) the bounding set stays. It limits only the capabilities that an execve
+    # may add, and with no_new_privs an execve adds none.
     with open(_LAST_CAPABILITY_FILE) as file:  # noqa: PTH123  pathlib is not loaded in this early stage
         last = int(file.read())
     for capability in range(last + 1):
@@ -134,7 +135,7 @@ def _empty_bounding_set(*, but: int = 0) -> None:
 
 
 def _reduce_capabilities(kept: int) -> None:
-    """Keep exactly the capabilities of this bit set, also for executed programs."""
+    """Keep exactly the capabilities of this bit set; executed programs inherit them."""
     prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     low, high = kept & 0xFFFFFFFF, kept >> 32
@@ -150,7 +151,7 @@ def prctl(option: int, first: int, second: int = 0) -> None:
 
 
 def _call(what: str, *arguments: Any) -> None:
-    """Call a function of the C library; `what` is `name(option)` for the error. Raises `OSError`."""
+    """Call a function of the C library; `what` is its name and option for the error text. Raises `OSError`."""
     function = ctypes.CDLL(None, use_errno=True)[what.partition("(")[0]]
     if function(*arguments) != 0:
         number = ctypes.get_errno()

@@ -1,7 +1,7 @@
 """Run one process from its start to its death, with the supervisor's end of its lifeline.
 
-Events go to the supervisor through callbacks, and it decides about restarts. The kernel reports a death on a pid
-descriptor, which a reuse of the process id cannot confuse.
+Callbacks report events to the supervisor, which decides about restarts. The kernel reports a death on a pid descriptor,
+so a reused process id causes no confusion.
 """
 
 import asyncio
@@ -27,7 +27,8 @@ from appliance.channel.messages import Lifeline, LinkOpened, Message, Ping, Wall
 from appliance.network.hang_detection import ProcessActivity
 from appliance.supervisor.child_entry import LaunchPlan
 
-# A start is mostly loading, which a kill would only repeat: a process that progresses gets more time.
+# A start is mostly loading, and a killed process would load everything again. So a process that progresses gets more
+# time.
 FIRST_ANSWER_SECONDS = 60.0
 LONGEST_START_SECONDS = 1800.0
 ANSWER_SECONDS = 5.0
@@ -44,7 +45,7 @@ class ProcessCallbacks:
 
 
 def is_hanging(silent: float, *, starting: bool, still: float) -> bool:
-    """Whether a process hangs that did not answer for `silent` seconds, `still` of them without progress.
+    """Whether a process hangs after `silent` seconds without an answer and `still` seconds without progress.
 
     During a start, `silent` counts from the start; a start that progresses may take long.
     """
@@ -59,7 +60,7 @@ class ProcessHandle:
     def __init__(
         self, role: str, index: int, plan: LaunchPlan, lifeline: socket.socket, reports: ProcessCallbacks
     ) -> None:
-        """Start the process; `lifeline` is the supervisor's end, `plan.lifeline` the child's; both are open."""
+        """Start the process; `lifeline` is the supervisor's open end, and `plan.lifeline` is the child's."""
         self.role = role
         self.index = index
         self.ready = False
@@ -69,13 +70,13 @@ class ProcessHandle:
         self.answered: float | None = None
         self.sandbox: Walled | None = None
         self.congestion = ""  # the congestion control of a relay's sockets
-        self.reason = ""  # why it cannot serve, from the process itself
-        self.output: tuple[str, ...] = ()  # the last lines of its program
+        self.reason = ""  # why the process cannot serve, as it reported
+        self.output: tuple[str, ...] = ()  # the last output lines of its program
         self._asked = 0
         self._reports = reports
         self._loop = asyncio.get_running_loop()
         self._process = subprocess.Popen(
-            # -s: no code from its home, which is a part of the state
+            # -s: load no code from the process's home, which is its part of the state directory
             [
                 sys.executable,
                 "-P",
@@ -95,7 +96,7 @@ class ProcessHandle:
         self._progress = ProcessActivity(self.pid)
         try:
             self._pidfd = os.pidfd_open(self.pid)
-        except OSError:  # too many open files: nothing would watch the process
+        except OSError:  # too many open files: without a pid descriptor, nothing would watch the process
             self._process.kill()
             self._process.wait()
             raise
@@ -107,12 +108,12 @@ class ProcessHandle:
 
     @property
     def alive(self) -> bool:
-        """Whether its death is not known yet."""
+        """Whether the process's death is not known yet."""
         return self._pidfd >= 0
 
     @property
     def sandbox_state(self) -> tuple[str, list[str]]:
-        """Return the sandbox in words, and what this kernel lacks of it."""
+        """Return the sandbox in words, and the limits that this kernel lacks."""
         if self.sandbox is None:
             return "", []
         calls = {"listed": "listed calls", "usual": "usual calls"}.get(self.sandbox.calls)
@@ -122,7 +123,7 @@ class ProcessHandle:
         ]
 
     def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
-        """Send a message, unless the process is gone (its death is reported separately)."""
+        """Send a message, unless the process is dead (its death is reported separately)."""
         if self._channel is None:
             return
         try:
@@ -133,23 +134,23 @@ class ProcessHandle:
             self._reports.violated(self, f"does not read its liveness pipe: {error}")
 
     def ping(self) -> None:
-        """Request an answer."""
+        """Ping the process, which must answer."""
         self._asked += 1
         self.send(Ping(self._asked))
 
     def note_answer(self) -> None:
-        """Note an answer."""
+        """Note that the process answered."""
         self.answered = time.monotonic()
 
     def discount_pause(self, seconds: float) -> None:
-        """Do not count `seconds` in which the supervisor did not run (a suspended machine)."""
+        """Add `seconds` to the deadline of the answer: the supervisor did not run (a suspended machine)."""
         self.started += seconds
         if self.answered is not None:
             self.answered += seconds
 
     @property
     def is_hanging(self) -> bool:
-        """Whether it hangs."""
+        """Whether the process hangs."""
         now = time.monotonic()
         # A role of the appliance may answer once, and then take long to load policy and specifications.
         starting = self.answered is None or not (self.ready or self.is_program)
@@ -158,7 +159,7 @@ class ProcessHandle:
 
     @property
     def stalled_seconds(self) -> float:
-        """Return the seconds since the process last progressed, or waited for a processor or a disk."""
+        """Return the seconds since the process last progressed or waited for a processor or a disk."""
         return self._progress.stalled_seconds()
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
@@ -173,8 +174,8 @@ class ProcessHandle:
         self._reports.violated(self, f"sent an invalid message: {reason}")
 
     def _lifeline_closed(self) -> None:
-        # An external program now runs, or a death will be reported soon. A role of the appliance that only closed its
-        # lifeline could not be stopped in order: it is killed.
+        # Either an external program now runs, or a death will be reported soon. A role of the appliance that only
+        # closed its lifeline is killed, because it could not be stopped in order.
         self._channel = None
         if not self.is_program:
             self.kill()
@@ -182,7 +183,7 @@ class ProcessHandle:
     def _dead(self) -> None:
         self._loop.remove_reader(self._pidfd)
         if self._channel is not None:
-            # The process's last message (why it could not start) may be unread.
+            # The process's last message may be unread; it has the reason of a failed start.
             channel, self._channel = self._channel, None
             with suppress(ChannelClosedError, msgspec.DecodeError):
                 for message, descriptors in channel.receive():
@@ -207,7 +208,7 @@ def _environment(home: str) -> dict[str, str]:
     return {
         **kept,
         "HOME": home,
-        "TMPDIR": home,  # for SQLite: no other folder is writable
+        "TMPDIR": home,  # SQLite needs it, because no other folder is writable
         "PATH": _PROGRAM_PATH,
         "PYTHONPATH": str(Path(appliance.__file__).parent.parent),
         "PYDANTIC_DISABLE_PLUGINS": "__all__",  # pydantic would search all installed packages for plugins

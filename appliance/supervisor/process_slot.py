@@ -15,7 +15,7 @@ from appliance.supervisor.users import account_of
 
 FAILING_AFTER = 5  # short runs in a row
 _BACKOFF = (0.0, 0.2, 0.5, 1.0)
-_LONGEST_DELAY = 60.0  # of dispensable roles
+_LONGEST_DELAY = 60.0  # seconds, for dispensable roles
 STABLE_SECONDS = 10.0
 
 
@@ -27,12 +27,12 @@ class ProcessSlot:
     index: int
     process: ProcessHandle | None = None
     starts: int = 0
-    short_runs: int = 0  # in a row
+    short_runs: int = 0  # number of short runs in a row
     due: asyncio.TimerHandle | None = None
-    wanted: bool = False  # for a role on demand: requested since this start
-    since: str = ""  # the last start
-    reason: str = ""  # why the last run ended, from the process itself if it said so
-    output: tuple[str, ...] = ()  # the last lines of its program
+    wanted: bool = False  # for a role on demand: requested again since its last start
+    since: str = ""  # time of the last start
+    reason: str = ""  # why the last run ended, in the process's own words if it sent any
+    output: tuple[str, ...] = ()  # the last output lines of its program
 
     @property
     def is_free(self) -> bool:
@@ -41,7 +41,7 @@ class ProcessSlot:
 
     @property
     def is_failing(self) -> bool:
-        """Whether operators must know that the last runs were all short."""
+        """Whether the last runs were all short, so that operators must be notified."""
         return self.short_runs >= FAILING_AFTER
 
     @property
@@ -54,7 +54,7 @@ class ProcessSlot:
         return waited_for and (self.process is None or not self.process.ready)
 
     def record_death(self, process: ProcessHandle) -> float:
-        """Note the end of the process; return the seconds that it ran."""
+        """Note the end of the process; return its run time in seconds."""
         self.process = None
         self.since = process.since
         lived = time.monotonic() - process.started
@@ -62,7 +62,7 @@ class ProcessSlot:
         return lived
 
     def recovers(self) -> bool:
-        """Reset the failures once a process runs long enough; return whether that happened now."""
+        """Reset the failures if the process has run long enough; return whether this call reset them."""
         lasts = self.process is not None and time.monotonic() - self.process.started >= STABLE_SECONDS
         if not (lasts and self.is_failing):
             return False
@@ -70,7 +70,7 @@ class ProcessSlot:
         return True
 
     def delay(self) -> float:
-        """Return the seconds until the next start: 0 after a long run, more after each short one."""
+        """Return the seconds until the next start: 0 after a long run, more after each short run."""
         if self.is_failing and self.role.dispensable:
             return min(2.0 ** (self.short_runs - FAILING_AFTER + 1), _LONGEST_DELAY)
         return _BACKOFF[min(max(self.short_runs - 1, 0), len(_BACKOFF) - 1)]

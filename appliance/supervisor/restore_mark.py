@@ -1,4 +1,4 @@
-"""Mark a state directory while a backup is restored to it, so that an unfinished restore is found."""
+"""Mark a state directory while a backup is restored to it, so that an unfinished restore is detected."""
 
 import os
 from pathlib import Path
@@ -7,7 +7,7 @@ from appliance.supervisor.errors import StartError
 
 
 def set_mark(state: Path) -> Path:
-    """Mark the empty folder `state`. Raises `OSError`, also if it is marked already."""
+    """Mark the empty folder `state`. Raises `OSError`, also if the folder is already marked."""
     mark = _mark(state)
     os.close(os.open(mark, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600))
     return mark

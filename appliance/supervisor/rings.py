@@ -1,8 +1,8 @@
-"""Keep the memory in which relays store the last messages; it survives a relay.
+"""Keep the memory (rings) in which relays store the last messages; the memory survives a relay.
 
 Each relay writes to its own ring. The recorder gets read-only descriptors, and no process can shrink a ring, so reading
-never fails. Nothing is read here. All memory is allocated at the start, so a lack of memory shows then and not during
-an incident, and a relay never waits for pages.
+never fails. This module reads no messages. All memory is allocated at the start. So a lack of memory shows at the start
+and not during an incident, and a relay never waits for pages.
 """
 
 import fcntl
@@ -23,7 +23,7 @@ _PAGE = 4096
 
 
 class RecorderRings:
-    """One ring per relay, of the total size in `rules`. Raises `StartError` (not enough memory), `OSError`."""
+    """One ring per relay; `rules` has their total size. Raises `StartError` (not enough memory), `OSError`."""
 
     def __init__(self, rules: RecorderRules, relays: int) -> None:
         if rules.memory > (left := _left()):
@@ -33,10 +33,10 @@ class RecorderRings:
             )
         size = int(rules.memory) // relays // _PAGE * _PAGE
         since, sums = time.time_ns(), known_sums(rules.never)
-        self._rings: list[tuple[RingGiven, int, int]] = []  # writable and readable descriptor
+        self._rings: list[tuple[RingGiven, int, int]] = []  # with the writable and the read-only descriptor
         for index in range(relays):
             writable = os.memfd_create(f"rosrv-ring-{index}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-            os.fchmod(writable, 0o600)  # otherwise a reader could open it again for writing
+            os.fchmod(writable, 0o600)  # otherwise a reader could open the ring again for writing
             os.posix_fallocate(writable, 0, size)
             fcntl.fcntl(writable, fcntl.F_ADD_SEALS, _SEALS)
             readable = os.open(f"/proc/self/fd/{writable}", os.O_RDONLY | os.O_CLOEXEC)

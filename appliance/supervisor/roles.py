@@ -1,7 +1,7 @@
-"""The table of processes: user, permissions and start of each.
+"""The table of processes, with the user, the permissions and the start of each process.
 
-To add a process, add its row to `ROLES`. A role is a part of the appliance (`entry`: a function that gets the lifeline)
-or an external program (`program`: the command and its environment).
+To add a process, add its row to `ROLES`. A role is either a part of the appliance (`entry`: a function that gets the
+lifeline) or an external program (`program`: the command and its environment).
 """
 
 import shutil
@@ -25,17 +25,17 @@ ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
 
 @dataclass(frozen=True)
 class Facts:
-    """The values that the rows of the table need: paths and ports; control reports some of them when it is ready."""
+    """The paths and ports that the rows of the table need; control reports some of them when it is ready."""
 
     state: Path
     config: Path
     rosmaster_port: int
     rosout_master: str | None = None
-    rosout_ports: range | None = None  # None: the kernel chooses
+    rosout_ports: range | None = None  # None: the kernel chooses the port
     ca_passphrase_file: Path | None = None
     control_reads: tuple[Path, ...] = ()
     syslog_reads: tuple[Path, ...] = ()
-    syslog_port: int | None = None  # of TCP
+    syslog_port: int | None = None  # the TCP port of the audit log's receiver
 
     def part(self, name: str) -> Path:
         """Return the part of the state directory with this name."""
@@ -54,17 +54,21 @@ class ExternalProgram:
 class Role:
     """One row of the table.
 
-    `part` is the role's folder in the state directory. `links` are the roles it talks to. `path` returns the last
-    argument of `entry`; `indexed` roles get their number. `asks`: the supervisor checks over HTTP whether it is alive
-    (for a program without a lifeline). `after` is the role that must be ready first. `outlives_control` roles are
-    stopped last. `files` is the limit on open files. `readable_by` is the user whose group may enter `part` and read
-    its group-readable files. `listens`: each of its processes gets the listening socket that the supervisor keeps for
-    it. `dispensable`: the others continue when it cannot serve. `on_demand`: started when control requests it, and not
-    again after it has ended with status 0. `group` is the user whose group replaces its own, to read files that are
-    `readable_by` that user. `capabilities`: those of `privileges.SUPERVISOR_CAPABILITIES` that it keeps. `secret`: a
-    file that its user may not read, opened before the privileges are dropped; the last argument of `entry` is the
-    descriptor or None. `sandbox`: its permitted system calls, and its files and ports besides its part and the system.
-    `ended_early`: how much earlier than others the kernel kills it if memory is short (`oom_score_adj`, 0 to 1000).
+    Start: `path` returns the last argument of `entry`. `indexed` roles get their number. `after` is the role that must
+    be ready first. `listens`: each process of the role gets the listening socket that the supervisor keeps for it.
+    `on_demand`: the role starts when control requests it, and does not restart after exit status 0.
+
+    Watching: `asks`: the supervisor checks over HTTP whether the role is alive (for a program without a lifeline).
+    `dispensable`: the other roles continue when this role cannot serve. `outlives_control` roles are stopped last.
+
+    Permissions: `part` is the role's folder in the state directory. `links` are the roles it talks to. `files` is the
+    limit on open files. `readable_by` is the user whose group may enter `part` and read its group-readable files.
+    `group` is the user whose group replaces the role's own, so the role can read files that are `readable_by` that
+    user. `capabilities` lists the `privileges.SUPERVISOR_CAPABILITIES` that the role keeps. `secret` is a file that the
+    role's user may not read; it is opened before the privileges are dropped, and the last argument of `entry` is its
+    descriptor or None. `sandbox` has the permitted system calls, and the files and ports besides the role's part and
+    the system. `ended_early` is the role's `oom_score_adj` (0 to 1000): the kernel kills a higher one earlier if memory
+    is short.
     """
 
     name: str
@@ -92,19 +96,19 @@ class Role:
 
 
 def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
-    """Return the environment of a ROS program; ROS_IP makes rosmaster listen on loopback only."""
+    """Return the environment of a ROS program; its ROS_IP makes rosmaster listen on loopback only."""
     return {
         "ROS_IP": "127.0.0.1",
         "ROS_MASTER_URI": master,
         "ROS_LOG_DIR": str(facts.part(part) / "log"),
         "ROS_PYTHON_LOG_CONFIG_FILE": str(_ROSMASTER_LOGGING),
-        # rosout would write up to a gigabyte of logs that are never read; subscribers get the messages anyway.
+        # rosout would write up to a gigabyte of logs that are never read; its subscribers get the messages anyway.
         "ROSOUT_DISABLE_FILE_LOGGING": "1",
     }
 
 
 def _messages_at(ports: range | None) -> tuple[str, ...]:
-    """Return the argument that makes roscpp serve messages at the first free one of these ports.
+    """Return the argument that makes roscpp serve messages at the first free port of the range.
 
     Connections of an earlier run may occupy a port for a minute.
     """
@@ -125,7 +129,7 @@ ROLES = (
             families=ROUTES,
             programs=executables_of(SYSTEM_PYTHON),
             binds=(facts.rosmaster_port,),
-            connects=None,  # the master-side endpoints: the firewall knows their port
+            connects=None,  # it calls the master-side endpoints, whose port the firewall permits
         ),
     ),
     _ours(
@@ -162,7 +166,7 @@ ROLES = (
         sandbox=lambda _facts: SandboxPlan(
             families=ROUTES,
             programs=executables_of(ROSOUT),
-            binds=None,  # the kernel chooses the port of its API; the firewall limits access
+            binds=None,  # the kernel chooses the port of its node API; the firewall limits access
             connects=None,
         ),
     ),
@@ -200,11 +204,11 @@ ROLES = (
         sandbox=lambda facts: SandboxPlan(allowlist=True, reads=(str(facts.part("control")),)),
     ),
 )  # fmt: skip
-"""In the order of their start."""
+"""The roles in the order of their start."""
 
 
 def roles_of(*, api: bool = True, syslog: bool = False, recorder: bool = False) -> tuple[Role, ...]:
-    """Return the roles of an appliance with these parts. Raises `StartError` if a program of ROS is missing."""
+    """Return the roles of an appliance with these parts. Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
     wanted = {"api": api, "syslog": syslog, "recorder": recorder}
     return tuple(role for role in ROLES if wanted.get(role.name, True))

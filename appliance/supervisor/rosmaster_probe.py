@@ -1,6 +1,6 @@
 """Check that `rosmaster`, which has no lifeline, is alive: call its `getPid`.
 
-Any answer counts. The firewall accepts only sockets of control's user, so the socket is made as that user.
+Any answer counts. The firewall accepts only sockets of control's user, so the socket is made as this user.
 """
 
 import asyncio
@@ -25,7 +25,7 @@ _REQUEST = (
 async def answers(port: int, account: Account, inside: AbstractContextManager[None], seconds: float) -> bool:
     """Whether `rosmaster` on this loopback port answers a call within `seconds`.
 
-    `inside` enters its network namespace while the socket is made.
+    `inside` enters rosmaster's network namespace while the socket is made.
     """
     loop = asyncio.get_running_loop()
     with inside, _as_user(account):
@@ -41,8 +41,8 @@ async def answers(port: int, account: Account, inside: AbstractContextManager[No
 
 @contextmanager
 def _as_user(account: Account) -> Iterator[None]:
-    # The firewall matches a socket's owner by fsuid, which is set for this thread alone. seteuid would take root from
-    # the threads that change the firewall.
+    # The firewall matches a socket's owner by fsuid, which is set for this thread alone. seteuid would also
+    # take root from the threads that change the firewall.
     if os.geteuid() != 0:
         yield
         return

@@ -27,9 +27,9 @@ from appliance.supervisor.service_manager import ServiceManager
 from appliance.supervisor.state_directory import StateDirectory
 from appliance.supervisor.supervisor import ControlReady, Supervisor
 
-_LIVES_A_MINUTE = 64  # starts of a failing rosout; connections occupy each port for a minute
+_LIVES_A_MINUTE = 64  # starts of a failing rosout; an old connection occupies each port for a minute
 _UNPRIVILEGED = range(1024, 65_536)
-_FILES = 65_536  # each kept socket, twice while it is sent to a new control
+_FILES = 65_536  # open files: each kept socket counts twice while it is sent to a new control
 
 log = structlog.get_logger()
 
@@ -43,8 +43,8 @@ def run_appliance(
 ) -> None:
     """Run the appliance until it is stopped. Raises `StartError` if it cannot start or go on.
 
-    `ready` is called once when nodes may connect, with control's message and the settings with all ports chosen.
-    `node_ports` is the policy's `[Ports] range`, which the firewall limits and `netns` forwards.
+    `ready` is called once, when nodes may connect; it gets control's message and the settings with all ports chosen.
+    `node_ports` is the policy's `[Ports] range`: the firewall limits connections to it, and `netns` forwards it.
     """
     if settings.isolation == "none":
         log.warning(
@@ -76,7 +76,7 @@ def _run(
     ready: Callable[[ControlReady, Settings], None],
     node_ports: range,
 ) -> None:
-    """Lock the state directory, run the appliance, and clean up, whatever signals arrive."""
+    """Lock the state directory, run the appliance, and clean up even if signals arrive."""
     manager = ServiceManager.of(os.environ)
     manager.starting("locks its state, builds its firewall")
     state = StateDirectory(settings.state)
@@ -106,7 +106,7 @@ def _run(
 
 
 def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
-    """Return the ports for rosout's messages, outside the range from which the kernel chooses ports."""
+    """Return the ports for rosout's messages; the kernel's local port range has none of them."""
     chosen = local_port_range()
     taken = [settings.listen_address[1], settings.rosmaster_port]
     taken += [settings.api_address[1]] if settings.api_address else []
@@ -123,7 +123,7 @@ def _files_of_syslog(settings: Settings) -> tuple[Path, ...]:
 
 
 def _port_of_syslog(settings: Settings) -> int | None:
-    """Return the receiver's TCP port, or None."""
+    """Return the TCP port of the syslog receiver; None if none is configured or it uses UDP."""
     if settings.audit.syslog.to is None:
         return None
     protocol, _address, port = settings.audit.syslog.destination
@@ -131,7 +131,7 @@ def _port_of_syslog(settings: Settings) -> int | None:
 
 
 def _with_ports(settings: Settings) -> Settings:
-    """Return the settings with all ports that must be known before the first process starts."""
+    """Return the settings, with every port chosen that must be known before the first process starts."""
     host, port = settings.listen_address
     if port == 0 and settings.isolation != "none":
         port = free_port()

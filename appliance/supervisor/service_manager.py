@@ -1,9 +1,9 @@
 """Notify systemd of the state of the appliance (`Type=notify`, `WatchdogSec`).
 
-During the start, systemd gets requests for more time: the supervisor itself ends a start without progress.
+During the start, the supervisor requests more time from systemd, and itself ends a start without progress.
 
-The protocol is sd_notify(3): datagrams of `KEY=value` lines to the socket in `NOTIFY_SOCKET`, if that is set. The
-watchdog covers the supervisor's loop, which itself watches the other processes.
+The protocol is sd_notify(3): datagrams of `KEY=value` lines to the socket in `NOTIFY_SOCKET`, if the variable is set.
+systemd's watchdog covers the supervisor's loop; that loop watches the other processes.
 """
 
 import asyncio
@@ -17,7 +17,7 @@ _MORE = "EXTEND_TIMEOUT_USEC=120000000\n"
 
 
 class ServiceManager:
-    """The service manager's socket and watchdog interval; does nothing without a socket."""
+    """Notifies systemd over its socket, and pings its watchdog; does nothing without a socket."""
 
     def __init__(self, address: str | None, watchdog_seconds: float | None) -> None:
         self._address = None if address is None else address.replace("@", "\0", 1)
@@ -26,7 +26,7 @@ class ServiceManager:
 
     @classmethod
     def of(cls, environment: MutableMapping[str, str]) -> "ServiceManager":
-        """Take socket and watchdog out of the environment, so that no child notifies systemd."""
+        """Remove the socket and the watchdog from the environment, so that no child notifies systemd."""
         said = {
             name: environment.pop(name, None) for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
         }
@@ -65,7 +65,7 @@ class ServiceManager:
         if self._address is None:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
-            # If systemd does not get it, it treats the service as silent.
+            # Without this message, systemd would treat the service as hanging.
             notify.connect(self._address)
             notify.send(text.encode())
 

@@ -18,9 +18,9 @@ log = structlog.get_logger()
 
 
 async def end_all(slots: Sequence[ProcessSlot], process_died: asyncio.Event) -> None:
-    """End every process; those that outlive control last.
+    """End every process; processes that outlive control come last.
 
-    `process_died` is set after each death, with the slot free. No process may start meanwhile.
+    `process_died` is set after each death, when its slot is free. No process may start meanwhile.
     """
     for slot in slots:
         if slot.due is not None:

@@ -1,8 +1,8 @@
 """Block ending signals while the isolation is built or removed, so that nothing is left on the machine.
 
-1. Signals during the build are delivered as soon as the supervisor's loop runs, which then ends in order.
-2. Signals during the removal are ignored: the end is already in progress.
-3. Threads block them too (`block`), otherwise the kernel would deliver them there.
+1. Signals during the build are delivered when the supervisor's loop runs; the loop then ends in order.
+2. Signals during the removal are ignored, because the end is already in progress.
+3. Other threads also block these signals (`block`); otherwise the kernel would deliver the signals to them.
 """
 
 import signal
@@ -14,7 +14,7 @@ _ENDING = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Block the signals until `heard`, and ignore those pending at the end. For the main thread only."""
+    """Hold the signals back until the end of the block, except within `heard`, then ignore them. Main thread only."""
     before = block()
     try:
         yield
@@ -36,5 +36,5 @@ def heard() -> Iterator[None]:
 
 
 def block() -> set[int]:
-    """Block the signals in the calling thread and its children; return what was blocked before."""
+    """Block the signals in the calling thread and its children; return the previously blocked signals."""
     return {int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)}

@@ -1,7 +1,7 @@
-"""Prepare the state directory: owners and modes of its parts, and a lock, so that only one appliance uses it.
+"""Prepare the state directory: set owners and modes of its parts, and lock it, so that only one appliance uses it.
 
-An existing directory is used, and closed to other users, only if it is empty or already an appliance's state: otherwise
-`--state /tmp` would close /tmp to all users.
+An existing directory is used, and closed to other users, only if it is empty or already an appliance's state.
+Otherwise `--state /tmp` would close /tmp to all users.
 
 state/            0711  root: others may pass through, not list
 state/lock        0600  locked while an appliance runs; contains its process id
@@ -9,7 +9,7 @@ state/admin.sock  0600  for the other verbs of `rosrv`
 state/monitors/   0700  root: the state of monitors (`monitor_memory.py`)
 state/run/        0755  the resolved configuration for the children
 state/relay/      0700  rosrv-relay    and so on, one folder per role, for its user only
-state/control/    2710  rosrv:rosrv-api  as root: new files get the group, for those it may read (audit log)
+state/control/    2710  rosrv:rosrv-api  (as root) new files get this group, which may read some of them (audit log)
 """
 
 import contextlib
@@ -27,13 +27,13 @@ from appliance.supervisor.users import account_of
 
 ADMIN_SOCKET = "admin.sock"
 _LOCK = "lock"
-_RESTORED = Path("control", "state.db")  # a backup has no lock
+_RESTORED = Path("control", "state.db")  # identifies a restored backup, which has no lock file
 _OF_THE_DISK = "lost+found"
 _SHOWN = 3
 
 
 def foreign(path: Path) -> str | None:
-    """Return why the directory at `path` is not an appliance's state; None if it is, or is empty or missing.
+    """Return why the directory at `path` is not an appliance's state; None if it is one, is empty, or is missing.
 
     Raises `OSError`.
     """
@@ -47,7 +47,7 @@ def foreign(path: Path) -> str | None:
 
 
 def _has_lock(path: Path) -> bool:
-    """Whether the folder has a lock file of its owner; in a shared folder any user may create a file of that name."""
+    """Whether the folder has a lock file of the folder's owner: in a shared folder, any user may create such a file."""
     try:
         lock = (path / _LOCK).lstat()
     except FileNotFoundError:
@@ -91,13 +91,13 @@ class StateDirectory:
                 f"the parts of the state directory {self.path} cannot be given to the users of the processes: {error}; "
                 "a container needs CAP_CHOWN for that (cap_add in compose.yaml)"
             ) from error
-        # The lock is held and no process runs, so nothing writes there.
+        # The lock is held and no process runs, so no process writes to these folders.
         place, mine = os.open(self.path, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC), os.geteuid()
         for user, part in {(mine, "run"), *((account_of(role.user).uid, role.part) for role in roles)}:
             with contextlib.suppress(
                 PermissionError
             ):  # without CAP_SETUID no process starts, which is reported
-                os.seteuid(user)  # in a container root may not read the folders of others
+                os.seteuid(user)  # in a container, root may not read the folders of other users
                 remove_unfinished(part, place)
                 os.seteuid(mine)
         os.close(place)
@@ -162,7 +162,7 @@ class StateDirectory:
             _hand_over(path, uid, gid, mode)
         except FileExistsError:
             found = path.lstat()
-            # Owned by this user: an earlier start was killed before it changed the owner.
+            # This user still owns the folder if an earlier start was killed before it changed the owner.
             if not stat.S_ISDIR(found.st_mode) or found.st_uid not in (uid, os.geteuid()):
                 raise StartError(
                     f"{path} is not a folder of user id {uid} (another user ran an appliance here): "
@@ -173,7 +173,7 @@ class StateDirectory:
 
 
 def _hand_over(path: Path, uid: int, gid: int, mode: int) -> None:
-    """Change owner, group and mode of a folder; own it first, otherwise the kernel drops the set-group-id bit."""
+    """Change owner, group and mode of a folder, as its owner; otherwise the kernel drops the set-group-id bit."""
     os.chown(path, os.geteuid(), os.getegid())
     path.chmod(mode)
     os.chown(path, uid, gid)

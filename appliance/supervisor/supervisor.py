@@ -1,13 +1,14 @@
 """Start, watch and restart the processes of the appliance.
 
-1. Nothing from a node or a browser is parsed here. A child that sends a message outside `_FROM_ANY` and `_FROM_CONTROL`
-   is killed and restarted.
-2. A dead process is restarted within a second; one that does not answer for five seconds is killed.
-3. After nodes may connect, no message or death of a process ends the appliance, except control's request to end it. A
-   process that cannot serve (a full disk) is restarted after a second at most, a dispensable one after a minute.
+1. The supervisor parses no data from a node or a browser. A child that sends a message outside `_FROM_ANY` and
+   `_FROM_CONTROL` is killed and restarted.
+2. A dead process is restarted within a second. A process that does not answer for five seconds is killed.
+3. Once nodes may connect, only control's request ends the appliance; no other message and no death of a process does. A
+   process that cannot serve (a full disk) is restarted after at most a second, a dispensable process after at most a
+   minute.
 4. If one end of a link is new, both ends get a new link. A new control first gets every kept socket, then its links,
    then the list of processes.
-5. The end takes less than five seconds, whatever the children do, and leaves no process behind.
+5. The end takes less than five seconds, even if children hang, and leaves no process behind.
 """
 
 import asyncio
@@ -49,11 +50,11 @@ from appliance.supervisor.users import account_of
 
 ADMIN = "admin"
 _READERS = "rosrv-api"  # the user whose group may read the audit log
-_START_SECONDS = 180.0  # without any progress
+_START_SECONDS = 180.0  # a longer start must show progress
 _LOOK_SECONDS = 10.0
-OUTPUT_LINES = 40  # of a failing process
+OUTPUT_LINES = 40  # last lines kept of a failing process
 _LONGEST_LINE = 500  # characters
-_MOST_UNANSWERED = 4096  # hosts whose route control requests
+_MOST_UNANSWERED = 4096  # requests of control at once
 
 _FROM_ANY: tuple[type[messages.Message], ...] = (
     messages.Walled,
@@ -105,9 +106,9 @@ class Supervisor:
     ) -> None:
         """Prepare the slots. `ready` is called once when nodes may connect; it may raise `StartError`.
 
-        Control gets `admin`. `listeners` are the sockets of roles that listen; they stay open between two runs, so that
-        connections wait. `rings` is the memory of the flight recorder; None: nothing is recorded. `memory` has the
-        state of monitors; None: it is lost with the relays.
+        Control gets `admin`. `listeners` are the sockets of roles that listen; they stay open while a process restarts,
+        so connections wait. `rings` is the memory of the flight recorder; None: nothing is recorded. `memory` keeps
+        the state of monitors; None: the state is lost when relays die.
         """
         self._facts = facts
         self.slots = [
@@ -134,7 +135,7 @@ class Supervisor:
     async def run(self) -> None:
         """Start all processes, keep them running, and end them on SIGTERM or SIGINT; SIGHUP reloads the policy.
 
-        Raises `StartError` if the appliance cannot start or go on; everything is stopped then.
+        Raises `StartError` if the appliance cannot start or go on; all processes are then stopped.
         """
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(_log_fault)
@@ -163,7 +164,7 @@ class Supervisor:
                 self._memory.close()
 
     def stop(self, failure: str | None = None) -> None:
-        """End the appliance; `failure` is why it cannot go on, None for an orderly end."""
+        """End the appliance; `failure` is the reason why it cannot go on, None for an orderly end."""
         if not self.stopping.is_set():
             self.failure = failure
             self.stopping.set()
@@ -194,7 +195,7 @@ class Supervisor:
         self.stop(f"rosmaster does not answer on 127.0.0.1:{self._facts.rosmaster_port}; check the log")
 
     async def until_ready(self) -> None:
-        """Log what the start waits for, and give up without progress."""
+        """Wait until all processes are ready; log the pending ones, and give up without progress."""
         began = time.monotonic()
         while not self.is_ready and not self.stopping.is_set():
             with suppress(TimeoutError):
@@ -212,7 +213,7 @@ class Supervisor:
                 log.info("still starting", waits_for=words, seconds=waited)
 
     def _gets_on(self, began: float, slots: list[ProcessSlot]) -> bool:
-        """Whether to continue a start: up to some minutes, and longer while processes progress."""
+        """Whether a start may continue: it may for some minutes, and longer while processes progress."""
         waited = time.monotonic() - began
         if waited < _START_SECONDS:
             return True
@@ -301,7 +302,10 @@ class Supervisor:
         self._tell_processes()
 
     def _cannot_serve(self, process: ProcessHandle, reason: str, output: Sequence[str]) -> None:
-        """End the appliance during its start, with the reason for the operator; later the next start may succeed."""
+        """End the appliance during its start, with the reason for the operator; later, only kill the process.
+
+        The process starts again, and its next start may succeed. A dispensable process never ends the appliance.
+        """
         slot = next(slot for slot in self.slots if slot.process is process)
         process.reason = reason
         process.output = tuple(_printable(line)[:_LONGEST_LINE] for line in output[-OUTPUT_LINES:])
@@ -309,7 +313,7 @@ class Supervisor:
             log.error("process cannot serve", role=process.role, reason=reason, output=list(process.output))
             process.kill()
         else:
-            self.stop(reason)  # which prints it as the last line
+            self.stop(reason)  # the reason becomes the last line of the output
 
     def control_said(
         self, process: ProcessHandle, message: messages.Message, descriptors: tuple[int, ...]
@@ -336,9 +340,9 @@ class Supervisor:
                 self.stop()
 
     def _free_log(self, processes: list[int]) -> None:
-        """Kill the readers of the audit log that hold a writer's lock, which a correct reader never does.
+        """Kill the audit log readers that hold a writer's lock: a correct reader never holds one.
 
-        If the kernel does not know the process (-1), or it is not a child, kill all readers.
+        If the holder is unknown to the kernel (-1) or not a child, kill all readers.
         """
         ours = {slot.process.pid for slot in self.slots if slot.process is not None}
         for slot in self.slots:
@@ -395,7 +399,7 @@ class Supervisor:
             process.send(messages.Announced())
 
     def _answer(self, process: ProcessHandle, work: Coroutine[Any, Any, None]) -> None:
-        """Start work that ends with an answer to control, up to a limit."""
+        """Start a task that ends with an answer to control. Too many requests at once count as a violation."""
         if self._unanswered >= _MOST_UNANSWERED:
             work.close()
             self._violated(process, f"sent more than {_MOST_UNANSWERED} requests at once")
@@ -425,7 +429,7 @@ class Supervisor:
         process.send(answer)
 
     def _demand(self, role: str) -> None:
-        """Start a role on demand; one that is just ending is started again."""
+        """Start a role on demand; if it is just ending, start it again afterwards."""
         for slot in self.slots:
             if slot.role.name == role:
                 slot.wanted = slot.process is not None
@@ -548,12 +552,12 @@ class Supervisor:
 
 
 def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    # A defect in one callback must not stop the robot's master: log it, and go on.
+    # A defect in one callback must not stop the robot's master: log the defect and continue.
     log.critical("fault in the supervisor", fault=context["message"], exc_info=context.get("exception"))
 
 
 def _about(slot: ProcessSlot) -> messages.ProcessInfo:
-    """Return the row for control of a process that runs or keeps failing."""
+    """Return a process's row for control, whether the process runs or keeps failing."""
     failing, output = (slot.reason, list(slot.output)) if slot.is_failing else ("", [])
     process, restarts = slot.process, slot.starts - 1
     if process is None:

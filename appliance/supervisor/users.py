@@ -1,7 +1,8 @@
 """Choose the users of the children.
 
-Started as root, each role has its own user: the one with the role's name in the user database, otherwise a reserved
-numeric id (so the appliance also runs in a container without these users). Otherwise everything runs as the caller.
+If the appliance is started as root, each role has its own user: the user with the role's name in the user database, or
+else a reserved numeric id, so that a container without these users also works. If it is not started as root, all
+processes run as the caller.
 """
 
 import os
@@ -24,7 +25,7 @@ NUMERIC_IDS = {
 
 @dataclass(frozen=True)
 class Account:
-    """A user as the kernel knows it."""
+    """A user with its numeric user and group ids."""
 
     name: str
     uid: int
@@ -32,7 +33,7 @@ class Account:
 
 
 def account_of(user: str, group: str | None = None) -> Account:
-    """Return the account of a role's user, in the group of the user `group` if given.
+    """Return the account of a role's user; its group is the group of the user `group`, if given.
 
     Raises `KeyError` for a user without a role.
     """

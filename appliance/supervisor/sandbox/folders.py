@@ -1,4 +1,4 @@
-"""List the files that every process reads, and those that a program needs to run."""
+"""List the files that every process reads, and the files that a program needs to run."""
 
 import sys
 from dataclasses import replace
@@ -8,12 +8,12 @@ import appliance
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
 
 _SYSTEM = ("/usr", "/lib", "/lib32", "/lib64", "/bin", "/sbin", "/etc", "/dev", "/proc", "/sys")
-_RESOLVER = Path("/etc/resolv.conf")  # often a link to another folder
+_RESOLVER = Path("/etc/resolv.conf")  # often a link to a file in another folder
 _LOADERS = (("/lib", "ld-linux-*"), ("/lib64", "ld-linux-*"))
 
 
 def with_system_files(sandbox: SandboxPlan, home: str, run: str) -> SandboxPlan:
-    """Let a process read the system, Python, our code and `run` (the resolved configuration), and write `home`."""
+    """Permit reading the system, Python, our code and `run` (the resolved configuration), and writing `home`."""
     code = {sys.prefix, sys.base_prefix, str(Path(appliance.__file__).parent.parent)}
     return replace(
         sandbox,
@@ -23,7 +23,7 @@ def with_system_files(sandbox: SandboxPlan, home: str, run: str) -> SandboxPlan:
 
 
 def executables_of(program: Path) -> tuple[str, ...]:
-    """Return the files that running a program executes: the program, with links resolved, and the dynamic linker."""
+    """Return the files that the kernel executes for a program: the program, links resolved, and the dynamic linker."""
     loaders = (loader for folder, name in _LOADERS for loader in Path(folder).glob(name))
     return (str(program.resolve()), *(str(loader.resolve()) for loader in loaders))
 

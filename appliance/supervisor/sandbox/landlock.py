@@ -1,7 +1,7 @@
-"""Limit files and TCP ports of a process with Landlock, which needs no privilege and is inherited by children.
+"""Limit files and TCP ports of a process with Landlock, which needs no privilege and which children inherit.
 
-The kernel's Landlock version (ABI) can limit files from 1 (Linux 5.13), TCP ports from 4 (6.7), and signals and
-abstract sockets from 6 (6.12). Limits that the kernel lacks are reported.
+Landlock limits files from ABI version 1 (Linux 5.13), TCP ports from version 4 (6.7), and signals and abstract sockets
+from version 6 (6.12). Limits that the kernel lacks are reported.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ from pathlib import Path
 from appliance.supervisor.privileges import prctl
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
 
-_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # the same on all machines
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # system calls; the same on all architectures
 _ASK_VERSION = 1
 _BENEATH, _PORT = 1, 2
 _BIND, _CONNECT = 1 << 0, 1 << 1
@@ -26,7 +26,7 @@ _READ = _READ_FILE | _READ_DIR
 _PR_SET_NO_NEW_PRIVS = 38
 
 FILES, PORTS, SIGNALS = 1, 4, 6
-"""The first ABI for each limit."""
+"""The first ABI version with each limit."""
 
 
 class LandlockError(Exception):
@@ -39,7 +39,7 @@ def version() -> int:
 
 
 def lacking(abi: int) -> list[str]:
-    """Return the limits that this version lacks, in words."""
+    """Return the limits that this ABI version lacks, in words."""
     if abi < FILES:
         return ["the kernel has no Landlock: only file permissions protect files"]
     missing = [(PORTS, "TCP ports"), (SIGNALS, "signals to other processes of its user")]
@@ -74,7 +74,7 @@ def restrict(sandbox: SandboxPlan) -> int:
 
 
 def _rights_of_files(abi: int) -> int:
-    """Return all rights of this version."""
+    """Return all access rights that this ABI version knows."""
     rights = (1 << 13) - 1
     for since, right in ((2, 1 << 13), (3, _TRUNCATE), (5, _IOCTL)):
         rights |= right if abi >= since else 0

@@ -12,11 +12,11 @@ ROUTES = (*NETWORK, int(socket.AF_NETLINK))  # name lookups read the kernel's ro
 class SandboxPlan:
     """The permissions of a process.
 
-    `allowlist`: permit only listed system calls; otherwise deny only those that no process of the appliance makes.
-    `families`: families of the sockets that it may make. `programs`: files that it may execute, and the libraries they
-    load. `reads`, `writes`: folders and files; what is in `writes` may also be read. A missing path grants nothing.
-    `binds`, `connects`: TCP ports to listen on and to connect to; None: any. With an allowlist and without ports the
-    calls `bind` and `connect` themselves fail, whatever the family.
+    `allowlist`: permit only listed system calls; otherwise, deny only those that no process of the appliance makes.
+    `families`: address families of the sockets that the process may make. `programs`: files that it may execute, and
+    the libraries they load. `reads`, `writes`: folders and files; paths in `writes` may also be read. A missing path
+    grants nothing. `binds`, `connects`: TCP ports to listen on and to connect to; None: any port. With an allowlist and
+    without ports, the system calls `bind` and `connect` fail for every family.
     """
 
     allowlist: bool = False

@@ -1,11 +1,12 @@
 """Filter the system calls of a process with libseccomp, which knows their numbers on every architecture.
 
-A denied call fails with EPERM. A call outside the allowlist, or one that hides its arguments (`clone3`), fails with
-ENOSYS, so that libraries use another. A library may try any call of a newer kernel, and a killed relay stops its
-topics; so only calls of another architecture (32 bits), which no program of the appliance makes, kill a process.
+A denied call fails with EPERM. A call outside the allowlist, or a call that hides its arguments (`clone3`), fails with
+ENOSYS, so that libraries try an older call instead. Only calls of another architecture (32 bits) kill a process,
+because no program of the appliance makes them. All other calls fail without a kill: a library may try calls of a newer
+kernel, and a killed relay stops its topics.
 
 Memory is never writable and executable at once. A written page may become executable later (`mprotect`), because
-compiled code needs that.
+compiled code needs this.
 """
 
 import ctypes
@@ -20,8 +21,8 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(text.split())
 
 
-# No process of the appliance needs these: other processes' memory, namespaces, mounts, keys, modules, tracing, and ways
-# around a filter (io_uring).
+# No process of the appliance needs these system calls: access to other processes' memory, namespaces, mounts, keys,
+# modules, tracing, and ways around a filter (io_uring).
 FORBIDDEN = _names("""
     acct add_key adjtimex bpf chroot clock_adjtime clock_settime create_module delete_module fanotify_init fanotify_mark
     finit_module fsconfig fsmount fsopen fspick get_kernel_syms init_module io_uring_enter io_uring_register
@@ -34,7 +35,7 @@ FORBIDDEN = _names("""
 
 STARTS_PROGRAMS = ("execve", "execveat", "fork", "vfork")
 
-# Python with threads, sockets and SQLite needs these. A process that parses untrusted input gets no others.
+# Python with threads, sockets and SQLite needs these calls. A process that parses untrusted input gets no other calls.
 ALLOWED = _names("""
     accept accept4 access alarm arch_prctl brk chdir chmod clock_getres clock_gettime clock_nanosleep close close_range
     copy_file_range dup dup2 dup3 epoll_create epoll_create1 epoll_ctl epoll_ctl_old epoll_pwait epoll_pwait2 epoll_wait
@@ -98,11 +99,11 @@ class _Filter:
         self._otherwise = otherwise
 
     def set(self, attribute: int, value: int) -> None:
-        """Set an attribute. One that this libseccomp or kernel does not know has no effect on what is denied."""
+        """Set an attribute. An attribute that libseccomp or the kernel lacks is skipped; the same calls are denied."""
         self._library.seccomp_attr_set(self._context, ctypes.c_int(attribute), ctypes.c_uint32(value))
 
     def add(self, action: int, names: Iterable[str], *comparisons: Comparison) -> None:
-        """Add a rule for these calls, if all comparisons hold. Calls that this architecture lacks are skipped."""
+        """Add a rule that applies to these calls if all comparisons hold. Calls this architecture lacks are skipped."""
         if action == self._otherwise:
             return
         compared = (_Comparison * len(comparisons))(*(_Comparison(*comparison) for comparison in comparisons))
