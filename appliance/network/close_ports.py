@@ -1,17 +1,17 @@
 """Close the ROS ports of the machine that the nodes run on, with an nftables file.
 
-A ROS node listens, for its API, TCPROS and UDPROS, on ports that the kernel picks from the local port range. The
-appliance hides these ports, but a port scanner finds them. The file closes the range to all but loopback and the
-appliance:
+For its API, TCPROS and UDPROS, a ROS node listens on ports that the kernel picks from the local port range. The
+appliance does not reveal these ports, but a port scanner finds them. The file closes the range to all but loopback and
+the appliance:
 
-1. A TCP connection is refused at its SYN, without the connection tracker. Older connections, and those that the machine
-   itself opens, continue.
+1. A TCP connection is refused at its SYN, without the connection tracker. Older connections, and connections that the
+   machine itself opens, continue.
 2. A UDP packet is dropped if it is new to the connection tracker. Answers to this machine (DNS, NTP, DHCP) pass.
-3. A connection to the appliance that this machine forwards (for a container, a virtual machine, a hotspot client) is
-   dropped if it has an address of this machine after all translation, because the policy would treat it as the
-   machine's. The rule needs Linux 5.7; with older kernels it never matches.
+3. This machine may forward a connection to the appliance, for a container, a virtual machine or a hotspot client. If
+   such a connection has an address of this machine after all translation, it is dropped: the policy would treat it as
+   the machine's own. The rule needs Linux 5.7; with older kernels it never matches.
 4. All rules are in one table, `inet rosrv_protect`, replaced in one transaction. Rules of other programs stay, and
-   nothing that they block is opened.
+   traffic that they block stays blocked.
 """
 
 import ipaddress
@@ -29,7 +29,7 @@ from appliance.network.namespaces import NetworkError
 
 TABLE = "rosrv_protect"
 RANGE_FILE = Path("/proc/sys/net/ipv4/ip_local_port_range")
-# Matches for ESP in the kernel, and for ESP in user space on strongSwan's TUN device. join.sh checks for both.
+# One match is for ESP in the kernel, the other for ESP in user space on strongSwan's TUN device. join.sh checks both.
 _THROUGH_IPSEC = ("meta ipsec exists ", 'iifname "ipsec*" ')
 _SYN = "tcp flags & (syn | ack) == syn"
 _SERVICE = re.compile(r"(tcp|udp)/(\d{1,5})(?:-(\d{1,5}))?")
@@ -37,7 +37,7 @@ _SERVICE = re.compile(r"(tcp|udp)/(\d{1,5})(?:-(\d{1,5}))?")
 
 @dataclass(frozen=True)
 class OpenService:
-    """Ports that stay open to all hosts."""
+    """A service whose ports stay open to all hosts."""
 
     protocol: Literal["tcp", "udp"]
     ports: PortRange
@@ -47,12 +47,12 @@ class OpenService:
 
 
 def parse_services(texts: Sequence[str]) -> tuple[OpenService, ...]:
-    """Parse services such as `tcp/22,udp/123,tcp/8000-8010`. Raises `ValueError` with the invalid one."""
+    """Parse services such as `tcp/22,udp/123,tcp/8000-8010`. Raises `ValueError` with the invalid service."""
     return tuple(_service(part.strip()) for text in texts for part in text.split(","))
 
 
 def parse_ports(text: str) -> PortRange:
-    """Parse a range of ports such as `32768-60999` (or one number)."""
+    """Parse a range of ports such as `32768-60999`, or a single port."""
     first, _, last = text.partition("-")
     if not (first.isdecimal() and (last or first).isdecimal()):
         raise ValueError(f"{text!r} is not a range of ports such as 32768-60999")
@@ -129,7 +129,7 @@ def _indented(rules: Sequence[str]) -> str:
 
 
 def apply(text: str) -> None:
-    """Apply a file of `protection` on this machine, in place of an earlier one."""
+    """Apply an nftables file from `protection` on this machine; it replaces an earlier one."""
     _nft(["-f", "-"], text)
 
 

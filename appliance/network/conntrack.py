@@ -1,8 +1,8 @@
 """Delete entries of the connection tracker.
 
-Address translation applies to the first packet of a connection only. A host that keeps sending UDP (IKE, ESP in UDP)
-keeps its old entry alive, so a change of the rules would not redirect its packets. Therefore entries of forwarded ports
-are deleted whenever the rules change.
+Address translation applies only to the first packet of a connection. A host that keeps sending UDP (IKE, ESP in UDP)
+keeps its old entry alive, so changed rules would not redirect its packets. Therefore the entries of forwarded ports are
+deleted whenever the rules change.
 """
 
 import errno

@@ -1,4 +1,4 @@
-"""Find out whether ESP can run in the kernel, otherwise in user space over a TUN device."""
+"""Find out where ESP can run: in the kernel, or else in user space over a TUN device."""
 
 import errno
 import os
@@ -19,7 +19,7 @@ _STATE = ("src", "192.0.2.1", "dst", "192.0.2.2", "proto", "esp", "spi")
 
 
 def choose_esp(namespace: Namespace) -> Esp:
-    """Return where ESP can run in this namespace. Raises `NetworkError` with what to do."""
+    """Return where ESP can run in this namespace. Raises `NetworkError` with the remedy."""
     refusal = _try_kernel(namespace)
     if refusal is None:
         return "kernel"
@@ -32,9 +32,9 @@ def choose_esp(namespace: Namespace) -> Esp:
 
 
 def lend_tun(uid: int, gid: int, tun: Path | None = None) -> None:
-    """Let a user open the TUN device, if needed with an entry in its access control list.
+    """Let a user open the TUN device; if needed, add an entry to the device's access control list.
 
-    Raises `NetworkError` with what to do.
+    Raises `NetworkError` with the remedy.
     """
     device, shown = tun or TUN, ""
     try:
@@ -51,14 +51,14 @@ def lend_tun(uid: int, gid: int, tun: Path | None = None) -> None:
         ) from error
 
 
-# The kernel's form of an access control list: a version, then tag, rights and id of each entry, sorted by tag.
+# The kernel's format of an access control list: a version, then each entry's tag, rights and id, sorted by tag.
 _ACL, _VERSION, _ENTRY = "system.posix_acl_access", struct.pack("<I", 2), struct.Struct("<HHI")
 _OWNER, _USER, _GROUP, _MASK, _OTHER = 1, 2, 4, 0x10, 0x20
 _NOBODY, _READ_WRITE = 0xFFFFFFFF, 6
 
 
 def _entries_of(device: Path, mode: int) -> list[tuple[int, int, int]]:
-    """Return the entries of the device's access control list, or those that its mode stands for."""
+    """Return the entries of the device's access control list; without a list, the entries that the mode implies."""
     try:
         return list(_ENTRY.iter_unpack(os.getxattr(device, _ACL)[len(_VERSION) :]))
     except OSError as error:
@@ -78,7 +78,7 @@ def _with_user(entries: list[tuple[int, int, int]], uid: int) -> bytes:
 
 
 def _try_kernel(namespace: Namespace) -> str | None:
-    """Return why the kernel rejects a state with the cipher of the tunnels, or None."""
+    """Return why the kernel rejects an IPsec state with the tunnels' cipher; None if it accepts the state."""
     spi = f"0x{secrets.randbelow(0x7FFFFFFF) + 0x1000:x}"
     key = "0x" + secrets.token_hex(36)  # 256 bits and the salt
     cipher = ("reqid", "1", "mode", "tunnel", "aead", "rfc4106(gcm(aes))", key, "128")

@@ -1,7 +1,7 @@
 """Wait for a program while it progresses, and end it if it hangs.
 
-A time limit alone is not enough: under emulation or load `nft` may need a minute instead of ten milliseconds. A program
-hangs if it uses no processor time and does not wait for a processor or a disk.
+A time limit alone is not enough: under emulation or load, `nft` may need a minute instead of ten milliseconds. A
+program hangs if it uses no processor time and waits for neither a processor nor a disk.
 """
 
 import logging
@@ -12,10 +12,10 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 STILL_SECONDS = 20.0
-LONGEST_SECONDS = 600.0  # also for an endless loop
+LONGEST_SECONDS = 600.0  # limit even for a program that progresses, such as an endless loop
 _LOOK_SECONDS = 0.5
 _SAY_SECONDS = 10.0
-# Fields of /proc/PID/stat after the name: proc_pid_stat(5).
+# Indexes of fields in /proc/PID/stat after the process name: proc_pid_stat(5).
 _STATE, _MAJOR_FAULTS, _TIMES = 0, 9, slice(11, 13)
 
 Start = Callable[..., "subprocess.Popen[str]"]
@@ -45,7 +45,7 @@ class ProcessActivity:
 
 
 def run_program(program: Start, text: str, what: str) -> tuple[int, str, str]:
-    """Start a program, send its input and wait for its end; return exit status, output and errors.
+    """Start a program, send its input and wait for its end; return exit status, standard output and standard error.
 
     `program` gets the pipes as arguments of `subprocess.Popen`. Raises `TimeoutError`, `OSError`.
     """
@@ -56,12 +56,12 @@ def run_program(program: Start, text: str, what: str) -> tuple[int, str, str]:
 
 
 def communicate(process: "subprocess.Popen[str]", text: str, what: str) -> tuple[str, str]:
-    """Send a program its input and wait for its end; return output and errors. Log long waits for `what`.
+    """Send a program its input and wait for its end; return standard output and error. Log long waits for `what`.
 
     Raises `TimeoutError` if it hangs, after it is killed.
     """
     began, progress, said = time.monotonic(), ProcessActivity(process.pid), _SAY_SECONDS
-    # A second `communicate` would not continue the input.
+    # Send the input here: a second call of `Popen.communicate` would not continue it.
     with ThreadPoolExecutor(1, "communicate") as pool:
         talk = pool.submit(process.communicate, text)
         while not wait((talk,), _LOOK_SECONDS).done:

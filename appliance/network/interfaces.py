@@ -1,7 +1,7 @@
 """Change interfaces, addresses and routes in a namespace, over netlink.
 
-Every function waits until the kernel is done. Addresses have the form `10.77.0.10/24` or `fd77::10/64`. An IPv6 address
-can be used at once, without duplicate address detection, because the networks made here have no other hosts.
+Every function waits until the kernel is done. Addresses have the form `10.77.0.10/24` or `fd77::10/64`. IPv6 addresses
+skip duplicate address detection, because the networks made here have no other hosts, so they are usable at once.
 """
 
 import ipaddress
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) -> None:
-    """Make a veth pair, one end in each namespace, both up."""
+    """Make a veth pair with one end in each namespace, and set both ends up."""
     for name in (near_name, far_name):
         if not 0 < len(name) <= IFNAMSIZ:
             raise ValueError(f"interface name {name!r} must have 1 to {IFNAMSIZ} characters")
@@ -42,7 +42,7 @@ def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) 
 
 
 def create_bridge(namespace: Namespace, name: str) -> None:
-    """Make a bridge without spanning tree, up."""
+    """Make a bridge without spanning tree, and set it up."""
     _netlink(
         namespace,
         f"creating the bridge {name}",
@@ -97,7 +97,7 @@ def add_address(namespace: Namespace, name: str, address: str) -> None:
 
 
 def delete_address(namespace: Namespace, name: str, address: str) -> None:
-    """Remove an address from the interface `name`, if it has it."""
+    """Remove an address from the interface `name`, if the interface has it."""
     interface = ipaddress.ip_interface(address)
 
     def delete(route: Any) -> None:
@@ -156,7 +156,7 @@ def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
         names = _names(route)
         held: dict[str, list[str]] = {name: [] for name in names.values()}
         for entry in route.get_addr():
-            # On a point-to-point link IFA_ADDRESS is the other end's. IPv6 has IFA_LOCAL only on such a link.
+            # On a point-to-point link, IFA_ADDRESS is the other end's address. IPv6 has IFA_LOCAL only on such a link.
             own = entry.get_attr("IFA_LOCAL") or entry.get_attr("IFA_ADDRESS")
             held.setdefault(names.get(entry["index"], ""), []).append(f"{own}/{entry['prefixlen']}")
         return held
@@ -196,7 +196,7 @@ def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
 
 
 def networks(namespace: Namespace) -> list[str]:
-    """Return every network of a route or an address of the namespace, without default routes."""
+    """Return the network of every route and address of the namespace, except default routes."""
 
     def read(route: Any) -> list[str]:
         routes = [
@@ -210,7 +210,7 @@ def networks(namespace: Namespace) -> list[str]:
 
 
 def source_address_for(namespace: Namespace, peer: str) -> str:
-    """Return the source address of packets to `peer` by the routing table. Raises `NetworkError` without a route."""
+    """Return the source address that the routing table gives packets to `peer`. Raises `NetworkError` if no route."""
     family = _family(peer)
 
     def look_up(route: Any) -> str:
@@ -224,7 +224,7 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
 
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
-    """Run `work` with a netlink socket of the namespace; errors have the operation and the namespace."""
+    """Run `work` with a netlink socket of the namespace; errors name the operation `what` and the namespace."""
     from pyroute2 import IPRoute  # noqa: PLC0415  a hundred modules, only needed to change a network
     from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415  likewise
 

@@ -8,19 +8,19 @@
                      +-------------------------------+         +---------------------------+
 ```
 
-1. Packets to an address of the host for a forwarded port go to the namespace with their source address. The host's own
-   processes reach it by any address of the host and by 127.0.0.1 (::1 stays refused, because it cannot leave a host).
-   Connections of the appliance have the host's address on the network.
-2. A connection arrives with the address of the machine that made it. Address translation by other programs (for
-   containers, virtual machines, hotspot clients) does not apply to the appliance's link: the first translation of a
-   connection wins, and ROSRV-KEEP, which keeps the source, comes first. If a forwarded packet still has an address of
-   this machine, ROSRV-POST drops it. If these rules are flushed, the appliance detects such packets by their TTL: the
-   host's own packets have 255 on that link, and a router decreases it.
-3. Nothing else in the namespace can be reached through the host, and the host does not become a router: forwarding is
+1. Packets to a forwarded port at any address of the host go to the namespace and keep their source address. The host's
+   own processes reach the port by any address of the host and by 127.0.0.1; ::1 stays refused, because it cannot leave
+   a host. On the network, the appliance's own connections have the host's address.
+2. A connection arrives with the address of the machine that made it. Other programs translate addresses (for
+   containers, virtual machines, hotspot clients), but not on the appliance's link. The first translation of a
+   connection wins, and the chain ROSRV-KEEP, which keeps the source, comes first. If a forwarded packet still has an
+   address of this machine, the chain ROSRV-POST drops it. If these rules are flushed, the appliance detects such
+   packets by their TTL: the host's own packets have 255 on the link, and a router decreases the TTL.
+3. Other ports in the namespace cannot be reached through the host, and the host does not become a router: forwarding is
    enabled, but the chain ROSRV-FWD passes only the appliance's packets.
-4. Every change is recorded first, so that `down`, or `up` after a crash, undoes it. A namespace or interface of the
-   same name without a record is an error.
-5. One appliance runs on a host. Its lock ends with the process, so a record without a lock is left from a crash.
+4. Every change is recorded before it is made, so that `down`, or `up` after a crash, undoes it. A namespace or an
+   interface of the same name without a record is an error.
+5. Only one appliance runs on a host. Its lock ends with its process, so a record without a lock is left from a crash.
 """
 
 import contextlib
@@ -69,7 +69,7 @@ class IsolationSettings:
 
     ports: tuple[PortRange, ...]  # TCP
     name: str = "rosrv"
-    directory: Path = Path("/run/rosrv")  # of record and lock, the same for all appliances of a host
+    directory: Path = Path("/run/rosrv")  # for the record and the lock; shared by all appliances of a host
 
     def __post_init__(self) -> None:
         if not self.ports:
@@ -77,13 +77,13 @@ class IsolationSettings:
 
     @property
     def link(self) -> str:
-        """Return the host's end of the veth pair."""
+        """Return the interface name of the host's end of the veth pair."""
         return f"veth-{self.name}"[: interfaces.IFNAMSIZ]
 
 
 @dataclass(frozen=True)
 class LinkAddresses:
-    """The addresses of a subnet: the host's and the appliance's, without prefix length."""
+    """The two addresses of a subnet, the host's and the appliance's, without prefix length."""
 
     network: str
     host: str
@@ -99,7 +99,7 @@ class _IpForwarding:
     """The forwarding settings of one host: enable them, and restore them.
 
     The kernel copies the global setting to every interface, so the value of each interface is also recorded. A host
-    that forwards ignores router advertisements, its source of IPv6 routes, unless `accept_ra` is 2.
+    gets its IPv6 routes from router advertisements; if it forwards, it ignores them unless `accept_ra` is 2.
     """
 
     def __init__(self, host: Namespace) -> None:
@@ -112,7 +112,7 @@ class _IpForwarding:
         return self._host.sysctl("net/ipv6/conf/all/disable_ipv6") == "0"
 
     def before(self, family: Family) -> bool:
-        """Whether the host already forwards."""
+        """Whether the host forwards packets of a family, before `enable` changes that."""
         return self._host.sysctl(_GLOBAL[family]) != "0"
 
     def record(self) -> dict[str, str]:
@@ -157,9 +157,9 @@ class Isolation:
         self._lock: int | None = None
 
     def up(self) -> None:
-        """Make the namespace, its addresses and its forwarding, after removing what a crash left.
+        """Remove leftovers of a crash; make the namespace, its addresses and its forwarding.
 
-        Raises `PrivilegeError`, or `NetworkError` with the obstacle, and then leaves nothing behind.
+        Raises `PrivilegeError`, or `NetworkError` with the obstacle; the host is then left unchanged.
         """
         require_privileges("isolation netns")
         self._take_lock()
@@ -192,7 +192,7 @@ class Isolation:
         return interfaces.source_address_for(self._host, peer)
 
     def endpoint(self) -> PublicAddress:
-        """Return where hosts of other networks reach the host. Raises `NetworkError` if that is not known."""
+        """Return the address at which other networks' hosts reach this host. Raises `NetworkError` if unknown."""
         return outward_address(self._host, without=("lo", self.settings.link))
 
     def obstacles(self) -> tuple[str, ...]:
@@ -209,7 +209,7 @@ class Isolation:
     def translations(self) -> tuple[str, ...]:
         """Return chains of other programs on the host that translate addresses of machines or containers.
 
-        They do not apply to connections to the appliance.
+        These translations do not apply to connections to the appliance.
         """
         return (*self._backend.foreign_translations(), *iptables.foreign_translations(self._host))
 
@@ -241,7 +241,7 @@ class Isolation:
         self._forget_tunnels()
 
     def _forget_tunnels(self) -> None:
-        """Make the next packet of each tunnel follow the present rules."""
+        """Delete the tunnels' entries in the connection tracker, so their next packets follow the present rules."""
         from appliance.network import conntrack  # noqa: PLC0415  pyroute2: see `links`
 
         conntrack.forget(self._host, [port.first for port in _TUNNELS])
@@ -258,7 +258,7 @@ class Isolation:
                 self._host, settings.link, ends.appliance, source=ends.host, hop_limit=255
             )
             interfaces.add_route(inside, "default", ends.host)
-            if family == 4:  # so that packets from 127.0.0.1 may leave on this link
+            if family == 4:  # let packets from 127.0.0.1 leave on this link
                 self._host.sysctl(f"net/ipv4/conf/{settings.link}/route_localnet", "1")
         routers = tuple(family for family in self.ends if self._forwarding.before(family))
         self._routers = routers
@@ -316,14 +316,14 @@ class Isolation:
         return self.settings.directory / "isolation.json"
 
     def _recorded_name(self) -> str:
-        """Return the name of the running appliance's namespace, for a message."""
+        """Return the name of the running appliance's namespace, for an error message."""
         try:
             return f"namespace {json.loads(self._record.read_text(encoding='utf-8'))['namespace']}"
         except (OSError, ValueError, KeyError, TypeError):
             return "still starting"
 
     def _write_record(self) -> None:
-        """Record what to restore, before any change."""
+        """Record, before any change, the settings to restore."""
         record = {
             "namespace": self.settings.name,
             "link": self.settings.link,
@@ -341,7 +341,7 @@ class Isolation:
             return
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise NetworkError(f"{self._record} cannot be read ({error}): check it and delete it") from error
-        self._forwarding.restore(settings)  # before ROSRV-FWD, which keeps the host from routing, is removed
+        self._forwarding.restore(settings)  # first: without ROSRV-FWD the host would route
         self._backend.remove()
         interfaces.delete_link(self._host, link)
         end_processes(leftover.processes())
@@ -357,7 +357,7 @@ def isolation_rules(
     *,
     udp: tuple[PortRange, ...] = (),
 ) -> tuple[PacketRule, ...]:
-    """Return the rules on the host; `routers` are the families for which the host was a router before.
+    """Return the rules on the host; `routers` are the address families for which the host was already a router.
 
     `udp` ports are forwarded besides the TCP ports of the settings.
     """
@@ -442,7 +442,7 @@ _Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
 def _choose(pool: _Network, length: int, taken: list[_Network]) -> LinkAddresses:
-    """Return the ends of the first subnet of the pool without a route on the host."""
+    """Return the ends of the pool's first subnet that overlaps no network in `taken`."""
     candidates: Iterator[_Network] = iter(pool.subnets(new_prefix=length))
     for candidate in itertools.islice(candidates, _CANDIDATES):
         if not any(candidate.version == other.version and candidate.overlaps(other) for other in taken):

@@ -1,4 +1,4 @@
-"""Read the kernel's tables of listening sockets, in the namespace of the calling thread."""
+"""Read the kernel's tables of listening sockets in the calling thread's network namespace."""
 
 import ipaddress
 import sys

@@ -1,14 +1,14 @@
 """Make network namespaces, run code and programs in them, and delete them.
 
-A namespace is a name under `/run/netns`, as with `ip netns`. A *thread* is in a namespace, so each call gets its own
-thread, which moves into the namespace and ends there:
+A namespace is a name under `/run/netns`, as with `ip netns`. A *thread*, not a process, is in a namespace. So each call
+gets its own thread, which moves into the namespace and ends there:
 
-1. No other thread of this process is in the namespace, and no return from it can fail.
-2. A program started with `popen` is inside before its first instruction. Only `subprocess` runs between fork and exec,
-   so `popen` is safe in a process with threads.
+1. No other thread of this process is in the namespace, and no thread has to return from it, which could fail.
+2. A program started with `popen` is inside the namespace before its first instruction. Only `subprocess` runs between
+   fork and exec, so `popen` is safe in a process with threads.
 3. The netlink library works whether or not the calling thread runs an asyncio loop.
 
-A program with `PR_SET_PDEATHSIG` would be killed when `popen` returns, because its parent *thread* ends then. Use
+A program with `PR_SET_PDEATHSIG` would be killed when `popen` returns, because its parent *thread* then ends. Use
 `entered()` for such a program.
 """
 
@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 DIRECTORY = Path("/run/netns")
-_HERE = Path("/proc/thread-self/ns/net")  # of the calling thread
+_HERE = Path("/proc/thread-self/ns/net")  # the calling thread's namespace
 _CLONE_NEWNET = 0x40000000
 _MS_BIND, _MS_REC, _MS_SHARED, _MNT_DETACH = 0x1000, 0x4000, 0x100000, 2
 _CAP_NET_ADMIN, _CAP_SYS_ADMIN = 12, 21
@@ -44,7 +44,7 @@ T = TypeVar("T")
 
 
 class NetworkError(RuntimeError):
-    """Report an obstacle in this machine's network; the message says what, where and what to do."""
+    """Report an obstacle in this machine's network; the message has the cause, the place and the remedy."""
 
 
 class PrivilegeError(NetworkError):
@@ -52,7 +52,7 @@ class PrivilegeError(NetworkError):
 
 
 def has_privileges() -> bool:
-    """Whether this process has CAP_SYS_ADMIN and CAP_NET_ADMIN, to make namespaces."""
+    """Whether this process has CAP_SYS_ADMIN and CAP_NET_ADMIN, which making namespaces needs."""
     return _has_capabilities(1 << _CAP_NET_ADMIN | 1 << _CAP_SYS_ADMIN)
 
 
@@ -93,7 +93,7 @@ class Namespace:
 
     @classmethod
     def own(cls) -> "Namespace":
-        """Return the namespace of this process; it can be neither made nor deleted."""
+        """Return the namespace of this process; the object can neither create nor delete it."""
         return _OwnNamespace()
 
     def __repr__(self) -> str:
@@ -114,7 +114,10 @@ class Namespace:
         return here.st_dev != above.st_dev
 
     def create(self) -> "Namespace":
-        """Create it, with only `lo`, which is down. Raises `PrivilegeError`, or `NetworkError` if the name exists."""
+        """Create the namespace; it has only `lo`, which is down.
+
+        Raises `PrivilegeError`, or `NetworkError` if the name exists.
+        """
         require_privileges(f"creating the network namespace {self.name}")
         with _directory_lock():
             if self.exists():
@@ -134,7 +137,7 @@ class Namespace:
         _mount(_HERE, self.path, _MS_BIND)
 
     def delete(self) -> None:
-        """Delete the name, if it exists; the namespace itself ends with its last process."""
+        """Delete the name, if it exists; the kernel's namespace ends with its last process."""
         if self.exists():
             require_privileges(f"deleting the network namespace {self.name}")
             if _libc().umount2(os.fsencode(self.path), _MNT_DETACH) != 0:
@@ -168,13 +171,13 @@ class Namespace:
         return _in_thread(inside)
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """Start a program inside the namespace; `options` are those of `subprocess.Popen`."""
+        """Start a program inside the namespace; `options` are passed to `subprocess.Popen`."""
         return self.run(lambda: subprocess.Popen(args, **options))
 
     def sysctl(self, key: str, value: str | None = None) -> str:
-        """Set the kernel setting `key` if `value` is given; return its value.
+        """Return the value of the kernel setting `key`, after setting it to `value` if given.
 
-        `key` has the form `net.ipv4.ip_forward`, or slashes instead if an interface name in it has a dot.
+        `key` has the form `net.ipv4.ip_forward`; use slashes instead of dots if it has an interface name with a dot.
         """
         path = Path("/proc/sys", *key.split("/" if "/" in key else "."))
 
@@ -192,7 +195,7 @@ class Namespace:
         """Whether forged first packets can fill a listener's queue of half-open connections."""
         try:
             return self.sysctl("net.ipv4.tcp_syncookies") == "0"
-        except NetworkError:  # a kernel built without them
+        except NetworkError:  # the kernel was built without SYN cookies
             return True
 
     def processes(self) -> list[int]:
@@ -249,7 +252,7 @@ class _OwnNamespace(Namespace):
 
 
 def namespaces(prefix: str = "") -> list[Namespace]:
-    """Return the named namespaces whose name begins with `prefix`, including dead names."""
+    """Return the namespaces whose name begins with `prefix`, including names whose namespace no longer exists."""
     if not DIRECTORY.is_dir():
         return []
     names = sorted(entry.name for entry in DIRECTORY.iterdir())
@@ -257,13 +260,13 @@ def namespaces(prefix: str = "") -> list[Namespace]:
 
 
 def _in_thread(function: Callable[[], T]) -> T:
-    """Call `function` in a thread of its own."""
+    """Call `function` in a thread of its own; return its result or raise its exception."""
     outcome: Future[T] = Future()
 
     def work() -> None:
         try:
             outcome.set_result(function())
-        except BaseException as error:  # noqa: BLE001 - handed to the caller, who waits for it
+        except BaseException as error:  # noqa: BLE001 - handed to the caller, which waits for it
             outcome.set_exception(error)
 
     thread = threading.Thread(target=work, name="namespace", daemon=True)
@@ -274,7 +277,7 @@ def _in_thread(function: Callable[[], T]) -> T:
 
 @contextlib.contextmanager
 def _directory_lock() -> Iterator[None]:
-    """Make `/run/netns` a shared mount, as `ip netns add` does, under a lock."""
+    """Make `/run/netns` a shared mount, as `ip netns add` does; hold its lock during the block."""
     DIRECTORY.mkdir(mode=0o755, exist_ok=True)
     lock = os.open(DIRECTORY.parent / "rosrv-netns.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
@@ -288,7 +291,7 @@ def _directory_lock() -> Iterator[None]:
 
 
 def _is_mount_point(path: Path) -> bool:
-    """Whether something is mounted here (`os.path.ismount` misses a bind mount onto itself)."""
+    """Whether `path` is a mount point (`os.path.ismount` misses a bind mount onto itself)."""
     with Path("/proc/thread-self/mountinfo").open(encoding="utf-8", errors="replace") as lines:
         return any(line.split(" ", 5)[4] == str(path) for line in lines)
 
@@ -329,7 +332,7 @@ def is_contained(root: Path = Path("/")) -> bool:
 
 
 def bridges(classes: Path = Path("/sys/class/net")) -> list[str]:
-    """Return the bridges of this namespace: a container has none, a machine that runs containers has one."""
+    """Return the bridges of this namespace. A container has none; a machine that runs containers has at least one."""
     return sorted(link.name for link in classes.glob("*") if (link / "bridge").is_dir())
 
 

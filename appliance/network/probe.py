@@ -1,8 +1,8 @@
 """Probe a hidden port: try to reach it as another local user.
 
-At the start and every minute, a child process becomes an unprivileged user inside the namespace and connects to the
-port over loopback, IPv4 and IPv6. A refusal proves nothing without a listener, so the addresses of the listening
-sockets are also read; they show whether a socket listens outside loopback.
+At the start and every minute, a child process becomes an unprivileged user inside the namespace. It connects to the
+port over loopback, IPv4 and IPv6. Without a listener, a refusal proves nothing. So the addresses of the listening
+sockets are also read; they also show whether a socket listens outside loopback.
 """
 
 import ipaddress
@@ -64,19 +64,19 @@ class ProbeResult:
     port: int
     uid: int
     attempts: tuple[ConnectAttempt, ...]
-    # Addresses with a listener on the port; without a listener nothing is proven.
+    # Addresses with a listener on the port. Without a listener, a refusal proves nothing.
     listening: tuple[str, ...]
 
     @property
     def closed(self) -> bool:
-        """Whether no attempt connected, and every outcome is clear."""
+        """Whether every attempt has a clear outcome and none connected."""
         return not any(
             attempt.outcome in (ConnectOutcome.REACHED, ConnectOutcome.UNCLEAR) for attempt in self.attempts
         )
 
     @property
     def listening_outside(self) -> tuple[str, ...]:
-        """Return the addresses of `listening` that are not loopback."""
+        """Return the addresses in `listening` that are not loopback addresses."""
         return tuple(text for text in self.listening if not ipaddress.ip_address(text).is_loopback)
 
     def describe(self) -> str:
@@ -88,7 +88,7 @@ class ProbeResult:
 
 
 def probe_port(namespace: Namespace, port: int, uid: int = PROBE_UID) -> ProbeResult:
-    """Try to reach `port` over loopback as the user `uid`, not root. Raises `NetworkError` if that cannot be tried."""
+    """Try to reach `port` over loopback as the user `uid`, not root. Raises `NetworkError` if the probe cannot run."""
     if uid <= 0:
         raise ValueError("the probe must run as an unprivileged user, not as root")
     listening = namespace.run(lambda: listening_addresses(port))

@@ -1,7 +1,7 @@
 """Find the address by which hosts of other networks reach this machine.
 
-The machine cannot see address translation, or published ports of its container, in front of it. So an address has a
-reason; operators see it and can configure another address.
+The machine cannot see address translation in front of it, such as a container's published ports. So each address comes
+with the reason for its choice; operators see the reason and can configure another address.
 """
 
 import ipaddress
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from appliance.network import interfaces
 from appliance.network.namespaces import Namespace, NetworkError
 
-_VERSIONS = (4, 6)  # IPv4 first, which every ROS 1 host has
+_VERSIONS = (4, 6)  # IPv4 first, because every ROS 1 host has it
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class PublicAddress:
 def outward_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddress:
     """Return the address towards the default route; without such a route, the only address.
 
-    Interfaces in `without` do not count. Raises `NetworkError` if there is no such address, or several.
+    Interfaces in `without` do not count. Raises `NetworkError` if there is no such address or more than one.
     """
     for version in _VERSIONS:
         route = interfaces.default_route(namespace, version)
@@ -38,9 +38,9 @@ def outward_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAd
 
 
 def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddress:
-    """Return the only IPv4 address of all interfaces but those in `without`; if there is none, the only IPv6 address.
+    """Return the only IPv4 address of all interfaces except `without`; without IPv4, the only IPv6 address.
 
-    Raises `NetworkError` if there is none, or several.
+    Raises `NetworkError` if there is no such address or more than one.
     """
     held = interfaces.addresses_by_interface(namespace)
     own = [text.partition("/")[0] for name, texts in held.items() if name not in without for text in texts]
@@ -58,7 +58,7 @@ def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddre
 
 
 def _first(namespace: Namespace, route: interfaces.DefaultRoute, version: int) -> str | None:
-    """Return the source address of packets to the gateway; without a gateway (a modem), the interface's first one."""
+    """Return the source address of packets to the gateway; without one (a modem), the interface's first address."""
     if route.gateway is not None:
         return interfaces.source_address_for(namespace, route.gateway)
     held = interfaces.addresses_by_interface(namespace).get(route.interface, [])

@@ -1,10 +1,10 @@
-"""Scan TCP ports: find those of a machine that accept a connection from here.
+"""Scan a machine's TCP ports: find the ports that accept a connection from here.
 
 Many connections are tried at once, each with its own time limit, so the scan takes at most
-`len(ports) / AT_ONCE * seconds`. An open connection is reset at once without data.
+`len(ports) / AT_ONCE * seconds`. A connection that opens is reset at once without data.
 
-A connection that fails before a packet leaves (no route, a rule of this machine) does not show whether the port is
-open. Only the result of `connect` shows such a failure; the socket reports no error later.
+If a connection fails before a packet leaves (no route, a rule of this machine), it is unknown whether the port is open.
+Only the result of `connect` shows such a failure; the socket reports no error later.
 """
 
 import errno
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from appliance.network.namespaces import NetworkError
 
-AT_ONCE = 256  # connections, fewer where the process may not open as many files
+AT_ONCE = 256  # connections; fewer if the process may not open as many files
 _REFUSED = (errno.ECONNREFUSED, errno.ECONNRESET)
 _UNDER_WAY = (0, errno.EINPROGRESS)
 _SILENT = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ETIMEDOUT, errno.EACCES, errno.EPERM)
@@ -34,7 +34,7 @@ class ScanResult:
     refused: int  # ports that answered with a reset
     silent: int  # ports without an answer in time, or unreachable
     untried: int = 0  # ports to which no packet could be sent from here
-    obstacle: str = ""  # the reason for the last of them
+    obstacle: str = ""  # why the last untried port could not be tried
 
     @property
     def answered(self) -> bool:
@@ -87,7 +87,7 @@ def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
 
 
 def _at_once() -> int:
-    """Return the number of connections to try at once: `AT_ONCE`, or as many files as the process may still open."""
+    """Return the number of connections to try at once: `AT_ONCE`, limited by the files the process may still open."""
     used = len(os.listdir("/proc/self/fd"))  # noqa: PTH208  only their number counts
     return max(1, min(AT_ONCE, resource.getrlimit(resource.RLIMIT_NOFILE)[0] - used))
 
@@ -108,7 +108,7 @@ def _try(address: str, port: int, seconds: float) -> tuple[bool, int]:
 
 
 def _is_own(address: str) -> bool:
-    """Whether an address is this machine's own: packets to it would have the same source."""
+    """Whether an address is this machine's own: packets to it would have the same address as source."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:

@@ -20,7 +20,7 @@ class RuleCounter:
     """A rule in the kernel, with its counters."""
 
     chain: str
-    family: Family | None  # None: one rule for both
+    family: Family | None  # None: one rule for both families
     purpose: str
     packets: int
     octets: int
@@ -35,7 +35,7 @@ class Backend(Protocol):
 
     @property
     def families(self) -> tuple[Family, ...]:
-        """Return the address families of the rules: those that the kernel has."""
+        """Return the address families of the rules: those that the kernel supports."""
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
         """Replace all rules of the appliance; rules of other programs stay.

@@ -1,8 +1,8 @@
-"""Test that a back end works here, with a port of our own on loopback.
+"""Test on a loopback port of our own that a back end works on this machine.
 
 A kernel may accept rules that it never applies (a match extension is a stub, or a container engine filters the calls).
-So a back end is used only after three tests on IPv4 and IPv6: the port is reached without a rule, refused with a rule
-for another user, and reached with a rule for this user.
+So a back end is used only after three tests on IPv4 and IPv6. The port must be reached without a rule, refused with a
+rule for another user, and reached with a rule for this user.
 """
 
 import errno
@@ -13,7 +13,7 @@ from appliance.network.firewall.backend import Backend, FirewallError
 from appliance.network.firewall.firewall_rules import inner_port
 from appliance.network.namespaces import Namespace
 
-_SECONDS = 20.0  # for a slow machine: usually the answer comes at once
+_SECONDS = 20.0  # enough for a slow machine; usually the answer comes at once
 _LOOPBACK = ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1"))
 
 
@@ -25,7 +25,7 @@ def prove(backend: Backend, namespace: Namespace) -> None:
             with namespace.entered():
                 server = _listen(family, address)
             if server is None:
-                continue  # this family is missing, so there is nothing to protect
+                continue  # the machine lacks this family, so no port needs protection
             with server:
                 port = server.getsockname()[1]
                 _expect(namespace, server, "before any rule", reached=True)
@@ -47,7 +47,7 @@ def _listen(family: socket.AddressFamily, address: str) -> socket.socket | None:
 
 
 def _expect(namespace: Namespace, server: socket.socket, when: str, *, reached: bool) -> None:
-    """Connect to `server` from the namespace. Raises `FirewallError` unless the result is `reached`."""
+    """Connect to `server` from the namespace. Raises `FirewallError` unless the outcome is as `reached` demands."""
     address = server.getsockname()[:2]
 
     def connect() -> str | None:

@@ -1,7 +1,7 @@
 """Run the firewall of the appliance's namespace: choose a back end that works, install the rules, report them.
 
 Call `install` before `rosmaster` starts, `update` when a port becomes known or a host is enrolled, and `remove` at the
-end. `install` replaces rules of an earlier run, of either back end.
+end. `install` also replaces rules of an earlier run, whichever back end installed them.
 """
 
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ BackendChoice = Literal["auto", "nft", "iptables"]
 class FirewallReport:
     """The state of the firewall."""
 
-    backend: str | None  # None: not installed
+    backend: str | None  # None: no rules are installed
     rules: tuple[FirewallRule, ...]
-    not_used: tuple[str, ...]  # why a back end was not used
+    not_used: tuple[str, ...]  # the reason for each back end that was not used
 
     @property
     def intact(self) -> bool:
@@ -33,7 +33,7 @@ class FirewallReport:
 
 
 class Firewall:
-    """The rules of one namespace, with a given back end or the first that works (nft, then iptables)."""
+    """The rules of one namespace, with the given back end or the first one that works (nft, then iptables)."""
 
     def __init__(self, namespace: Namespace, backend: BackendChoice = "auto") -> None:
         self._namespace = namespace
@@ -56,7 +56,7 @@ class Firewall:
         return self._backend.name
 
     def update(self, settings: FirewallSettings) -> None:
-        """Replace the rules by those of new settings. Raises `FirewallError`; the old rules then stay in force."""
+        """Replace the rules according to new settings. Raises `FirewallError`; the old rules then stay in force."""
         if self._backend is None:
             raise FirewallError("the firewall is not installed yet: call install first")
         rules = appliance_rules(settings)
@@ -84,10 +84,10 @@ class Firewall:
         return (NftBackend(self._namespace), IptablesBackend(self._namespace))
 
     def _choose(self, rules: tuple[PacketRule, ...]) -> Backend:
-        """Return the first back end that works and accepts all rules, which are then installed."""
+        """Install the rules with the first back end that works and accepts all of them; return the back end."""
         backends = self._all()
         for backend in backends:
-            self._clear(backend)  # first: an old rule of either would disturb the test
+            self._clear(backend)  # an old rule of any back end would disturb the test
         self._not_used = []
         for backend in backends:
             if self._choice in ("auto", backend.name):
@@ -105,7 +105,7 @@ class Firewall:
         )
 
     def _clear(self, backend: Backend) -> None:
-        """Remove old rules of a back end. A back end that cannot be used here has none."""
+        """Remove old rules of a back end. A back end that this machine lacks has no rules."""
         try:
             backend.remove()
         except FirewallError as error:
@@ -117,9 +117,9 @@ class Firewall:
 def statuses(
     rules: tuple[PacketRule, ...], counters: tuple[RuleCounter, ...], families: tuple[Family, ...] = (4, 6)
 ) -> tuple[FirewallRule, ...]:
-    """Join the rules with their counters in the kernel, the sum of both families.
+    """Join the rules with their counters in the kernel; a rule's counters are summed over both address families.
 
-    A rule is in force if the kernel has it once for each of its families (or once for both); only `families` count.
+    A rule is in force if the kernel has it once for each of its families, or once for both. Only `families` count.
     """
     of_rule: dict[tuple[str, str], list[RuleCounter]] = {}
     for counter in counters:

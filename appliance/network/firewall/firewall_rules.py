@@ -1,9 +1,9 @@
 """Define the rules of the firewall as data. No I/O.
 
-1. The rules only refuse, or RETURN to the rules of other programs: they open nothing that another firewall closed.
-2. A connection is refused at its first packet, a SYN without ACK, whatever the connection tracker knows. So a `NOTRACK`
-   rule cannot open the port, and packets of closed sockets pass (rejecting them would delay their end).
-3. Permitted users are listed; all others, and packets without a known owner, are refused.
+1. The rules only refuse, or RETURN to the rules of other programs, so they open no port that another firewall closed.
+2. A connection is refused at its first packet, a SYN without ACK, without the connection tracker. So a `NOTRACK` rule
+   cannot open the port. Packets of closed sockets pass, because rejecting them would delay the end of a connection.
+3. Permitted users are listed; all other users, and packets without a known owner, are refused.
 4. A limit per host counts connections after the handshake, because the address of a first packet can be forged.
 """
 
@@ -39,8 +39,8 @@ class Hook(NamedTuple):
     priority: int = 0
 
 
-# The first matching chain of the kind `nat` translates a connection, whichever program made the chain. Other programs
-# use priority 100 (firewalld: 110); none may be below -199.
+# The first matching chain of type `nat` translates a connection, whichever program made the chain. Other programs use
+# priority 100 (firewalld: 110); the kernel permits no priority below -199 for this type.
 HOOKS: dict[Chain, tuple[Hook, ...]] = {
     Chain.IN: (Hook("INPUT"),),
     Chain.OUT: (Hook("OUTPUT"),),
@@ -64,8 +64,8 @@ class PacketVerdict(StrEnum):
     DNAT = "DNAT"
     MASQUERADE = "MASQUERADE"
     COUNTED = "COUNTED"  # mark the connection; `answered` no longer matches
-    KEEP_SOURCE = "KEEP SOURCE"  # translate to the present source, so no later chain can change it
-    # set TTL or hop limit to 255 and continue; routers decrease it
+    KEEP_SOURCE = "KEEP SOURCE"  # translate to the present source, so no later chain can translate it
+    # Set the TTL or hop limit to 255 and continue; routers decrease it.
     FULL_HOPS = "FULL HOPS"
 
 
@@ -88,7 +88,7 @@ class PortRange:
         return cls(port, port)
 
     def overlaps(self, other: "PortRange") -> bool:
-        """Whether a port is in both."""
+        """Whether the ranges share a port."""
         return self.first <= other.last and other.first <= self.last
 
     def __str__(self) -> str:
@@ -97,7 +97,7 @@ class PortRange:
 
 @dataclass(frozen=True)
 class Interface:
-    """A network interface; with `other`, every other interface."""
+    """A network interface; `other` means every interface except this one."""
 
     name: str
     other: bool = False
@@ -108,7 +108,7 @@ class Interface:
 
 @dataclass(frozen=True)
 class RateLimit:
-    """A limit that matches more than `per_second` new connections of one host, after a burst of `burst`."""
+    """A limit per host; it matches new connections above `per_second`, after a burst of `burst`."""
 
     per_second: int
     burst: int
@@ -126,28 +126,28 @@ class PacketRule:
     verdict: PacketVerdict
     _: KW_ONLY
     chain: Chain
-    family: Family | None = None  # None: both
+    family: Family | None = None  # None: both families
     arrives_on: Interface | None = None
     leaves_on: Interface | None = None
     source: str | None = None
     destination: str | None = None
     tcp_ports: PortRange | None = None
     udp_ports: PortRange | None = None
-    from_ports: PortRange | None = None  # of TCP
+    from_ports: PortRange | None = None  # TCP source ports
     opening: bool = False  # a SYN without ACK
     accepting: bool = False  # a SYN with ACK: the answer of a listening socket
     uid: int | None = None  # the owner of the local socket; chain OUT only
-    clear_text: bool = False  # did not come (OUT: does not leave) through IPsec
+    clear_text: bool = False  # did not arrive (chain OUT: does not leave) through IPsec
     above: RateLimit | None = None
-    local_destination: bool = False  # an address of this machine
-    local_source: bool = False  # an address of this machine
-    forwarded: bool | None = None  # chain LEAVING only: for another machine (False: made here)
+    local_destination: bool = False  # the destination is an address of this machine
+    local_source: bool = False  # the source is an address of this machine
+    forwarded: bool | None = None  # chain LEAVING only: forwarded for another machine (False: made here)
     distant: bool = False  # forwarded by a router: TTL or hop limit below 255
     new_connection: bool = False  # new to the connection tracker
-    unknown: bool = False  # not of a tracked connection: new, untracked, invalid
-    answered: bool = False  # of an uncounted connection whose opener answered our SYN-ACK
-    translated: bool = False  # of a connection with a translated destination
-    to: str | None = None  # of DNAT: the address
+    unknown: bool = False  # belongs to no tracked connection: new, untracked or invalid
+    answered: bool = False  # belongs to an uncounted connection whose opener answered our SYN-ACK
+    translated: bool = False  # belongs to a connection with a translated destination
+    to: str | None = None  # for DNAT: the new destination address
 
     def __post_init__(self) -> None:
         impossible = {
@@ -172,7 +172,7 @@ class PacketRule:
         return self.tcp_ports is not None or self.from_ports is not None or self.opening or self.accepting
 
     def families(self) -> tuple[Family, ...]:
-        """Return the families of the rule: its own, that of its addresses, or both."""
+        """Return the families of the rule: its own family, else the family of its addresses, else both."""
         given = self.source or self.destination or self.to
         if given is not None:
             return (family_of(given),)
@@ -217,7 +217,7 @@ class ForwarderAccess:
     uid: int
     address: str
     port: int
-    datagrams: bool = False  # UDP, else TCP
+    datagrams: bool = False  # True: UDP; False: TCP
 
     def __post_init__(self) -> None:
         PortRange.one(self.port)
@@ -230,9 +230,9 @@ class ForwarderAccess:
 class OwnNodeAccess:
     """Access to and from the appliance's own node (rosout).
 
-    The node listens on every address: for its node API at a port that the kernel chooses, and for messages at one of
-    `ports`. Its API is called at `address`, a loopback address that only control may connect to; only the relay may
-    connect to `ports`. `master_port` is the port of its master (None: not known yet).
+    The node listens on every address: for its node API on a port that the kernel chooses, and for messages on one of
+    `ports`. Only control may call the API, at the loopback address `address`; only the relay may connect to `ports`.
+    `master_port` is the port of the node's master (None: not known yet).
     """
 
     uid: int
@@ -253,9 +253,10 @@ class FirewallSettings:
 
     `rosmaster_port` and `inner_port` may be unknown (None) until their processes run. Hosts in `tunnel_only` are
     accepted through IPsec only: by the kernel's policy, or on `tunnel_interface` if ESP runs in user space.
-    `api_networks` may reach the REST port besides loopback. `neighbours` are addresses of the machine at the other end
-    of the link (isolation netns): only its own packets may have them, which arrive with a full TTL. `client_ports` is
-    the kernel's local port range, where the own node (rosout) listens on every address, whatever ROS_IP is.
+    `api_networks` and loopback may reach the REST port. `neighbours` are addresses of the machine at the other end of
+    the link (isolation netns); only packets from that machine itself, which arrive with a full TTL, may have them.
+    `client_ports` is the kernel's local port range; there the own node (rosout) listens on every address, even with
+    ROS_IP.
     """
 
     control_uid: int
@@ -294,7 +295,7 @@ LOOPBACK = Interface("lo")
 OUTSIDE = Interface("lo", other=True)
 _ANY_PORT = PortRange(1, MAX_PORT)
 
-# Conditions that most rules share: first packets from outside, and from local users over loopback.
+# Conditions that most rules share: first packets from outside, and first packets of local users over loopback.
 _arriving = partial(PacketRule, chain=Chain.IN, arrives_on=OUTSIDE, opening=True)
 _connecting = partial(PacketRule, chain=Chain.OUT, leaves_on=LOOPBACK, opening=True)
 _sending = partial(PacketRule, chain=Chain.OUT)
@@ -338,7 +339,7 @@ def family_of(address: str) -> Family:
 
 
 def inner_port(name: str, port: int | None, user: str, uid: int) -> tuple[PacketRule, ...]:
-    """Return the rules of a port that only one local user may connect to, over loopback; none for None."""
+    """Return the rules of a port that only one local user may connect to, over loopback; no rules without a port."""
     return () if port is None else _inner_ports(name, PortRange.one(port), user, uid)
 
 
@@ -351,7 +352,7 @@ def _inner_ports(name: str, ports: PortRange, user: str, uid: int) -> tuple[Pack
 
 
 def _rosmaster(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """Let `rosmaster` connect only to the master-side endpoint, once that exists."""
+    """Let `rosmaster` connect only to the master-side endpoint, once the endpoint exists."""
     if settings.inner_port is None:
         return ()
     uid = settings.rosmaster_uid
@@ -362,7 +363,7 @@ def _rosmaster(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """Let only control call the own node, and let that reach only its master, proxy endpoints and relays."""
+    """Let only control call the own node, and let the node reach only its master, proxy endpoints and relays."""
     node = settings.own_node
     if node is None:
         return ()
@@ -384,7 +385,7 @@ def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 def _ports_of_others(uid: int, settings: FirewallSettings) -> Iterator[PacketRule]:
     """Block the own node from RVMaster's port, REST, low ports, and the kernel's local port range.
 
-    The permitted ports are not listed instead, because a new policy may change them.
+    The rules list blocked instead of permitted ports, because a new policy may change the permitted ones.
     """
     chosen, faces = settings.client_ports, settings.node_ports
     if faces is not None and chosen is not None and faces.overlaps(chosen):
@@ -405,7 +406,7 @@ def _sends_nothing_out(name: str, uid: int) -> PacketRule:
 
 
 def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
-    """Accept packets of a network, and send to it, through its tunnel only."""
+    """Accept packets from a network, and send packets to it, only through its tunnel."""
     outside = Interface(interface, other=True) if interface else None
     refused = partial(PacketRule, verdict=PacketVerdict.DROP, clear_text=interface is None)
     return (
@@ -455,7 +456,7 @@ def _rate_limits(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[PacketRule]:
-    """Close the local port range, where the own node listens, to outside; except ports that are configured."""
+    """Close the local port range, where the own node listens, to other machines, except for configured ports."""
     if settings.client_ports is None:
         return
     chosen = {
@@ -475,7 +476,8 @@ def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[P
     """Limit the connections of each host; packets above the limit are dropped, and the host's kernel sends them again.
 
     The first packet after the handshake counts: its sender received our SYN-ACK, so its address is not forged. Against
-    forged first packets the kernel limits half-open connections, and answers more with SYN cookies, without memory.
+    forged first packets, the kernel limits half-open connections; above that limit it answers with SYN cookies, which
+    need no memory.
     """
     if limit is None:
         return ()

@@ -1,10 +1,11 @@
 """The iptables back end: legacy xtables through python-iptables (libiptc), IPv4 and IPv6.
 
-The chains are in the table `filter`; address translation needs nft (the library cannot build the NAT targets of current
-xtables). The rules of a family change in one commit. The library caches tables for the whole process, with the
-namespace they were opened in. So each call opens its tables in a thread inside the namespace, one at a time
-(`_ONE_AT_A_TIME`), and under the lock of the `iptables` programs. `Chain.append_rule` is not used, because it redirects
-the standard output of the whole process to check a rule.
+The chains are in the table `filter`. Address translation needs nft, because the library cannot build the NAT targets of
+current xtables. The rules of a family change in one commit.
+
+The library caches each table, with the namespace in which it was opened, for the whole process. So each call opens its
+tables in a thread inside the namespace, one call at a time (`_ONE_AT_A_TIME`), under the lock of the `iptables`
+programs. `Chain.append_rule` is not used: to check a rule, it redirects the standard output of the whole process.
 """
 
 import contextlib
@@ -32,7 +33,7 @@ from appliance.network.firewall.firewall_rules import (
 from appliance.network.namespaces import Namespace
 
 LOCK = Path("/run/xtables.lock")  # the lock of the `iptables-legacy` programs
-_ONE_AT_A_TIME = threading.Lock()  # guards state of the library, which is global
+_ONE_AT_A_TIME = threading.Lock()  # guards the library's global state
 _EXPIRE_MILLISECONDS = 10_000
 _MODPROBE_SECONDS = 20.0
 _MATCH_HEADER = 32  # bytes of struct xt_entry_match before its content
@@ -95,9 +96,9 @@ class IptablesBackend:
 
 
 def load_modules() -> None:
-    """Load the kernel modules of legacy xtables, which the kernel does not load automatically.
+    """Load the kernel modules of legacy xtables, because the kernel does not load them automatically.
 
-    Call this while the process may still load modules; `install` reports a failure.
+    Call this while the process may still load modules. A failure appears only later, as an error of `install`.
     """
     command = ["modprobe", "--quiet", "--all", "ip_tables", "ip6_tables"]
     with contextlib.suppress(OSError, subprocess.TimeoutExpired):  # a container has no modprobe
@@ -115,14 +116,14 @@ def foreign_forward_drops(namespace: Namespace) -> tuple[str, ...]:
 
 
 def _foreign(namespace: Namespace, name: str, look: "Callable[[_Table], list[str]]") -> tuple[str, ...]:
-    """Return what `look` finds in the table `name` of each family, if the table is in use."""
+    """Return the results of `look` for the table `name` of each family, if the table is in use."""
     found: list[str] = []
     _in_used_tables(namespace, name, lambda table: found.extend(look(table)))
     return tuple(found)
 
 
 def _in_used_tables(namespace: Namespace, name: str, work: "Callable[[_Table], None]") -> None:
-    """Run `work` with the table `name` of each family if it is in use; the library is loaded only then."""
+    """Run `work` with the table `name` of each family that uses it; the library is loaded only if one does."""
 
     def inside() -> None:
         used = [family for family in _families() if name in _tables_in_use(family)]
@@ -136,7 +137,7 @@ def _in_used_tables(namespace: Namespace, name: str, work: "Callable[[_Table], N
 
 
 def _tables_in_use(family: Family) -> list[str]:
-    """Return the tables in use; opening another one would create it."""
+    """Return the names of the tables in use. Opening an unused table would create it."""
     names = "ip6_tables_names" if family == 6 else "ip_tables_names"
     try:
         return Path("/proc/thread-self/net", names).read_text(encoding="ascii").split()
@@ -337,7 +338,7 @@ class _Table:
 
 
 def _comment(rule: Any) -> str:
-    """Read a rule's comment from its match; the library's own function would redirect our standard output."""
+    """Return a rule's comment, read from its match. The library's own function would redirect our standard output."""
     for match in rule.matches:
         if match.name == "comment":
             content = bytes(match.match_buf)[_MATCH_HEADER:]
@@ -366,14 +367,14 @@ def _opened(family: Family, name: str = "filter") -> Iterator[_Table]:
     finally:
         if table is not None:
             table.close()
-            type(table)._cache.pop(name, None)  # the cached table is of this namespace
+            type(table)._cache.pop(name, None)  # the cached table is bound to this namespace
 
 
 def _library() -> Any:
     try:
         with warnings.catch_warnings(action="ignore"):  # its sources are for an older Python
             import iptc  # noqa: PLC0415 - loading it looks for the C libraries, which a machine may lack
-    except Exception as error:  # the library raises bare exceptions if a C library is missing
+    except Exception as error:  # the library raises plain `Exception` if a C library is missing
         raise BackendMissingError(
             f"the firewall back end iptables needs libiptc and xtables: "
             f"sudo apt install iptables; a wheel, its extra [iptables] ({error})"

@@ -1,10 +1,12 @@
 """The nftables back end: libnftables' JSON through `nft -j -f -`, in one transaction.
 
-The appliance has its own table, `inet rosrv`, for IPv4 and IPv6. In it a base chain for each hook jumps to the chain
-with the rules, so the chains have the same names and shape as with iptables. Other tables can only refuse more.
+The appliance has its own table, `inet rosrv`, for IPv4 and IPv6. For each hook, a base chain in this table jumps to the
+chain with the rules. So the chains have the same names and structure as with iptables. Other tables can only refuse
+more packets.
 
-A limit per host is a set of buckets of limited size, and a rule that adds to a full set does not match. So a second
-rule gives all hosts without a bucket a shared one. (iptables drops packets if its table is full.)
+A limit per host uses a set of limited size with one bucket for each host. A rule that adds to a full set does not
+match, so a second rule gives all hosts without a bucket one shared bucket. (iptables drops packets if its table is
+full.)
 """
 
 import json
@@ -35,7 +37,7 @@ _METER_SIZE = 65535  # hosts
 _METER_SECONDS = 60
 _OF_A_FAMILY = (PacketVerdict.DNAT, PacketVerdict.KEEP_SOURCE, PacketVerdict.FULL_HOPS)
 _FULL_HOPS = 255
-_SHARED = " (no bucket left)"  # after the purpose, in the comment of the second rule
+_SHARED = " (no bucket left)"  # ends the comment of the second rule, after the purpose
 
 Json = dict[str, Any]
 _MARK: Json = {"ct": {"key": "mark"}}
@@ -45,7 +47,7 @@ class NftBackend:
     """The rules of one namespace in nftables."""
 
     name = "nft"
-    families: tuple[Family, ...] = (4, 6)  # a table of `inet` has both
+    families: tuple[Family, ...] = (4, 6)  # an `inet` table has both
 
     def __init__(self, namespace: Namespace) -> None:
         self._namespace = namespace
@@ -127,7 +129,7 @@ def render(rules: tuple[PacketRule, ...]) -> list[Json]:
 
 
 def render_rule(rule: PacketRule) -> list[Json]:
-    """Return the rule in libnftables' form, once or once per family."""
+    """Return the rule in libnftables' format: one rule, or one for each family."""
     same = rule.above is None and not rule.distant and rule.verdict not in _OF_A_FAMILY
     if same and len(rule.families()) == 2:
         return [_body(rule, [], None)]
@@ -178,7 +180,7 @@ def _body(rule: PacketRule, head: list[Json], family: int | None) -> Json:
 
 
 def _origin(rule: PacketRule, protocol: str) -> list[Json]:
-    """Return the matches of a packet's origin and destination by routes and interfaces."""
+    """Return the matches of a packet's origin and destination: routes and interfaces."""
     expressions: list[Json] = []
     if rule.local_destination:
         expressions.append(_match({"fib": {"result": "type", "flags": ["daddr"]}}, "local"))
@@ -231,7 +233,7 @@ def _over_limit(rule: PacketRule, protocol: str) -> Json:
 
 
 def _shared(rule: PacketRule, own: Json, family: Family) -> Json:
-    """Return the rule after `own`, for hosts without a bucket."""
+    """Return the second rule, which follows `own` and limits hosts without a bucket."""
     assert rule.above is not None  # noqa: S101 - the caller asked
     address = _payload("ip6" if family == 6 else "ip", "saddr")
     expressions: list[Json] = []
@@ -248,7 +250,7 @@ def _limit(above: RateLimit) -> Json:
 
 
 def _meter(rule: PacketRule, family: int) -> str:
-    """Return the name of the set of buckets: a host has one bucket for all ports."""
+    """Return the name of the set of buckets. A host has one bucket for all ports."""
     assert rule.above is not None  # noqa: S101 - the caller asked
     return f"new-ipv{family}-{rule.above.per_second}-{rule.above.burst}"
 
@@ -274,7 +276,7 @@ def _hook(chain: Chain, hook: Hook) -> list[Json]:
 
 
 def _delete_table() -> list[Json]:
-    """Delete the table if it exists: adding an existing table is not an error."""
+    """Return the commands that delete the table if it exists: adding an existing table first is not an error."""
     return [_table("add"), _table("delete")]
 
 
@@ -325,7 +327,7 @@ def _translates_source(rule: Json) -> bool:
 
 
 def _counters(rules: list[Json]) -> tuple[RuleCounter, ...]:
-    """Return the rules with their counters; the two rules of a limit count as one, and only together."""
+    """Return the rules with their counters. The two rules of a limit count as one rule, and only if both exist."""
     shared = {_key(counter): counter for counter in map(_counter, rules) if counter.purpose.endswith(_SHARED)}
     found = []
     for rule in rules:
