@@ -1,4 +1,4 @@
-/** Categories of decisions: name, the host's action, the letter of the graph's keys. */
+/** Categories of decisions: the name, the host's action, and the letter that the graph's keys use. */
 
 export const CATEGORIES = /** @type {[string, string, string][]} */ ([
   ["publish", "publish a topic", "t"], ["subscribe", "subscribe to a topic", "t"], ["offer", "offer a service", "s"],

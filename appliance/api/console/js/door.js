@@ -1,4 +1,4 @@
-/** The sign-in page: the appliance checks an access token, which is kept only as long as its holder wants. */
+/** The sign-in page. The appliance checks the access token; the page keeps it only as long as its holder wants. */
 
 import { html, useEffect, useRef, useState } from "./html.js";
 import { lasting } from "./moments.js";

@@ -1,11 +1,11 @@
-// Before anything is painted: the theme that was chosen here before, else the one the reader's system has.
+// Set the theme before the page is painted: the theme chosen in this browser, or else the system's theme.
 "use strict";
 (() => {
   let chosen = /** @type {string | null} */ (null);
   try {
     chosen = localStorage.getItem("rosrv.theme");
   } catch {
-    // storage is closed to this page: the system's theme it is
+    // without storage, the system's theme is used
   }
   const dark = chosen ? chosen === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   document.documentElement.dataset.theme = dark ? "dark" : "light";

@@ -7,13 +7,13 @@ import { Problem } from "./problem.js";
 import { send } from "./rest.js";
 import { session } from "./session.js";
 
-const SILENCE = 40_000; // the appliance says something every 15 s at least
+const SILENCE = 40_000; // milliseconds; the appliance sends at least a comment every 15 s
 const FIRST_PAUSE = 1000;
 const LONGEST_PAUSE = 30_000;
 
 /**
  * @typedef {{state: "connecting" | "live" | "lost", reason: string | null, again: number | null}} Standing
- * `again`: when the next try is (milliseconds since the epoch).
+ * `again`: the time of the next attempt (milliseconds since the epoch).
  */
 
 /**
@@ -53,7 +53,7 @@ export function follow(path, heard, stands, last = null) {
       } catch (error) {
         if (stopped) return;
         if (error instanceof Problem) {
-          if (error.status === 401) return; // the session has ended, and says so
+          if (error.status === 401) return; // the session has ended, and the sign-in page says so
           reason = error.message;
           least = (error.retryAfter ?? 0) * 1000;
         }
@@ -71,7 +71,7 @@ export function follow(path, heard, stands, last = null) {
   }
 
   const leave = session.subscribe(() => {
-    if (session.get().locked) running.abort(); // the next try waits until somebody is there again
+    if (session.get().locked) running.abort(); // the next attempt waits until the page is unlocked
   });
   run();
   return {

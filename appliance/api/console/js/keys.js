@@ -1,5 +1,5 @@
 /**
- * The two keys that are derived from a token (docs/reference/rest.md, "Signed orders"): the token itself is never sent.
+ * The two keys derived from a token (docs/reference/rest.md, "Signed orders"). The token itself is never sent.
  *
  * The reading key is sent with every request. The signing key (Ed25519) signs each change together with a
  * challenge that the appliance accepts once.

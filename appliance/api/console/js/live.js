@@ -1,4 +1,4 @@
-/** The appliance's live state: status, open alarms, samples and, on request, the graph. */
+/** The appliance's live state: status, present alarms, samples and, on request, the graph. */
 
 import { follow } from "./events.js";
 import { get } from "./rest.js";
@@ -51,7 +51,7 @@ async function recall() {
     const newest = samples.at(-1)?.time ?? 0;
     live.update({ samples: [...samples, ...live.get().samples.filter((one) => one.time > newest)] });
   } catch {
-    // the curves begin now; the standing of the stream says what is wrong
+    // the curves begin now, and the state of the stream shows the error
   }
 }
 

@@ -1,4 +1,4 @@
-/** Times in the user's time zone; on hover in UTC, to the nanosecond where known. */
+/** Times in the user's time zone; on hover, the time in UTC, to the nanosecond if known. */
 
 import { html, useEffect, useState } from "./html.js";
 
@@ -12,7 +12,7 @@ export function dateOf(value) {
   return new Date(typeof value === "number" ? value * 1000 : value);
 }
 
-/** A point in time: today only the time of day, else also the date. */
+/** A point in time: for today only the time of day, otherwise also the date. */
 export function Moment(/** @type {{at: string | number | null, always?: "day"}} */ { at, always }) {
   if (at === null || at === undefined) return html`<span class="muted">never</span>`;
   const date = dateOf(at);

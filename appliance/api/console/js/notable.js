@@ -14,8 +14,8 @@ const NEAR = "1d";
 
 export const notable = createStore({
   denials: /** @type {AuditRecord[] | null} */ (null),
-  doings: /** @type {AuditRecord[] | null} */ (null), // of monitors
-  incidents: /** @type {AuditRecord[] | null} */ (null), // of severity alarm
+  doings: /** @type {AuditRecord[] | null} */ (null), // actions of monitors
+  incidents: /** @type {AuditRecord[] | null} */ (null), // records of severity alarm
 });
 
 let running = /** @type {ReturnType<typeof follow> | null} */ (null);
@@ -52,12 +52,12 @@ function heard(/** @type {string} */ event, /** @type {AuditRecord} */ record) {
   if (Object.keys(change).length) notable.update(change);
 }
 
-/** Whether a record is a refusal, or would have been one. @param {AuditRecord} record */
+/** Whether a record is a denial, or would be one if the policy were enforced. @param {AuditRecord} record */
 export function isDenial(record) {
   return record.decision === "deny" || record.decision === "would deny";
 }
 
-/** Whether a monitor did something, and not somebody something to it. @param {AuditRecord} record */
+/** Whether a record is an action of a monitor, and not an operator's change of a monitor. @param {AuditRecord} record */
 function isDoing(record) {
   return record.category === "monitor" && record.detail?.monitor !== undefined && !["monitor log", "shadow observed"].includes(record.event);
 }

@@ -44,7 +44,8 @@ export function counted(value, one, many = `${one}s`) {
 const LEAST = 1.5; // shortest interval of a rate in seconds: the relay reports its counters once a second
 
 /**
- * The growth of counters up to each sample, since the newest sample that is `LEAST` older; null after a restart.
+ * The growth of a counter per second at each sample, since the newest sample that is at least `LEAST` older. It is null
+ * after a restart.
  * @template {{time: number}} S
  * @param {S[]} samples @param {(sample: S) => number} read
  * @returns {{time: number, value: number | null}[]}

@@ -12,17 +12,17 @@ import { Problem } from "./problem.js";
 import { createStore } from "./store.js";
 
 const KEY = "rosrv.token";
-const LAST_USE = "rosrv.used"; // beside it: a browser may unload a tab and reload it hours later
+const LAST_USE = "rosrv.used"; // time of the last use: a browser may unload a tab and reload it hours later
 const RANK = { viewer: 1, investigator: 1, operator: 2, admin: 3 };
 const USES = ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"];
-const LONGEST = 2 ** 31 - 1; // what a browser's timer can wait, in milliseconds
-/** After how long without use the page is locked, in milliseconds. */
+const LONGEST = 2 ** 31 - 1; // longest delay of a browser's timer, in milliseconds
+/** Time without use after which the page is locked, in milliseconds. */
 export const UNUSED = Number(stated("lock-seconds")) * 1000;
 
 /**
  * @typedef {{token: string, name: string, role: "viewer" | "investigator" | "operator" | "admin", expires: number}} Session
- * `current` is null while signed out; `ended` is why the last session ended. While the page is locked, `locked` is
- * the former session. `number` counts sessions; unlocking does not start another.
+ * `current` is null while signed out; `ended` is the reason why the last session ended. While the page is locked,
+ * `locked` is the locked session. `number` counts sessions; unlocking does not start a new session.
  */
 export const session = createStore({
   current: /** @type {Session | null} */ (null),
@@ -34,9 +34,9 @@ export const session = createStore({
 
 let ending = 0;
 let locking = 0;
-let used = 0; // when, in milliseconds since the epoch
+let used = 0; // time of the last use, in milliseconds since the epoch
 
-/** What the site has the page say and do, as the appliance wrote it into the page. @param {string} name */
+/** Return a setting of the site, which the appliance wrote into the page's `meta` element. @param {string} name */
 export function stated(name) {
   return document.querySelector(`meta[name="rosrv:${name}"]`)?.getAttribute("content") ?? "";
 }
@@ -64,7 +64,7 @@ export function end(why) {
   session.update({ current: null, ended: why, checking: false, locked: null });
 }
 
-/** Nobody is here: the token is forgotten, what was being done stays. */
+/** Lock the unused page: forget the token, but keep unsaved work. */
 export function lock() {
   const { current } = session.get();
   if (!current) return;
@@ -87,7 +87,7 @@ export async function unlocked() {
   });
 }
 
-/** The token of an earlier page of this tab, unless nobody used that for so long that it would be locked. */
+/** Return the token of an earlier page of this tab, unless that page was unused for so long that it would be locked. */
 export function kept() {
   try {
     const last = Number(sessionStorage.getItem(LAST_USE) ?? Date.now());
@@ -98,7 +98,7 @@ export function kept() {
   }
 }
 
-/** Whether who reads may do what this role may; what is for investigators nobody else may. @param {keyof typeof RANK} role */
+/** Whether the user has the rights of this role; only investigators have the rights of investigators. @param {keyof typeof RANK} role */
 export function may(role) {
   const held = session.get().current?.role;
   return held !== undefined && (role === "investigator" ? held === role : RANK[held] >= RANK[role]);
@@ -121,7 +121,7 @@ function use() {
   }
 }
 
-/** Lock the page as soon as it was not used for long enough. */
+/** Start the timer that locks the page after `UNUSED` milliseconds without use. */
 function watch() {
   clearTimeout(locking);
   const left = used + UNUSED - Date.now();
@@ -141,6 +141,6 @@ function forget() {
   try {
     for (const name of [KEY, LAST_USE]) sessionStorage.removeItem(name);
   } catch {
-    // there was none
+    // without storage, no token is stored
   }
 }

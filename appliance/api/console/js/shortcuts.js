@@ -1,4 +1,4 @@
-/** Keys: 1 to 7 for the views, / for the search of a view, t for the theme, ? for this list. */
+/** Keys: 1 to 7 select a view, / searches in the view, t switches the theme, ? shows this list. */
 
 import { html, useEffect, useState } from "./html.js";
 import { Dialog } from "./parts/dialog.js";

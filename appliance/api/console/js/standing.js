@@ -1,4 +1,4 @@
-/** Whether the page is live: a word beside the navigation, and a banner when it is not. */
+/** Shows whether the page is live: a word beside the navigation, and a banner if it is not. */
 
 import { html } from "./html.js";
 import { live, retry } from "./live.js";

@@ -31,7 +31,7 @@ export function createStore(value) {
 }
 
 /**
- * The store's value, or a part of it; drawn again only when that part changes.
+ * Return the store's value, or a part of it; the component renders again only when that part changes.
  * @template T, S
  * @param {Store<T>} store
  * @param {(value: T) => S} [select]
@@ -40,7 +40,7 @@ export function createStore(value) {
 export function useStore(store, select = (value) => /** @type {any} */ (value)) {
   const [, again] = useState(0);
   const part = select(store.get());
-  // Another `select` may come each time it is drawn: what is looked for is the part by the last one.
+  // Each render may pass a new `select`, so compare with the part that the last `select` returned.
   const drawn = useRef({ select, part });
   drawn.current = { select, part };
   useEffect(() => {

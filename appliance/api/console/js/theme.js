@@ -20,7 +20,7 @@ export function switchTheme() {
   try {
     localStorage.setItem(KEY, next);
   } catch {
-    // not stored: it lasts until the page is closed
+    // without storage, the theme lasts until the page is closed
   }
   theme.set(next);
 }

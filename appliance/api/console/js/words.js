@@ -1,6 +1,6 @@
 /**
- * Text from the network (names, headers, values), made safe to display: invisible characters and characters that would
- * reorder their surroundings become code points; text that is too long is cut, with its length.
+ * Make text from the network (names, headers, values) safe to display. Invisible characters, and characters that would
+ * reorder their surroundings, become code points. Text that is too long is cut, with its length.
  */
 
 // Controls, invisible and joining characters, directions (bidi), line separators, lone surrogates, tags, private use.
@@ -38,7 +38,7 @@ export function pieces(value, most = 200) {
   return found;
 }
 
-/** The same as one plain text, for titles, labels and drawings. @param {unknown} value @param {number} [most] */
+/** Return the safe text as one plain string, for titles, labels and drawings. @param {unknown} value @param {number} [most] */
 export function plain(value, most = 200) {
   return pieces(value, most).map((one) => (one.unseen ? `⟨${one.text}⟩` : one.text)).join("");
 }

@@ -1,4 +1,4 @@
-/** A monitor's changes to a message: by field if the type is known, else by byte. */
+/** A monitor's changes to a message: by field if the message type is known, otherwise by byte. */
 
 import { html } from "../html.js";
 import { Given } from "../parts/given.js";

@@ -12,7 +12,7 @@ import { go } from "../router.js";
 /** @param {{id: string}} given */
 export function Grant({ id }) {
   const [found, setFound] = useState(/** @type {any} */ (null));
-  const [unsaved, setUnsaved] = useState(false); // the editor has a text that this one would replace
+  const [unsaved, setUnsaved] = useState(false); // whether this change would replace an unsaved text
   const [error, setError] = useState(/** @type {unknown} */ (null));
   const ask = async () => {
     setError(null);
@@ -25,7 +25,7 @@ export function Grant({ id }) {
   const edit = async () => {
     await look();
     const { live, text, base } = draft.get();
-    if (live?.revision !== found.revision) return ask(); // it was worked out for another policy
+    if (live?.revision !== found.revision) return ask(); // the change was computed for another policy
     if (text !== base && text !== found.text && !unsaved) return setUnsaved(true);
     discard();
     write(found.text);

@@ -1,4 +1,4 @@
-/** Saved searches: built-in ones, and the user's own in this browser. */
+/** Saved searches: built-in searches, and searches that the user saved in this browser. */
 
 import { html, useState } from "../html.js";
 import { plain } from "../words.js";
@@ -6,7 +6,7 @@ import { Icon } from "../parts/icon.js";
 import { go } from "../router.js";
 import { auditPath, NAMES } from "./filters.js";
 
-const KEY = "rosrv.searches"; // filters only: no token, and nothing of the log
+const KEY = "rosrv.searches"; // stores only filters: no token, and no content of the log
 const MOST = 12;
 const PRESETS = /** @type {[string, Record<string, string>][]} */ ([
   ["What matters", {}], ["Denied", { decision: "deny" }], ["Monitors", { category: "monitor" }],
@@ -21,7 +21,7 @@ export function Presets({ filter }) {
     try {
       localStorage.setItem(KEY, JSON.stringify(next));
     } catch {
-      // a browser that keeps nothing: the search is there until the page is left
+      // without storage, the search is kept only until the page is left
     }
   };
   const known = [...PRESETS.map(([, one]) => one), ...kept].some((one) => same(one, filter));
@@ -31,7 +31,7 @@ export function Presets({ filter }) {
     ${!known && html`<button class="link small" onClick=${() => keep([...kept, filter].slice(-MOST))}>Save this search</button>`}</div>`;
 }
 
-/** What was kept; anything else that stands there is nothing. @returns {Record<string, string>[]} */
+/** Return the stored searches; ignore invalid content. @returns {Record<string, string>[]} */
 function read() {
   try {
     const found = JSON.parse(localStorage.getItem(KEY) ?? "[]");

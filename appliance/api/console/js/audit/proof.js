@@ -52,7 +52,7 @@ function now() {
   return new Date().toISOString().slice(0, 19).replaceAll(":", "");
 }
 
-/** Download an answer of REST as a file. */
+/** Download a REST answer as a file. */
 export async function take(/** @type {string} */ path, /** @type {string} */ name) {
   try {
     const response = await send("GET", path);

@@ -5,12 +5,13 @@ import { follow } from "../events.js";
 import { get, queryText } from "../rest.js";
 
 const PAGE = 100;
-const KEPT = 2000; // while it is followed; what the reader asked for by hand comes on top
-const PAUSE = 250; // after the last key of a search
+const KEPT = 2000; // records kept while following; pages that the user fetched come on top
+const PAUSE = 250; // milliseconds after the last key of a search
 
 /**
- * What is asked: calls of REST that only looked (this page's own, above all) only where they are asked for; and without
- * a filter but of time what matters, from notices on: refusals, what monitors did, changes, faults.
+ * Return the query for a filter. REST calls that only read (mostly this page's own) are included only on request.
+ * Without a filter, or with a filter of time only, records start at severity notice: denials, actions of monitors,
+ * changes, faults.
  */
 export function askedOf(/** @type {Record<string, string>} */ { looks, ...filter }) {
   const matters = !looks && Object.keys(filter).every((name) => name === "since" || name === "until");
@@ -48,7 +49,7 @@ export function useRecords(filter, following) {
   useEffect(() => {
     if (!following || !ready) return undefined;
     const { until, ...rest } = askedOf(filter);
-    const newest = state.records?.[0]?.sequence ?? 0; // from the beginning: what was made since the list came is in it
+    const newest = state.records?.[0]?.sequence ?? 0; // the stream starts there, so no record since the list is missed
     const running = follow(() => `/v1/audit/stream${queryText(rest)}`, (event, record) => {
       if (event === "record") setState((state) => ({ ...state, ...added(state, record) }));
     }, setStanding, String(newest));
@@ -71,7 +72,7 @@ export function useRecords(filter, following) {
 }
 
 /**
- * The list with one record more; what falls off its end is fetched again from `cursor` on.
+ * Return the list with one more record. Records that fall off its end are fetched again from `cursor` on.
  * @param {{records: any[] | null, cursor: string | null, most: number}} state @param {any} record
  */
 export function added({ records, cursor, most }, record) {

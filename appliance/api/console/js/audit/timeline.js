@@ -1,4 +1,4 @@
-/** The times of the shown records, a mark each, in the colour of its outcome. */
+/** The times of the shown records: one mark for each record, in the colour of its outcome. */
 
 import { html } from "../html.js";
 import { Moment } from "../moments.js";

@@ -1,4 +1,7 @@
-/** Why a verdict, drop, change, fault or publication of a monitor happened: the necessary events, the values compared, the lines. For a denial, the line that would allow it, or why none would. */
+/**
+ * The reasons for a monitor's action: the necessary events, the compared values, the lines. For a denial: the rule that
+ * would allow the request, or why none would.
+ */
 
 import { html } from "../html.js";
 import { Given } from "../parts/given.js";

@@ -1,7 +1,7 @@
 /**
- * The layout: from left to right in the direction of messages; in a narrow frame from top to bottom,
- * in two columns. Existing items keep their places while the graph changes a little; new items are placed beside what
- * they belong to, in a narrow frame below the rest.
+ * The layout: from left to right in the direction of messages; in a narrow frame from top to bottom, in two columns.
+ * While the graph changes only a little, existing items keep their places. New items are placed beside the items that
+ * they are connected to; in a narrow frame, below all other items.
  */
 
 import { Graph, layout } from "/console/static/vendor/dagre.js";
@@ -14,8 +14,8 @@ export const SIZES = {
 const GAP = 16;
 const COLUMN = 52;
 const GROUP = [206, 50];
-const BETWEEN = 44; // the two columns of a narrow frame: the lines are there
-const TALLEST = 12; // parts of an opened group in one column
+const BETWEEN = 44; // distance of the two columns in a narrow frame, for the lines
+const TALLEST = 12; // most parts of an opened group in one column
 const LITTLE = 0.25; // fraction of new items above which the whole layout is computed again
 
 /**
@@ -31,8 +31,8 @@ export function arrange(items, lines, before, narrow) {
 }
 
 /**
- * An opened group is replaced by its parts, in columns: nodes, then topics. Items to the right of it or below
- * make room, and nothing else moves.
+ * Replace an opened group by its parts, in columns: nodes, then topics. Items to the right of the group or below it
+ * make room, and all other items stay.
  */
 function unfolded(/** @type {Map<string, any>} */ items, /** @type {Map<string, Spot>} */ before) {
   let spots = before;
@@ -41,7 +41,7 @@ function unfolded(/** @type {Map<string, any>} */ items, /** @type {Map<string, 
     const space = group.replace(/^g[a-z]+/, "");
     const parts = [...items.values()].filter((one) => !spots.has(one.key) && one.within?.some((/** @type {string} */ key) => key.replace(/^g[a-z]+/, "") === space));
     if (!parts.length) continue;
-    const here = /** @type {Spot} */ (spots.get(group)); // moved, perhaps, by another group
+    const here = /** @type {Spot} */ (spots.get(group)); // another group may have moved it
     const [left, top] = [here.x - here.w / 2, here.y - here.h / 2];
     const placed = inColumns(parts, left, top);
     const room = extent(placed.values());
@@ -52,7 +52,7 @@ function unfolded(/** @type {Map<string, any>} */ items, /** @type {Map<string, 
   return spots;
 }
 
-/** Columns of one kind each, from a corner on. @param {any[]} parts @param {number} left @param {number} top */
+/** Place parts in columns of one kind each, starting at a corner. @param {any[]} parts @param {number} left @param {number} top */
 function inColumns(parts, left, top) {
   /** @type {Map<string, Spot>} */
   const spots = new Map();
@@ -74,7 +74,7 @@ function inColumns(parts, left, top) {
   return spots;
 }
 
-/** All of it anew. @param {Map<string, any>} items @param {Map<string, any>} lines @param {boolean} narrow */
+/** Compute the whole layout again. @param {Map<string, any>} items @param {Map<string, any>} lines @param {boolean} narrow */
 export function afresh(items, lines, narrow) {
   const graph = new Graph({ multigraph: false });
   graph.setGraph({ rankdir: "LR", nodesep: GAP, ranksep: COLUMN, edgesep: 8, ranker: items.size > 150 ? "longest-path" : "tight-tree", acyclicer: "greedy" });
@@ -100,7 +100,7 @@ export function afresh(items, lines, narrow) {
   return narrow ? stacked(spots) : spots;
 }
 
-/** Each column below the one before it, two boxes in a row. */
+/** Place each column below the previous column, with two boxes in a row. */
 function stacked(/** @type {Map<string, Spot>} */ spots) {
   /** @type {Map<string, Spot>} */
   const placed = new Map();
@@ -114,7 +114,7 @@ function stacked(/** @type {Map<string, Spot>} */ spots) {
   return placed;
 }
 
-/** The new ones at the nearest free place beside what they are connected to. */
+/** Place new items at the nearest free place beside the items that they are connected to. */
 function added(/** @type {Map<string, any>} */ items, /** @type {Map<string, any>} */ lines, /** @type {Map<string, Spot>} */ before, /** @type {string[]} */ fresh) {
   /** @type {Map<string, Spot>} */
   const spots = new Map();
@@ -150,7 +150,7 @@ function sizeOf(/** @type {any} */ item) {
   return SIZES[/** @type {keyof typeof SIZES} */ (item.kind)];
 }
 
-/** The rectangle that holds all of them. @param {Iterable<Spot>} spots */
+/** The rectangle around all spots. @param {Iterable<Spot>} spots */
 export function extent(spots) {
   let [left, top, right, bottom] = [Infinity, Infinity, -Infinity, -Infinity];
   for (const { x, y, w, h } of spots) {

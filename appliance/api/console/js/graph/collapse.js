@@ -1,10 +1,10 @@
 /**
  * Make a large graph readable: items of one namespace are drawn as one group until it is opened.
  *
- * The names of each kind form a tree, by host with the hosts as its first level; what is shown is a cut through it: the
- * groups of the first level, and the parts of those that the user opened. A level with very many names is divided into
- * ranges, so that no step shows too much at once. The result depends on the names alone: rates and the order of an
- * answer move nothing. The nodes and the topics of a namespace are one group while it is closed.
+ * The names of each kind form a tree; grouped by host, the hosts are its first level. The page shows the groups of the
+ * first level, and the parts of groups that the user opened. A level with very many names is divided into ranges, so
+ * that no step shows too much at once. The result depends only on the names, not on rates or on the order of an answer.
+ * While a namespace is closed, its nodes and topics are one group.
  */
 
 import { counted } from "../numbers.js";
@@ -78,7 +78,7 @@ function joined(/** @type {import("./model.js").Model} */ model, /** @type {Map<
   return lines;
 }
 
-/** The shown branches: the largest unopened ones, each with the opened ones around it, outermost first. */
+/** The shown branches: the largest unopened branches, each with the opened branches around it, outermost first. */
 function cut(/** @type {Branch} */ branch, /** @type {Set<string>} */ opened, /** @type {string[]} */ within = []) {
   /** @type {{branch: Branch, within: string[]}[]} */
   const found = [];
@@ -111,7 +111,7 @@ function grow(/** @type {Placed[]} */ items, /** @type {string} */ kind, /** @ty
     const deeper = members.some((one) => one.path.split("/").length > depth + 1);
     return deeper ? grow(members, kind, name, depth + 1) : { key: `${kind}:${name}`, label: name, items: members.map(({ one }) => one), parts: members.map(({ one }) => leaf(one)) };
   });
-  // A namespace whose only child is a namespace is that child.
+  // A namespace whose only child is a namespace is replaced by that child.
   if (parts.length === 1 && parts[0].parts.length) return parts[0];
   const key = `${kind}:${prefix}`;
   return { key, label: prefix.replace(/\/\*$/, ""), items: items.map(({ one }) => one), parts: parts.length > RANGE ? ranges(parts, key) : parts };

@@ -8,11 +8,11 @@ import { extent } from "./arrange.js";
 
 const MARGIN = 24;
 const CLOSEST = 2.5;
-const FARTHEST = 0.27; // a box is then as high as its name, which is never drawn smaller than it is read
+const FARTHEST = 0.27; // at this zoom a box is as high as its name, which is never drawn smaller than readable
 const BOW = 46;
 const NARROW_BOW = 10;
-const NAME = 11.5; // size of a name on the screen, as in graph.css
-const GLYPH = 0.61; // width of a letter of the name's typeface, of its size
+const NAME = 11.5; // font size of a name on the screen, as in graph.css
+const GLYPH = 0.61; // width of a letter in the name's typeface, as a fraction of the font size
 
 /** @typedef {{x: number, y: number, zoom: number}} Look the corner of what is seen, and how large it is drawn */
 
@@ -125,8 +125,8 @@ function Line(/** @type {any} */ { line, spots, chosen, near, choose, narrow }) 
     <path class="reach" d=${path} />${shape}<title>${said}</title></g>`;
 }
 
-/** From the right side of one box to the left of the other; backwards around all boxes on its way, below them, and
- * beside other lines: the longer it is, the further out. */
+/** A line from the right side of one box to the left side of the other. A line that goes back passes below all boxes on
+ * its way; the longer it is, the further out it runs, beside the other lines. */
 function curve(/** @type {any} */ from, /** @type {any} */ to, /** @type {Map<string, any>} */ spots) {
   const x1 = from.x + from.w / 2;
   const x2 = to.x - to.w / 2 - 2;
@@ -140,7 +140,7 @@ function curve(/** @type {any} */ from, /** @type {any} */ to, /** @type {Map<st
   return `M${x1} ${from.y}h${aside}q16 0 16 16V${low - 16}q0 16 -16 16H${x2 - aside}q-16 0 -16 -16V${to.y + 16}q0 -16 16 -16h${aside}`;
 }
 
-/** In two columns: out of the inner side of a box into the space between them, and into the inner side of the other. */
+/** A line in the layout with two columns: between the inner sides of two boxes, through the space between the columns. */
 function between(/** @type {any} */ from, /** @type {any} */ to) {
   const inner = (/** @type {any} */ spot, /** @type {number} */ out) => spot.x + (spot.x < 0 ? 1 : -1) * (spot.w / 2 + out);
   return `M${inner(from, 0)} ${from.y}C${inner(from, BOW)} ${from.y} ${inner(to, BOW)} ${to.y} ${inner(to, 2)} ${to.y}`;
@@ -150,7 +150,7 @@ function shortened(/** @type {string} */ text, /** @type {number} */ most) {
   const said = plain(text, 400);
   const points = [...said];
   if (points.length <= most) return said;
-  const head = most > 14 ? 5 : 0; // of a short one the end says more
+  const head = most > 14 ? 5 : 0; // for short texts only the end is kept, because it says more
   return `${points.slice(0, head).join("")}…${points.slice(-(most - head - 1)).join("")}`;
 }
 
@@ -165,14 +165,14 @@ function neighbours(/** @type {string} */ chosen, /** @type {Map<string, any>} *
   return near;
 }
 
-/** The same with room for the lines that go back, around the outermost boxes. */
+/** The rectangle, enlarged for the lines that go back around the outermost boxes. */
 function withBows(/** @type {{x: number, y: number, w: number, h: number}} */ { x, y, w, h }, /** @type {number} */ bow) {
   return { x: x - bow, y, w: w + 2 * bow, h: h + bow };
 }
 
 function fitted(/** @type {{x: number, y: number, w: number, h: number}} */ all, /** @type {HTMLElement} */ box) {
   const zoom = Math.min(1.15, (box.clientWidth - 2 * MARGIN) / all.w, (box.clientHeight - 2 * MARGIN) / all.h);
-  const readable = Math.max(zoom, FARTHEST); // panning shows the rest
+  const readable = Math.max(zoom, FARTHEST); // the user pans to see the rest
   const [w, h] = [box.clientWidth / readable, box.clientHeight / readable];
   return { zoom: readable, x: all.w < w ? all.x - (w - all.w) / 2 : all.x - MARGIN / readable, y: all.h < h ? all.y - (h - all.h) / 2 : all.y - MARGIN / readable };
 }

@@ -1,4 +1,4 @@
-/** A topic's last message as subscribers receive it, and one of its numbers over time. The audit log records it. */
+/** A topic's last message as subscribers receive it, and one of its numbers over time. The audit log has the query. */
 
 import { html, useEffect, useState } from "../html.js";
 import { Moment } from "../moments.js";
@@ -8,7 +8,7 @@ import { Failure } from "../parts/notice.js";
 import { Plot } from "../parts/plot.js";
 import { get } from "../rest.js";
 
-const SECONDS = 60; // to show; the query ends automatically after them
+const SECONDS = 60; // shown period; the query ends automatically after it
 const EACH = { messages: 20, seconds: 2 };
 
 /** @param {{topic: string}} given */
@@ -52,7 +52,7 @@ export function Messages({ topic }) {
 
 const pause = (/** @type {number} */ milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 
-/** The paths of numbers in a message, the first of them. @returns {string[]} */
+/** The paths of the first numbers in a message. @returns {string[]} */
 function numbers(/** @type {any} */ value, /** @type {string} */ path) {
   if (typeof value === "number") return [path];
   if (typeof value !== "object" || value === null) return [];

@@ -1,8 +1,8 @@
 /**
  * The graph's items and lines, from `/v1/graph` and the denials of the audit log.
  *
- * Keys are a letter and a name (`n/talker`, `t/chatter`, `s/set_mode`); a denied host that is not in the graph has
- * `x` and its name and host. The model has no layout.
+ * A key is a letter and a name (`n/talker`, `t/chatter`, `s/set_mode`). The key of a denied caller that is not in the
+ * graph is `x`, the caller's name, and its host. The model has no layout.
  */
 
 /**
@@ -49,7 +49,7 @@ export function isSelftest(record) {
   return record.resource === "/rosrv_selftest" && /^\/rosrv_selftest_(publisher|subscriber)$/.test(record.caller_id ?? "");
 }
 
-/** A replaced node withdraws its registrations: denied, but not an attempt. */
+/** Whether a denial is the late withdrawal of a replaced node's registration, which is not an attempt to show. */
 function isLateWithdrawal(/** @type {any} */ record) {
   return record.rule === null && String(record.detail?.call ?? "").startsWith("unregister");
 }
@@ -83,7 +83,7 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
   const known = model.items.get(`n${caller}`);
   const from = known && known.sub === host ? known.key : `x${caller ?? ""}@${host}`;
   const to = attempt.command ? MASTER : `${letterOf(category)}${resource}`;
-  // A resource that the host has now was denied only briefly (a late call): not an attempt.
+  // If the host now has the resource, the denial was brief (a late call) and not an attempt to show.
   if (model.lines.has(`${from}>${to}`) || model.lines.has(`${to}>${from}`)) return;
   if (!model.items.has(from)) put(model, { key: from, kind: "party", name: caller || "no name", sub: host ?? "" });
   if (!model.items.has(to)) {
@@ -91,7 +91,7 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
     put(model, { key: to, kind, name: attempt.command ? "RVMaster" : resource, sub: attempt.command ? "calls" : `denied ${category ?? event}` });
   }
   const key = `!${attempt.key}`;
-  const line = { key, from, to }; // towards the resource, whichever way messages would flow
+  const line = { key, from, to }; // always towards the resource, regardless of the direction of messages
   const would = attempt.records.every((one) => one.decision === "would deny");
   model.lines.set(key, { ...line, kind: "denied", mediated: false, rate: 0, denials: attempt.records, would });
 }

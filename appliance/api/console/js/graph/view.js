@@ -83,7 +83,7 @@ function Legend() {
     <li><svg width="34" height="16" aria-hidden="true"><path class="line would" d="M1 8H33" /></svg>would be denied</li></ul>`;
 }
 
-/** Places that hold while the graph changes; a search, a filter or an opened group arranges afresh. */
+/** Places that stay while the graph changes; a search, a filter or an opened group computes a new layout. */
 function useSpots(/** @type {any} */ shown, /** @type {number} */ round, /** @type {string} */ cause, /** @type {boolean} */ narrow) {
   const kept = useRef({ spots: new Map(), cause: "", round: -1, arranged: 0, narrow });
   return useMemo(() => {
@@ -102,7 +102,7 @@ function recentOf(/** @type {any[]} */ denials) {
   return denials.filter((one) => Date.parse(one.time) > since);
 }
 
-/** What a search leaves: what matches, and what that is connected to. */
+/** The items that match a search, and the items that they are connected to. */
 function narrowed(/** @type {import("./model.js").Model} */ model, /** @type {string} */ search) {
   if (!search.trim()) return model;
   const hit = new Set([...model.items.values()].filter((one) => matches(search, [one.name, one.sub])).map((one) => one.key));
@@ -112,7 +112,7 @@ function narrowed(/** @type {import("./model.js").Model} */ model, /** @type {st
   return { items: new Map([...model.items].filter(([key]) => near.has(key))), lines };
 }
 
-/** The thing of this name, else the one with the shortest name that has it in it: what Enter in the search opens. */
+/** The item that Enter in the search opens: the item with the shortest name that contains the searched text. */
 function found(/** @type {import("./model.js").Model} */ model, /** @type {string} */ search) {
   const named = [...model.items.values()].filter((one) => search.trim() && matches(search, [one.name]));
   return named.sort((a, b) => a.name.length - b.name.length)[0]?.key ?? null;

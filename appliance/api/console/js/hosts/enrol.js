@@ -49,7 +49,7 @@ export function Enrol({ host, etag, close, after }) {
       ${!host && html`<${Field} label="Virtual address" mono value=${form.address} set=${set("address")} placeholder="the next free one" />`}</div></${Dialog}>`;
 }
 
-/** Hosts reach the appliance where the browser does, unless the browser runs on the same machine. */
+/** Return the browser's address for the appliance, which hosts also use; empty if it is a loopback address. */
 function reachedAt(/** @type {string} */ hostname) {
   const name = hostname.replace(/^\[|\]$/g, "");
   return name === "localhost" || name === "::1" || name.startsWith("127.") ? "" : name;

@@ -73,7 +73,7 @@ function MachineTable(/** @type {{machines: any[]}} */ { machines }) {
   return html`<div class="table-wrap"><table class="table"><thead><tr><th>Machine</th><th class="number">Nodes</th><th>Ports of its nodes</th></tr></thead><tbody>${machines.map((one) => html`<tr key=${one.address}><td><${Given} value=${one.address} mono /></td><td class="number">${one.nodes}</td><td><${Ports} ports=${one.ports} /></td></tr>`)}</tbody></table></div>`;
 }
 
-/** Whether other machines can reach the ports of its nodes, from the last check. */
+/** The last check's result: whether other machines can reach the ports of the host's nodes. */
 function Ports(/** @type {{ports: any}} */ { ports }) {
   const tone = { closed: "allow", open: "deny", unknown: "" }[/** @type {string} */ (ports.state)];
   return html`<div><${Badge} word=${ports.state} tone=${tone} />${ports.state === "unknown" ? html`<div class="muted small">try: rosrv protect --check</div>` : html`<div class="muted small">seen <${Moment} at=${ports.checked} /></div>`}

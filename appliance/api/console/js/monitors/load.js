@@ -27,7 +27,7 @@ export function LoadSpecification({ etag, files, signed, close, loaded }) {
   const [name, setName] = useState("example.rv");
   const [note, setNote] = useState("");
   const [definitions, setDefinitions] = useState(/** @type {Record<string, string>} */ ({}));
-  const [signatures, setSignatures] = useState(/** @type {Record<string, string>} */ ({})); // by the names of files, without folders
+  const [signatures, setSignatures] = useState(/** @type {Record<string, string>} */ ({})); // by file name, without folders
   const [line, setLine] = useState(/** @type {any} */ (null));
   const draft = useSpecification(EXAMPLE);
   const send = (/** @type {boolean} */ dry) => {

@@ -6,8 +6,8 @@ import { ask } from "../rest.js";
 import { useStore } from "../store.js";
 
 /**
- * `change` sends a change of one monitor. Changes are queued: each one makes a new
- * ETag, and a second click before the first answer applies to its result.
+ * `change` sends a change of one monitor. Changes are queued, because each change makes a new ETag: a second click
+ * before the first answer applies to the result of the first click.
  * @returns {{body: any, etag: string, error: unknown, again: () => Promise<void>, change: (name: string, to: any) => Promise<void>}}
  */
 export function useMonitors() {
@@ -21,7 +21,7 @@ export function useMonitors() {
     const { changes } = shown.current;
     try {
       const { body, etag } = await ask("GET", "/v1/monitors");
-      if (changes !== shown.current.changes) return; // the answer may be older than a change, which fetches again
+      if (changes !== shown.current.changes) return; // a later change makes this answer outdated, and fetches again
       shown.current.etag = etag ?? "";
       setState({ body, etag: etag ?? "", error: null });
     } catch (error) {
@@ -46,7 +46,7 @@ export function useMonitors() {
   return { ...state, again, change };
 }
 
-/** In one word. @param {any} row */
+/** A monitor's state in one word. @param {any} row */
 export function stateOf(row) {
   return row.shadow ? "shadow mode" : row.held ? "held" : row.failing ? "failing" : row.enabled ? "enabled" : "disabled";
 }

@@ -3,8 +3,8 @@
 import { counted } from "../numbers.js";
 
 const SPAN = 60; // seconds
-const DENIALS = 10; // in `SPAN`; fewer may be one node that misses a right
-const DROPS = 1; // place in the counts of a monitor: verdicts, drops, changes, faults
+const DENIALS = 10; // least number in `SPAN`; fewer may come from one node that lacks a right
+const DROPS = 1; // index in the counts of a monitor: verdicts, drops, changes, faults
 
 /** @typedef {import("../live.js").Sample} Sample */
 

@@ -1,4 +1,4 @@
-/** Open conditions, and the last day's alarms that were not reviewed in this browser. */
+/** Present alarms, and the last day's alarms that were not reviewed in this browser. */
 
 import { html, useState } from "../html.js";
 import { Moment } from "../moments.js";
@@ -24,7 +24,7 @@ export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ {
     try {
       localStorage.setItem(SEEN, String(last));
     } catch {
-      // holds until the page is closed
+      // without storage, the review is remembered only until the page is closed
     }
     setSeen(last);
   };

@@ -72,7 +72,7 @@ function Processes(/** @type {{status: any}} */ { status }) {
       <td class="number">${one.restarts ? html`<${Badge} word=${String(one.restarts)} tone="warn" />` : "0"}</td></tr>`)}</tbody></table></div></section>`;
 }
 
-/** Processes by the names that `rosrv status` has for them: those of one role are numbered from 0. @param {any[]} processes @returns {{name: string, one: any}[]} */
+/** Processes with the names that `rosrv status` prints: processes of one role are numbered from 0. @param {any[]} processes @returns {{name: string, one: any}[]} */
 export function numbered(processes) {
   return processes.map((one, at) => {
     const same = (/** @type {any} */ other) => other.role === one.role;

@@ -7,7 +7,7 @@ import { useStore } from "../store.js";
 /**
  * @param {{role?: "viewer" | "investigator" | "operator" | "admin", tone?: string, small?: boolean, disabled?: boolean, why?: string,
  *   onClick: () => any, children?: any, [more: string]: any}} given
- * `why`: the reason it is disabled. While a click's promise is open it cannot be clicked again.
+ * `why`: the reason why the button is disabled. While a click's promise is pending, the button cannot be clicked again.
  */
 export function Button({ role = "viewer", tone = "", small = false, disabled = false, why, onClick, children, ...more }) {
   useStore(session);
@@ -28,7 +28,7 @@ export function Button({ role = "viewer", tone = "", small = false, disabled = f
     aria-busy=${busy ? "true" : undefined} ...${more} title=${reason ?? more.title} onClick=${click}>${children}${!allowed && html`<span class="sr-only"> (${reason})</span>`}</button>`;
 }
 
-/** On or off. @param {{on: boolean, label: string, change: () => any, role?: "viewer" | "operator" | "admin"}} given */
+/** A switch, on or off. @param {{on: boolean, label: string, change: () => any, role?: "viewer" | "operator" | "admin"}} given */
 export function Switch({ on, label, change, role = "viewer" }) {
   useStore(session);
   const allowed = may(role);

@@ -1,4 +1,4 @@
-/** A modal dialog. Escape and the close button close it; the focus returns to the former element. */
+/** A modal dialog. Escape and the close button close it; the focus then returns to the previous element. */
 
 import { html, useEffect, useId, useRef } from "../html.js";
 import { Icon } from "./icon.js";

@@ -1,8 +1,8 @@
 /**
  * An editor with line numbers, colours and errors in place (CodeMirror).
  *
- * It lives in a shadow root: there its style sheets are constructed objects, which the page's content security policy
- * allows, unlike style elements. It is loaded on first use.
+ * The editor lives in a shadow root. There its style sheets are constructed objects, which the page's content security
+ * policy allows; style elements would be blocked. The editor is loaded on first use.
  */
 
 import { html, useEffect, useRef, useState } from "../html.js";
@@ -14,7 +14,7 @@ const SOURCE = "/console/static/vendor/codemirror.js";
 /**
  * @param {{label: string, value: string, change?: (text: string) => void, language: "policy" | "rv", findings?: any[],
  *   line?: {number: number, column?: number, count: number} | null, dry?: () => void, height?: string}} given
- * Without `change` it can only be read. A new `line.count` moves to that line.
+ * Without `change`, the editor is read-only. A new `line.count` moves to that line.
  */
 export function Editor({ label, value, change, language, findings = [], line = null, dry, height = "60vh" }) {
   const host = useRef(/** @type {HTMLElement | null} */ (null));
@@ -95,8 +95,8 @@ function tell(/** @type {any} */ reader, /** @type {string} */ text) {
 }
 
 /**
- * Insert text over a selection here: the browser would merge the lines in the page first and
- * add style attributes, which the policy forbids.
+ * Insert text over a selection here. The browser would first merge the lines in the page and add style attributes,
+ * which the content security policy forbids.
  */
 function typedOver(/** @type {InputEvent} */ event, /** @type {any} */ view) {
   if (event.inputType !== "insertText" || event.data === null || view.state.selection.main.empty || view.state.readOnly) return false;

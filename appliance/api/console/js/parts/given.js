@@ -1,4 +1,4 @@
-/** Text from the network: never markup, never invisible, never reordering its surroundings. */
+/** Text from the network. It never becomes markup, is never invisible, and never reorders its surroundings. */
 
 import { html } from "../html.js";
 import { pieces, plain } from "../words.js";

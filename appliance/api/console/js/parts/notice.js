@@ -27,7 +27,7 @@ export function Failure({ error, retry }) {
   </${Notice}>`;
 }
 
-/** An empty state: what would be here, and what to do. @param {{icon: any, title: string, children?: any}} given */
+/** An empty state: it describes the missing content and the next step. @param {{icon: any, title: string, children?: any}} given */
 export function Empty({ icon, title, children }) {
   return html`<div class="empty"><${Icon} name=${icon} size=${26} /><strong>${title}</strong>${children && html`<p>${children}</p>`}</div>`;
 }

@@ -1,4 +1,4 @@
-/** Tabs, also moved through with the arrow keys. */
+/** Tabs; the arrow keys also move between them. */
 
 import { html, useId, useRef } from "../html.js";
 

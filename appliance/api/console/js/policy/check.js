@@ -1,4 +1,4 @@
-/** Errors of the text, failed tests, and the changes it would make. */
+/** Errors in the text, failed tests, and the changes that the text would make. */
 
 import { html } from "../html.js";
 import { counted } from "../numbers.js";

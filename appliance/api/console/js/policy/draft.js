@@ -5,14 +5,14 @@ import { session } from "../session.js";
 import { createStore } from "../store.js";
 
 export const draft = createStore({
-  live: /** @type {any} */ (null), // as GET /v1/policy has it
-  etag: /** @type {string | null} */ (null), // of what the text was begun from
-  base: "", // the text it was begun from
+  live: /** @type {any} */ (null), // the answer to GET /v1/policy
+  etag: /** @type {string | null} */ (null), // of the revision that the edited text started from
+  base: "", // the text that the edited text started from
   text: "",
-  signature: "", // of the site, for the text
+  signature: "", // the site's signature of the text
   error: /** @type {unknown} */ (null),
   findings: /** @type {any[]} */ ([]),
-  report: /** @type {any} */ (null), // of the last dry run, or load
+  report: /** @type {any} */ (null), // of the last dry run or load
   tested: /** @type {any} */ (null),
 });
 
@@ -21,7 +21,7 @@ session.subscribe(() => {
   if (!current && !locked) draft.set({ live: null, etag: null, base: "", text: "", signature: "", error: null, findings: [], report: null, tested: null });
 });
 
-/** Ask for the policy in force. A text that was changed here stays, and keeps what it was begun from. */
+/** Fetch the policy in force. An edited text stays, together with the revision that it started from. */
 export async function look() {
   try {
     const { body, etag } = await ask("GET", "/v1/policy");
@@ -37,19 +37,19 @@ export function write(/** @type {string} */ text) {
   if (text !== draft.get().text) draft.update({ text, report: null });
 }
 
-/** Begin anew from what is in force. */
+/** Discard the edited text and start again from the policy in force. */
 export function discard() {
   const { live } = draft.get();
   draft.update({ text: live.text, base: live.text, etag: `"${live.revision}"`, findings: [], report: null, tested: null });
 }
 
-/** Keep the text, and take it as one that knows the revision now in force. */
+/** Keep the edited text, but base it on the revision that is now in force. */
 export function rebase() {
   const { live } = draft.get();
   draft.update({ base: live.text, etag: `"${live.revision}"`, report: null });
 }
 
-/** Errors, warnings and tests of the text, for whoever writes. Changes nothing. */
+/** Check the text and run its tests, for the person who edits it. The policy in force does not change. */
 export async function check(/** @type {AbortSignal} */ signal) {
   const { text } = draft.get();
   try {
@@ -60,7 +60,7 @@ export async function check(/** @type {AbortSignal} */ signal) {
   }
 }
 
-/** What the text would do. */
+/** Compute the effect of the text with a dry run. Throws `Problem`. */
 export async function dryRun() {
   const { text, signature } = draft.get();
   try {
@@ -86,7 +86,7 @@ export async function load(note, within) {
   }
 }
 
-/** The report of a change that is not a text: rollback, reload, confirm. @param {string} what @param {any} [json] */
+/** Make a change that has no text: rollback, reload or confirm. @param {string} what @param {any} [json] */
 export async function change(what, json) {
   const { live } = draft.get();
   const { body } = await ask("POST", `/v1/policy/${what}`, { json, match: `"${live.revision}"` });

@@ -12,7 +12,7 @@ import { useStore } from "../store.js";
 import { Report } from "./check.js";
 import { draft, dryRun, load, look } from "./draft.js";
 
-const MINUTES = "300"; // preselected where connections would end
+const MINUTES = "300"; // preselected if connections would end
 const WITHIN = /** @type {[string, string][]} */ ([["", "Permanent"], ["60", "Roll back in 1 minute unless confirmed"], ["300", "Roll back in 5 minutes unless confirmed"], ["900", "Roll back in 15 minutes unless confirmed"]]);
 
 /** A policy that would end live connections rolls back unless it is confirmed. @param {any} report of a dry run */

@@ -27,7 +27,7 @@ export function Revisions() {
     ${open && html`<${RevisionDialog} revision=${open.revision} back=${open.back} close=${() => setOpen(null)} />`}`;
 }
 
-/** A kept revision beside the one in force; with `back`, the question whether to go there. */
+/** A kept revision beside the one in force; with `back`, the page asks whether to roll back to it. */
 function RevisionDialog(/** @type {{revision: number, back: boolean, close: () => void}} */ { revision, back, close }) {
   const live = useStore(draft, (one) => one.live);
   const { value, error } = useResource((signal) => get(`/v1/policy/revisions/${revision}`, {}, signal), [revision]);

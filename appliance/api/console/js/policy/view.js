@@ -22,7 +22,7 @@ import { LoadDialog } from "./load.js";
 import { Revisions, RevisionText } from "./revisions.js";
 import { Tests } from "./tests.js";
 
-const PAUSE = 1200; // after the last key, before the text is checked
+const PAUSE = 1200; // milliseconds between the last key and the check of the text
 const TABS = /** @type {[string, string][]} */ ([["check", "Check"], ["diff", "Diff"], ["explain", "Explain"], ["tests", "Tests"], ["revisions", "Revisions"]]);
 
 export function PolicyView() {
@@ -76,7 +76,7 @@ export function PolicyView() {
     ${older(query, live) && html`<${RevisionText} revision=${Number(query.get("revision"))} line=${Number(query.get("line")) || 1} close=${() => go("/console/policy")} />`}`;
 }
 
-/** Whether the address names a revision that is not in force now. */
+/** Whether the URL names a revision that is not in force now. */
 function older(/** @type {URLSearchParams} */ query, /** @type {any} */ live) {
   const named = Number(query.get("revision"));
   return live !== null && named > 0 && named !== live.revision;

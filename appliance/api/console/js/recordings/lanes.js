@@ -9,10 +9,10 @@ import { kindOf } from "./times.js";
 
 export const COLUMNS = 160;
 const HEIGHT = 20;
-const LEAST = 4; // of a bar: one message is seen beside a thousand
+const LEAST = 4; // least height of a bar, so that one message is visible beside a thousand
 const SHOWN = 12;
 const MORE = 50;
-const TAIL = 16; // characters of a long name's end, which tells it from its neighbours
+const TAIL = 16; // characters shown of a long name's end, which distinguishes it from its neighbours
 
 /**
  * @param {{line: any, at: number, move: (time: number) => void, zoom: (factor: number) => void, all: () => void,
@@ -58,7 +58,7 @@ export function Lanes({ line, at, move, zoom, all, topics, choose, about }) {
     ${line.more_topics > 0 && html`<p class="muted small lane-note">${counted(line.more_topics, "topic")} with fewer messages are in the bag only.</p>`}</div>`;
 }
 
-/** One lane: its name, a bar for each column, how many in all. */
+/** One lane: its name, a bar for each column, and the total number. */
 function Lane(/** @type {any} */ { name, counts, tone, what, senders = [], picked, pick, column, point }) {
   const total = counts.reduce((/** @type {number} */ sum, /** @type {number} */ one) => sum + one, 0);
   const by = senders.map((/** @type {any} */ one) => `${plain(one.node)} ${plain(one.host)}`).join(", ");
@@ -69,7 +69,7 @@ function Lane(/** @type {any} */ { name, counts, tone, what, senders = [], picke
     <span class="lane-count muted small">${count(total)}</span></div>`;
 }
 
-/** A name whose middle is left out where there is no room. */
+/** A name; its middle is left out if the name does not fit. */
 function Name(/** @type {{name: string}} */ { name }) {
   const at = name.length > 2 * TAIL ? name.length - TAIL : name.length;
   return html`<span class="lane-head"><${Given} value=${name.slice(0, at)} most=${120} /></span>${at < name.length && html`<span class="lane-tail"><${Given} value=${name.slice(at)} /></span>`}`;

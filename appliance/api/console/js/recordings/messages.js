@@ -9,13 +9,13 @@ import { Failure } from "../parts/notice.js";
 import { get } from "../rest.js";
 import { iso } from "./times.js";
 
-const PAUSE = 250; // after the last step on the time line
+const PAUSE = 250; // milliseconds after the last step on the time line
 const EACH = 5;
 
 /** @param {{path: string, at: number, topics: string[], clear: () => void, span: number}} given `topics`: none: of all */
 export function Messages({ path, at, topics, clear, span }) {
   const [reading, setReading] = useState(false);
-  const [page, setPage] = useState(""); // the place of a message, when the reader has gone on from the moment
+  const [page, setPage] = useState(""); // the place of a message, once the user has paged on from the selected time
   const [found, setFound] = useState(/** @type {any} */ (null));
   const [error, setError] = useState(/** @type {unknown} */ (null));
   useEffect(() => setPage(""), [at, topics]);
@@ -47,7 +47,7 @@ export function Messages({ path, at, topics, clear, span }) {
         ${one.why && html`<p class="small"><${Given} value=${one.why} most=${400} /></p>`}<pre class="bytes" tabindex="0" aria-label="Its fields">${lines(one.fields)}</pre></details></li>`)}</ul></div></section>`;
 }
 
-/** Fields as JSON, a field a line: the breaks are ours, whatever is in the fields. */
+/** Fields as JSON, one field on each line. Line breaks come only from this function, never from the fields. */
 function lines(/** @type {any} */ fields) {
   return JSON.stringify(fields, null, 1).split("\n").map((line, at) => html`<div key=${at}><${Given} value=${line} most=${400} /></div>`);
 }

@@ -17,8 +17,8 @@ import { Messages } from "./messages.js";
 import { Remove, Taking } from "./taking.js";
 import { iso, kindOf } from "./times.js";
 
-const SHORTEST = 1e8; // nanoseconds that are shown at least
-const SHOWN = 100; // events
+const SHORTEST = 1e8; // shortest shown period, in nanoseconds
+const SHOWN = 100; // most shown events
 
 /** @param {{id: string}} given */
 export function RecordingPage({ id }) {
@@ -46,7 +46,7 @@ function Incident(/** @type {{row: any, path: string}} */ { row, path }) {
     setAt(event.time);
     go(`/console/recordings/${row.id}?record=${event.record}`, { replace: true });
   };
-  const placed = useRef(trigger ? record : ""); // the record that the moment was set by
+  const placed = useRef(trigger ? record : ""); // the record that set the selected time
   useEffect(() => {
     const known = events.find((/** @type {any} */ one) => one.record === record);
     if (!known || placed.current === record) return;
@@ -75,7 +75,7 @@ function Events(/** @type {any} */ { line, chosen, pick, row }) {
   useEffect(() => {
     if (place >= most) setMost(place + SHOWN);
     const row = /** @type {HTMLElement | null} */ (list.current?.children[place]);
-    if (list.current && row) list.current.scrollTop = row.offsetTop - list.current.offsetTop - row.offsetHeight; // the page stays
+    if (list.current && row) list.current.scrollTop = row.offsetTop - list.current.offsetTop - row.offsetHeight; // the page does not scroll
   }, [place, most]);
   const span = (row.ended - row.began) / 1e9;
   return html`<section class="panel" aria-labelledby="happened"><div class="panel-head"><h2 id="happened">What happened</h2><span class="muted small end">j, k: next, previous</span></div>
@@ -93,7 +93,7 @@ function Event(/** @type {{event: any}} */ { event }) {
     <dl class="facts"><dt>Node</dt><dd><${Given} value=${event.caller_id} mono most=${200} /></dd><dt>Host</dt><dd><${Given} value=${event.host} mono /></dd><dt>About</dt><dd><${Given} value=${event.resource} mono most=${200} /></dd><dt>When</dt><dd><${Moment} at=${iso(event.time)} /></dd></dl></div></section>`;
 }
 
-/** j and k go through the events, from the moment that is chosen. */
+/** The keys j and k move through the events, starting at the selected time. */
 function useSteps(/** @type {any[]} */ events, /** @type {number} */ at, /** @type {(event: any) => void} */ pick) {
   const newest = useRef({ events, at, pick });
   newest.current = { events, at, pick };

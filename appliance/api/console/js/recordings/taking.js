@@ -51,7 +51,7 @@ export function OnTimeline({ record }) {
     if (!asked) return undefined;
     const controller = new AbortController();
     const at = Date.parse(record.time) * 1e6;
-    // While the recorder is off, or its answer does not come, there is no time line to lead to.
+    // While the recorder is off or does not answer, there is no time line to link to.
     get("/v1/recordings", {}, controller.signal).then(({ recordings }) => setFound(recordings.find((/** @type {any} */ one) => (closed ? one.id === closed : one.began <= at && at <= one.ended)) ?? null), () => setFound(null));
     return () => controller.abort();
   }, [record.id, asked]);
