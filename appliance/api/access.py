@@ -5,8 +5,8 @@ Invariants:
 1. Only a token from control's list that has not expired identifies its owner.
 2. The costly check (scrypt) runs in a thread, for one request at a time. A peer that keeps sending wrong tokens must
    wait between checks, so guessing cannot keep the process busy.
-3. A token that passed is remembered as a hash under a random key of this process, never in clear text. A change of the
-   tokens clears this memory.
+3. A valid token is remembered only as a hash under a random key of this process, never in clear text. A change of the
+   list of tokens clears this memory.
 """
 
 import asyncio
@@ -36,7 +36,7 @@ _MOST_KNOWN = 1024
 class Bearer:
     """The holder of a token; `expires` is seconds since the epoch.
 
-    `shown` is the token, or its reading key, as sent with the request. `asked` is the request, unless it is a GET.
+    `shown` is the token (or its reading key) that the request carries. `asked` is the request, unless it is a GET.
     `gone` is set when the client disconnects.
     """
 
@@ -50,20 +50,20 @@ class Bearer:
 
 
 class TokenAuthenticator:
-    """The check of tokens; at most `failures_per_minute` wrong ones of a peer are checked."""
+    """Checks tokens; of each peer, at most `failures_per_minute` wrong tokens are checked."""
 
     def __init__(self, failures_per_minute: int) -> None:
         self._tokens: dict[str, TokenKept] = {}
         self._recognised: dict[bytes, str] = {}
         self._key = secrets.token_bytes(32)
-        # Separate, so that a peer that tries random ids does not lock out a neighbour with a valid token.
+        # Counted separately, so that a peer that tries random ids does not lock out a neighbour with a valid token.
         self._unknown = Buckets(failures_per_minute / 60, failures_per_minute)
         self._wrong = Buckets(failures_per_minute / 60, failures_per_minute)
         self._checking = asyncio.Lock()
-        self._shown: OrderedDict[str, float] = OrderedDict()  # peers that showed a valid token, and when
+        self._shown: OrderedDict[str, float] = OrderedDict()  # by peer: the time of its last valid token
 
     def quota_class(self, peer: str) -> QuotaClass:
-        """Return a peer's quota class: registered if it is this machine or lately sent a valid token, else unknown."""
+        """Return a peer's class: registered for this machine, or after a recent valid token; else unknown."""
         shown = self._shown.get(peer)
         lately = shown is not None and time.monotonic() - shown < _KNOWN_SECONDS
         return QuotaClass.REGISTERED if lately or is_loopback(peer) else QuotaClass.UNKNOWN
@@ -74,7 +74,7 @@ class TokenAuthenticator:
         self._recognised.clear()
 
     def still_good(self, bearer: Bearer) -> bool:
-        """Whether a token that passed before may still be used."""
+        """Whether a previously valid token may still be used."""
         return bearer.id in self._tokens and time.time() < bearer.expires
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
@@ -105,7 +105,7 @@ class TokenAuthenticator:
             return True
         _require_patience(self._wrong, host)
         async with self._checking:
-            _require_patience(self._wrong, host)  # others of this host may have failed while this one waited
+            _require_patience(self._wrong, host)  # other requests of this host may have failed meanwhile
             if not await asyncio.to_thread(is_secret, secret, kept.salt, kept.hash):
                 return False
         if kept.id in self._tokens:

@@ -1,4 +1,4 @@
-"""Derive the open conditions that need attention from the status, for the console, REST and `rosrv status`."""
+"""Derive alarms (present conditions that need attention) from the status: for the console, REST, `rosrv status`."""
 
 import datetime
 import time
@@ -27,7 +27,7 @@ class Alarm(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def open_alarms(status: Status) -> list[Alarm]:
-    """Return the open conditions, the most severe first."""
+    """Return the alarms for the present conditions, the most severe first."""
     found = [*_system(status), *_policy(status), *_monitors(status)]
     found += [("warning", "ipsec", "hosts", line) for line in status.ipsec.troubles]
     alarms = (
@@ -105,7 +105,7 @@ def _monitors(status: Status) -> Iterator[_Condition]:
 
 
 def _failing(process: ProcessInfo) -> str:
-    """Return why a process keeps restarting, with its last output."""
+    """Return the reason why a process keeps restarting, with its last output."""
     lines = "".join(f"\n    {line}" for line in process.output)
     printed = f"; it printed last:{lines}" if lines else ""
     return f"{process.role} is failing, after {process.restarts} restarts: {process.failing}{printed}"

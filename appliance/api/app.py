@@ -35,7 +35,7 @@ The appliance's own interface for scripts and other programs. Every call but the
 
 
 def build_app(services: Services) -> FastAPI:
-    """Return the application, without `RequestGate`."""
+    """Return the application; the caller wraps it in `RequestGate`."""
     app = FastAPI(
         title="ROSRV appliance",
         version=appliance.__version__,
@@ -80,7 +80,10 @@ def build_app(services: Services) -> FastAPI:
 
 
 async def _only_known(request: Request) -> None:
-    """Raise `ProblemError` (422) for query parameters that the contract lacks; other pages (the console) take any."""
+    """Raise `ProblemError` (422) for query parameters that the contract lacks.
+
+    Pages outside the contract, such as the console, accept any query parameters.
+    """
     given = request.query_params.keys()
     if not given:
         return
@@ -133,7 +136,7 @@ async def _of_http(request: Request, error: Exception) -> Response:
 
 
 def _methods(request: Request) -> set[str]:
-    """Return the methods of a path; GET if no route matches."""
+    """Return the methods that a request's path supports; GET if no route matches."""
     matching = [
         route
         for route in iter_route_contexts(request.app.routes)

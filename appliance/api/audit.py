@@ -1,7 +1,7 @@
-"""`/v1/audit`: search, one record, follow live, verify, export. Reads the log's file, which it cannot write.
+"""`/v1/audit`: search, one record, follow live, verify, export. The api reads the log's file, but cannot write it.
 
-Costly work is limited: the numbers of searches, exports and followers, and one verification at a time. A request above
-a limit waits briefly; then the answer is 503.
+Costly work is limited: the numbers of searches, exports and followers have limits, and only one verification runs at a
+time. A request above a limit waits briefly; then the answer is 503.
 """
 
 import asyncio
@@ -49,7 +49,7 @@ _POLL_SECONDS = 0.2
 _PING_SECONDS = 15
 _STREAM_PAGE = 500
 _LARGEST_PAGE = 1000
-_MOST_NEIGHBOURS = 1000  # the same as on the command line
+_MOST_NEIGHBOURS = 1000  # the same limit as on the command line
 
 RECORD = {key: value for key, value in json_schema().items() if key != "$schema"}
 _RECORD_REF = {"$ref": "#/components/schemas/AuditRecord"}
@@ -150,7 +150,7 @@ OneRecord = Annotated[
 
 
 class LogReader:
-    """A reader of the log in threads, limited in number."""
+    """Reads the log in threads; the number of threads is limited."""
 
     def __init__(self, services: Services) -> None:
         self.path = services.audit_log
@@ -324,7 +324,7 @@ async def _follow(
 def page_of(
     path: pathlib.Path, wanted: Filter, cursor: str | None, limit: int, bearer: Bearer, *, newest_first: bool
 ) -> dict[str, Any]:
-    """Return a page that the bearer may read; its cursor discloses nothing about hidden records."""
+    """Return a page of records that the bearer may read; the cursor reveals nothing about hidden records."""
     shown: list[dict[str, Any]] = []
     more: str | None = cursor
     count = limit + 1
@@ -333,14 +333,14 @@ def page_of(
         shown += _shown(entries, bearer, wanted.text)
         if more is None:
             break
-        count = _STREAM_PAGE  # many records may be hidden: skip them in large steps
+        count = _STREAM_PAGE  # many records may be hidden; large steps skip them faster
     last = str(shown[limit - 1]["sequence"]) if len(shown) > limit else None
     page: dict[str, Any] = {"records": shown[:limit], "cursor": last}
     return page | {"notes": notes} if (notes := unrecorded(wanted)) else page
 
 
 def _shown(entries: Iterable[LogEntry], bearer: Bearer, text: str | None = None) -> list[dict[str, Any]]:
-    """Return the records that the bearer may read, without those whose hidden parts alone matched the text."""
+    """Return the records that the bearer may read, without records that match `text` only in their hidden parts."""
     shown = []
     for entry in entries:
         readable = _readable(entry, bearer)
@@ -350,7 +350,7 @@ def _shown(entries: Iterable[LogEntry], bearer: Bearer, text: str | None = None)
 
 
 def _readable(entry: LogEntry, bearer: Bearer) -> LogEntry:
-    """Return the record as the bearer may read it."""
+    """Return the record without the parts that the bearer may not read."""
     return entry if reads_contents(bearer) else without_contents(entry)
 
 
@@ -362,7 +362,7 @@ def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer) -> Iterator[st
 
 
 def _begun(entries: Iterator[_T]) -> Iterator[_T]:
-    """Return the entries with the first already read, so that an invalid search fails before the answer begins."""
+    """Read the first entry now and return all entries, so that an invalid search fails before the answer begins."""
     first = next(entries, None)
     return iter(()) if first is None else itertools.chain((first,), entries)
 

@@ -1,7 +1,7 @@
-"""Make and keep the certificate of REST: self-signed, made at the first start, in the api's part of the state.
+"""Make and keep the self-signed certificate of REST; it is made at the first start, in the api's part of the state.
 
-The authority of the tunnels' hosts does not sign it, because REST also runs without tunnels. Give `certificate.pem` to
-clients by hand, or let them pin the key's fingerprint, as the kits of hosts do.
+The authority for hosts in tunnels does not sign the certificate, because REST also runs without tunnels. Copy
+`certificate.pem` to clients by hand, or let them pin the key's fingerprint, as the kits of hosts do.
 """
 
 import base64
@@ -24,15 +24,15 @@ CERTIFICATE = "certificate.pem"
 KEY = "key.pem"
 _DAYS = 825
 _RENEW_DAYS = 30
-_TOO_EARLY = datetime.datetime(2025, 1, 1, tzinfo=datetime.UTC)  # a clock before this is wrong
+_TOO_EARLY = datetime.datetime(2025, 1, 1, tzinfo=datetime.UTC)  # an earlier clock is wrong
 _HOST_NAME_LIMIT = 64
 
 
 def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl.SSLContext:
-    """Return a server's context with the kept certificate.
+    """Return the server's TLS context with the stored certificate.
 
-    Make a new certificate when there is none, or when it ends soon or lacks a name. Raises `OSError`, `ValueError` and
-    `ssl.SSLError` when the kept one cannot be used.
+    Make a new certificate if none is stored, or if the stored one ends soon or lacks a name. Raises `OSError`,
+    `ValueError` and `ssl.SSLError` if the stored files cannot be used.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -43,7 +43,7 @@ def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl
 
 
 def renew(context: ssl.SSLContext, home: Path, names: Iterable[str], now: datetime.datetime) -> bool:
-    """Replace a certificate that ends soon, or was made with a wrong clock; return whether it was replaced.
+    """Replace a certificate that ends soon or was made with a wrong clock; return whether it was replaced.
 
     Raises the same errors as `tls_context`.
     """
@@ -100,7 +100,7 @@ def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: dat
 
 
 def pin_of(home: Path) -> str:
-    """Return the pin of a server's key, in the form of curl's `--pinnedpubkey`."""
+    """Return the pin of the server's key, in the format of curl's `--pinnedpubkey`."""
     certificate = x509.load_pem_x509_certificate((home / CERTIFICATE).read_bytes())
     public = certificate.public_key().public_bytes(
         serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
@@ -109,7 +109,7 @@ def pin_of(home: Path) -> str:
 
 
 def _kept_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    """Return the stored key, which enrolled hosts have pinned; make one if there is none."""
+    """Return the stored key, which enrolled hosts have pinned; make a key if none is stored."""
     if path.exists():
         key = serialization.load_pem_private_key(path.read_bytes(), password=None)
         if isinstance(key, ec.EllipticCurvePrivateKey):

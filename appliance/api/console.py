@@ -2,11 +2,11 @@
 
 Invariants:
 
-1. The files are part of the program. Only the site's notice, and the time after which the page locks, are settings.
-   They need no token and contain no secret. The page requests its content from `/v1` with its reader's token.
-2. Only files that existed when the routes were made are served, by exact name: no path of a request reaches the file
+1. The files are part of the program, need no token and contain no secret. Only the site's notice, and the time after
+   which the page locks, are settings. The page requests its content from `/v1` with its reader's token.
+2. Only files that existed when the routes were made are served, by exact name: a request's path never reaches the file
    system.
-3. The headers let the page load from, and connect to, this origin alone, and run only these scripts. A string never
+3. The headers restrict the page to this origin, for loading and for connections, and to its own scripts. A string never
    becomes markup (Trusted Types).
 """
 
@@ -36,7 +36,7 @@ _HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(), geolocation=(), microphone=(), payment=(), usb=()",
     "X-Frame-Options": "DENY",
-    "Cache-Control": "no-cache",  # cached and checked by its ETag, so that an update takes effect at once
+    "Cache-Control": "no-cache",  # revalidate cached files by ETag, so that an update takes effect at once
 }
 
 
@@ -84,7 +84,7 @@ def _answer(request: Request, found: _File) -> Response:
 
 
 def _collect(folder: Traversable, prefix: str) -> dict[str, _File]:
-    """Return all files under a folder, by their path in it."""
+    """Return all files under a folder, by their paths relative to it."""
     found: dict[str, _File] = {}
     for entry in folder.iterdir():
         if entry.is_dir():
@@ -100,7 +100,7 @@ def _stating(page: _File, said: dict[str, str]) -> _File:
     for name, text in said.items():
         empty = f'<meta name="rosrv:{name}" content="'
         before, found, after = body.partition(empty)
-        assert found, name  # noqa: S101  the page has a place for each
+        assert found, name  # noqa: S101  the page has a `meta` element for each setting
         body = f"{before}{found}{html.escape(text)}{after}"
     return _file(body.encode(), page.media_type)
 

@@ -12,7 +12,7 @@ from appliance.api.audit import RECORD
 from appliance.api.problems import MEDIA_TYPE, Problem
 from appliance.api.routing import CONTRACT
 
-# Answers of the gate to any call.
+# Answers that the request gate may give to any call.
 _ALWAYS = {
     "403": "The request is from a page of another site, or not for this role.",
     "408": "The body did not arrive in time.",
@@ -27,16 +27,16 @@ _WITH_TOKEN = {
 _NOT_HTTP = "The request is not HTTP, or its first line or headers are too long (64 KiB); the text is the server's own."
 _HASH = {"description": "ETag of this body; If-None-Match takes it", "schema": {"type": "string"}}
 _REFERENCE = CONTRACT.reference(Problem)
-# Requests and answers of an appliance, with long texts and lists cut, by the kind of the body, or by the operation for
-# a body without a kind. tests/integration/api/test_examples.py compares them with real answers.
+# Requests and answers of a real appliance, with long texts and lists cut. The key is the kind of the body, or the
+# operation for a body without a kind. tests/integration/api/test_examples.py compares the examples with real answers.
 EXAMPLES: dict[str, Any] = json.loads(files(__package__).joinpath("examples.json").read_text("utf-8"))
-# Descriptions of fields by name, for fields that their structs do not describe. A name with another meaning in one kind
-# is described there as `Kind.name`.
+# Descriptions by field name, for fields that their structs do not describe. If a name has another meaning in one kind,
+# the key for that kind is `Kind.name`.
 WORDS: dict[str, str] = json.loads(files(__package__).joinpath("field_words.json").read_text("utf-8"))
 
 
 def contract_of(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document; it is made once."""
+    """Return the OpenAPI document, which is made only once."""
     if app.openapi_schema is None:
         app.openapi_schema = _made(app)
     return app.openapi_schema
@@ -70,7 +70,7 @@ def _made(app: FastAPI) -> dict[str, Any]:
 
 
 def _plain(schema: Any) -> Any:
-    """Return a schema that client generators understand: `maxItems` alone gives a tuple's length."""
+    """Return the schema in a form that client generators understand: only `maxItems` gives a tuple's length."""
     if isinstance(schema, list):
         return [_plain(part) for part in schema]
     if not isinstance(schema, dict):
@@ -79,7 +79,7 @@ def _plain(schema: Any) -> Any:
 
 
 def _described(kind: str, schema: dict[str, Any]) -> None:
-    """Describe the fields without a description; a field that refers to a kind has the kind's description."""
+    """Describe the fields that lack a description. A field that refers to a kind uses the kind's description."""
     for name, field in schema.get("properties", {}).items():
         words = WORDS.get(f"{kind}.{name}", WORDS.get(name))
         if words is not None and "$ref" not in field and not is_described(field):
@@ -87,7 +87,7 @@ def _described(kind: str, schema: dict[str, Any]) -> None:
 
 
 def is_described(field: dict[str, Any]) -> bool:
-    """Whether a field is described: itself, or one of its possible types."""
+    """Whether the field or one of its possible types has a description."""
     return "description" in field or any(map(is_described, field.get("anyOf", ())))
 
 
@@ -103,7 +103,7 @@ def _tagged(responses: dict[str, Any]) -> None:
 
 
 def _exemplified(operation: dict[str, Any]) -> None:
-    """Add the examples of an answer without a kind, and of a body that is sent as text."""
+    """Add the examples for answers without a kind, and for bodies that are sent as text."""
     name = operation["operationId"]
     if name in EXAMPLES:
         (answer,) = operation["responses"]["200"]["content"].values()

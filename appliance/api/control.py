@@ -2,10 +2,10 @@
 
 Invariants:
 
-1. At most `_MOST_OPEN` requests are open; one more is rejected here and costs control nothing.
-2. A request ends with its answer, with the link, or after a time limit.
-3. A notice (`tell`) never waits. Without control the last `_MOST_KEPT` notices are kept for the next control; lost ones
-   are counted and logged.
+1. At most `_MOST_OPEN` requests are open; a further request is rejected here and costs control nothing.
+2. A request ends with its answer, with the end of the link, or after a time limit.
+3. A notice (`tell`) never waits. While control is away, the last `_MOST_KEPT` notices are kept for the next control;
+   lost notices are counted and logged.
 """
 
 import asyncio
@@ -36,7 +36,7 @@ from appliance.channel.rest_operation import ANSWER_SECONDS
 _log = structlog.get_logger()
 _MOST_OPEN = 48
 _MOST_KEPT = 1000
-_GRACE_SECONDS = 10.0  # for control's report on an order whose time is over
+_GRACE_SECONDS = 10.0  # extra time for control to report on an order whose time is over
 _UNKNOWN = (
     ": the order may have taken effect; if it has not by now, it never will. Orders that took effect are in the audit"
     " log: rosrv audit search --since 5m (GET /v1/audit)"
@@ -44,7 +44,7 @@ _UNKNOWN = (
 
 
 class ControlAwayError(Exception):
-    """Report that control does not answer now; the text has the reason, for the client."""
+    """Report that control does not answer now; the text gives the client the reason."""
 
 
 def _made(
@@ -56,7 +56,7 @@ def _made(
 
 
 class ControlLink:
-    """The link to the control process that is connected.
+    """The link to the control process.
 
     `tokens_stated(tokens)` is called with the tokens that are valid from now on, `lost()` when control disconnects.
     """
@@ -88,7 +88,7 @@ class ControlLink:
 
     def _tell_pin(self) -> None:
         if self._pin:
-            with contextlib.suppress(ChannelFullError):  # the link ends, and the next one gets it
+            with contextlib.suppress(ChannelFullError):  # this link ends, and the next link gets the pin
                 self._link.send(RestServed(self._pin))
 
     async def ask(
@@ -96,8 +96,8 @@ class ControlLink:
     ) -> AdminAnswer[A]:
         """Return control's answer to a request of the bearer. Raises `ControlAwayError`.
 
-        A request is withdrawn if it has not taken effect after `seconds` (None: the operation's own limit), or when the
-        client disconnects.
+        A request is withdrawn if the client disconnects, or if it has not taken effect after `seconds` (None: the
+        operation's own limit).
         """
         if seconds is None:
             operation = operation_of(request)
@@ -135,7 +135,7 @@ class ControlLink:
 
         def withdraw(gone: "asyncio.Future[None]") -> None:
             if not gone.cancelled():
-                with contextlib.suppress(ChannelFullError):  # the time of the request ends it
+                with contextlib.suppress(ChannelFullError):  # the request then ends at its time limit
                     self._link.send(RequestWithdrawn(number))
 
         gone = bearer.gone if bearer is not None else None

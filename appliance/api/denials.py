@@ -1,6 +1,6 @@
-"""Derive from a record of a denial its request to the policy, or the reason why no policy would allow it.
+"""Derive the denied request from the record of a denial, or the reason why no policy would allow the request.
 
-Every event that can be a denial has its row in `DENIALS`.
+Every event that can be a denial has a row in `DENIALS`.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from appliance.policy.model import Category
 from appliance.policy.policy_settings import AT_ONCE
 
 _ASKS = {"topic": "requestTopic", "service": "lookupService"}
-"""The call that grants a connection, by the connection's category."""
+"""By category of a connection: the call that grants it."""
 
 
 def is_denial(record: AuditRecord) -> bool:
@@ -27,7 +27,7 @@ def is_denial(record: AuditRecord) -> bool:
 
 
 def asks_policy(record: AuditRecord) -> bool:
-    """Whether a change of the policy might allow a denied request; the policy in force shows which."""
+    """Whether a change of the policy might allow a denied request."""
     try:
         return is_denial(record) and asked_of(record) is not None
     except UngrantableError:
@@ -35,7 +35,7 @@ def asks_policy(record: AuditRecord) -> bool:
 
 
 def asked_of(record: AuditRecord) -> DecidedRequest:
-    """Return the request that the policy denied. Raises `UngrantableError` if no change would allow it."""
+    """Return the denied request. Raises `UngrantableError` if no change of the policy would allow it."""
     what = DENIALS.get(record.event)
     if what is None:
         raise UngrantableError("it is not a record of a decision about a host's call")
@@ -71,7 +71,7 @@ def _of_connection(record: AuditRecord) -> DecidedRequest:
 
 
 def _of_call(record: AuditRecord, call: str) -> DecidedRequest:
-    """Return the request to the policy for the call that a record is about."""
+    """Return the request that the policy decided for the call in a record."""
     category, detail = policy_call(call).category, {**record.detail, "call": call}
     resource = record.resource
     if category is Category.COMMAND:
@@ -115,4 +115,4 @@ DENIALS: dict[str, str | Callable[[AuditRecord], DecidedRequest]] = {
     "tunnel refused": "a tunnel needs a valid certificate of this appliance (rosrv host list)",
     "packets refused": "replayed packets, and packets with the address of another host, are never accepted",
 }
-"""For each event, the function that derives the request from its record, or why no policy would allow it."""
+"""For each event: a function that derives the request from the record, or why no policy would allow the request."""

@@ -1,7 +1,7 @@
 """Compute the effects of a policy without RVMaster: errors, tests, live connections, explanations.
 
-Everything is a pure function of texts and runs in a thread, so a client's long text costs RVMaster nothing.
-`current` is control's answer to `PolicyWanted`; a text of None means the policy in force.
+Every function here is pure, takes texts, and runs in a thread, so a client's long text costs RVMaster nothing.
+`current` is control's answer to `PolicyWanted`; if `text` is None, the policy in force is used.
 """
 
 from collections.abc import Iterable
@@ -36,7 +36,7 @@ _GRANTED = (
 
 
 def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterable[Registration]) -> Report:
-    """Return what loading a new text would change. Raises `ProblemError` with every finding when it is rejected."""
+    """Return the effects of loading a new text. Raises `ProblemError` with every finding if the text is rejected."""
     known = PolicyContext.of(msgspec.structs.asdict(current))
     before = compile_policy(current.text, file=current.file, hosts=known.hosts, robot=known.robot)
     try:
@@ -60,7 +60,7 @@ def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterabl
 
 
 def granted(record: AuditRecord, current: PolicyKnown) -> Granted:
-    """Return the change that grants a recorded denial. Raises `UngrantableError` if no line can."""
+    """Return the policy change that allows the denied request of a record. Raises `UngrantableError` if none does."""
     known = PolicyContext.of(msgspec.structs.asdict(current))
     found = grant(current.text, current.file, known, asked_of(record))
     return Granted(
@@ -74,7 +74,7 @@ def granted(record: AuditRecord, current: PolicyKnown) -> Granted:
 
 
 def explained(record: AuditRecord, current: PolicyKnown | None) -> Why:
-    """Explain a record; for a denial that a policy might allow, `current` must be given."""
+    """Explain a record; if it is a denial that a policy might allow, `current` must be given."""
     found, refusal = None, ""
     try:
         if current is not None:
@@ -89,7 +89,7 @@ def explained(record: AuditRecord, current: PolicyKnown | None) -> Why:
 
 
 def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> PolicyJudgement:
-    """Judge a text, signed or not; `cases`: also run the test cases beside the policy file.
+    """Check a policy text, signed or not; `cases`: also run the test cases in the file next to the policy file.
 
     Raises `ProblemError` with every finding if the text or the cases are invalid.
     """
@@ -105,7 +105,7 @@ def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Policy
 def explanation(
     text: str | None, current: PolicyKnown, *, host: str, node: str, category: Category, resource: str
 ) -> DecisionExplanation:
-    """Return why a request is decided as it is. Raises `ProblemError` when the request makes no sense."""
+    """Return the reasons for the decision of a request. Raises `ProblemError` if the request is invalid."""
     policy = judge_text(text, current, cases=False).policy
     try:
         request = Request(find_hosts(host, policy)[0], node, category, check_resource(category, resource))

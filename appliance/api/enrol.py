@@ -2,12 +2,11 @@
 
 Invariants:
 
-1. Enrolment needs only a one-time token. A host that sends wrong tokens must wait, and all such hosts share another
-   limit. A host that sent no wrong token never waits, so an unknown host with many addresses cannot keep out a valid
-   token.
-2. Only a host in its tunnel can renew: control compares the peer's address with the virtual address of the name, which
-   the firewall accepts through IPsec alone, and the signer checks the signature of its present key.
-3. Signing requests are not parsed here.
+1. Enrolment needs only a one-time token. A host that sends wrong tokens must wait, and all such hosts also share one
+   limit. A host that sent no wrong token never waits, so an attacker with many addresses cannot keep out a valid token.
+2. Only a host in its tunnel can renew. Control compares the peer's address with the virtual address of the name, which
+   the firewall accepts only through IPsec. The signer checks the signature by the host's present key.
+3. This module does not parse signing requests.
 """
 
 import base64
@@ -160,7 +159,7 @@ def _add_renewal(router: Routes, services: Services) -> None:
 
 
 class _Patience:
-    """The limits on wrong tokens, for one host and for all."""
+    """The limits on wrong tokens: one for each host, and one for all hosts together."""
 
     def __init__(self, per_minute: int) -> None:
         self._one = Buckets(per_minute / 60, per_minute)

@@ -1,4 +1,4 @@
-"""Answer with ETags, so that a client does not get an answer twice (If-None-Match, RFC 9110, 13.1)."""
+"""Answer with ETags, so that a client does not download an unchanged answer again (If-None-Match, RFC 9110, 13.1)."""
 
 import hashlib
 
@@ -9,15 +9,15 @@ _JSON = "application/json"
 
 
 def etag(tag: int | str) -> str:
-    """Return the ETag of a revision, or of an answer with its own tag."""
+    """Return the ETag for a revision number, or for an answer's own tag."""
     return f'"{tag}"'
 
 
 class ConditionalGet:
-    """ASGI middleware that gives each JSON answer to GET without an ETag the hash of its body.
+    """ASGI middleware: a JSON answer to GET that has no ETag gets the hash of its body as its ETag.
 
-    A client that sends the hash in `If-None-Match` gets 304, without the body. An answer with its own ETag is sent
-    completely: that ETag is of a revision, for `If-Match` of a change, and does not cover the rest of the body.
+    A client that sends the hash in `If-None-Match` gets 304, without the body. An answer with its own ETag is always
+    sent completely: such an ETag names a revision, for `If-Match` of a change, and does not cover the whole body.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -31,7 +31,7 @@ class ConditionalGet:
 
 
 class _Answer:
-    """One answer; its start is sent together with the first part of the body."""
+    """One answer; its start is delayed until the first part of the body is known."""
 
     def __init__(self, known: str, send: Send) -> None:
         self._known = {tag.strip().removeprefix("W/") for tag in known.split(",")}

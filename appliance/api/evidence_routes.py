@@ -1,4 +1,4 @@
-"""`/v1/evidence` and `/v1/recordings/{id}/evidence`: one file that proves what happened on any machine."""
+"""`/v1/evidence` and `/v1/recordings/{id}/evidence`: one file of evidence that any machine can verify."""
 
 import asyncio
 from typing import Annotated, Any

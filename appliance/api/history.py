@@ -1,7 +1,7 @@
 """Keep samples of the last hour: counters that only grow, from which clients compute rates.
 
-Control is queried every `BUSY_SECONDS` while a client follows, else every `IDLE_SECONDS`, once for all clients, so
-their number costs RVMaster nothing. The age and the number of samples are limited.
+While a client follows, control is queried every `BUSY_SECONDS`; otherwise every `IDLE_SECONDS`. One query serves all
+clients, so more clients cost RVMaster nothing. The age and the number of samples are limited.
 """
 
 import asyncio
@@ -62,7 +62,7 @@ class SampleHistory:
         self.seen = LastSample(0, None, None, _AWAY)
 
     def samples(self, most: int) -> list[Sample]:
-        """Return at most `most` samples of the last hour at even distances, the newest last."""
+        """Return at most `most` evenly spaced samples of the last hour, the newest last."""
         kept = list(self._samples)
         step = -(-len(kept) // most)
         return kept[::-1][::step][::-1] if step > 1 else kept
@@ -84,7 +84,7 @@ class SampleHistory:
             return self.seen
 
     async def again(self, seconds: float) -> LastSample:
-        """Sample early and return the result, or the last sample if that takes longer than `seconds`.
+        """Sample early and return the result; if sampling takes longer than `seconds`, return the last sample.
 
         Control is queried at most once in `LEAST_SECONDS`.
         """
@@ -118,7 +118,7 @@ class SampleHistory:
             self._news.notify_all()
 
     def _keep(self, sample: Sample) -> None:
-        while self._samples and self._samples[-1].time > sample.time:  # the clock was set back
+        while self._samples and self._samples[-1].time > sample.time:  # drop them: the clock was set back
             self._samples.pop()
         while self._samples and self._samples[0].time < sample.time - _KEPT_SECONDS:
             self._samples.popleft()

@@ -1,7 +1,7 @@
-"""Routes of `/v1/hosts` that are not derived: one host and its kit, and changes with answers of their own.
+"""Routes of `/v1/hosts` that are not derived: one host, its kit, and changes whose answer is not control's.
 
-Every change needs `If-Match` with the ETag of `GET /v1/hosts`, which only changes of the table of hosts change, not
-tunnels that go up or down.
+Every change needs `If-Match` with the ETag of `GET /v1/hosts`. This ETag changes with the table of hosts, but not when
+a tunnel goes up or down.
 """
 
 import asyncio
@@ -83,7 +83,7 @@ async def _enrol(call: OperationCall[Any]) -> Response:
 
 
 async def _kit(call: OperationCall[Any]) -> Response:
-    """Answer with a kit; make its key here unless the host has made its own."""
+    """Answer with a kit; make its key here unless the host has its own key."""
     wishes, key, order = _wishes(call.body), None, call.order
     if not order.request:
         made = await asyncio.to_thread(make_key)
@@ -99,7 +99,7 @@ async def _ports(call: OperationCall[admin.HostPorts]) -> Tagged[answers.PortsSe
 
 
 def _archive(parts: answers.KitParts, wishes: KitOptions, key: str | None, status: int = 200) -> Response:
-    """Return a kit as a download."""
+    """Return a kit as a downloadable archive."""
     headers = {
         "ETag": etag(parts.revision),
         "Content-Disposition": f'attachment; filename="rosrv-{parts.name}.tar.gz"',

@@ -1,8 +1,8 @@
 """Report all REST calls to control, which records them; equal reads and rejections are folded.
 
-The first call of a kind is reported at once; repetitions within `FOLD_SECONDS` are counted and reported as one. Beyond
-`kinds` kinds, calls are counted by status only. Changes (anything but GET and HEAD with a valid token) are never
-folded.
+The first call of a kind is reported at once; repetitions within `FOLD_SECONDS` are counted and reported as one call.
+Calls beyond `kinds` kinds are counted by status only. Changes are never folded: a change is any call with a valid token
+except GET and HEAD.
 """
 
 from collections import Counter
@@ -17,13 +17,13 @@ _Kind = tuple[str, str, str, str, int, str]
 
 
 class Journal:
-    """The report of answers; call `flush` every `FOLD_SECONDS`."""
+    """Reports answers to control; call `flush` every `FOLD_SECONDS`."""
 
     def __init__(self, tell: Callable[[RestCalled], None], *, kinds: int = 512) -> None:
         self._tell = tell
         self._kinds = kinds
         self._repeated: dict[_Kind, int] = {}
-        self.calls: Counter[tuple[str, str]] = Counter()  # by method and status, for the metrics
+        self.calls: Counter[tuple[str, str]] = Counter()  # number by method and status, for the metrics
 
     def answered(
         self,
@@ -55,7 +55,7 @@ class Journal:
             self._repeated[rest] = self._repeated.get(rest, 0) + 1
 
     def flush(self) -> None:
-        """Report repetitions."""
+        """Report the counted repetitions."""
         repeated, self._repeated = self._repeated, {}
         for kind, count in repeated.items():
             if count:

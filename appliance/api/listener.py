@@ -1,16 +1,16 @@
 """Accept connections of REST behind the same front as RVMaster's; uvicorn serves them.
 
-uvicorn's configuration, a public interface, makes the protocol of a connection for HTTP and ASGI. The protocol gets the
+uvicorn's configuration, a public interface, makes each connection's protocol for HTTP and ASGI. This protocol gets the
 bytes that the front accepts. Invariants besides those of `rpc/front`:
 
-1. A connection is entered in the table before anything (such as TLS) is set up for it; if the table has no room, the
-   connection is closed at once.
-2. A peer is known if it lately sent a valid token or is on this machine. For a peer that has no connection yet, a
-   connection of an unknown peer may be closed at any time, one of a known peer only for another known peer, and only if
-   it has waited for a second.
+1. A connection is entered in the connection table before anything (such as TLS) is set up for it. If the table is full,
+   the connection is closed at once.
+2. A peer is known if it recently sent a valid token or is on this machine. To admit a peer that has no connection
+   yet, a connection of another peer may be closed. A connection of an unknown peer may be closed at any time. A
+   connection of a known peer may be closed only for another known peer, and only after it has waited for a second.
 3. Connections are opened (with TLS: the handshake begins) in the order of the processor time that their peers have
-   used. All unknown peers count as one.
-4. The deadline for the head of the next request starts with the first byte after an answer, so neither an empty line
+   used. All unknown peers count as one peer.
+4. The deadline for the head of the next request starts with the first byte after an answer. So neither an empty line
    nor the rest of a body keeps a connection open.
 """
 
@@ -40,11 +40,11 @@ from appliance.rpc.processor_time import ProcessorTime
 _HANDSHAKE_SECONDS = 0.002  # processor time of a TLS handshake on a slow machine
 _KEEP_ALIVE_SECONDS = 30
 _END_SECONDS = 1.0
-_CONNECTION = "rosrv.connection"  # the key of a request's state that has its connection
+_CONNECTION = "rosrv.connection"  # the key of the connection in a request's state
 
 
 class _Connection(Front, asyncio.Protocol):
-    """One connection; it passes the bytes that the front accepts on to uvicorn's protocol."""
+    """One connection; bytes that the front accepts go to uvicorn's protocol."""
 
     most_waiting = 16
     _uvicorn = asyncio.Protocol()  # does nothing until uvicorn's protocol replaces it
@@ -52,8 +52,8 @@ class _Connection(Front, asyncio.Protocol):
     def __init__(self, listener: "Listener", sock: socket.socket) -> None:
         super().__init__(listener.limits, listener.connection_table, sock)
         self._listener = listener
-        self._unanswered = 0  # requests whose head has arrived
-        self._rests = False  # nothing has arrived since the last answer
+        self._unanswered = 0  # requests without an answer whose head has arrived
+        self._rests = False  # whether no byte has arrived since the last answer
 
     @property
     def is_quiet(self) -> bool:
@@ -65,7 +65,7 @@ class _Connection(Front, asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         if self.open(cast(asyncio.Transport, transport)):
-            # Like uvicorn's own parser, ignore data after the last request of a connection.
+            # Ignore data after the last request of a connection, as uvicorn's own parser does.
             self.parser.set_dangerous_leniencies(lenient_data_after_close=True)
             self._uvicorn = self._listener.protocol_of(self)
             self._uvicorn.connection_made(transport)
@@ -91,7 +91,7 @@ class _Connection(Front, asyncio.Protocol):
     def on_headers_complete(self) -> None:
         super().on_headers_complete()
         self._unanswered += 1
-        self.deadline = math.inf  # body and answer have deadlines of their own (`api/gate`)
+        self.deadline = math.inf  # body and answer have their own deadlines (`api/request_gate`)
         self.connection_table.file(self, Stage.SERVED)
 
     def answered(self) -> None:
@@ -105,7 +105,7 @@ class _Connection(Front, asyncio.Protocol):
         self.connection_table.file(self, Stage.UNFINISHED if begun else Stage.IDLE)
 
     def reject(self, _status: bytes, what: str) -> None:
-        """Answer with the error and stop reading. To close at once would lose the answer together with unread bytes."""
+        """Answer with the error and stop reading. Closing at once with unread bytes would lose the answer."""
         self.closing = True
         self.transport.pause_reading()
         said = f"The peer {what}.\n".encode()
@@ -119,7 +119,7 @@ class _Connection(Front, asyncio.Protocol):
 
 
 def _class_of(quota_class: Callable[[str], QuotaClass], host: Address) -> str:
-    """Return the key under which a peer's processor time counts; all unknown peers share one."""
+    """Return the key under which a peer's processor time counts; all unknown peers share one key."""
     peer = peer_key(str(host))
     return "" if quota_class(peer) is QuotaClass.UNKNOWN else peer
 
@@ -131,7 +131,7 @@ def _patience(quota_class: QuotaClass, stage: Stage, _own: bool) -> float:
 
 
 class Listener:
-    """The server of `app` on a listening socket; `quota_class(peer)` tells known peers from unknown ones."""
+    """The server of `app` on a listening socket; `quota_class(peer)` distinguishes known from unknown peers."""
 
     def __init__(self, app: ASGIApp, limits: ApiLimits, quota_class: Callable[[str], QuotaClass]) -> None:
         self._app = app
@@ -161,12 +161,12 @@ class Listener:
         self._time = ProcessorTime(partial(_class_of, quota_class))
 
     def protocol_of(self, connection: _Connection) -> asyncio.Protocol:
-        """Make the protocol for HTTP and ASGI of this connection as uvicorn's server does."""
+        """Make this connection's protocol for HTTP and ASGI, as uvicorn's server does."""
         make = cast(Callable[..., asyncio.Protocol], self._config.http_protocol_class)
         return make(config=self._config, server_state=self._state, app_state={_CONNECTION: connection})
 
     async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request, and notify its connection when the answer is sent."""
+        """Serve a request; when the answer is sent, notify its connection."""
         connection: _Connection = scope["state"].pop(_CONNECTION)
 
         async def sending(message: Message) -> None:
@@ -218,8 +218,8 @@ class Listener:
     async def _open(
         self, connection: _Connection, sock: socket.socket, context: ssl.SSLContext | None
     ) -> None:
-        """Hand the connection to its protocol, after the handshake if there is one."""
-        # The handshake has the front's deadline.
+        """Hand the connection to its protocol; with TLS, after the handshake."""
+        # The front's deadline also limits the handshake.
         timeouts = {} if context is None else {"ssl_shutdown_timeout": _END_SECONDS}
         try:
             await asyncio.get_running_loop().connect_accepted_socket(

@@ -1,6 +1,6 @@
 """Answer `/v1/history` (the last hour), `/v1/live` (the present state) and `/v1/whoami` (the token's holder).
 
-A page that follows sends one request and gets every change; the audit log has one record of it.
+A page that follows sends one request and gets every change; the audit log has one record of that request.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ from appliance.channel.answers.token_answers import TokenRole
 from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
 _PING_SECONDS = 15
-_SHARE = 20  # the wait before the next graph, as a multiple of the time to make one
+_SHARE = 20  # the pause between two graphs, as a multiple of the time to make one graph
 _TEXT = file("text/event-stream", "Events `now`, `graph`, `away`, `end`.")
 
 

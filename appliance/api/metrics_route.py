@@ -30,7 +30,7 @@ _TEXT = file("text/plain", "Prometheus's text format")
 
 
 def routes(services: Services) -> Routes:
-    """Return the route, at both of its paths."""
+    """Return the route, which has two paths."""
     router = Routes(tags=["metrics"])
 
     async def metrics(bearer: Viewer) -> Response:
@@ -50,7 +50,7 @@ def routes(services: Services) -> Routes:
 
 
 def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
-    """Return control's measures, and the REST calls by method and status, in Prometheus's format."""
+    """Return control's measures and the numbers of REST calls by method and status, in Prometheus's format."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Once(body, calls))
     return generate_latest(registry)
@@ -172,7 +172,7 @@ _PORTS = {"open": 1, "closed": 0, "unknown": -1}
 
 
 def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
-    """Return the samples of hosts; revoked hosts are only counted."""
+    """Return the samples of hosts with tunnels; revoked hosts are only counted."""
     enrolled = [host for host in hosts if host.serial is not None and host.revoked is None]
     now = time.time()
     return {
@@ -192,7 +192,7 @@ def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
 
 
 def _named(processes: Sequence[ProcessInfo]) -> Iterator[tuple[str, ProcessInfo]]:
-    """Yield the processes with unique names: two processes of one role are two series."""
+    """Yield each process with a unique name, so that two processes of one role are two series."""
     return zip(process_names(processes), processes, strict=True)
 
 
@@ -201,5 +201,5 @@ def _memory(processes: Sequence[ProcessInfo]) -> Iterator[tuple[tuple[str, ...],
         try:
             pages = Path(f"/proc/{process.pid}/statm").read_text().split()[1]
         except OSError:
-            continue  # it ended just now
+            continue  # the process has just ended
         yield (name,), float(int(pages) * _PAGE_BYTES)

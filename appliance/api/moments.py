@@ -1,7 +1,7 @@
-"""Write times in JSON twice: as the number in a struct's field, and as RFC 3339 beside it (`since`, `since_utc`).
+"""Write each time in JSON twice: as the number in the struct's field (`since`), then as RFC 3339 (`since_utc`).
 
-The type of a field (`Moment`, `NanoMoment`) marks it as a time, so answers need no code for it. The contract gets the
-additional fields from the same types.
+A field is marked as a time by its type (`Moment`, `NanoMoment`), so answers need no code for times. The contract gets
+the additional fields from the same types.
 """
 
 import functools
@@ -21,7 +21,7 @@ _OF_A_SECOND = 1_000_000  # a float has no more digits
 
 
 def in_full(value: Any) -> Any:
-    """Return a value for msgspec to encode, with the text of each time added."""
+    """Return a value that msgspec can encode, with the RFC 3339 text of each time added."""
     if isinstance(value, msgspec.Struct):
         units = _units(type(value))
         if units is None:
@@ -40,7 +40,7 @@ def in_full(value: Any) -> Any:
 
 
 def describe(schema: dict[str, Any]) -> None:
-    """Add the texts to the schema of a struct, each after its time."""
+    """Add the RFC 3339 fields to the schema of a struct, each after its time."""
     fields: dict[str, Any] = {}
     for name, field in schema.get("properties", {}).items():
         fields[name] = field
@@ -67,7 +67,7 @@ def _text(moment: float, unit: str) -> str:
 
 @functools.cache
 def _units(kind: type[msgspec.Struct]) -> dict[str, str] | None:
-    """Return the units of the times of a struct; None if neither it nor a struct in it has a time."""
+    """Return the units of a struct's times; None if neither the struct nor a struct within it has a time."""
     _, kinds = msgspec.json.schema_components([kind])
     found = {
         name: {field: unit for field, of in schema.get("properties", {}).items() if (unit := _unit(of))}

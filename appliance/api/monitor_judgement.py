@@ -1,7 +1,7 @@
 """Compile the specifications in force from their texts, and convert findings to structures.
 
-Everything is a pure function of texts and runs in a thread. The compiler is imported when it is first needed, so that
-an unused api starts without it.
+Every function here is pure, takes texts, and runs in a thread. The compiler is imported when it is first needed, so
+that an unused api starts without it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _PLACE = re.compile(r"(?s)(.*?):([0-9]+):([0-9]+): (error|warning): (.*)")
 
 
 def findings_of(texts: list[str]) -> list[Finding]:
-    """Return findings as structures; skip those that are not of the form `file:line:column: error: text`."""
+    """Return findings as structures; skip findings that do not have the form `file:line:column: error: text`."""
     return [
         Finding(file=file, line=int(line), column=int(column), severity=severity, text=text)
         for file, line, column, severity, text in (
@@ -31,7 +31,7 @@ def findings_of(texts: list[str]) -> list[Finding]:
 
 
 def refusal(error: str, findings: list[str]) -> ProblemError:
-    """Return a rejection of specifications as a problem; its detail has every finding on a line of its own."""
+    """Return a rejection of specifications as a problem; its detail has each finding on a separate line."""
     return ProblemError(
         422,
         "specifications-refused",
@@ -41,7 +41,7 @@ def refusal(error: str, findings: list[str]) -> ProblemError:
 
 
 class Compiler:
-    """The compiler of the specifications in force; it keeps the last result, so that many queries compile once."""
+    """The compiler of the specifications in force; it keeps the last result, so repeated queries compile only once."""
 
     def __init__(self) -> None:
         self._last: tuple[int, MonitorSet] | None = None

@@ -1,7 +1,7 @@
 """Derive routes from the table of operations (`channel/admin.py`): parameters, role, ETag, answer, contract.
 
-A route reads its order with the function that control uses (`channel/rest_meaning.py`), so that both understand a
-request in the same way; FastAPI only checks parameters and body before that. The answer is control's, unless the
+A route reads its order with the function that control also uses (`channel/rest_meaning.py`), so that both understand a
+request in the same way. Before that, FastAPI only checks parameters and body. The answer is control's, unless the
 operation's module has an `Answer` for the request.
 """
 
@@ -41,7 +41,7 @@ _CONVERTORS = {"{recording_id}": "{recording_id:recording}"}  # of Starlette
 
 @dataclass(frozen=True)
 class OperationCall(Generic[Q]):
-    """An operation that a bearer requests; `body` is as it was sent."""
+    """An operation that a bearer requests; `body` is the body as sent."""
 
     services: Services
     operation: Operation
@@ -65,9 +65,9 @@ class OperationCall(Generic[Q]):
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer of our own in place of control's; the contract has the return type of `function`.
+    """An answer that replaces control's; the contract has the return type of `function`.
 
-    `success` describes it in the contract, if it is not a struct.
+    If the answer is not a struct, `success` describes it in the contract.
     """
 
     function: Callable[[OperationCall[Any]], Awaitable[Any]]
@@ -75,7 +75,7 @@ class Answer:
 
 
 def routes(services: Services, answers: Mapping[str, Answer]) -> Routes:
-    """Return the routes of all operations with a name; `answers` has answers of our own by that name."""
+    """Return the routes of all operations with a name; `answers` has our own answers by operation name."""
     router = Routes()
     assert answers.keys() <= {one.name for one in OPERATIONS}  # noqa: S101  no name is misspelt
     for operation in sorted(OPERATIONS, key=lambda one: "{" in one.path):  # literal paths before parameters
@@ -116,7 +116,7 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
 
 
 def _call(services: Services, operation: Operation, received: Mapping[str, Any]) -> OperationCall[Any]:
-    """Return the requested operation. Raises `ProblemError` if role, `If-Match` or request are not valid."""
+    """Return the requested operation. Raises `ProblemError` if the role, `If-Match` or the request is invalid."""
     bearer, request = received["bearer"], received["request"]
     dry_run, if_match = received.get("dry_run", False), received.get("if_match")
     role, reason = operation.least(received, dry_run=dry_run)
@@ -175,7 +175,7 @@ def _parameters(operation: Operation) -> list[inspect.Parameter]:
 
 
 def _of_path(kind: Any) -> tuple[Any, Mapping[str, Any]]:
-    """Return the type and the bounds of a field in a path; for a list, of its only element."""
+    """Return the type and the bounds of a field in a path; for a list, those of its only element."""
     base = plain(kind)
     if get_origin(base) is list:
         (kind,) = get_args(base)

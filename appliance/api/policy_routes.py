@@ -165,7 +165,7 @@ async def _load(call: OperationCall[admin.PolicyLoad]) -> Tagged[Report]:
     except ProblemError as refusal:
         if call.dry_run:
             raise
-        # Control decides, and records the rejection; the places of the findings are from here.
+        # Control decides and records the rejection; this process adds the findings with their places.
         try:
             loaded = await call.ask(order)
         except ProblemError as said:

@@ -45,7 +45,7 @@ class Problem(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class ProblemError(Exception):
-    """Answers the request with a problem. `kind` is the end of its type, `retry_after` seconds."""
+    """Answers the request with a problem. `kind` is the end of the problem's type; `retry_after` is in seconds."""
 
     def __init__(
         self,
@@ -88,16 +88,16 @@ class ProblemError(Exception):
 
 
 def too_many(kind: str, detail: str, seconds: float) -> ProblemError:
-    """Return the problem of too many requests (429), with the seconds to wait."""
+    """Return the problem for too many requests (429), with the seconds to wait."""
     return ProblemError(429, kind, detail, retry_after=int(seconds) + 1)
 
 
 def bad_input(wrong: list[BadInput], *, besides: str = "") -> ProblemError:
-    """Return the problem of a request with these wrong parts (422); `besides` ends its detail."""
+    """Return the problem for a request with these invalid parts (422); `besides` is added to the end of its detail."""
     detail = "; ".join(f"{problem.where}: {problem.text}" for problem in wrong[:5])
     return ProblemError(422, "bad-input", detail + besides, errors=wrong)
 
 
 def defect(error: Exception) -> ProblemError:
-    """Return the problem of a defect of the appliance: its kind, and nothing about its cause."""
+    """Return the problem for a defect of the appliance; it has the kind, and nothing about the cause."""
     return ProblemError(500, "defect", f"a defect of rosrv, please report it: {type(error).__name__}")

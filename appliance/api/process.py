@@ -1,8 +1,8 @@
 """Run the api process: its lifeline, its link to control, its certificate, and the listener.
 
-It ends when the supervisor sends `Stop` or has ended. It outlives control: meanwhile, calls that need control are
-answered 503. If control does not come back, or closed the link because of an invalid message, the api ends and the
-supervisor starts another. Routes and contract are made for the first request that passes the gate, so an unused api
+The process ends when the supervisor sends `Stop` or has ended. It outlives control; while control is away, calls that
+need control get 503. If control does not come back, or closed the link because of an invalid message, the api ends and
+the supervisor starts a new one. Routes and contract are made when the first request passes the gate, so an unused api
 needs little memory.
 """
 
@@ -66,7 +66,7 @@ class _Application:
 
 
 class _Api:
-    """The parts of the api and their connections."""
+    """The process: it connects the gate, the application, the listener and the link to control."""
 
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
         self._settings = settings
@@ -80,9 +80,9 @@ class _Api:
         self._without_control: asyncio.TimerHandle | None = None
 
     async def run(self) -> None:
-        """Serve from start to end."""
+        """Serve until the process ends."""
         loop = asyncio.get_running_loop()
-        # More threads than concurrent work, so that a verification of the log never delays the check of a token.
+        # There are more threads than concurrent tasks, so a verification of the log never delays the check of a token.
         loop.set_default_executor(ThreadPoolExecutor(_THREADS, "api"))
         self._lifeline.attach(loop, self._received, self._end)
         history = SampleHistory(lambda: measures_of(self._control))

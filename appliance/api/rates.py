@@ -2,9 +2,9 @@
 
 Invariants:
 
-1. There are at most `peers` buckets. One more replaces the least recently used one, so a flood from many addresses
-   gains at most one burst for each.
-2. An IPv6 peer is its /64, since one host can use all addresses of it.
+1. There are at most `peers` buckets. A further bucket replaces the least recently used one, so a flood from many
+   addresses gains at most one burst for each address.
+2. An IPv6 peer is identified by its /64 network, because one host can use all addresses of that network.
 """
 
 import ipaddress
@@ -36,7 +36,7 @@ class Buckets:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, host: str, now: float) -> float:
-        """Take one token; return 0, or the seconds until there will be one."""
+        """Take one token and return 0; if the bucket is empty, return the seconds until the next token."""
         left = self._left(host, now)
         if left < 1:
             self._keep(host, left, now)
@@ -45,12 +45,12 @@ class Buckets:
         return 0.0
 
     def wait(self, host: str, now: float) -> float:
-        """Return the seconds that `take` would return, without taking."""
+        """Return the seconds that `take` would return, without taking a token."""
         left = self._left(host, now)
         return 0.0 if left >= 1 else (1 - left) / self._per_second
 
     def touched(self, host: str, now: float) -> bool:
-        """Whether the peer's bucket is not full again."""
+        """Whether the peer's bucket has not refilled completely."""
         return self._left(host, now) < self._burst
 
     def _left(self, host: str, now: float) -> float:

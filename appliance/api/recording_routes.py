@@ -104,7 +104,7 @@ def _add_reading(router: Routes, services: Services) -> None:
     async def read(
         asked: admin.RecordingWanted | admin.RecordingRead, bearer: Bearer, what: _Reading[_T]
     ) -> _T:
-        """Read from the bag of the recording that control returns; one bag is read at a time."""
+        """Read from the bag of the recording that control returns; only one bag is read at a time."""
         recording = answered(await services.control.ask(asked, bearer))
         async with turn(reading, "readings of recordings"):
             try:
@@ -160,9 +160,9 @@ def _add_reading(router: Routes, services: Services) -> None:
 
 
 async def bag_response(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:
-    """Answer with the file, after the audit log has recorded who fetches it."""
+    """Answer with the file, after the audit log has recorded which bearer fetches it."""
     found = answered(await services.control.ask(admin.RecordingFetch(recording_id), bearer))
-    try:  # open before the answer: a recording that is removed later is still sent to its end
+    try:  # open it before the answer begins: a recording that is then removed is still sent completely
         pieces = await asyncio.to_thread(as_mcap if mcap else _pieces_of, _bag_of(services, found.id))
     except FileNotFoundError:
         raise _gone(found.id) from None

@@ -2,13 +2,14 @@
 
 Order: rate → Host → Origin → size of the body → token. Invariants:
 
-1. A request that fails a check costs no more than its headers: neither a route, a parser of bodies nor control sees it.
-2. Only `PUBLIC` and the console's own files answer without a token; an unknown path is answered like a known one.
-3. A page of another site cannot use the browser of a person who can reach the appliance: a foreign name as Host (DNS
+1. A request that fails a check costs no more than reading its headers: no route, body parser or control handles it.
+2. Only `PUBLIC` paths and the console's own files are served without a token. Without a token, an unknown path gets the
+   same answer as a known path.
+3. A page of another site cannot misuse the browser of a person who can reach the appliance: a foreign name as Host (DNS
    rebinding) and a foreign Origin are rejected, and no CORS header is ever sent.
-4. Every answer except those of the health probes and the console's own files is reported (equal reads folded, see
-   `Journal`).
-5. A client that does not read its answer is cut off.
+4. Every answer is reported, with equal reads folded (see `Journal`), except answers of the health probes and the
+   console's own files.
+5. A client that does not read its answer is disconnected.
 """
 
 import asyncio
@@ -37,17 +38,17 @@ PUBLIC = frozenset({
     "/healthz", "/readyz", "/v1/healthz", "/v1/readyz", "/v1/openapi.json",
     "/v1/enrol", "/v1/revocations", "/v1/authority",
 })  # fmt: skip
-BEARER = "rosrv.bearer"  # the key of a request's scope for its bearer
+BEARER = "rosrv.bearer"  # the key of the bearer in a request's scope
 _NOT_RECORDED = frozenset({"/healthz", "/readyz", "/v1/healthz", "/v1/readyz"})
 _QUESTIONS = frozenset({"/v1/policy/explain", "/v1/policy/test"})  # queries with a body
 _LOOKS = frozenset({"GET", "HEAD"})
 _BODY_SECONDS = 30.0
 _LONGEST_ANONYMOUS_BODY = 1024  # bytes of a body without a token
-_REQUEST_BODY = 24 << 10  # of a host that brings a signing request
-_RENEWAL = re.compile(r"/v1/hosts/[^/]{1,63}/renew(ed)?")  # for a host in its tunnel, which identifies it
+_REQUEST_BODY = 24 << 10  # bytes of a body with a host's signing request
+_RENEWAL = re.compile(r"/v1/hosts/[^/]{1,63}/renew(ed)?")  # for hosts, which their tunnels identify
 _IN_TUNNELS = frozenset({"/v1/revocations", "/v1/authority"})
 _SEND_SECONDS = 30.0
-_PAGE_SHARE = 10  # the rate of the console's files, as a multiple of REST's
+_PAGE_SHARE = 10  # the rate limit of the console's files, as a multiple of REST's rate limit
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
@@ -75,7 +76,7 @@ class RequestGate:
         tunnels: ipaddress.IPv4Network | None = None,
         networks: Iterable[Network] = (),
     ) -> None:
-        """Let hosts in `tunnels` that are in none of `networks` only renew their certificates."""
+        """Make the gate. Hosts in `tunnels` that are in none of `networks` may only renew their certificates."""
         self._app = app
         self._tunnels = tunnels
         self._networks = tuple(networks)
@@ -84,7 +85,7 @@ class RequestGate:
         self._journal = journal
         self._names = {"localhost", *(name.lower() for name in names)}
         self._rate = Buckets(limits.requests_per_second, limits.burst)
-        # A page is many small files at once, which cost only this process anything.
+        # A page loads many small files at once, and they cost only this process time.
         self._page_rate = Buckets(limits.requests_per_second * _PAGE_SHARE, limits.burst * _PAGE_SHARE)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -107,7 +108,7 @@ class RequestGate:
                 "a client was cut off", path=scope["path"], reason=str(error) or "it does not read the answer"
             )
             raise
-        except Exception as error:  # noqa: BLE001  a defect in a route is one client's failure
+        except Exception as error:  # noqa: BLE001  a defect in a route must fail only for its client
             _log.exception("a REST call failed", path=scope["path"])
             await answer.fail(defect(error), receive)
         finally:
@@ -161,7 +162,7 @@ class RequestGate:
 
 
 def asked_of(scope: Scope, headers: Headers, body: bytes) -> ClientRequest:
-    """Return the request in the form that control compares with its signature."""
+    """Return the request in the form in which control verifies its signature."""
     query = scope["query_string"].decode("latin-1")
     return ClientRequest(
         host=scope["client"][0],
@@ -175,7 +176,7 @@ def asked_of(scope: Scope, headers: Headers, body: bytes) -> ClientRequest:
 
 
 class _Answer:
-    """One outgoing answer: with hardening headers, limited in time, reported when its status is known."""
+    """One outgoing answer; it gets hardening headers and a time limit, and is reported when its status is known."""
 
     def __init__(self, scope: Scope, send: Send, journal: Journal) -> None:
         self._scope = scope

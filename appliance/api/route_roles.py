@@ -16,7 +16,7 @@ _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token
 
 
 class _Requires:
-    """A dependency that returns the bearer, whose role must be at least `least`."""
+    """A dependency that returns the bearer and requires at least the role `least`."""
 
     def __init__(self, least: TokenRole) -> None:
         self.least = least
@@ -30,7 +30,7 @@ class _Requires:
 
 
 VIEWER = Depends(_Requires("viewer"))
-"""For `dependencies=` of a route that requires the role and does not use the bearer."""
+"""Use it in `dependencies=` of a route that requires the role and does not use the bearer."""
 
 OPERATOR = Depends(_Requires("operator"))
 Viewer = Annotated[Bearer, VIEWER]
@@ -40,7 +40,7 @@ Admin = Annotated[Bearer, Depends(_Requires("admin"))]
 
 
 def reads_contents(bearer: Bearer) -> bool:
-    """Whether a bearer may read message contents in the records of monitors: all but viewers."""
+    """Whether a bearer may read message contents in records of monitors; only viewers may not."""
     return bearer.role != "viewer"
 
 

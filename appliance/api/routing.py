@@ -1,7 +1,7 @@
 """Make routes whose handlers take and return structs (msgspec): parse, encode, and add schemas to the contract.
 
-A handler returns a struct, or `Tagged` with a struct and its ETag; the struct's schema is in the contract. It takes a
-body by `Annotated[Kind, body(Kind)]`. For anything else it returns a `Response`.
+A handler returns a struct, or `Tagged` with a struct and its ETag; the struct's schema is in the contract. The handler
+declares a body as `Annotated[Kind, body(Kind)]`. If its answer is not a struct, it returns a `Response`.
 """
 
 import enum
@@ -29,19 +29,19 @@ _PLACE = re.compile(r"(?s)(.*) - at `(?:key` in `)?\$(.*)`")
 
 
 class Tagged(NamedTuple, Generic[A]):
-    """An answer with the revision, or the tag, of its ETag."""
+    """An answer with the revision or tag that becomes its ETag."""
 
     body: A
     tag: int | str
 
 
 def tagged(body: A) -> Tagged[A]:
-    """Return an answer with its own tag, or its revision."""
+    """Return an answer with its own tag; without a tag, with its revision."""
     return Tagged(body, getattr(body, "tag", None) or body.revision)  # type: ignore[attr-defined]  # each versioned answer has a revision
 
 
 def answer(body: Any, status: int = 200, tag: int | str | None = None) -> Response:
-    """Return a struct as JSON."""
+    """Return a JSON response with a struct."""
     headers = None if tag is None else {"ETag": etag(tag)}
     return Response(msgspec.json.encode(in_full(body)), status, headers, _JSON)
 
@@ -53,12 +53,12 @@ class Contract:
         self.kinds: set[Any] = set()
 
     def reference(self, kind: Any) -> dict[str, Any]:
-        """Return the schema of a struct, by its name."""
+        """Return the reference to a struct's schema, and add the schema to the contract."""
         self.kinds.add(kind)
         return {"$ref": f"#/components/schemas/{kind.__name__}"}
 
     def components(self) -> dict[str, Any]:
-        """Return the schemas of all structs, and of the structs in them."""
+        """Return the schemas of all added structs and of the structs within them."""
         kinds = sorted(self.kinds, key=lambda kind: str(kind.__name__))
         return msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")[1]
 
@@ -78,7 +78,7 @@ def file(media_type: str, description: str, *, binary: bool = False) -> Response
 
 
 class _Body:
-    """A dependency that reads a body of one kind; `text` describes its field `text` if text/plain is also accepted."""
+    """A dependency that reads a body of one kind; if text/plain is also accepted, `text` describes the field `text`."""
 
     def __init__(self, kind: Any, text: str | None) -> None:
         self.kind = kind
@@ -107,7 +107,7 @@ class _Body:
             try:
                 return msgspec.json.decode(text, type=self.kind)
             except msgspec.ValidationError as error:
-                # The error is about the first wrong field; invalid JSON may follow it.
+                # msgspec reports the first wrong field; invalid JSON may follow this field.
                 wrong = _all_wrong(msgspec.json.decode(text), self.kind) or [_bad(error)]
         except (msgspec.DecodeError, RecursionError) as error:
             raise _not_json(text, error) from None
@@ -157,14 +157,14 @@ def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
 
 
 def _bad(error: msgspec.ValidationError, where: str = "body", kind: Any = None) -> BadInput:
-    """Return the error of a part of a body of this kind, with its place."""
+    """Return the error of one part of a body of this kind, with the part's place."""
     found = _PLACE.fullmatch(str(error))
     text, place = (str(error), "") if found is None else found.groups()
     return BadInput(where + place, body_refusal(text, _choices(kind)))
 
 
 def _choices(kind: Any) -> tuple[str, ...]:
-    """Return the permitted strings of a kind with a fixed set of values, otherwise nothing."""
+    """Return the permitted strings of a kind with a fixed set of values; empty for any other kind."""
     parts = typing.get_args(kind)
     if isinstance(kind, type) and issubclass(kind, enum.StrEnum):
         return tuple(kind)
@@ -186,7 +186,7 @@ def _not_json(text: str, error: Exception) -> ProblemError:
 
 
 def body(kind: type, *, text: str | None = None) -> Any:
-    """Return the annotation of a handler's parameter for a body of this kind, or for the text that `text` describes."""
+    """Return the annotation of a handler's parameter for a body of this kind; with `text`, also for a plain text."""
     return Depends(_Body(kind, text))
 
 
@@ -194,7 +194,7 @@ class Routes(APIRouter):
     """FastAPI's router, for handlers that take and return structs."""
 
     def add_api_route(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
-        """Add a handler; its name, answer, ETag and body are put into the contract."""
+        """Add a handler, and add its name, answer, ETag and body to the contract."""
         options["operation_id"] = options.get("operation_id") or endpoint.__name__
         hints = typing.get_type_hints(endpoint, include_extras=True)
         for hint in hints.values():

@@ -15,10 +15,10 @@ from appliance.quotas.table import REST_EXPORTS
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """The parts that the routes share; `stopping` is set when the process is to end.
+    """The parts that the routes share; `stopping` is set when the process must end.
 
-    `judging` limits the texts that are compiled at once for queries and dry runs, `ordering` those for orders, which
-    never wait for the former; `exports` limits the exports of the audit log.
+    `judging` limits how many texts are compiled at once for queries and dry runs. `ordering` limits the same for
+    orders, so that orders never wait for queries. `exports` limits the exports of the audit log.
     """
 
     settings: Settings

@@ -1,8 +1,8 @@
 """Limit long answers, which are streams and exports, by quotas.
 
-A long answer counts for its token and for its peer, and each has a quota. So neither viewers' tokens with many
-connections nor one machine with many tokens can use up the places of others, or those for operators and admins.
-A place is free again when the response ends, for whatever reason.
+A long answer counts for its token and for its peer, and each has a quota. So neither a viewer's token with many
+connections nor a machine with many tokens can take the places of others, in particular of operators and admins. When
+the response ends, for any reason, its place is free again.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ def peer_of(request: Request) -> str:
 
 
 class Streams:
-    """The places for long answers of one kind: `whole` in number, with quotas for `tokens` and `peers`."""
+    """The places for long answers of one kind: `whole` places, with quotas for `tokens` and `peers`."""
 
     def __init__(self, tokens: QuotaRow, peers: QuotaRow, whole: int) -> None:
         self.roles: dict[str, TokenRole] = {}
@@ -45,7 +45,7 @@ class Streams:
         )
 
     def take(self, bearer: Bearer, peer: str, what: str) -> Callable[[], None]:
-        """Take a place; return the function that gives it back. Raises `ProblemError` (503)."""
+        """Take a place; return the function that releases it. Raises `ProblemError` (503)."""
         self.roles[bearer.id] = bearer.role
         busy = self._tokens.refusal(bearer.id) or self._peers.refusal(peer)
         if busy:
@@ -73,7 +73,7 @@ class Streams:
 
 @contextlib.asynccontextmanager
 async def turn(turns: asyncio.Semaphore, what: str) -> AsyncIterator[None]:
-    """Wait a moment for one of the `turns`. Raises `ProblemError` (503)."""
+    """Wait briefly for one of the `turns` and hold it during the block. Raises `ProblemError` (503)."""
     try:
         async with asyncio.timeout(_PATIENCE_SECONDS):
             await turns.acquire()
@@ -86,14 +86,14 @@ async def turn(turns: asyncio.Semaphore, what: str) -> AsyncIterator[None]:
 
 
 async def in_thread(pieces: Iterator[A]) -> AsyncIterator[A]:
-    """Yield the pieces of a slow iterator, without empty ones."""
+    """Read a slow iterator in a thread; yield its pieces, except empty ones."""
     while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
         if piece:
             yield piece
 
 
 class StreamResponse(Response):
-    """A long response that gives its place back when it ends."""
+    """A long response that releases its place when it ends."""
 
     def __init__(self, response: Response, give_back: Callable[[], None]) -> None:
         self._response = response
@@ -102,7 +102,7 @@ class StreamResponse(Response):
         self.background = response.background
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the response, then give its place back."""
+        """Send the response, then release its place."""
         try:
             await self._response(scope, receive, send)
         finally:

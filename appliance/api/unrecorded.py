@@ -1,4 +1,4 @@
-"""Find names in an audit search that this version never records: misspelt, or of another version."""
+"""Find names in an audit search that this version never records: misspelt names, or names of another version."""
 
 from appliance.audit.events import EVENTS
 from appliance.audit.query import Filter
@@ -6,7 +6,7 @@ from appliance.base.validation_messages import meant
 from appliance.policy.model import Category
 
 CATEGORIES = (*Category, "monitor", "parameter", "publication", "rest", "service", "subscription", "topic")
-"""The categories of records: those that the policy decides, and the others."""
+"""The categories of records, whether the policy decides them or not."""
 
 
 def unrecorded(wanted: Filter) -> list[str]:
