@@ -1,6 +1,6 @@
-"""Complete names in the shell, by queries of the running appliance's admin socket.
+"""Complete names in the shell by querying the running appliance over its admin socket.
 
-Completion never prints errors: without access to a running appliance it offers no names.
+Completion never prints errors: without access to a running appliance, it offers no names.
 """
 
 from collections.abc import Callable, Iterable

@@ -1,7 +1,7 @@
 """The health check of a container, `python -m appliance.cli.healthy`: exit status 0 while nodes are served.
 
-Problems that do not affect nodes (a certificate that expires soon) appear in `rosrv status` only, because a container
-engine would restart the appliance for them in vain. The check runs every few seconds, so it imports very little.
+Problems that do not affect nodes, such as a certificate that expires soon, appear only in `rosrv status`: for them, a
+container engine would restart the appliance in vain. The check runs every few seconds, so it imports very little.
 """
 
 import os

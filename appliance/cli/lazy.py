@@ -1,7 +1,7 @@
-"""Make typer commands that import their module when they run.
+"""Make typer commands that import their modules only when they run.
 
 Importing all modules takes a second of processor time, so `rosrv status` must not import the compiler. `--help` and
-completion take the names from the table, and the first sentences of help from the source files.
+completion take the verbs' names from the table of verbs, and the first sentences of help from the source files.
 """
 
 import functools
@@ -22,7 +22,7 @@ from appliance.base.validation_messages import refusal
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """A verb's function in this folder (`module:function`); `first` is put before its docstring in the help."""
+    """A verb's function in this folder (`module:function`); in the help, `first` precedes its docstring."""
 
     place: str
     first: str = ""
@@ -30,7 +30,7 @@ class Verb:
 
     @property
     def help(self) -> str:
-        """Return the first sentence, read without importing the module."""
+        """Return the first sentence of the help, read without importing the module."""
         module, _colon, function = self.place.partition(":")
         file = _FOLDER.joinpath(*module.split(".")).with_suffix(".py")
         return self.first or _first_sentence(file, function)
@@ -53,7 +53,7 @@ def _first_sentence(file: Path, function: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A command with verbs of its own, such as `rosrv audit`."""
+    """A command with its own verbs, such as `rosrv audit`."""
 
     help: str
     verbs: Mapping[str, Verb]

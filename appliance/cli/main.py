@@ -1,4 +1,4 @@
-"""Define the `rosrv` command: the table of its verbs, and the handling of errors that they do not catch."""
+"""Define the `rosrv` command: the table of its verbs, and the handling of errors that the verbs do not catch."""
 
 import errno
 import os
@@ -156,7 +156,7 @@ app = application(
 )
 
 _USER_ERRORS = frozenset({"ConfigError", "StartError", "NetworkError"})
-"""Errors whose text is shown to users. Compared by name, so that their modules need not be imported."""
+"""Names of the errors whose text is shown to users. With names, the errors' modules need not be imported."""
 
 
 def main() -> None:
@@ -165,7 +165,7 @@ def main() -> None:
     sys.argv[1:] = _asking_for_help(_without_old_flags(sys.argv[1:]))
     try:
         app()
-    except Exception as error:  # noqa: BLE001  the last resort; the error and its place are printed
+    except Exception as error:  # noqa: BLE001  the last resort: print the error and its place
         if any(
             cls.__name__ in _USER_ERRORS and cls.__module__.startswith("appliance.")
             for cls in type(error).__mro__
@@ -184,7 +184,7 @@ def main() -> None:
 
 
 def _open_closed_streams() -> None:
-    """Open closed standard streams (`>&-`) on /dev/null, so that no other file gets their descriptor."""
+    """Open closed standard streams (`>&-`) on /dev/null, so that no other file gets their descriptors."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(descriptor, True)
     os.close(descriptor)

@@ -1,7 +1,7 @@
 """`rosrv protect`: close the ROS ports of a machine with nodes, and check from outside that they are closed.
 
-It works without a state directory, on any machine with this program. From a running appliance it gets the address, and
-reports the result of a check to it. Exit status: 0 done, or closed; 1 a port is open; 2 failed, or no answer.
+The verb works without a state directory, on any machine with this program. A running appliance supplies its address and
+receives the result of a check. Exit status: 0 done, or closed; 1 a port is open; 2 failed, or no answer.
 """
 
 import json
@@ -22,7 +22,7 @@ from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.scan import ScanResult, addresses_of, scan
 
 OPEN_STATUS, ERROR_STATUS = 1, 2
-_SHOWN = 20  # open ports named on a terminal
+_SHOWN = 20  # most open ports listed on a terminal
 _MOST_TOLD = 100
 
 HELP = """Nodes listen on ports of the local port range. Without --apply, --check or --remove, print the nftables rules.
@@ -142,7 +142,7 @@ def _remove(as_json: bool) -> None:
 
 @dataclass(frozen=True)
 class _CheckTarget:
-    """The target of a check; its result is reported under `name`, or under the address if that is None."""
+    """The target of a check; the result is reported under `name`, or under the address if `name` is None."""
 
     host: str
     name: str | None

@@ -233,7 +233,7 @@ def remove(appliance: Appliance, recording: _Id) -> None:
 
 
 def bag_of(appliance: Appliance, recording: str, part: Path) -> Path:
-    """Audit the request; return the bag's path in the state directory, or `part` filled over REST. Raises `OSError`."""
+    """Audit the request; return the bag's path in the state directory. Over REST, fill `part`. Raises `OSError`."""
     way = appliance.way
     if isinstance(way, AdminSocket):
         return _bag(way, appliance.ask_or_exit(admin.RecordingFetch(recording)))
@@ -253,7 +253,7 @@ def _bag(way: AdminSocket, recording: Recording) -> Path:
 
 
 def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> _T:
-    """Return REST's answer. Exits with status 2 for bad input or without an answer, 1 for a rejected request."""
+    """Return REST's answer. Exits with status 1 for a rejected request, and 2 for bad input or without an answer."""
     from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
     given = {name: value for name, value in query.items() if value is not None}
@@ -308,7 +308,7 @@ def _drawn(found: Timeline) -> Iterator[str]:
 
 
 def _private(path: Path) -> int:
-    """Create a file for its owner only, since messages are private to the robot's operators. Raises `OSError`."""
+    """Create a file that only its owner can read, because messages are private. Raises `OSError`."""
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
 
 

@@ -63,7 +63,7 @@ def _private(file: Path) -> Ed25519PrivateKey:
 
 
 def _text(file: Path) -> str:
-    """Return the file's text. Exits with status 2 for anything but UTF-8 with LF, which the appliance reads."""
+    """Return the file's text. Exits with status 2 unless it is UTF-8 with LF, the only format the appliance reads."""
     try:
         text = read_given(file).decode("utf-8")
     except OSError as error:

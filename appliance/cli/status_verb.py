@@ -31,7 +31,7 @@ from rosmop.tool.terminal import counted
 _PORT_STATES = ("closed", "open", "unknown")
 _MOST_NAMED = 8
 _MOST_TROUBLES = 5
-_COLUMN = 38  # characters for one process
+_COLUMN = 38  # width for one process, in characters
 _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
 
@@ -55,7 +55,7 @@ def status(
 
 
 def troubles_of(body: Status) -> list[str]:
-    """Return the problems that need attention, most urgent first: alarms without notices and audit-only sections."""
+    """Return the problems that need attention, most urgent first: alarms except notices, and audit-only sections."""
     return [
         alarm.text
         for alarm in open_alarms(body)
@@ -140,7 +140,7 @@ def _tunnels(ipsec: IpsecState) -> str:
 
 
 def _ports(known: dict[str, PortsSeen]) -> str:
-    """Summarize whether the machines of nodes are closed to all but the appliance."""
+    """Summarize whether the machines with nodes have closed their ROS ports to all but the appliance."""
     by_state = {
         state: [name for name, ports in known.items() if ports.state == state] for state in _PORT_STATES
     }
@@ -151,7 +151,7 @@ def _ports(known: dict[str, PortsSeen]) -> str:
 
 
 def _others_rules(firewall: FirewallState) -> Iterator[tuple[str, str]]:
-    """Yield a row about other programs' firewall chains on the host (isolation netns); --json lists their names."""
+    """Yield rows about other programs' firewall chains on the host (isolation netns); --json lists their names."""
     translating, dropping = firewall.translations or [], firewall.obstacles or []
     words = []
     if translating:
@@ -194,7 +194,7 @@ def _cells(row: ProcessInfo, name: str, now: float | None) -> list[Text]:
 
 
 def missing_sandbox(rows: Sequence[ProcessInfo]) -> str | None:
-    """Return what this kernel lacks for the processes' sandbox, on one line; None if it lacks nothing."""
+    """Return one line with the sandbox limits that this kernel lacks; None if it supports all of them."""
     lacking = [f"{row.role}: {what}" for row in rows for what in row.lacks]
     if not lacking:
         return None
@@ -227,7 +227,7 @@ def age(since: float, now: float | None = None) -> str:
 
 
 def shortened(lines: Sequence[str], most: int) -> list[str]:
-    """Return at most `most` lines; the last one counts those left out."""
+    """Return at most `most` lines; if lines are left out, the last line has their number."""
     if len(lines) <= most:
         return list(lines)
     return [*lines[: most - 1], f"and {len(lines) - most + 1} more: rosrv status --json"]

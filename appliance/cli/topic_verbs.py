@@ -92,7 +92,7 @@ def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
 
 
 def part_of(fields: Any, path: str) -> Any:
-    """Return a nested field, or the mark of left-out values (`… 704 more`). Exits with status 2 if there is none."""
+    """Return a nested field, or the mark of left-out values (`… 704 more`). Exits with status 2 without either."""
     value = fields
     for name in path.split("."):
         if isinstance(value, Mapping) and name in value:
@@ -108,7 +108,7 @@ def part_of(fields: Any, path: str) -> Any:
 
 
 def _left_out(value: Any, name: str) -> str:
-    """Return the mark of left-out values if a field may be among them; otherwise an empty string."""
+    """Return the mark of left-out values if the field may be among these values; otherwise an empty string."""
     if isinstance(value, Mapping):
         return str(value.get(CUT, ""))
     last = value[-1] if isinstance(value, list) and value else value
@@ -136,7 +136,7 @@ def lines_of(value: Any, depth: int) -> Iterator[str]:
 
 
 def _is_deep(value: Any) -> bool:
-    """Whether a value has fields, which take a line each."""
+    """Whether a value has fields, each of which needs its own line."""
     return isinstance(value, Mapping) or (isinstance(value, list) and any(map(_is_deep, value)))
 
 

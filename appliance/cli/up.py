@@ -1,6 +1,6 @@
 """`rosrv up`: start the appliance and run until a signal stops it."""
 
-from appliance.supervisor.logs import configure_logs  # before the first import of structlog: see there
+from appliance.supervisor.logs import configure_logs  # must precede the first import of structlog: see there
 
 # isort: split
 import contextlib
@@ -114,7 +114,7 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
 
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
-    """Print that nodes may connect. Raises `StartError`, and prints nothing, if the first token cannot be stored."""
+    """Print that nodes may connect. If the first token cannot be stored, print nothing and raise `StartError`."""
     rest = _rest_url(settings)
     more: list[str] = []
     if as_json:
@@ -169,7 +169,7 @@ def _rest_url(settings: Settings) -> str | None:
 
 
 def _keep_token(state: Path, token: str) -> Path:
-    """Write the first token to a file for its owner only. Raises `StartError` and leaves no file behind."""
+    """Write the first token to a file that only its owner can read. Raises `StartError`; no file is then left."""
     path = state / "first-token"
     try:
         path.unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """Validate the policy and the specifications before `rosrv up` starts anything.
 
-RVMaster reads both again and decides. A policy or specifications that an operator loaded survive a restart; RVMaster
-then does not read the file or the folder, so they may be invalid.
+RVMaster reads both again and decides. If an operator loaded a policy or specifications, these survive a restart.
+RVMaster then does not read the file or the folder, so the file or the folder may be invalid.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ _VALID = "valid"
 
 
 def read_inputs(settings: Settings) -> range:
-    """Validate both; return the range of ports that the policy file gives to nodes.
+    """Validate policy and specifications; return the range of ports that the policy file gives to nodes.
 
     Raises `StartError` with every error of the policy or of the specifications.
     """
@@ -53,7 +53,7 @@ def _text(file: Path) -> str:
 
 
 def _require_specifications(folder: Path, site_keys: Sequence[str]) -> None:
-    """Compile in a child process: this process becomes the supervisor and would keep the compiler's memory."""
+    """Compile in a child process, because this process becomes the supervisor and would keep the compiler's memory."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
@@ -85,7 +85,7 @@ def _errors_in(folder: Path, site_keys: Sequence[str]) -> str:
 def _is_read_at_start(state: Path, table: str) -> bool:
     """Whether RVMaster will read the files on disk, rather than a revision that an operator loaded.
 
-    False if unknown: an earlier run may have left statements beside the database that are not in it yet.
+    False if unknown: an earlier run may have left statements that are not in the database yet.
     """
     try:
         if not state.exists():

@@ -31,7 +31,7 @@ class Errors:
             case FilterError() | TimestampError() | ExportUnreadableError():
                 fail(str(error), CANNOT_READ)
             case BrokenPipeError():
-                # The reader (head, less) has ended: discard what is still buffered.
+                # The reader (head, less) has ended: discard the buffered output.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 raise typer.Exit(0)
             case KeyboardInterrupt():

@@ -1,7 +1,7 @@
 """`rosrv audit tail|search|show|verify|checkpoints|export`: review the audit log.
 
-With a state directory the verbs read the file of the log; the appliance may be stopped, and the directory a copy. With
-`--api` they read the running appliance's log over REST.
+With a state directory, the verbs read the log's file; the appliance may be stopped, and the directory may be a copy.
+With `--api`, they read the running appliance's log over REST.
 """
 
 import json
@@ -35,7 +35,7 @@ from appliance.evidence.export_verification import verify_export
 from rosmop.tool.progress_bar import progress
 
 _CHECKPOINT_SECONDS = (
-    5.0  # between two queries: a checkpoint is made once a minute, and REST queries are recorded
+    5.0  # pause between two queries: a checkpoint is made once a minute, and REST queries are recorded
 )
 _PROGRESS_EVERY = 1000  # records
 _Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJSON)")]

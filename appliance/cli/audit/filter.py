@@ -84,7 +84,7 @@ def _filter(
 def filtered(
     verb: Callable[Concatenate[Appliance, Filter, _P], None],
 ) -> Callable[Concatenate[Appliance, _P], None]:
-    """Replace the second parameter of a verb, a `Filter`, by the filter options."""
+    """Replace a verb's second parameter, a `Filter`, by the filter options."""
     options = inspect.signature(_filter).parameters
 
     @functools.wraps(verb)

@@ -172,7 +172,7 @@ def _joined(*parts: str | None) -> str:
 
 
 def _why(record: AuditRecord) -> str:
-    """Return the reason, with the rule unless the reason names it, and the count of a folded record."""
+    """Return the reason, with the rule (unless the reason already names it) and the count of a folded record."""
     rule = record.rule
     named = rule is None or f"{Path(rule.file).name}:{rule.line}" in record.reason
     why = record.reason if named else f"{record.reason} ({rule_text(record.rule)})"

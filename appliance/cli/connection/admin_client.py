@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 ADMIN_SOCKET = "admin.sock"
 SECONDS = 60.0
-"""Longer than control's slowest answers: enrolling a host through charon, compiling specifications."""
+"""Time limit in seconds; longer than control's slowest answers (enrolment through charon, compiling specifications)."""
 _GRACE_SECONDS = 10.0
 UNKNOWN = (
     "the change may have taken effect; if it has not by now, it never will. List recent changes:"
@@ -22,7 +22,7 @@ UNKNOWN = (
 
 
 class NotRunningError(Exception):
-    """Report that no appliance answers, or not for this user or token; the text says what to do."""
+    """Report that no appliance answers, or that it rejects this user or token; the text has the remedy."""
 
 
 class AdminSocket:
@@ -73,7 +73,7 @@ class AdminSocket:
             raise NotRunningError(f"{path}: an appliance of another version answers: {error}") from None
 
     def _read(self, sock: socket.socket) -> bytes:
-        """Read the answer. After the time-out, withdraw the request and wait for its outcome."""
+        """Read the answer. At the time limit, withdraw the request and wait for its outcome."""
         line = bytearray()
         try:
             _read_line(sock, line)

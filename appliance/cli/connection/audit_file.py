@@ -19,7 +19,7 @@ Progress = Callable[[int], None]
 
 
 class FileLog:
-    """The log in a state directory of a running or stopped appliance, or in a copy of one.
+    """The log in the state directory of a running or stopped appliance, or in a copy of the directory.
 
     All methods raise `LogUnreadableError`.
     """
@@ -54,7 +54,7 @@ class FileLog:
         )
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:
-        """Yield the last matching records, oldest first; then, if `on`, new ones without end."""
+        """Yield the last matching records, oldest first; then, if `on`, yield new records without end."""
         path = self._path
         follower = Follower(path, wanted)
         if lines:
@@ -67,9 +67,9 @@ class FileLog:
     def verify(
         self, key: bytes | None, copies: Sequence[SignedCheckpoint] | None, progress: Progress
     ) -> Verification:
-        """Verify the log, also against the signer's own records if they are readable.
+        """Verify the log; if the signer's own records are readable, compare the log with them.
 
-        `progress` is called with the sequence verified last.
+        `progress` is called with the sequence of the last verified record.
         """
         path = self._path
         signer = path.parent.parent / "signer"

@@ -20,7 +20,7 @@ from appliance.cli.connection.rest_session import RestClient, RestProblemError
 
 _PATH = "/v1/audit"
 _PAGE = 1000
-ID = re.compile("[0-9a-f]{1,20}")  # of a record, or its sequence
+ID = re.compile("[0-9a-f]{1,20}")  # a record's id or sequence
 _VERIFY_SECONDS = 3600.0
 _SILENCE_SECONDS = 60.0  # a stream sends at least a comment every 15 s
 _AGAIN_SECONDS = 1.0
@@ -28,7 +28,7 @@ _MOST_FAILURES = 5
 
 
 class RestLog:
-    """The audit log over REST; it has the methods of `FileLog`, which here raise `NotRunningError`."""
+    """The audit log over REST. It has the same methods as `FileLog`, but they raise `NotRunningError`."""
 
     def __init__(self, client: RestClient) -> None:
         self._client = client
@@ -76,7 +76,7 @@ class RestLog:
                     yield int(json.loads(line)["sequence"]), line
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:
-        """Yield the last matching records, then new ones; reconnect when the connection breaks."""
+        """Yield the last matching records, then new records; reconnect when the connection breaks."""
         position = self.last()
         if lines:
             yield self.search(wanted, str(position + 1), lines, newest_first=True).entries[::-1]
@@ -128,7 +128,7 @@ class RestLog:
 
     @contextmanager
     def _lines(self, path: str, params: dict[str, Any], seconds: float) -> Iterator[Iterator[str]]:
-        """Stream the lines of an answer; translate errors, also those raised inside the block."""
+        """Stream the lines of an answer; translate errors, including errors raised inside the block."""
         with (
             self._refusals(),
             self._client.streamed("GET", _PATH + path, params=params, seconds=seconds) as answer,

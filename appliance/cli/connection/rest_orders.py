@@ -1,4 +1,4 @@
-"""Send requests of operators' tools as REST calls, and convert the answers to those of the admin socket."""
+"""Send admin requests as REST calls, and convert the answers to the admin socket's answers."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class RestWay:
-    """The appliance at a URL; it takes the same requests and gives the same answers as over its socket."""
+    """The appliance at a URL; it takes the same requests and gives the same answers as over the admin socket."""
 
     def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
         """Make the client. Raises `ValueError` if a token must not be sent to this URL."""
@@ -40,7 +40,7 @@ class RestWay:
 
 
 def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
-    """Send a request over REST. Raises `NotRunningError` for a request that REST does not have."""
+    """Send a request over REST. Raises `NotRunningError` for a request that REST does not offer."""
     asked: Any = request  # its kind is checked below
     if isinstance(asked, admin.RegistrationsWanted):
         return cast(A, _registrations(_carry_out(rest, admin.GraphWanted())))
@@ -77,7 +77,7 @@ _UNASKED = "this cannot be asked over REST; run it with --state"
 
 
 def _line(finding: dict[str, Any]) -> str:
-    """Return a finding as one line, like those of the admin socket."""
+    """Return a finding as one line, in the format of the admin socket."""
     return "{file}:{line}:{column}: {severity}: {text}".format_map(finding)
 
 

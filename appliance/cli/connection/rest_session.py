@@ -3,10 +3,10 @@
 Invariants:
 
 1. A credential leaves this machine only encrypted, to a server whose certificate is trusted (`--api-ca`, else the
-   system's authorities); that cannot be switched off. Clear text is for loopback addresses only.
-2. The token comes from the environment, never from the command line, which every user of the machine can see. It
-   does not leave the program: its reading key is sent, and each order is signed (`request_signing.py`).
-3. No redirect, proxy or credentials from `.netrc` are used.
+   system's authorities). This check cannot be switched off. Clear text is used only for loopback addresses.
+2. The token comes from the environment, never from the command line, which every user of the machine can see. The token
+   does not leave the program: only its reading key is sent, and each order is signed (`request_signing.py`).
+3. Redirects, proxies and credentials from `.netrc` are not used.
 """
 
 import json
@@ -31,12 +31,12 @@ _MAKE = "make one on its machine: rosrv token add NAME"
 
 
 class RestProblemError(Exception):
-    """Report a request that REST denied or rejected; `lines` is the text, the first line a summary."""
+    """Report a request that REST denied or rejected; `lines` is the text, and its first line is a summary."""
 
     def __init__(
         self, status: int, kind: str, lines: list[str], findings: list[dict[str, Any]] | None = None
     ) -> None:
-        """Store the problem; `findings` are the errors in a text that was sent, with their places."""
+        """Store the problem; `findings` are the errors in the sent text, with their places."""
         super().__init__(lines[0])
         self.findings = findings
         self.status = status
@@ -77,7 +77,7 @@ class RestClient:
         match: bool = False,
         order: bool = True,
     ) -> dict[str, Any]:
-        """Return the answer's body. `match`: change whatever is in force (`If-Match: *`).
+        """Return the answer's body. `match`: accept any present revision (`If-Match: *`).
 
         An `order` is signed unless it is a GET; a dry run is not an order.
         """
@@ -224,7 +224,7 @@ def _context(authority: Path | None) -> ssl.SSLContext:
     try:
         if authority is None:
             return ssl.create_default_context()
-        # An empty text would select the system's authorities.
+        # An empty string would select the system's authorities.
         text = read_given_text(authority, "ascii", "ignore") or "no certificate"
         return ssl.create_default_context(cadata=text)
     except ssl.SSLError:

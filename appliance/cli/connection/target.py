@@ -1,7 +1,7 @@
 """Choose the running appliance for a verb: over the socket in its state directory, or over REST.
 
-A verb takes an `Appliance` as its first parameter and is decorated with `speaks`, which adds the options `--state`,
-`--api` and `--api-ca`. Both ways give the same answers. The command line overrides the environment; in the
+A verb takes an `Appliance` as its first parameter; the decorator `speaks` adds the options `--state`, `--api` and
+`--api-ca`. The socket and REST give the same answers. The command line overrides the environment; within the
 environment, REST overrides the socket.
 """
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 DEFAULT_STATE = Path(
     "/var/lib/rosrv"
-)  # the default in appliance.configuration.settings, which is slow to import
+)  # repeats the default of appliance.configuration.settings, which is slow to import
 TOKEN = "ROSRV_TOKEN"  # noqa: S105  the name of an environment variable
 State = Annotated[
     Path,
@@ -37,7 +37,7 @@ State = Annotated[
         "--state",
         envvar="ROSRV_STATE",
         help="State directory of the running appliance",
-        readable=False,  # search permission is enough
+        readable=False,  # the user needs only search permission
     ),
 ]
 Api = Annotated[
@@ -65,8 +65,8 @@ _P = ParamSpec("_P")
 class Appliance:
     """The appliance that a verb talks to.
 
-    `said`: whether the command line or the environment names it. `place`: the URL of REST; None over the socket.
-    `as_json`: whether to print answers as JSON.
+    `said`: whether the command line or the environment names the appliance. `place`: the URL of REST; None over the
+    socket. `as_json`: whether to print answers as JSON.
     """
 
     way: "AdminSocket | RestWay"
@@ -85,18 +85,18 @@ class Appliance:
         return self.way.ask(request)
 
     def audit(self) -> "FileLog | RestLog":
-        """Return its audit log; with a state directory the appliance may be stopped."""
+        """Return the appliance's audit log; with a state directory, the appliance may be stopped."""
         return self.way.audit()
 
     def ask_or_exit(self, request: AdminRequest[A]) -> A:
-        """Return the answer's body. Exits with status 1 for a rejected request, 2 if no appliance answers."""
+        """Return the answer's body. Exits with status 1 for a rejected request, and 2 if no appliance answers."""
         try:
             return self.body_or_exit(self.way.ask(request))
         except NotRunningError as error:
             raise usage_error(str(error)) from None
 
     def answer_or_exit(self, request: AdminRequest[A]) -> A:
-        """Return the answer's body like `ask_or_exit`; with --json, print it and exit instead."""
+        """Return the answer's body, as `ask_or_exit` does; with --json, print the body and exit instead."""
         body = self.ask_or_exit(request)
         if self.as_json:
             say_json(body)  # type: ignore[arg-type]  # each answer is a struct
@@ -117,7 +117,7 @@ class Appliance:
 
 
 def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
-    """Replace a verb's first parameter, an `Appliance`, by the options that choose it; add --json if it is missing."""
+    """Replace a verb's first parameter, an `Appliance`, by the options that choose one; add --json if missing."""
     own = inspect.signature(verb, eval_str=True)
     its_json = next(filter(lambda name: name.startswith("as_json"), own.parameters), None)
 

@@ -1,4 +1,4 @@
-"""Write the kit of a host, or the script with which it enrols itself."""
+"""Write a host's kit, or the script with which a host enrols itself."""
 
 import re
 from dataclasses import replace
@@ -22,7 +22,7 @@ _SHOWN = ("name", "address", "appliance", "master", "serial", "expires")
 
 
 def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> KitOptions:
-    """Return the kit's options; the endpoint is empty if the appliance should choose it.
+    """Return the kit's options; the endpoint is empty if the appliance must choose it.
 
     Exits with status 2 for invalid options.
     """
@@ -46,7 +46,7 @@ def placed(running: Appliance, wishes: KitOptions) -> tuple[KitOptions, str]:
 
 
 def key_and_request(csr: Path | None) -> tuple[str | None, str]:
-    """Return a new key with its signing request; or no key and the request in `csr`, in PEM."""
+    """Return a new key and its signing request, in PEM; with `csr`, return None and the request in that file."""
     if csr is not None:
         return None, _read_request(csr)
     key = make_key()
@@ -56,7 +56,7 @@ def key_and_request(csr: Path | None) -> tuple[str | None, str]:
 def write_kit(
     output: Output, body: KitParts, key: str | None, wishes: KitOptions, reason: str, *, as_json: bool
 ) -> None:
-    """Write the archive; `reason` explains an endpoint that the appliance chose, else it is empty."""
+    """Write the archive. If the appliance chose the endpoint, `reason` explains the choice; otherwise it is empty."""
     again = (
         f"{body.name} is enrolled, but its kit was not written; run:"
         f" rosrv host kit {body.name} --appliance {wishes.endpoint} --out FILE"

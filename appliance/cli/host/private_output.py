@@ -1,7 +1,7 @@
-"""Write a kit or a script to a new file for its owner only, or to standard output.
+"""Write a kit or a script to standard output, or to a new file that only its owner can read.
 
-Enrolment cannot be undone: a new kit revokes the old certificate, and a token is shown once. So the file is created,
-with disk space reserved, before the request. It is removed if the request fails.
+Enrolment cannot be undone: a new kit revokes the old certificate, and a token is shown only once. So the file is
+created, and disk space reserved, before the request is sent. If the request fails, the file is removed.
 """
 
 import contextlib
@@ -19,11 +19,11 @@ from rosmop.tool.terminal import printable, refused, say
 
 STANDARD_OUTPUT = Path("-")
 usage_error = functools.partial(output.usage_error, verb="rosrv host")
-_RESERVED = 64 << 10  # bytes; a kit has about ten thousand
+_RESERVED = 64 << 10  # bytes; a kit needs about ten thousand
 
 
 class Output:
-    """A new file, or standard output. `written`: whether it has the data; `name`: the file's name on the host."""
+    """A new file, or standard output. `written`: whether the data is written. `name`: the file's name on the host."""
 
     def __init__(self, path: Path, name: str, file: BinaryIO) -> None:
         self.path = path
@@ -37,7 +37,7 @@ class Output:
         return self.path == STANDARD_OUTPUT
 
     def write(self, data: bytes, lost: str) -> None:
-        """Write all data, once. If that fails, print `lost`, which says what to do, and exit with status 1."""
+        """Write all data, once. If writing fails, print `lost`, which has the remedy, and exit with status 1."""
         try:
             self._file.write(data)
             if not self.is_standard:
@@ -59,7 +59,7 @@ class Output:
 def new_output(out: Path | None, default: str, *, as_json: bool) -> Iterator[Output]:
     """Open `out`, or the file `default`. Existing files are never replaced.
 
-    Exits with status 2 if the file cannot be created. A file that the block did not write is removed.
+    Exits with status 2 if the file cannot be created. If the block did not write the file, it is removed.
     """
     name = default.replace("/", "_")
     if out == STANDARD_OUTPUT:

@@ -36,7 +36,7 @@ EVER = Span(0, 1 << 63)
 
 
 class Piece(NamedTuple):
-    """A bag of the recorder, its name, and the period to read from it. Periods of pieces do not overlap."""
+    """A bag of the recorder, its name, and the period to read from the bag. Periods of pieces do not overlap."""
 
     name: str
     bag: Path
@@ -110,7 +110,7 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
 
 
 def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
-    """Yield the periods of the span between the ordered parts."""
+    """Yield the periods of the span that the ordered parts do not cover."""
     at = span.since
     for part in parts:
         if part.since > at:
@@ -121,7 +121,7 @@ def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
 
 
 def _lent(appliance: Appliance, span: Span) -> Recording | None:
-    """Return the recorder's memory of a period as a recording, or None. Exits with status 1 if it is rejected."""
+    """Return the recorder's memory of a period as a recording, or None. Exits with status 1 for a rejected request."""
     try:
         answer = appliance.ask(admin.RecordingOfMemory(*span))
     except NotRunningError as error:

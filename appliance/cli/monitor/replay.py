@@ -137,7 +137,7 @@ def replay_monitor(
 def _specifications(
     appliance: Appliance, what: str, folders: Sequence[Path]
 ) -> tuple[dict[str, str], Definitions, str | None]:
-    """Return texts, definitions and the monitor's name; for a file the name is None."""
+    """Return texts, definitions and the monitor's name; for a file, the name is None."""
     path = Path(what)
     if path.suffix == ".rv" or path.is_file():
         return read_specifications(MONITOR, [path]), read_definitions(MONITOR, [path], folders), None
@@ -152,7 +152,7 @@ def _specifications(
 
 
 def _topics(texts: Mapping[str, str], chosen: str | None, patterns: Sequence[str]) -> dict[str, str]:
-    """Return the selected topics, with their types, of a monitor or (None) of all monitors in the texts."""
+    """Return the selected topics and their types, for the chosen monitor; if None, for all monitors in the texts."""
     return {
         topic: kind
         for topic, kind in topics_of(texts, chosen).items()
@@ -161,7 +161,7 @@ def _topics(texts: Mapping[str, str], chosen: str | None, patterns: Sequence[str
 
 
 def _only(chosen: str | None, monitors: MonitorSet) -> MonitorSet:
-    """Enable only the chosen monitor and those that share variables with it; None enables all."""
+    """Enable only the chosen monitor and monitors that share variables with it; if None, enable all monitors."""
     if chosen is not None:
         uses = {monitor.name: monitor.code.uses for monitor in monitors.monitors}
         together = next(group for group in sharing(uses) if chosen in group)

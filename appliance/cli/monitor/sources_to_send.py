@@ -13,7 +13,7 @@ from rosmop.tool.specification_input import definition_folders, definition_texts
 
 _NOT_UTF_8 = re.compile("[\udc80-\udcff]")
 _SAVE_AS_UTF_8 = "these bytes are not UTF-8; save the file as UTF-8"
-_STRING_CONSTANT = re.compile(r"\s*string\s+\w+\s*=")  # whose value goes to the end of the line
+_STRING_CONSTANT = re.compile(r"\s*string\s+\w+\s*=")  # its value extends to the end of the line
 
 
 def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
@@ -47,7 +47,7 @@ def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
 
 
 def _sendable(text: str, place: str) -> str:
-    """Return the text in valid UTF-8. Replace other bytes in comments of old definitions; reject them elsewhere."""
+    """Return the text in valid UTF-8. Invalid bytes are replaced in comments of definitions, and rejected elsewhere."""
     lines = text.split("\n")
     for number, line in enumerate(lines):
         if line.isascii() or not _NOT_UTF_8.search(line):

@@ -1,6 +1,6 @@
 """Compute the impact of a policy on the running appliance, for `rosrv policy check --state` (or `--api`).
 
-Over the socket this program checks the policy with the hosts, robot and test cases that a reload would use. Over REST
+Over the socket, this program checks the policy with the hosts, robot and test cases that a reload would use. Over REST,
 the appliance does a dry run.
 """
 

@@ -47,14 +47,14 @@ def read_text(file: Path) -> str:
 def known_of(
     robot: list[str] | None, enrolled: list[str] | None, running: PolicyContext | None = None
 ) -> PolicyContext:
-    """Return the known hosts; options override what the running appliance knows."""
+    """Return the known hosts; options override the hosts of the running appliance."""
     known = running or PolicyContext()
     hosts = dict(_enrolled(text) for text in enrolled or ())
     return replace(known, hosts={**known.hosts, **hosts}, robot=networks_of(robot) or known.robot)
 
 
 def networks_of(robot: list[str] | None) -> list[Network]:
-    """Return the networks given with `--robot`. Exits with status 2 for an invalid one."""
+    """Return the networks given with `--robot`. Exits with status 2 for an invalid network."""
     return [_network(text) for text in robot or ()]
 
 
@@ -74,7 +74,7 @@ def _enrolled(text: str) -> tuple[str, Address]:
 
 
 def find_host(text: str, policy: Policy) -> Address:
-    """Return the address that an address, `robot` (its first) or `host:NAME` means. Raises `BadWordError`."""
+    """Resolve an address, `robot` (its first address) or `host:NAME` to an address. Raises `BadWordError`."""
     try:
         return find_hosts(text, policy)[0]
     except BadWordError as error:
@@ -110,7 +110,7 @@ def live_now(appliance: Appliance) -> list[LiveRight]:
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
-    """Yield the decided requests in the audit log, without folded records, which do not name their requests."""
+    """Yield the decided requests in the audit log. Folded records are left out: they do not name their requests."""
     decided = Filter(decision=("allow", "deny", "would deny"))
     try:
         for entry in appliance.audit().export(decided):

@@ -15,7 +15,7 @@ from appliance.cli.selftest.probe_nodes import TOPIC, ProbeError, call, message_
 from appliance.cli.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
 from appliance.cli.status_verb import troubles_of
 
-_CALLER = "/rosrv_selftest"  # followed by a random number: repeated reads by one caller are only counted
+_CALLER = "/rosrv_selftest"  # a random number follows, because repeated reads of one caller are only counted
 _MANY_RESTARTS = 3
 _MANY_RECORDS = 200_000
 _RECORD_SECONDS = 5.0
@@ -133,9 +133,9 @@ def _last(appliance: Appliance) -> int | None:
 
 
 def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> bool:
-    """Whether a record after the sequence `before` is of our call, or the denial in `refusal` names its record.
+    """Whether our call is recorded: by a record after the sequence `before`, or by the record that `refusal` names.
 
-    Polls for some seconds, with growing pauses. Raises `LogUnreadableError` or `NotRunningError` if the last query
+    Poll for some seconds, with growing pauses. Raises `LogUnreadableError` or `NotRunningError` if the last query
     failed.
     """
     source, deadline, pause = appliance.audit(), time.monotonic() + _RECORD_SECONDS, _FIRST_PAUSE

@@ -1,7 +1,7 @@
 """Check whether this machine can run the appliance: programs, users, namespaces, firewall, tunnels, ports.
 
-The checks create a network namespace, try firewall rules and interfaces in it, and delete it again. Nothing outside
-the namespace changes.
+The checks create a network namespace, try firewall rules and interfaces in it, and delete it again. They change nothing
+outside the namespace.
 """
 
 import os

@@ -1,6 +1,6 @@
 """Test a running appliance with two minimal ROS nodes: a publisher and a subscriber of one message.
 
-They register, answer `requestTopic`, connect, and always unregister at the end.
+The nodes register, answer `requestTopic`, connect, and always unregister at the end.
 """
 
 import contextlib
@@ -138,10 +138,10 @@ class _Node:
                 connection.sendall(
                     encode_header(_fields(_PUBLISHER)) + encode_frame(encode_frame(b"selftest"))
                 )
-                connection.recv(1)  # until the appliance has the message and disconnects
+                connection.recv(1)  # wait until the appliance has the message and disconnects
 
     def close(self) -> None:
-        """Close both ports."""
+        """Close the API port and the TCPROS port."""
         self._api.shutdown()
         self._api.server_close()
         self._messages.close()

@@ -9,7 +9,7 @@ Outcome = Literal["ok", "warn", "fail", "skip"]
 
 @dataclass(frozen=True, slots=True)
 class SelftestFinding:
-    """The result of one check; `advice` says how to correct it."""
+    """The result of one check; `advice` is the remedy."""
 
     check: str
     outcome: Outcome
@@ -23,17 +23,17 @@ def ok(check: str, text: str) -> SelftestFinding:
 
 
 def warn(check: str, text: str, advice: str) -> SelftestFinding:
-    """Return a check that needs attention although the appliance works."""
+    """Return a check whose result needs attention, although the appliance works."""
     return SelftestFinding(check, "warn", text, advice)
 
 
 def fail(check: str, text: str, advice: str) -> SelftestFinding:
-    """Return a check that prevents the appliance from working."""
+    """Return a failed check: the appliance cannot work until its cause is corrected."""
     return SelftestFinding(check, "fail", text, advice)
 
 
 def skip(check: str, text: str, advice: str = "") -> SelftestFinding:
-    """Return a check that could not be run here."""
+    """Return a check that could not run on this machine."""
     return SelftestFinding(check, "skip", text, advice)
 
 
