@@ -1,6 +1,6 @@
 """The ROSRV appliance: a network-security appliance for ROS 1 robots.
 
-`docs/dev/architecture.md` starts with a picture of the folders, who calls whom, and the way of a request.
+`docs/dev/architecture.md` starts with diagrams of the folders, the calls between them, and the path of a request.
 """
 
 __version__ = "0.2.0"
