@@ -36,7 +36,7 @@ class _LiteralError(Exception):
 
 
 class _Unsaid:
-    """Text without a node: a stray `;`, a `using` line."""
+    """Marks text that has no node, such as a stray `;` or a `using` line."""
 
 
 def _binary(operator: str) -> Callable[..., tree.BinaryExpression]:

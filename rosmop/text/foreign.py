@@ -103,7 +103,7 @@ _FAMILIES = {
 
 
 def instead(parts: Sequence[str]) -> str | None:
-    """Return what to write for a known foreign name, or None."""
+    """Return the text to write for a known foreign name, or None."""
     pointer = re.fullmatch(r"(\w+::\w+?)(?:::)?(?:Const)?Ptr", "::".join(parts))
     if pointer is not None:
         return f"there are no pointers; write `{pointer[1]}`"
@@ -120,7 +120,10 @@ _Advice = str | Callable[[re.Match[str]], str]
 
 @dataclass(frozen=True)
 class _Shape:
-    """A construct outside the grammar; `depths`: outside specifications (0), in them (1), in braces there (2)."""
+    """A construct outside the grammar, and the brace `depths` where it can occur.
+
+    Depth 0 is outside all specifications, depth 1 in a specification, and depth 2 in braces inside a specification.
+    """
 
     pattern: re.Pattern[str]
     advice: _Advice
@@ -288,7 +291,7 @@ _WINDOW = 200
 
 
 def foreign(text: str, offset: int, depth: int) -> tuple[int, int, str] | None:
-    """Return the start and end of a foreign construct at `offset`, and the advice; None if none is known."""
+    """Return the start and end of a foreign construct at `offset`, and the advice; None if the construct is unknown."""
     before = text[max(0, offset - _WINDOW) : offset]
     begin = offset - len(before) + max(before.rfind(mark) for mark in ";{}\n") + 1
     end = min(len(text), offset + _WINDOW)

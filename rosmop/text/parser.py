@@ -23,7 +23,7 @@ MAX_DEPTH = 100
 _NO_TEXT = re.compile("[\ud800-\udfff]")
 """Surrogates, which replace bytes that are not UTF-8."""
 
-# Lines of the C++ preprocessor are ignored if that changes nothing.
+# Lines of the C++ preprocessor are ignored where the meaning stays the same.
 _PREPROCESSED = re.compile(
     r"""(?P<comment>//[^\n]*|/\*(?:[^*]|\*(?!/))*(?:\*/|\Z))
     |\#[ \t]*(?P<word>if|ifn?def|el(?:se|if)|endif|define|undef|include|pragma|error|warning|line)\b
@@ -128,7 +128,7 @@ def _parser() -> Lark:
 
 
 def _check_directives(text: str, file: str) -> None:
-    """Raise `SpecificationError` for conditions around more than comments, and for macros whose names are used."""
+    """Raise `SpecificationError` for `#if` around anything but comments, and for each macro that is used."""
     macros: dict[str, int] = {}
     used: set[str] = set()
     conditions: list[tuple[str, int]] = []

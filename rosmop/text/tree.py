@@ -137,7 +137,7 @@ class ConditionalExpression(Expression):
 
 @dataclass(frozen=True)
 class CommaExpression(Expression):
-    """`a, b`: the last one is the value."""
+    """`a, b`: the value is that of the last expression."""
 
     items: tuple[Expression, ...]
 
