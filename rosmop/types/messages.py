@@ -15,7 +15,7 @@ from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_text import Constant, Field, MessageDefinition
 
-_COMPARED = 600  # the maximum number of names that an unknown one is compared with
+_COMPARED = 600  # the maximum number of names to compare with an unknown name
 
 PRIMITIVES: Mapping[str, Type] = MappingProxyType(
     {
@@ -125,8 +125,8 @@ def field_type(field: Field) -> Type:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a suggestion, as the tail of an error. Only the first of very many names are compared."""
-    known = list(islice(known, _COMPARED))  # a file can have thousands of names and of mistakes
+    """Return a suggestion to append to an error. Compares at most `_COMPARED` names."""
+    known = list(islice(known, _COMPARED))  # a file can have thousands of names and thousands of mistakes
     near = difflib.get_close_matches(name[:100], known, 1, 0.65)
     if near:
         return f"; did you mean `{near[0]}`?"

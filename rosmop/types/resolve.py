@@ -105,7 +105,7 @@ def _message(name: tree.TypeName, messages: MessageTypes) -> Type:
 
 
 def _meant(parts: tuple[str, ...], messages: MessageTypes) -> str:
-    """Return the tail of the error for an unknown type that is not written as a message type."""
+    """Return the advice to append to the error for an unknown type that is not written as a message type."""
     advice = instead(parts)
     if advice is not None:
         return f"; {advice}"

@@ -1,8 +1,8 @@
 """The types of values: C++'s arithmetic types, strings, times, vectors and messages.
 
-A type is a value object; its text is how C++ writes it. While actions run, values are: `bool`, `int` and
-`float` as Python's; strings and `char *` buffers as bytes; times and durations as integer nanoseconds; vectors
-and messages as lists (a message's fields in the order of its definition).
+A type is a value object, and its text is the C++ spelling. While actions run, values have these Python types: `bool`,
+`int` and `float` for numbers; bytes for strings and `char *` buffers; integer nanoseconds for times and durations;
+lists for vectors and messages. The list of a message has its fields in the order of the definition.
 """
 
 import msgspec
@@ -55,7 +55,7 @@ class IntegerType(_Kind, frozen=True):
         return (1 << (self.bits - self.signed)) - 1
 
     def holds(self, other: "IntegerType") -> bool:
-        """Whether every value of the other type is a value of this one."""
+        """Whether every value of the other type is also a value of this type."""
         return self.least <= other.least and other.most <= self.most
 
     def __eq__(self, other: object) -> bool:
@@ -201,7 +201,7 @@ def convertible(source: Type, target: Type) -> bool:
 
 
 def same_elements(one: Type, other: Type) -> bool:
-    """Whether ROS encodes vectors of these elements alike: bytes, characters and booleans are all bytes."""
+    """Whether ROS encodes vectors of both element types alike. Bytes, characters and booleans each take one byte."""
     bytes_alike = all(isinstance(kind, BoolType) or (isinstance(kind, IntegerType) and kind.bits == 8)
                       for kind in (one, other))  # fmt: skip
     if bytes_alike:
