@@ -17,7 +17,7 @@ from rosmop.types.value_types import Type
 class EventCode:
     """A compiled event: the name of its function, and its trigger.
 
-    `type` is the type of the message, request or response, `service_type` that of the service.
+    `type` is the type of the message, request or response. `service_type` is the type of the service.
     """
 
     name: str
@@ -31,7 +31,7 @@ class EventCode:
     binds: tuple[int, ...] = ()
     """Numbers of the specification's parameters that the event binds."""
     key: str = ""
-    """For an event on messages, the function that returns the values of these parameters."""
+    """The function that returns the values of these parameters; only for an event on messages."""
     creates: bool = False
     """Whether the event may begin a slice."""
     plain: bool = False
@@ -41,15 +41,16 @@ class EventCode:
 
     @property
     def channel(self) -> str | None:
-        """Return the topic or the part of a service (see `channel_of`) of the messages; None for a timer."""
+        """Return the topic of the messages, or their part of a service (see `channel_of`); None for a timer."""
         return self.topic if self.topic is None or self.part is None else channel_of(self.topic, self.part)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of a specification. `when_true` and `when_false` are variables (double) for its sides.
+    """A comparison of a specification. `when_true` and `when_false` each name the variables (double) for its two sides.
 
-    The left one is infinite until the comparison is evaluated. `threshold`: the constant side (0, 1), or None.
+    The left variable is infinite until the comparison is evaluated. `threshold` is the constant side (0: left, 1:
+    right), or None.
     """
 
     position: Position
@@ -75,7 +76,7 @@ class Publication:
 
 @dataclass(frozen=True)
 class Slicing:
-    """The parameters of slices (name in the text, name in the code, type), and their own variables.
+    """The parameters of slices (name in the text, name in the code, type), and the slices' own variables.
 
     `enforces`: the specification drops, changes or publishes messages.
     """
@@ -102,7 +103,7 @@ class PropertyCode:
 class SpecificationCode:
     """A compiled specification. `variables` maps its shared variables to their names in the code.
 
-    `start` are the functions that initialise it: constants and zeros, first values, `init`.
+    `start` lists the functions that initialise the specification: constants and zeros, first values, `init`.
     """
 
     name: str
@@ -125,7 +126,7 @@ class SpecificationCode:
     slicing: Slicing | None = None
     """Parameters and own variables of slices; None without parameters."""
     begins: bool = False
-    """Declared `begin`: when its state is lost, it restarts instead of holding its topics."""
+    """Whether it is declared `begin`: if its state is lost, it restarts instead of holding its topics."""
 
 
 @dataclass(eq=False)
@@ -142,7 +143,7 @@ class Compiled:
     publications: tuple[Publication, ...]
 
     def alone(self, names: Collection[str]) -> "Compiled":
-        """Return `part` without data of the other specifications, so that it does not depend on them."""
+        """Return `part` without the data of other specifications, so that the result does not depend on them."""
         part = self.part(names)
         functions = {name: each for name, each in self.functions.items() if Symbols.owner(name) in names}
         found = [node for function in functions.values() for node in nodes.walk(function)]
@@ -157,7 +158,7 @@ class Compiled:
         )
 
     def groups(self, names: Collection[str]) -> list[set[str]]:
-        """Return the groups of specifications that share variables, also indirectly, with one of `names`."""
+        """Return the groups of specifications that share variables, directly or indirectly, with one of `names`."""
         uses = {one.name: one.uses for one in self.specifications}
         return [group for group in sharing(uses) if not group.isdisjoint(names)]
 
@@ -167,7 +168,10 @@ class Compiled:
         return self.part({one.name for one in self.specifications} - gone)
 
     def part(self, names: Collection[str]) -> "Compiled":
-        """Return the set with only `names`, which must include all that share variables with one of them."""
+        """Return the set with only `names`.
+
+        They must include every specification that shares variables with one of `names`.
+        """
         return replace(
             self,
             specifications=tuple(one for one in self.specifications if one.name in names),

@@ -1,10 +1,13 @@
-"""Group connected items, also indirectly connected ones."""
+"""Group items that are connected, directly or indirectly."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 
 def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
-    """Group specifications that share variables, also indirectly; `uses` lists whose variables each uses."""
+    """Group specifications that share variables, directly or indirectly.
+
+    `uses` maps each specification to those whose variables it uses.
+    """
     names = list(uses)
     return [
         {names[number] for number in group} for group in connected([(name, *uses[name]) for name in names])
@@ -12,7 +15,7 @@ def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
 
 
 def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
-    """Return groups of indices whose items have keys in common, also indirectly, in order."""
+    """Return groups of indices, in order, whose items share keys, directly or indirectly."""
     owners: dict[object, int] = {}
     chief = list(range(len(keys)))
 
@@ -31,5 +34,8 @@ def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
 
 
 def channel_of(service: str, part: str) -> str:
-    """Return the name that replaces a topic for the `request` or `response` of a service; no topic has a blank."""
+    """Return the name that replaces a topic for the `request` or `response` of a service.
+
+    The name contains a blank, as no topic does.
+    """
     return f"{service} {part}"

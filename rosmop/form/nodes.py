@@ -8,13 +8,13 @@ are references: assigning one shares it, so copies are also explicit (`Copy`).
 Names belong to the set of specifications (`g…`, the variables that specifications share) or to one call of one
 function. A *site* is the number of a position in the text, for reports of faults; -1 means the statement's own site.
 
-A message is its bytes, from 0. A `Spot` is a position in it: an offset from the start, or from a position that an
-earlier statement named. Reading beyond the end is a fault.
+A message is its bytes, counted from 0. A `Spot` is a position in the message: an offset from the start, or from a
+position that an earlier statement named. Reading beyond the end is a fault.
 
-The effects of an action are a list, in order: drop this message (`Drop`, or a `Return` that drops), write fields
+The effects of an action form a list, in order: drop this message (`Drop`, or a `Return` that drops), write fields
 (`WriteBack`), print a line (`Log`), publish a message (`Publish`), restart the property (`Reset`). Each back end has a
-row for each kind of expression and statement: an implementation, or `Left`. Bounds: `Charge` and `Allocate` take from
-the budgets of instructions and bytes, as do functions with long values; exceeding a budget is a fault.
+row for each kind of expression and statement: an implementation, or `Left`. `Charge` and `Allocate` take from the
+budgets of instructions and bytes, and functions with long values do the same. Exceeding a budget is a fault.
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,7 +26,7 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 CHARGED = 1024
-"""The size of a message in bytes from which decoding an array or the whole message is charged."""
+"""In messages of at least this number of bytes, decoding an array or the whole message is charged."""
 
 SHORT = 64
 """Comparing with a string of at most this many bytes costs no more than other instructions."""
@@ -40,7 +40,10 @@ class FormNode(msgspec.Struct, frozen=True, tag=True, tag_field="node", array_li
 
 
 class Literal(FormNode, frozen=True):
-    """A constant. None and the names of parts of a time have the type void, as they are not values of the language."""
+    """A constant.
+
+    Its type is void for None and for the name of a part of a time, which are not values of the language.
+    """
 
     type: Type
     value: bool | int | float | bytes | None
@@ -92,7 +95,7 @@ class Unary(FormNode, frozen=True):
 
 
 class Moment(FormNode, frozen=True):
-    """An exact sum or difference of times and durations; a fault if this type cannot hold it."""
+    """An exact sum or difference of times and durations; a fault if the type cannot hold the result."""
 
     type: Type
     operator: str
@@ -102,7 +105,7 @@ class Moment(FormNode, frozen=True):
 
 
 class MomentOf(FormNode, frozen=True):
-    """A time or duration from seconds and nanoseconds (`long`); a fault if this type cannot hold it."""
+    """A time or duration from seconds and nanoseconds (`long`); a fault if the type cannot hold the result."""
 
     type: Type
     seconds: "Expression"
@@ -121,8 +124,10 @@ class Compare(FormNode, frozen=True):
 
 
 class CompareTexts(FormNode, frozen=True):
-    """Compare strings. The left one is charged by its length, unless one of them is known to be `short`, or the right
-    one is a variable with few bytes.
+    """Compare strings.
+
+    The left string is charged by its length. It is free if either string is known to be `short`, or if the right string
+    is a variable with few bytes.
     """
 
     operator: str
@@ -134,7 +139,7 @@ class CompareTexts(FormNode, frozen=True):
 
 
 class Logical(FormNode, frozen=True):
-    """`and`, `or`: the right operand is evaluated only if the left one does not decide."""
+    """`and`, `or`: the right operand is evaluated only if the left one does not decide the result."""
 
     operator: str
     left: "Expression"
@@ -204,7 +209,7 @@ class Copy(FormNode, frozen=True):
 
 
 class Recast(FormNode, frozen=True):
-    """A vector of bytes (or of vectors of them), converted to another type of bytes."""
+    """A vector of bytes, or of vectors of bytes, converted to another type of bytes."""
 
     type: value_types.VectorType
     value: "Expression"
@@ -230,8 +235,8 @@ class Call(FormNode, frozen=True):
 
 
 class Accumulate(FormNode, frozen=True):
-    """The sum of `start` and a vector's elements from `first` to before `last`, calculated in `wide`; each step is
-    converted to the type.
+    """The sum of `start` and a vector's elements from `first` to before `last`. Each step is calculated in the type
+    `wide`, then converted to the node's type.
     """
 
     type: Type
@@ -244,10 +249,10 @@ class Accumulate(FormNode, frozen=True):
 
 
 class Invoke(FormNode, frozen=True):
-    """A call of a helper function; with references, the result is its value and their new values.
+    """A call of a helper function; with references, the result is its value and the new values of the references.
 
-    `depth` is None for a function that is not recursive; else whether the caller is recursive, so the call is one
-    level deeper.
+    `depth` is None if the function is not recursive. Otherwise it says whether the caller is also recursive, so that
+    the call is one level deeper.
     """
 
     type: Type
@@ -257,8 +262,8 @@ class Invoke(FormNode, frozen=True):
 
 
 class Format(FormNode, frozen=True):
-    """Text formatted by a template, as with Python's `%` of bytes. `size` is the maximum length without its strings
-    if that is charged, else None.
+    """Text formatted by a template, as with Python's `%` of bytes. `size` is the maximum length of the text without its
+    strings, or None if the text is not charged.
     """
 
     template: bytes
@@ -286,7 +291,7 @@ class Log(FormNode, frozen=True):
 
 
 class Throttle(FormNode, frozen=True):
-    """A test whether output at this site is due: the last one was at least `seconds` ago."""
+    """A test whether output at this site is due: the last output was at least `seconds` ago."""
 
     seconds: "Expression"
     site: int
@@ -362,7 +367,7 @@ class Continue(FormNode, frozen=True):
 
 
 class Select(FormNode, frozen=True):
-    """Assign the number that a table has for a value, or the default."""
+    """Look up a value in a table, and assign the number found there, or the default."""
 
     site: int
     name: str
@@ -372,7 +377,7 @@ class Select(FormNode, frozen=True):
 
 
 class Return(FormNode, frozen=True):
-    """Return from a helper function, with its value and those of its references."""
+    """Return from a helper function, with its value and the values of its references."""
 
     site: int
     value: Expression
@@ -380,7 +385,7 @@ class Return(FormNode, frozen=True):
 
 
 class Leave(FormNode, frozen=True):
-    """Return from any other function; for an event, whether it happened."""
+    """Return from any other function. An event returns whether it happened."""
 
     site: int
     happened: bool | None
@@ -394,7 +399,7 @@ class Charge(FormNode, frozen=True):
 
 
 class Allocate(FormNode, frozen=True):
-    """Charge for the bytes of a new value (None: of the message, if it is long)."""
+    """Charge for the bytes of a new value. None stands for the bytes of the message, if they are many."""
 
     site: int
     size: int | None
@@ -408,7 +413,7 @@ class LimitDepth(FormNode, frozen=True):
 
 
 class Drop(FormNode, frozen=True):
-    """Drop the message. `anyway`: there always is one; otherwise only if there is (a deadline has none)."""
+    """Drop the message. `anyway`: there always is a message. Otherwise there may be none, as at a deadline."""
 
     site: int
     anyway: bool
@@ -453,7 +458,10 @@ class AfterText(FormNode, frozen=True):
 
 
 class Count(FormNode, frozen=True):
-    """Name the number of elements of the array at `at`; fault if that many, of `least` bytes each, do not fit."""
+    """Name the number of elements of the array at `at`.
+
+    Fault if this number of elements, of `least` bytes each, does not fit.
+    """
 
     site: int
     name: str
@@ -474,7 +482,7 @@ class AfterElements(FormNode, frozen=True):
 class Skip(FormNode, frozen=True):
     """Name the position after `count` elements of variable size; `skipper` measures each (None: strings).
 
-    They are charged if they are many, or if they are `inner` (within a skipped element).
+    The elements are charged if there are many, or if they are `inner` (within a skipped element).
     """
 
     site: int
@@ -486,7 +494,7 @@ class Skip(FormNode, frozen=True):
 
 
 class NotPast(FormNode, frozen=True):
-    """Let the event not happen, and report it, unless there are more elements than `index`."""
+    """Unless there are more elements than `index`, the event does not happen, and this is reported."""
 
     site: int
     count: str
@@ -569,10 +577,11 @@ class Skipper(FormNode, frozen=True):
 
 
 class Function(FormNode, frozen=True):
-    """A function: an event, which has happened at the statement `happens`, a handler, a timer, a helper function, or a
-    stage of the start.
+    """A function: an event, a handler, a timer, a helper function, or a stage of the start. An event has happened from
+    the statement with the number `happens` on.
 
-    `context` names the specification whose budget is charged. `shared` are the shared variables that it assigns.
+    `context` names the specification whose budget is charged. `shared` are the shared variables that the function
+    assigns.
     """
 
     name: str
@@ -587,8 +596,8 @@ class Function(FormNode, frozen=True):
 
 
 class PropertyClock(FormNode, frozen=True):
-    """The clock of a property: the table for events more than `within` ns after its start, and the deadline of each
-    state after the start (-1: none).
+    """The clock of a property: the table for events more than `within` ns after the clock's start, and for each state
+    the time from this start to its deadline (-1: none).
     """
 
     late: tuple[int, ...]
@@ -597,7 +606,7 @@ class PropertyClock(FormNode, frozen=True):
 
 
 class HandledCategory(FormNode, frozen=True):
-    """The handler of a category, and the states that run it when they are entered, also from themselves."""
+    """The handler of a category, and the states that run it whenever they are entered, even from themselves."""
 
     category: str
     function: str
@@ -607,10 +616,10 @@ class HandledCategory(FormNode, frozen=True):
 class Advance(FormNode, frozen=True):
     """The step of a property at an event: the next state for each state (-1: no table).
 
-    `property` is its number among those with tables; None without one. `event` is the event's number in its
-    specification. `handlers` run in their order, and may restart it in its state `initial`. With a `clock`, an entry is
-    twice the next state, plus one where the clock restarts; -1 where a handler runs. A property that `suppresses`
-    undoes the step when the message is dropped.
+    `property` is the number of the property among those with tables; None without a table. `event` is the event's
+    number in its specification. `handlers` run in their order, and may restart the property in its state `initial`.
+    With a `clock`, an entry is twice the next state, plus one where the clock restarts, or -1 where a handler runs. A
+    property that `suppresses` undoes the step when the message is dropped.
     """
 
     property: int | None
@@ -637,7 +646,7 @@ class Component(FormNode, frozen=True):
     """Specifications that share topics or variables only with each other: their variables, the number of properties
     with tables, and their topics (also requests and responses of services) with the events on each, in order.
 
-    `noted` are variables that only explain; repeating a message leaves them equal.
+    `noted` are variables that serve only explanations; processing a message twice leaves them as after the first time.
     """
 
     variables: tuple[str, ...]

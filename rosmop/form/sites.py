@@ -34,7 +34,7 @@ class Site:
 
 
 class Symbols:
-    """Makes the names of variables and functions, and the sites, of a set while it is compiled.
+    """Makes the names of variables and functions, and the sites, of a set during its compilation.
 
     The names of a specification do not depend on the rest of the set.
     """

@@ -11,9 +11,11 @@ from rosmop.logics.interface import ClockedProperty, FiniteProperty
 
 @dataclass(frozen=True)
 class SpecificationGroup:
-    """A component, with the indices of its specifications, of its properties with tables (specification, property), and
-    of the events on each topic or part of a service (specification, event). Topics of parametric specifications have
-    no events here: the engine takes their messages.
+    """A component, with the indices of its specifications, of its properties with tables, and of the events on each
+    channel.
+
+    A property is a pair (specification, property), an event a pair (specification, event). A channel is a topic or a
+    part of a service. Topics of parametric specifications have no events here: the engine processes their messages.
     """
 
     component: nodes.Component
