@@ -11,8 +11,8 @@ from rosmop.types.value_types import Type
 class Variable:
     """A variable: its names in the text and in the code.
 
-    `flag` is the code's name for "was assigned", for parameters that are bound to fields. `alias` is the value that a
-    reference refers to. `shared` variables belong to the set of specifications, others to one function.
+    `flag` is the code's name for "was assigned"; only for parameters that are bound to fields. `alias` is the value
+    that a reference refers to. `shared` variables belong to the set of specifications, other variables to one function.
     """
 
     name: str
@@ -37,9 +37,9 @@ class Variable:
 class Value:
     """A compiled expression: its form, and the facts known about it.
 
-    `place` is the place of a value that can be assigned. `owned`: nothing else refers to the value (no copy needed).
-    `constant` is its value if that is known at compile time. `first` are the expressions at the start of the form,
-    before the place is known. For an iterator, `vector` is the vector that it points into.
+    `place` is the place of a value that can be assigned. `owned`: nothing else refers to the value, so it needs no
+    copy. `constant` is the value if it is known at compile time. `first` lists the expressions at the start of the form
+    that are evaluated before the place is known. For an iterator, `vector` is the vector that it points into.
     """
 
     form: Expression

@@ -1,6 +1,6 @@
 """Assignments: to variables, elements, fields, characters and parts of times.
 
-A parameter that is bound to a field remembers that it was assigned, because the field is written only then.
+A parameter that is bound to a field remembers whether it was assigned, because only then is the field written.
 """
 
 from rosmop.check.assignables import (
@@ -52,13 +52,13 @@ def note_copy(target: Value, value: Value) -> None:
 
 
 def store(scope: FunctionScope, target: Value, value: nodes.Expression) -> nodes.Expression:
-    """Return an expression that assigns; its result is the assigned value."""
+    """Return an expression that assigns `value` to `target`; its result is the assigned value."""
     stored = _store(scope, require_place(target, "an assignment"), value)
     return marked(mark(scope, target), stored)
 
 
 def write_store(scope: FunctionScope, target: Value, value: nodes.Expression) -> None:
-    """Write the statements that assign."""
+    """Write the statements that assign `value` to `target`."""
     place = require_place(target, "an assignment")
     flag = mark(scope, target)
     scope.evaluate(_store(scope, place, value))
@@ -67,7 +67,7 @@ def write_store(scope: FunctionScope, target: Value, value: nodes.Expression) ->
 
 
 def marked(flag: str | None, change: nodes.Expression) -> nodes.Expression:
-    """Return `change`, preceded by an assignment that sets `flag` if there is one."""
+    """Return `change`. If there is a `flag`, first set it."""
     if flag is None:
         return change
     assigned = nodes.Assign(value_types.BOOL, flag, nodes.Literal(value_types.BOOL, True))
@@ -75,7 +75,7 @@ def marked(flag: str | None, change: nodes.Expression) -> nodes.Expression:
 
 
 def mark(scope: FunctionScope, target: Value) -> str | None:
-    """Note that (a part of) this place changes; return the flag to set then, or None."""
+    """Note that this place, or a part of it, changes; return the flag to set at the change, or None."""
     variable = root(target)
     scope.changes = True
     if variable is None:
@@ -104,7 +104,7 @@ def _store(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> node
 
 def _store_part(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> nodes.Expression:
     """Store a changed string or time as a whole, because neither changes in place."""
-    assert isinstance(place, CharacterLvalue | TimePartLvalue)  # the last kinds of places
+    assert isinstance(place, CharacterLvalue | TimePartLvalue)  # the remaining kinds of places
     inner, base = require_place(place.base, "an assignment"), place.base.form
     if isinstance(place, TimePartLvalue):
         part = nodes.Literal(value_types.VOID, place.part.encode())

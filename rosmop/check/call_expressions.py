@@ -62,7 +62,7 @@ def _named(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ..
 
 
 def _known(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ...]) -> Value | None:
-    """Compile a call of a predefined function; None for another name."""
+    """Compile a call of a predefined function; return None for any other name."""
     if parts[-2:] == ("Time", "now"):
         if node.arguments:
             raise SpecificationError.at(node.position, "`now` takes no argument")
@@ -171,7 +171,7 @@ def _check_referenced(value: Value, kind: value_types.Type, function: HelperFunc
 
 
 def _check_apart(one: Value, other: Value, function: HelperFunction) -> None:
-    """Reject references to overlapping values: one change would undo the other, or not be seen."""
+    """Reject references to overlapping values: one change would undo the other, or stay invisible."""
     if all(step == beside for step, beside in zip(path(one), path(other), strict=False)):
         raise SpecificationError.at(
             other.position,

@@ -10,7 +10,10 @@ from rosmop.types.value_types import Type
 
 
 def convert(scope: FunctionScope, value: Value, target: Type, site: int | None = None) -> nodes.Expression:
-    """Return a value converted to the target type, to which nothing else refers; rejects impossible conversions."""
+    """Return a value converted to the target type; rejects impossible conversions.
+
+    Nothing else refers to the result.
+    """
     check_convertible(value, target)
     if value_types.is_number(target):
         return number(value.form, target)
@@ -37,7 +40,7 @@ def check_convertible(value: Value, target: Type) -> None:
 
 
 def refusal(source: Type, target: Type) -> str:
-    """Return the error for a type that does not convert to another: the reason, and what to write instead."""
+    """Return the error for a type that cannot be converted to another: the reason, and the text to write instead."""
     text, moment = (
         (value_types.StringType, value_types.CharactersType),
         (value_types.TimeType, value_types.DurationType),

@@ -88,7 +88,7 @@ def _sum(
             at[0], "`accumulate` goes from `v.begin()` to `v.end()`, with a number to start from"
         )
     kind = values[2].type
-    assert values[0].vector is not None  # the caller has checked
+    assert values[0].vector is not None  # the caller checks this
     element = _vector(values[0].vector, at[0]).element
     if not value_types.is_number(element):
         raise SpecificationError.at(at[0], f"{element} has no sum")

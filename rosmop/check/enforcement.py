@@ -37,7 +37,7 @@ def enforcement(
     published: Sequence[str],
     dropping: Collection[str],
 ) -> str:
-    """Describe whether and how violations of a property can be prevented, or what is missing for that.
+    """Describe whether and how violations of a property can be prevented, or which requirement is missing.
 
     `published` are the topics of its remedy, `dropping` the categories whose handlers drop the message.
     """
@@ -73,7 +73,7 @@ _COUNTS = {
 def _bringing(compiled: CompiledProperty, graph: VerdictGraph, category: str) -> set[str]:
     """Return the events that lead to the category from a state without it.
 
-    If a dropped message has not happened, only states that undropped messages reach are considered.
+    If dropped messages do not count for the property, only states that other messages reach are considered.
     """
     reached, brings = {graph.initial}, set[str]()
     waiting = [graph.initial]

@@ -72,8 +72,9 @@ def _key(
     trigger: tree.MessageTrigger,
     kind: str,
 ) -> str:
-    """Write the function for the values that an event binds: False if the message does not match; else a list of True
-    and the values, or True alone.
+    """Write the function that returns the values that an event binds.
+
+    It returns False if the message does not match. Otherwise it returns True alone, or a list of True and the values.
     """
     scope = FunctionScope(shared, names, "action")
     scope.message_type = kind
@@ -96,7 +97,7 @@ def _key(
 def _timer(
     shared: CompilationContext, names: SpecificationNames, event: tree.EventDefinition, function: str
 ) -> EventCode:
-    assert isinstance(event.trigger, tree.TimerTrigger)  # the caller has checked
+    assert isinstance(event.trigger, tree.TimerTrigger)  # the caller checks this
     if event.parameters:
         raise SpecificationError.at(
             event.parameters[0].position, "a timer has no message, so it takes no parameters"
@@ -172,7 +173,7 @@ def _bind(
 def _binds_nothing(
     scope: FunctionScope, binding: tree.Binding, parameters: dict[str, tree.ParameterDeclaration], kind: str
 ) -> bool:
-    """Whether a variable of a pattern is not a parameter of the event, which is a warning, as ROSMOP accepts it.
+    """Whether a variable of a pattern is not a parameter of the event. ROSMOP accepts this, so it is only a warning.
 
     Raises SpecificationError if the message has no such field.
     """
@@ -221,7 +222,7 @@ def _bind_one(
 
 
 def _constant(scope: FunctionScope, binding: tree.Binding, field: Type) -> bool | int | float | bytes:
-    assert binding.constant is not None  # the caller has checked
+    assert binding.constant is not None  # the caller checks this
     constant = scope.value_of(binding.constant).constant
     held = None if constant is None else _held(constant, field)
     if held is None:
@@ -243,7 +244,7 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
         return None
     if isinstance(field, value_types.BoolType):
         return bool(constant) if constant in (0, 1) else None
-    assert isinstance(field, value_types.IntegerType)  # numbers are one of the three
+    assert isinstance(field, value_types.IntegerType)  # a number has one of three types
     return int(constant) if field.least <= constant <= field.most else None
 
 
@@ -253,7 +254,7 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
 def _body(
     scope: FunctionScope, event: tree.EventDefinition, trigger: tree.MessageTrigger
 ) -> tuple[list[nodes.Statement], list[nodes.Statement]]:
-    """Compile the `when` and the action. They come first, because they decide which fields are needed."""
+    """Compile the `when` and the action. This comes first because they determine which fields are needed."""
     when = trigger.when
     with scope.nested() as conditions:
         if when is not None:

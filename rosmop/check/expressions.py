@@ -36,7 +36,7 @@ _MAX_DIGITS = 400
 
 
 def value_of(scope: FunctionScope, node: tree.Expression) -> Value:
-    """Compile an expression; rejects one without a meaning."""
+    """Compile an expression; rejects an expression that has no meaning."""
     return _KINDS[type(node)](scope, node)
 
 
@@ -88,7 +88,7 @@ def _integer(scope: FunctionScope, node: tree.NumberLiteral, text: str, suffix: 
     for kind in candidates:
         if value <= kind.most:
             return constant_value(node.position, kind, value)
-    if value <= value_types.ULONG.most:  # g++ uses a type of 128 bits for it, and also warns
+    if value <= value_types.ULONG.most:  # g++ uses a 128-bit type for this value, and also warns
         warning = (
             f"{shown(node.text)} is larger than `long` holds, and an `unsigned long` here; write `{text}u`"
         )
@@ -244,7 +244,7 @@ def assignment(scope: FunctionScope, node: tree.Assignment) -> tuple[order.First
     if node.operator == "=" and (target.pure or value_types.is_number(target.type)):
         return order.of_assignment(scope, target, _assigned(scope, target, value, site))
     first, target, value = order.of_change(scope, target, value)
-    if node.operator == "=":  # of a class: C++ reads the assigned value when all places are known
+    if node.operator == "=":  # for a class, C++ reads the assigned value after all places are known
         return first, target, _assigned(scope, target, value, site)
     operands = operators.Operands(scope, node.position, target, value, scope.site(node))
     if node.operator == "+=" and isinstance(target.type, value_types.StringType):

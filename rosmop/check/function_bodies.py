@@ -71,7 +71,10 @@ def _shared_variable(
 def _known(
     scope: FunctionScope, declaration: tree.Declaration, declarator: tree.Declarator, kind: value_types.Type
 ) -> bool | int | float | None:
-    """Return the value of a constant, or None if it is not known now. Compiling the constant reports its errors."""
+    """Return the value of a constant, or None if the value is not known yet.
+
+    Compiling the constant reports its errors.
+    """
     try:
         return known(scope, declaration.type, declarator, kind)
     except SpecificationError:
@@ -83,7 +86,7 @@ def compile_start(
 ) -> tuple[str, ...]:
     """Write the functions that start a specification: constants and zeros, first values, `init`.
 
-    Each stage runs for all specifications before the next stage, because one may read another's variables.
+    Each stage runs for all specifications before the next stage, because a specification may read another's variables.
     """
     scopes = [
         _constants(shared, names, specification),
@@ -128,7 +131,7 @@ def _constants(
 
 
 def _constant(scope: FunctionScope, declarator: tree.Declarator) -> Value | None:
-    """Return a first value that is a constant, or None. Compiling it as a first value reports its errors."""
+    """Return the constant that a variable starts with, or None. Compiling the first value reports its errors."""
     if declarator.is_array or declarator.value is None or isinstance(declarator.value, tree.InitializerList):
         return None
     try:
@@ -186,13 +189,13 @@ def declare_functions(
 
 
 def _calls(names: SpecificationNames) -> dict[str, set[str]]:
-    """Return, for each function of the specification, the ones that it calls."""
+    """Return the functions that each function of the specification calls."""
     known = names.functions
     return {name: {*_called(function.node.body)} & known.keys() for name, function in known.items()}
 
 
 def topics_of(names: SpecificationNames, function: str) -> list[str]:
-    """Return the topics that a function publishes, and the functions that it calls."""
+    """Return the topics that are published by a function, or by the functions that it calls."""
     reached = _reached({function}, _calls(names))
     found = (node for name in reached for node in tree.walk(names.functions[name].node.body))
     return sorted({node.topic for node in found if isinstance(node, tree.PublishStatement)})
@@ -226,7 +229,7 @@ def _signature(
 
 
 def _reached(first: Set[str], called: Mapping[str, Set[str]]) -> set[str]:
-    """Return these functions and all that they call, also indirectly."""
+    """Return these functions and all functions that they call, directly or indirectly."""
     seen = set(first)
     waiting = list(first)
     while waiting:

@@ -30,7 +30,7 @@ class MemberCall:
         self.position, self.site = at
 
     def count(self, least: int, most: int | None = None) -> int:
-        """Check the number of arguments; return it."""
+        """Check and return the number of arguments."""
         number_of = len(self.arguments)
         if not least <= number_of <= (least if most is None else most):
             wanted = str(least) if most in (None, least) else f"{least} to {most}"
@@ -49,7 +49,7 @@ class MemberCall:
         return number(value.form, value_types.ULONG)
 
     def text(self, position: int) -> nodes.Expression:
-        """Return an argument as a string; a character is one of length 1."""
+        """Return an argument as a string; a character becomes a string of length 1."""
         value = self.arguments[position]
         if value.type == value_types.CHAR:
             return nodes.Call(value_types.STRING, "t_byte", (value.form,))
@@ -60,11 +60,11 @@ class MemberCall:
         return nodes.Call(kind, function, (self.base.form, *arguments), self.site)
 
     def value(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> Value:
-        """Return the same call as a value."""
+        """Return the call made by `called` as a value."""
         return Value(self.called(kind, function, *arguments), self.position)
 
     def changes(self, value: nodes.Expression) -> Value:
-        """Assign the base a new value; return a value without a result."""
+        """Assign the base a new value; return the call's value, which is void."""
         require_place(self.base, f"`{self.name}`")
         stored = store(self.scope, self.base, value)
         return Value(nodes.Discard(stored), self.position)

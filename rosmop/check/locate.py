@@ -100,7 +100,7 @@ class MessageCursor:
         step: tree.PathStep,
         rest: tuple[tree.PathStep, ...],
     ) -> Spot | None:
-        assert isinstance(item, FixedField | ArrayPart)  # its type is an array
+        assert isinstance(item, FixedField | ArrayPart)  # its type is an array here
         index = step.index or 0
         key = (part * 1_000_000 + start.offset, index)
         if key not in self._elements:
@@ -147,7 +147,7 @@ class FieldLocator:
         return Spot(end, 0)
 
     def element(self, item: FixedField | ArrayPart, start: Spot, step: tree.PathStep) -> Spot:
-        """Return the start of an array element; the event does not happen if it does not exist."""
+        """Return the start of an array element. If the element does not exist, the event does not happen."""
         index = step.index or 0
         if isinstance(item, FixedField):
             return start.plus(index * (item.size // (item.count or 1)))

@@ -17,7 +17,7 @@ from rosmop.types.resolve import resolve
 from rosmop.types.value_types import Type
 
 Write = Callable[[FunctionScope, tree.Statement], None]
-"""A function that writes a statement. It is a parameter, because statements and loops contain each other."""
+"""A function that writes a statement. Loops take it as a parameter because statements and loops contain each other."""
 
 MAX_NESTED = 15
 """The maximum depth of nested loops; Python allows 20."""
@@ -109,7 +109,7 @@ def _by_value(
 ) -> None:
     charge(scope, node)
     read: nodes.Expression = nodes.Read(element, item)
-    if element == value_types.CHAR:  # of a string; elements of a vector are already signed
+    if element == value_types.CHAR:  # a character of a string; elements of a vector are already signed
         read = nodes.Convert(value_types.CHAR, nodes.Read(value_types.UINT8, item))
     value = Value(read, node.position, owned=node.type.reference)
     variable = scope.local(node.name, kind, node.position, constant=node.type.constant)
@@ -117,7 +117,7 @@ def _by_value(
 
 
 def _first_index(scope: FunctionScope, node: tree.RangeForStatement, values: Value, kind: Type) -> str:
-    """Return the name of a new index that is before the first element."""
+    """Return the name of a new index variable, which starts before the first element."""
     if not isinstance(values.type, value_types.VectorType) or values.place is None:
         raise SpecificationError.at(
             node.values.position, "a reference needs a vector variable to iterate over; leave out the `&`"

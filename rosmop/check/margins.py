@@ -1,8 +1,9 @@
-"""Note how close comparisons of numbers came: their sides when nearest, while true and while false.
+"""Note how close comparisons of numbers came: the values of both sides when they were nearest, while true and while
+false.
 
-An expression that notes both sides replaces the comparison. It has the same value, compares the sides in the same type
-as C++, and charges nothing. Comparisons in loop conditions (a counter's distance from its end says nothing), `when`,
-first values and `init` are not noted.
+The comparison is replaced by an expression that also notes both sides. This expression has the same value, compares the
+sides in the same type as C++, and charges nothing. Comparisons in `when`, first values and `init` are not noted. Nor
+are loop conditions, because a counter's distance from its end means nothing.
 """
 
 from dataclasses import replace
@@ -18,7 +19,7 @@ from rosmop.text import tree
 from rosmop.types import value_types
 
 MOST_NOTED = 32
-"""The maximum number of noted comparisons of a specification; later ones are not noted."""
+"""The maximum number of noted comparisons of a specification; later comparisons are not noted."""
 
 _COMPARED = frozenset({"<", "<=", ">", ">="})
 _TRUE, _FALSE = (nodes.Literal(value_types.BOOL, truth) for truth in (True, False))
@@ -62,7 +63,7 @@ def noted(
 
 
 def _note(now: list[nodes.Expression], variables: tuple[str, str]) -> nodes.Expression:
-    """Return an expression that keeps the sides if they are nearer to each other than the kept ones."""
+    """Return an expression that stores both sides if they are nearer to each other than the stored ones."""
     before = [nodes.Read(value_types.DOUBLE, name) for name in variables]
     nearer = nodes.Compare("<", _distance(*now), _distance(*before), -1)
     kept = (nodes.Assign(value_types.DOUBLE, name, side) for name, side in zip(variables, now, strict=True))

@@ -1,7 +1,7 @@
-"""Compile reading bound fields from the bytes of a message, and writing assigned ones.
+"""Compile the reads of bound fields from the bytes of a message, and the writes of assigned fields.
 
-Numbers at known distances from each other are read together. A changed number is written in place; only a
-changed string, array or message of another size makes a new buffer.
+Numbers at known distances from each other are read together. A changed number is written in place. A new buffer is made
+only for a changed string, array or message of a different size.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class PatternField:
     constant: bool | int | float | bytes | None = None
     spot: Spot | None = None
     read: str = ""  # the code's name for the field's value
-    end: str = ""  # of a field of variable size: the code's name for its end
+    end: str = ""  # the code's name for the end of a field of variable size
 
 
 def writes(scope: FunctionScope, written: list[PatternField]) -> tuple[nodes.Write, ...]:
@@ -50,7 +50,7 @@ def writes(scope: FunctionScope, written: list[PatternField]) -> tuple[nodes.Wri
 
 
 def _slots(scope: FunctionScope, field: PatternField) -> list[int | str]:
-    """Return the path of a field as list indices; the parts of a time by name."""
+    """Return the path of a field as list indices; parts of a time are names."""
     kind: Type = value_types.RecordType(scope.message_type or "")
     path: list[int | str] = []
     for step in field.binding.path:
@@ -92,10 +92,10 @@ def read_fields(scope: FunctionScope, bound: list[PatternField]) -> None:
 
 
 def _read_fixed(scope: FunctionScope, fixed: list[PatternField]) -> None:
-    """Write reads of numbers; one read for numbers at known distances from each other."""
+    """Write reads of numbers, with one read for all numbers at known distances from each other."""
     groups: dict[str | None, list[PatternField]] = {}
     for field in fixed:
-        assert field.spot is not None  # a number is somewhere
+        assert field.spot is not None  # a number always has a position
         groups.setdefault(field.spot.base, []).append(field)
     for group in groups.values():
         waiting = sorted(group, key=_offset)
@@ -117,7 +117,7 @@ def _near(one: PatternField, other: PatternField) -> bool:
 
 def _read_together(scope: FunctionScope, together: list[PatternField]) -> None:
     first = together[0].spot
-    assert first is not None  # a number is somewhere
+    assert first is not None  # a number always has a position
     for field in together:
         field.read = scope.temporary("r")
     fields = tuple((field.read, field.type, _offset(field) - first.offset) for field in together)
@@ -150,7 +150,10 @@ def check_overlaps(bound: list[PatternField], written: list[PatternField]) -> No
 
 
 def _overlap(one: tree.Binding, other: tree.Binding) -> bool:
-    """Whether one binding is the other or a part of it; an array without an index is all its elements."""
+    """Whether one binding is the same as the other, or a part of it.
+
+    An array without an index means all its elements.
+    """
     return all(
         step.name == beside.name and (step.index == beside.index or None in (step.index, beside.index))
         for step, beside in zip(one.path, other.path, strict=False)

@@ -1,8 +1,8 @@
 """Keep the order of evaluation of C++17 by storing values in variables first.
 
 The form is evaluated from left to right. In an assignment the right side comes first, then the indices on the left. In
-a member call the object comes first, then the arguments; references and members are read after all arguments are
-evaluated. If C++ leaves the order open, any order is correct.
+a member call the object comes first, then the arguments. References and members are read after all arguments are
+evaluated. Where C++ leaves the order open, any order is correct.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,10 @@ def kept(scope: FunctionScope, value: nodes.Expression) -> tuple[First, nodes.Ex
 
 
 def settled(scope: FunctionScope, value: Value) -> tuple[First, Value]:
-    """Return the statements that fix the indices of a place, and the place; for a temporary, its value."""
+    """Return the statements that fix the indices of a place, and the place.
+
+    For a temporary, return its value instead.
+    """
     place = value.place
     if place is None:
         first, read = kept(scope, value.form)
@@ -103,7 +106,7 @@ def of_change(scope: FunctionScope, target: Value, value: Value) -> tuple[First,
     """Return the target and the value of an operator such as `+=`; both are read after all indices are known."""
     if target.pure and value.pure:
         return [], target, value
-    if value_types.is_number(value.type):  # of a class: only the place is evaluated first
+    if value_types.is_number(value.type):  # for a class, only the place is evaluated first
         value = replace(value, place=None)
     first, value = settled(scope, value)
     before, target = ([], target) if target.pure else settled(scope, target)

@@ -17,7 +17,7 @@ from rosmop.types import value_types
 
 _CONVERSION = re.compile(rb"%([-+ #0]*)(\*|[0-9]*)(?:\.(\*|[0-9]*))?(hh|h|ll|l|z|j|t|L|q)?(.?)", re.DOTALL)
 _MAX_WIDTH = 1000
-_LONG = 1024  # maximum bytes of text that is not charged in advance
+_LONG = 1024  # bytes; shorter text without strings is not charged in advance
 _SIGNED, _UNSIGNED, _FLOATING = b"di", b"uoxX", b"fFeEgGaA"
 _TEXTS = (value_types.StringType, value_types.CharactersType)
 
@@ -145,7 +145,10 @@ def _integer(letter: bytes, size: bytes | None, value: Value) -> nodes.Expressio
 def _integer_head(
     flags: bytes, width: bytes, precision: bytes | None, letter: bytes, value: nodes.Expression
 ) -> tuple[bytes, nodes.Expression]:
-    """Return the Python format and the argument of an integer conversion; where C differs, C's text."""
+    """Return the Python format and the argument of an integer conversion.
+
+    Where C differs from Python, return C's text.
+    """
     if letter in _UNSIGNED:
         flags = flags.replace(b"+", b"").replace(b" ", b"")
     if precision is not None:

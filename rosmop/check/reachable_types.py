@@ -1,8 +1,8 @@
-"""Find the message types that a specification uses, also nested ones.
+"""Find the message types that a specification uses, including nested types.
 
 The state of a specification survives a change of definitions only if these types are unchanged.
 
-The result may include an unused type (a string that is the name of a type), but never lacks a used one.
+The result includes every type in use. It may also include an unused type, if a string equals the name of a type.
 """
 
 from collections.abc import Iterator
@@ -48,7 +48,7 @@ def _plain(node: Any) -> object:
 
 
 def _names(root: object) -> Iterator[str]:
-    """Yield every string of a tree that may name a type: `pkg/T`, `pkg::T`, or the two parts apart."""
+    """Yield every string of a tree that may name a type: `pkg/T`, `pkg::T`, or both parts as separate strings."""
     waiting = [root]
     while waiting:
         node = waiting.pop()

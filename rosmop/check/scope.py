@@ -27,7 +27,7 @@ ValueOf = Callable[["FunctionScope", tree.Expression], Value]
 class HelperFunction:
     """A helper function; `references` are the parameters whose new values it returns.
 
-    `names` are the names of other variables that it, or a function it calls, reads or assigns.
+    `names` are the names of other variables that are read or assigned by this function, or by a function that it calls.
     """
 
     name: str
@@ -39,7 +39,7 @@ class HelperFunction:
     recursive: bool = False
     names: frozenset[str] = frozenset()
     changes: frozenset[str] = frozenset()
-    """The shared variables that it assigns, as the code names them."""
+    """The code's names of the shared variables that this function assigns."""
     calls: frozenset[str] = frozenset()
 
 
@@ -72,7 +72,7 @@ class SpecificationNames:
     lent: list[ConstantReference] = field(default_factory=list)
 
     def changed_by(self, name: str) -> frozenset[str]:
-        """Return the shared variables that a function, or one that it calls, assigns, as the code names them."""
+        """Return the code's names of the shared variables that a function, or one that it calls, assigns."""
         waiting, seen, found = [name], {name}, frozenset[str]()
         while waiting:
             function = self.functions[waiting.pop()]
@@ -86,13 +86,13 @@ class SpecificationNames:
 class LoopScope:
     """A loop or switch around the current statement, and the step that a `continue` runs first.
 
-    `blocks` are the names visible to the step: those around the loop, not those around the `continue`.
+    `blocks` are the names visible to the step: the names around the loop, not the names around the `continue`.
     """
 
     step: Callable[[], None] | None
     blocks: list[dict[str, Variable]] = field(default_factory=list)
-    flag: str | None = None  # of a switch: set if the loop around it continues
-    continued: bool = False  # of a switch: whether a `continue` in it sets the flag
+    flag: str | None = None  # for a switch: the flag that is set if the loop around it continues
+    continued: bool = False  # for a switch: whether a `continue` in it sets the flag
 
 
 @dataclass
@@ -117,13 +117,13 @@ class CompilationContext:
         self.types: dict[str, Type] = {}
         """The types of the variables, by their names in the form."""
         self.owners: dict[str, list[SpecificationNames]] = {}
-        """The specifications that declare a variable of a name."""
+        """For each name, the specifications that declare a variable of this name."""
         self.unsliced: set[str] = set()
         """The variables that slices share, by their names in the form."""
         self.findings: list[Diagnostic] = []
         self.publications: list[Publication] = []
         self.partial = False
-        """Whether some files of the set could not be parsed, so that they may declare unknown names."""
+        """Whether some files of the set could not be parsed. These files may declare names that seem unknown."""
 
     def define(self, function: nodes.Function) -> None:
         """Add a function."""
@@ -174,13 +174,13 @@ class FunctionScope:
         self.result: Type = value_types.VOID
         self.references: tuple[Variable, ...] = ()
         self.message_type: str | None = None  # the type of `MESSAGE`
-        self.pending: str | None = None  # `MESSAGE` was read: the code's name for what this action assigns
+        self.pending: str | None = None  # the code's name for the assigned fields, if `MESSAGE` was read
         self.drop_refused: str | None = None  # why `DROP;` is not allowed here
         self.below: set[str] = set()  # shared variables that are declared later
         self.loops: list[LoopScope] = []
         self.written: set[str] = set()
         self.changes = False  # something was assigned
-        self.changes_shared: set[str] = set()  # the assigned shared variables, as the code names them
+        self.changes_shared: set[str] = set()  # the code's names of the assigned shared variables
         self.calls: set[str] = set()  # the helper functions that are called
         self.recursive = False
         self.notes = shared.margins and role != "init"  # comparisons are noted
@@ -231,7 +231,9 @@ class FunctionScope:
         return variable
 
     def find(self, name: str, position: Position) -> Variable | None:
-        """Return the variable of this name (local, of this specification, or of another one), and note its use."""
+        """Return the variable of this name (local, of this specification, or of another specification), and note its
+        use.
+        """
         variable, owner = self._known(name, position)
         if owner is not None:
             self.names.uses.add(owner)
@@ -336,7 +338,7 @@ class FunctionScope:
 
 
 def names_in(node: object) -> Iterator[str]:
-    """Yield the simple names in an expression, or in the expressions of a statement but not of those inside it."""
+    """Yield the simple names in an expression, or in a statement's own expressions (not in nested statements)."""
     waiting = [node]
     while waiting:
         current = waiting.pop()

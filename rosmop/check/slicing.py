@@ -1,7 +1,7 @@
 """Compile parametric specifications: their parameters as variables, and the parameters that each event binds.
 
-An event binds a parameter of the specification by having one of the same name and type. A second function of the event
-returns the values that it binds, and reads nothing else of the message.
+An event binds a parameter of the specification if the event has a parameter of the same name and type. A second
+function of the event returns the bound values. It reads nothing else of the message.
 """
 
 from collections.abc import Iterable, Sequence
@@ -58,7 +58,7 @@ def declare_parameters(
 
 
 def check_own(names: SpecificationNames, variable: Variable) -> None:
-    """Reject a slice variable that is not a number or a time: only the number of slices bounds their memory."""
+    """Reject a slice variable that is not a number or a time, because only the number of slices bounds their memory."""
     if variable.sliced and not (
         value_types.is_number(variable.type)
         or isinstance(variable.type, value_types.TimeType | value_types.DurationType)
@@ -94,7 +94,7 @@ def slicing_of(
 
 
 def _enforces(shared: CompilationContext, functions: Sequence[str]) -> bool:
-    """Whether these functions, or those that they call, drop, change or publish a message."""
+    """Whether these functions, or the functions that they call, drop, change or publish a message."""
     waiting, seen = [*functions], {*functions}
     while waiting:
         function = shared.functions.get(waiting.pop())
@@ -116,7 +116,7 @@ def binds(names: SpecificationNames, event: tree.EventDefinition) -> tuple[int, 
 
 
 def creates(specification: tree.Specification, event: tree.EventDefinition) -> bool:
-    """Whether a slice may begin with an event: with any event if none is a `creation event`."""
+    """Whether a slice may begin with an event. If no event is a `creation event`, a slice may begin with any event."""
 
     def marked(event: tree.EventDefinition) -> bool:
         return any(modifier.parts == ("creation",) for modifier in event.modifiers)

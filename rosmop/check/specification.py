@@ -1,6 +1,6 @@
 """Compile a set of files with specifications.
 
-Specifications of one set see each other's variables. One pass finds all errors of all of them.
+Specifications of one set see each other's variables. One pass finds all errors of the whole set.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -65,7 +65,10 @@ def compile_files(
 
 
 def findings_of(files: Sequence[tree.SpecificationFile], definitions: Definitions) -> list[Diagnostic]:
-    """Return the errors of these files while others of the set cannot be parsed; names may be declared in those."""
+    """Return the errors of these files while other files of the set cannot be parsed.
+
+    Unknown names are not reported, because the other files may declare them.
+    """
     shared = CompilationContext(MessageTypes(definitions), value_of)
     shared.partial = True
     _compile_all(shared, [(file, specification) for file in files for specification in file.specifications])
@@ -173,7 +176,9 @@ def _compile(
 
 
 def _seen_changes(names: SpecificationNames) -> Iterator[Diagnostic]:
-    """Yield errors for constant references to variables that the function changes: here they would not change."""
+    """Yield errors for constant references to variables that the called function changes, because here the reference
+    would keep the old value.
+    """
     for loan in names.lent:
         if loan.variable.code in names.changed_by(loan.function):
             text = (
@@ -184,7 +189,7 @@ def _seen_changes(names: SpecificationNames) -> Iterator[Diagnostic]:
 
 
 def _noted(shared: CompilationContext, action: Callable[[], _T]) -> _T | None:
-    """Return the result of `action`; None if it raised an error, which is added to the findings."""
+    """Return the result of `action`. If it raises an error, add the error to the findings and return None."""
     try:
         return action()
     except SpecificationError as error:

@@ -88,7 +88,10 @@ def _for_good(compiled: CompiledProperty) -> set[str]:
 
 
 def unused_events(specification: tree.Specification, properties: Sequence[_HasProperty]) -> list[Diagnostic]:
-    """Return warnings about events that no property names, if there are properties; `default` names all events."""
+    """Return warnings about events that no property names, if there are properties.
+
+    The word `default` counts as a use of every event.
+    """
     if not properties:
         return []
     named = {word for code in properties for word in _WORD.findall(code.property.formula)}

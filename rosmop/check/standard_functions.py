@@ -226,7 +226,7 @@ def _fills_at_most(call: Arguments) -> Value:
 
 
 def _stored(call: Arguments, target: Value, function: str, *arguments: nodes.Expression) -> Value:
-    """Return the buffer after a function of the form has filled it."""
+    """Return the target buffer as filled by a function of the form."""
     filled = nodes.Call(value_types.CHARACTERS, function, (target.form, *arguments), call.site)
     return Value(store(call.scope, target, filled), call.position)
 
@@ -248,7 +248,7 @@ def _prints_at_most(call: Arguments) -> Value:
 def _printed(
     call: Arguments, target: Value, function: str, text: nodes.Expression, *arguments: nodes.Expression
 ) -> Value:
-    """Return the length of a text that a function of the form puts into a buffer."""
+    """Return the length of the text that a function of the form writes to a buffer."""
     made = nodes.Read(value_types.STRING, call.scope.temporary())
     filled = _stored(call, target, function, made, *arguments)
     length = nodes.Call(value_types.INT, "h_len", (made,))

@@ -1,6 +1,6 @@
 """Compile statements: one function for each class of statement in `text/tree.py`.
 
-An error is noted and the next statement is compiled, so one check finds as many errors as it can.
+After an error, compilation continues with the next statement, so that one check finds as many errors as possible.
 """
 
 from collections.abc import Callable, Mapping
@@ -66,7 +66,7 @@ def _declare(scope: FunctionScope, node: tree.Declaration) -> None:
 
 
 def _is_copy(scope: FunctionScope, declarator: tree.Declarator, kind: value_types.Type) -> bool:
-    """Whether a `char *` is initialised with another one."""
+    """Whether a `char *` is initialised with another `char *`."""
     if kind != value_types.CHARACTERS or declarator.is_array or not isinstance(declarator.value, tree.Name):
         return False
     return isinstance(scope.value_of(declarator.value).type, value_types.CharactersType)
@@ -75,7 +75,10 @@ def _is_copy(scope: FunctionScope, declarator: tree.Declarator, kind: value_type
 def known(
     scope: FunctionScope, name: tree.TypeName, declarator: tree.Declarator, kind: value_types.Type
 ) -> bool | int | float | None:
-    """Return the value of a `const` number that is a literal, for array sizes and cases; else None."""
+    """Return the value of a `const` number that is a literal, for array sizes and cases.
+
+    Return None for other variables.
+    """
     if not name.constant or not value_types.is_number(kind) or declarator.is_array:
         return None
     node = declarator.value
@@ -152,7 +155,7 @@ def _array(
             )
         return value_types.CHARACTERS, nodes.Call(value_types.CHARACTERS, "e_filled", (zeros, text), site)
     if size is None:
-        assert isinstance(declarator.value, tree.InitializerList)  # _array_size has checked
+        assert isinstance(declarator.value, tree.InitializerList)  # _array_size checks this
         size = len(declarator.value.items)
     array = value_types.VectorType(kind, size)
     if declarator.value is None:

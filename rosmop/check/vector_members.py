@@ -15,7 +15,7 @@ from rosmop.types import value_types
 
 def element_value(base: Value, index: Value, position: Position, site: int) -> Value:
     """Compile `base[index]` of a vector."""
-    assert isinstance(base.type, value_types.VectorType)  # the caller has checked
+    assert isinstance(base.type, value_types.VectorType)  # the caller checks this
     kind = base.type
     if not value_types.is_number(index.type):
         raise SpecificationError.at(index.position, f"an index is a number; this is {index.type}")
@@ -31,7 +31,7 @@ def element_value(base: Value, index: Value, position: Position, site: int) -> V
 
 
 def _vector(call: MemberCall) -> value_types.VectorType:
-    assert isinstance(call.base.type, value_types.VectorType)  # methods_of has checked
+    assert isinstance(call.base.type, value_types.VectorType)  # methods_of checks this
     return call.base.type
 
 
