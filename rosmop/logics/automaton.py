@@ -1,7 +1,7 @@
 """Finite automata as tables: explore, minimise and walk them.
 
-States and events are numbers. ``verdicts[s]`` are the categories of a property after a step *into* ``s``;
-those of the initial state count only if it is entered again.
+States and events are numbers. ``verdicts[s]`` are the categories of a property after a step *into* ``s``; the
+categories of the initial state count only if the automaton enters it again.
 """
 
 from collections import deque
@@ -12,7 +12,7 @@ from typing import TypeVar
 MAX_STATES = 10_000
 """The maximum number of states before minimisation."""
 MAX_TRANSITIONS = 500_000
-"""The maximum number of transitions; minimising takes about 300 bytes for each."""
+"""The maximum number of transitions; minimising takes about 300 bytes per transition."""
 
 State = TypeVar("State", bound=Hashable)
 
@@ -71,7 +71,10 @@ def explore(
 
 
 def minimise(automaton: Automaton) -> Automaton:
-    """Return the smallest automaton with the same verdicts on every trace; states numbered in order of discovery."""
+    """Return the smallest automaton with the same verdicts on every trace.
+
+    States are numbered in order of discovery.
+    """
     block_of = _coarsest_partition(automaton)
     numbers = {block_of[automaton.initial]: 0}
     order = [automaton.initial]
@@ -141,7 +144,10 @@ def _split(blocks: list[set[int]], block_of: list[int], cut: int, members: list[
 
 
 def reachable(automaton: Automaton) -> list[int]:
-    """Return the states that a trace can lead to, nearest first; the initial one only if it can be entered again."""
+    """Return the states that a trace can lead to, nearest first.
+
+    The initial state is included only if a trace enters it again.
+    """
     seen: dict[int, None] = {}
     frontier = [automaton.initial]
     while frontier:
@@ -154,10 +160,10 @@ def reachable(automaton: Automaton) -> list[int]:
 
 
 def letter_classes(events: Sequence[str], named: Sequence[str]) -> tuple[list[int], list[int]]:
-    """Group the events that a formula cannot distinguish: those that it does not name are one class.
+    """Group the events that a formula cannot distinguish: all events that it does not name form one class.
 
-    Returns the class of each event, and for each class the index into ``named`` (-1: none of them). Classes
-    are numbered in order of first event.
+    Returns the class of each event, and the index of each class in ``named`` (-1 for the class of unnamed events).
+    Classes are numbered in the order of their first events.
     """
     position = {name: index for index, name in enumerate(named)}
     classes: dict[int, int] = {}
@@ -166,6 +172,6 @@ def letter_classes(events: Sequence[str], named: Sequence[str]) -> tuple[list[in
 
 
 def spread(automaton: Automaton, of_event: Sequence[int]) -> Automaton:
-    """Return the automaton over events for an automaton over their classes."""
+    """Return the automaton over events that corresponds to an automaton over classes of events."""
     table = tuple(tuple(row[letter] for letter in of_event) for row in automaton.table)
     return Automaton(automaton.initial, table, automaton.verdicts, automaton.names)

@@ -1,24 +1,24 @@
 """Monitors for mtl formulas about a bounded future (`past_monitors.py` has the other part of mtl).
 
-The formula is evaluated at every event. Its answer for an event comes once it is certain: after an event, or when a
-bound passes. `x or y` is certain once one of them is; `x until[l,h] y` once `y` came in time and `x` held until then,
-once `x` failed, or once the time is over.
+The formula is evaluated at every event. Its value at an event is reported once it is certain: after an event, or when a
+bound passes. `x or y` is certain once either operand is true. `x until[l,h] y` is certain once `y` came in time and `x`
+held until then, once `x` failed, or once the time is over.
 
-Theory of operation. A `PastProgram` has the distinct subformulas. Those that only look back are computed at their event
-(`FoldedProgram`). For the others, a *cell* is the value of one subformula at one event while it is open, and a decided
-cell notifies its *users*. Cells exist only where needed: for `fire => eventually[0,1s] safe`, only the waiting `fire`
-events are kept.
+Theory of operation. A `PastProgram` has the distinct subformulas. The subformulas that only look back are computed at
+their event (`FoldedProgram`). For each other subformula, a *cell* is its value at one event while the value is open. A
+decided cell notifies its *users*. Cells exist only where needed: for `fire => eventually[0,1s] safe`, only the waiting
+`fire` events are kept.
 
-- `until` over operands known at once keeps the waiting events in order, and decides them from the oldest: the cost of
-  a step does not depend on their number.
+- `until` over operands known at once keeps the waiting events in order and decides the oldest first. So the cost of a
+  step does not depend on their number.
 - `until` and `since` over open operands keep *rows*, one for each relevant event. A result is certain if it is the same
-  when all open operands fail and when all hold (both operators are monotonic). When an operand is decided, `until`
-  visits the rows that it may decide, and `since` all rows.
+  whether all open operands fail or all hold (both operators are monotonic). When an operand is decided, `until` visits
+  only the rows that the operand may decide; `since` visits all rows.
 
 A run waits for at most `MOST_OPEN` events; a step beyond that is a fault, and its event is ignored.
 
-To undo a step (`BoundedRun.mark`), the operators' rows are copied, and each cell before its first change
-(`FormulaCell.touch`); rows do not change after their step.
+To undo a step, `BoundedRun.mark` copies the operators' rows, and `FormulaCell.touch` copies each cell before its first
+change. Rows do not change after their step.
 """
 
 from abc import ABC, abstractmethod
@@ -44,7 +44,7 @@ _LATER = ("until", "next")
 class FormulaCell:
     """The open value of a subformula at one event.
 
-    `tells` is the number of the event (`BoundedRun.place`) if the subformula is the whole formula, else 0.
+    `tells` is the number of the event (`BoundedRun.place`) if the subformula is the whole formula; otherwise it is 0.
 
     With a `kind` (`and`, `or`, `xor`, `not`) the value is computed from `operands`, of which `missing` are open.
     """
@@ -83,7 +83,7 @@ class FormulaCell:
         return self.value is None and bool(self.tells or self.users)
 
     def hear(self, value: bool) -> bool | None:
-        """Return the value after one more operand is known, or None if it is still open."""
+        """Return the value after one more operand is known, or None if the value is still open."""
         self.touch()
         self.missing -= 1
         if self.kind == "not":
@@ -103,7 +103,7 @@ def _known(value: Value) -> bool | None:
 
 
 def _use(value: Value, user: "FormulaCell | _Operator") -> bool:
-    """Register a user of an open value, which is notified later; return whether the value is open."""
+    """Register a user to be notified of an open value; return whether the value is open."""
     if isinstance(value, FormulaCell) and value.value is None:
         value.touch()
         value.users.append(user)
@@ -112,7 +112,7 @@ def _use(value: Value, user: "FormulaCell | _Operator") -> bool:
 
 
 def _leave(value: Value, user: "FormulaCell | _Operator") -> None:
-    """Remove a user of a value, and the value's own uses if no user remains."""
+    """Remove a user of a value. If no user remains, also remove the value from the users of its operands."""
     waiting = [(value, user)]
     while waiting:
         left, leaver = waiting.pop()
@@ -170,11 +170,11 @@ class _Operator(ABC):
         """Decide the rows that have become certain, now that operands are decided."""
 
     def hear(self, cell: FormulaCell) -> None:
-        """Note that an open operand has a value now; one call of `settle` follows for all of them."""
+        """Note that an open operand has a value now. One call of `settle` follows for all such operands."""
         del cell
 
     def pass_by(self, time: int) -> None:
-        """Note that no further event comes up to this time."""
+        """Note that no further event comes at or before this time."""
         del time
 
     @property
@@ -242,10 +242,10 @@ class _Rows(_Operator):
 class _OpenUntil(_Rows):
     """The operator `until` over values that may be open. All time up to `passed` is over.
 
-    `pending` are the undecided rows. To decide them, marks in order list the events where the right operand holds
-    (`holds`) or may hold (`hopes`), and where the left one fails (`fails`) or may fail (`doubts`). A new value concerns
-    only the pending rows for which it was the first or last of its kind. They are found by their times, so the cost of
-    a step depends only on the number of rows that it decides.
+    `pending` are the undecided rows. They are decided from sorted lists of marks: the events where the right operand
+    holds (`holds`) or may hold (`hopes`), and where the left operand fails (`fails`) or may fail (`doubts`). A new
+    value concerns only the pending rows for which it was the first or last of its kind. These rows are found by their
+    times, so the cost of a step depends only on the number of rows that it decides.
     """
 
     keeps = ("rows", "passed", "pending", "holds", "hopes", "fails", "doubts", "waits")
@@ -321,7 +321,7 @@ class _OpenUntil(_Rows):
             self._look(begins, [(best[0] - self.low + 1, 0), (time, place + 1)])
 
     def _look(self, begins: list[_Mark], ends: list[_Mark]) -> None:
-        """Decide pending rows, if certain, from the last of these beginnings to the first of these ends."""
+        """Decide the pending rows that are certain, from the latest of `begins` to the earliest of `ends`."""
         begin = bisect_left(self.pending, max(begins))
         end = max(begin, bisect_left(self.pending, min(ends)))
         self.pending[begin:end] = [entry for entry in self.pending[begin:end] if not self._decided(entry[2])]
@@ -339,7 +339,7 @@ class _OpenUntil(_Rows):
         return True
 
     def _value(self, row: _Row, goods: _Marks, bads: _Marks) -> bool:
-        """Whether a mark of `goods` is within the row's bounds, and not after the first mark of `bads`."""
+        """Whether some mark of `goods` is within the row's bounds, and not after the first mark of `bads`."""
         good = _first(goods, (row.time + self.low, row.place))
         if good is None or good[0] > row.time + self.high:
             return False
@@ -347,7 +347,7 @@ class _OpenUntil(_Rows):
         return bad is None or good <= bad
 
     def _forget(self) -> None:
-        """Drop the rows before the first one that is still needed."""
+        """Drop the rows before the first row that is still needed."""
         while self.rows and not _wanted(self.rows[0]):
             row = self.drop()
             for value in (row.left, row.right):
@@ -398,7 +398,7 @@ def _supposed(value: Value | None, *, hopeful: bool) -> bool:
 class _OpenSince(_Rows):
     """The operator `since` over values that may be open; `window` is its state before the rows.
 
-    `least` and `most` are its states after the newest row, if all open values fail or if all hold.
+    `least` is its state after the newest row if all open values fail, `most` its state if all open values hold.
     """
 
     keeps = ("rows", "window", "least", "most")
@@ -453,7 +453,7 @@ class _OpenPreviously(_Operator):
 
 
 class _Next(_Operator):
-    """The operator `next`: `before` are the rows of the previous event, `rows` those of the current one."""
+    """The operator `next`. `before` has the rows of the previous event, `rows` the rows of the current event."""
 
     keeps = ("rows", "before")
 
@@ -468,7 +468,7 @@ class _Next(_Operator):
                 continue
             inside = self.low <= now - row.time <= self.high
             value = self.run.value(self.left) if inside else False
-            if isinstance(value, FormulaCell):  # it is open
+            if isinstance(value, FormulaCell):  # the value is open
                 row.cell.stand_for("or", (value,))
             else:
                 self.run.decide(row.cell, value)
@@ -525,9 +525,9 @@ class BoundedProperty(CompiledProperty):
         return found
 
     def _decided_late(self) -> set[str]:
-        """Return the verdicts that a passed bound may cause, because an `until` or `next` fails then.
+        """Return the verdicts that a passed bound may cause because an `until` or `next` fails.
 
-        It causes `violation` if the operator is positive in the formula, and `validation` if it is negated.
+        The failure causes `violation` if the operator is positive in the formula, and `validation` if it is negated.
         """
         signs: dict[int, set[bool]] = {self.program.result: {False}}
         for number in sorted(self.later, reverse=True):
@@ -542,7 +542,7 @@ class BoundedProperty(CompiledProperty):
         return {VERDICTS[sign] for signs_of in found for sign in signs_of}
 
     def blocking_refused(self, category: str) -> str | None:
-        """Return why: a deadline decides without a message."""
+        """Return why a handler cannot drop the message: a deadline may decide the category without a message."""
         super().blocking_refused(category)
         if category not in self._failing:
             return None
@@ -638,7 +638,7 @@ class BoundedRun:
         return self._tell()
 
     def mark(self) -> tuple[Any, ...]:
-        """Return the place, the values that look back, and the rows of the operators."""
+        """Return a copy of the place, of the values that look back, and of the operators' rows."""
         self.journal.clear()
         operators = [
             {
@@ -659,7 +659,7 @@ class BoundedRun:
         self.journal.clear()
 
     def value(self, number: int) -> Value:
-        """Return the value of an instruction at the current event, as a cell only while it is open."""
+        """Return the value of an instruction at the current event, or a cell while the value is open."""
         index = self._compiled.at_once.get(number)
         if index is not None:
             return bool(self._at_once[self._places[index]])
@@ -686,7 +686,7 @@ class BoundedRun:
         return cell if cell.missing else _together(kind, cell.operands)
 
     def decide(self, cell: FormulaCell | None, value: bool) -> None:
-        """Set the value of a cell (None: unused)."""
+        """Set the value of a cell. None stands for an unused cell."""
         if cell is not None and cell.value is None:
             cell.touch()
             cell.value = value
@@ -710,7 +710,7 @@ class BoundedRun:
         return self._about[category == VERDICTS[True]]
 
     def _pass_on(self, cell: FormulaCell) -> None:
-        assert cell.value is not None  # noqa: S101  it was decided
+        assert cell.value is not None  # noqa: S101  the cell was decided
         cell.touch()
         if cell.tells:
             self._told[cell.value] = cell.tells
@@ -718,7 +718,7 @@ class BoundedRun:
             if not isinstance(user, FormulaCell):
                 user.hear(cell)
                 self.changed.add(user)
-            elif user.wanted:  # another user may have decided it just now
+            elif user.wanted:  # another user may just have decided this value
                 value = user.hear(cell.value)
                 if value is not None:
                     self.decide(user, value)

@@ -1,15 +1,15 @@
-"""Translate linear temporal logic to generalised Büchi automata, by way of alternating automata (Gastin and Oddoux,
-CAV 2001).
+"""Translate linear temporal logic to generalised Büchi automata, by way of alternating automata.
+
+The method is that of Gastin and Oddoux (CAV 2001).
 
 A state of the Büchi automaton is an *obligation set*: a set of nodes (``ltl_nodes``) that must all hold from here on.
 
 Invariants:
-- A transition fulfils an until if the until is not an obligation after it, or if the step could also have
-  discharged it with the same obligations left.
+- A transition fulfils an until in two cases: the until is not an obligation after it, or the step could also have
+  discharged the until with the same obligations left.
 - An infinite run is accepting if its transitions fulfil each until infinitely often.
-- ``live`` keeps exactly the states from which some infinite word is accepted. Where only the union of
-  languages counts (in ``after`` and ``live``, not in the search for accepting runs), a set that includes
-  another one is dropped.
+- ``live`` keeps exactly the states from which some infinite word is accepted. ``after`` and ``live`` drop a set that
+  includes another set, because there only the union of languages counts. The search for accepting runs keeps such sets.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
@@ -28,7 +28,7 @@ _Node = TypeVar("_Node", bound=Hashable)
 
 MAX_OBLIGATION_SETS = 20_000
 MAX_WORK = 1_500_000
-"""The maximum number of obligation sets in total, including dropped ones."""
+"""The maximum number of obligation sets in total, including dropped sets."""
 
 
 class TooLargeError(Exception):
@@ -52,8 +52,7 @@ class Automata:
         return self._choices(FormulaTranslation(self._nodes, atoms).node(formula, True))
 
     def _choices(self, node: int) -> Sets:
-        """Return the ways to satisfy a node, as obligation sets over nodes that are neither conjunction nor
-        disjunction."""
+        """Return the ways to satisfy a node, as obligation sets without conjunctions and disjunctions."""
         known = self._chosen.get(node)
         if known is None:
             known = self._chosen[node] = self._find_choices(node)
@@ -77,7 +76,7 @@ class Automata:
         return product
 
     def _smallest(self, sets: Iterable[Obligations]) -> Sets:
-        """Return the sets that do not include another one."""
+        """Return the sets that do not include another of the sets."""
         kept: list[Obligations] = []
         for candidate in sorted(set(sets), key=int.bit_count):
             self._spend(1 + len(kept) // 8)
@@ -135,7 +134,7 @@ class Automata:
         return found
 
     def live(self, states: Sets) -> Sets:
-        """Return the states that accept some word, without sets that include another one."""
+        """Return the states that accept some word, without sets that include another of them."""
         fresh = [state for state in states if state not in self._live]
         if fresh:
             self._decide_live(fresh)
@@ -217,7 +216,7 @@ def _members(bits: int) -> list[int]:
 def strong_components(
     nodes: Iterable[_Node], successors: Callable[[_Node], Iterable[_Node]]
 ) -> list[list[_Node]]:
-    """Return the strongly connected components of a graph, each after those that it leads to (Tarjan)."""
+    """Return the strongly connected components of a graph, each after the components that it leads to (Tarjan)."""
     index: dict[_Node, int] = {}
     low: dict[_Node, int] = {}
     open_nodes: dict[_Node, None] = {}

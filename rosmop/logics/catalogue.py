@@ -43,8 +43,9 @@ def compile_property(
 ) -> CompiledProperty:
     """Compile the formula of a property.
 
-    The case of ``logic`` does not matter. ``events`` are in source order, each name once. ``origin`` is the position
-    of the formula, ``logic_position`` that of the name of the logic (default: ``origin``). Raises `FormulaError`.
+    The case of ``logic`` does not matter. ``events`` are in source order, each name once. ``origin`` is the position of
+    the formula, and ``logic_position`` is the position of the logic's name (default: ``origin``). Raises
+    `FormulaError`.
     """
     found = LOGICS.get(logic.lower())
     if found is None:

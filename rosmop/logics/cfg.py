@@ -1,10 +1,10 @@
 """``cfg``: context-free grammars over the events, as MOP's CFG plugin reads them.
 
-``S -> a S b | epsilon``; the first left side starts. Any grammar is accepted, ambiguous and nullable ones
-too. The category is ``match`` while the trace so far is in the language, ``fail`` if no continuation can
-be.
+``S -> a S b | epsilon``; the first left side is the start symbol. Any grammar is accepted, even if it is ambiguous or
+derives the empty word. The category is ``match`` while the trace so far is in the language, and ``fail`` once no
+continuation can be in it.
 
-A grammar whose recogniser has few states, as for a plainly regular language, becomes a table.
+If the recogniser has few states, as for a regular language, the grammar becomes a table.
 """
 
 from rosmop.logics.automaton import Automaton, TooManyStatesError, explore

@@ -1,9 +1,9 @@
 """Read the context-free grammars of ``cfg`` properties, and transform them for parsing.
 
-``S -> a S b | epsilon, T -> c``. The first left side starts; a comma between productions may be left out.
-As in MOP, ``( … )`` groups, and ``*`` and ``+`` after a symbol or a group repeat it.
+``S -> a S b | epsilon, T -> c``. The first left side is the start symbol. The comma between productions is optional. As
+in MOP, ``( … )`` groups, and ``*`` and ``+`` after a symbol or a group repeat it.
 
-A symbol is a number: an event by its index, a nonterminal by a number from ``terminals`` on.
+A symbol is a number: an event has its index, a nonterminal a number from ``terminals`` on.
 """
 
 from dataclasses import dataclass
@@ -147,12 +147,11 @@ class _GrammarReader:
 
 
 def prepare(grammar: Grammar) -> Grammar:
-    """Return a grammar of the same language with only useful symbols, each of which derives more than the empty
-    word.
+    """Return an equivalent grammar that has only useful symbols, each of which derives more than the empty word.
 
-    ``A -> A x A`` becomes ``A -> A x B`` where ``B`` has the other rules of ``A``: both mean "B, any number
-    of times, with x between", but only the second one is unambiguous. The start symbol may still derive
-    the empty word. If it derives nothing else, no rule remains.
+    ``A -> A x A`` becomes ``A -> A x B``, where ``B`` has the other rules of ``A``. Both mean "B, any number of times,
+    with x between", but only the second form is unambiguous. The start symbol may still derive the empty word. If the
+    start symbol derives nothing else, no rule remains.
     """
     rules = _flat_repetitions(grammar)
     productive = _closure(rules, grammar.terminals)
@@ -220,7 +219,7 @@ def _closure(rules: list[Rule], terminals: int) -> set[int]:
 
 
 def _substantial(rules: list[Rule], terminals: int) -> set[int]:
-    """Return the nonterminals that derive more than the empty word (all rules being productive)."""
+    """Return the nonterminals that derive more than the empty word. All rules must be productive."""
     users: dict[int, list[int]] = {}
     waiting = []
     for head, body in rules:

@@ -19,7 +19,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Diagram:
-    """A graph: the reachable states by number, and all events that lead from one to another."""
+    """A graph: the reachable states by number, and all events that lead from one state to another."""
 
     initial: int
     states: dict[int, Box]

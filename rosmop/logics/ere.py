@@ -1,12 +1,12 @@
 """``ere``: extended regular expressions, as MOP's ERE plugin reads them.
 
 From loosest to tightest: ``|`` union, ``&`` intersection, juxtaposition, ``~`` complement, the suffixes ``*``, ``+``,
-``^n``; ``epsilon`` is the empty trace, ``empty`` no trace at all. The
-category is ``match`` while the trace so far is in the language, ``fail`` once no continuation can be.
+``^n``. ``epsilon`` is the empty trace, and ``empty`` matches no trace. The category is ``match`` while the trace so far
+is in the language, and ``fail`` once no continuation can be in it.
 
-The monitor is Brzozowski's: a state is an expression, an event leads to its derivative. Expressions are
-interned modulo associativity, commutativity and idempotence of union and intersection, so their number is
-finite.
+The monitor uses Brzozowski's derivatives: a state is an expression, and an event leads to the derivative of the
+expression. Expressions that are equal by associativity, commutativity and idempotence of union and intersection are
+stored once, so their number is finite.
 """
 
 from dataclasses import dataclass
@@ -63,18 +63,18 @@ class ExpressionTable:
         return number
 
     def symbol(self, letter: int) -> int:
-        """Return the one-event trace."""
+        """Return the expression for the trace of one event."""
         return self._intern("symbol", (letter,), nullable=False)
 
     def complement(self, inner: int) -> int:
-        """Return all other traces."""
+        """Return the expression for all other traces."""
         expression = self._all[inner]
         if expression.kind == "not":
             return expression.parts[0]
         return self._intern("not", (inner,), nullable=not expression.nullable)
 
     def star(self, inner: int) -> int:
-        """Return any number of traces, one after the other."""
+        """Return the expression for any number of traces, one after the other."""
         if inner in (self.empty, self.epsilon):
             return self.epsilon
         if inner == self.anything or self._all[inner].kind == "star":
@@ -82,7 +82,7 @@ class ExpressionTable:
         return self._intern("star", (inner,), nullable=True)
 
     def sequence(self, factors: list[int]) -> int:
-        """Return one trace after the other."""
+        """Return the expression for one trace of each factor, one after the other."""
         flat: list[int] = []
         for factor in factors:
             expression = self._all[factor]
@@ -99,7 +99,7 @@ class ExpressionTable:
         )
 
     def join(self, kind: str, operands: list[int]) -> int:
-        """Return the traces of any operand (`union`), or of all of them (`intersection`)."""
+        """Return the expression for the traces of any operand (`union`), or of all operands (`intersection`)."""
         neutral, absorbing, quantor = self.empty, self.anything, any
         if kind == "intersection":
             neutral, absorbing, quantor = self.anything, self.empty, all
@@ -177,7 +177,7 @@ def _match_automaton(source: Source, reader: "_ExpressionReader") -> Automaton:
 
 
 def with_fail(automaton: Automaton) -> Automaton:
-    """Add ``fail`` to the state of a minimal automaton from which nothing can match, if there is one."""
+    """Add ``fail`` to the state of a minimal automaton from which nothing can match, if there is such a state."""
     verdicts = tuple(
         ("fail",) if not verdict and all(target == state for target in row) else verdict
         for state, (row, verdict) in enumerate(zip(automaton.table, automaton.verdicts, strict=True))

@@ -1,4 +1,4 @@
-"""Parse temporal formulas: one parser for ltl, ptltl and mtl, with a table of operators for each.
+"""Parse temporal formulas: one parser for ltl, ptltl and mtl, with a table of operators for each logic.
 
 A ``Syntax`` names the unary operators, which bind tightest, and the levels of binary operators from tightest
 to loosest. Nesting is bounded, so no walk over a formula can exhaust the stack.
@@ -37,8 +37,10 @@ class Formula:
 
 @dataclass(frozen=True)
 class Level:
-    """Binary operators of one strength. ``flat`` ones associate; ``left`` ones group leftwards; ``once`` do
-    not chain."""
+    """Binary operators of equal precedence.
+
+    ``flat`` operators associate, ``left`` operators group leftwards, and ``once`` operators do not chain.
+    """
 
     operators: Mapping[str, str]
     chain: Literal["flat", "left", "once"]
@@ -46,8 +48,10 @@ class Level:
 
 @dataclass(frozen=True)
 class Syntax:
-    """The operators of a temporal logic: spelling to operator. ``bounded`` ones may be followed by
-    ``[from,to]``."""
+    """The operators of a temporal logic: spelling to operator.
+
+    ``bounded`` operators may be followed by ``[from,to]``.
+    """
 
     unary: Mapping[str, str]
     levels: tuple[Level, ...]
@@ -103,7 +107,7 @@ class _FormulaReader:
         return self._expression(len(self._syntax.levels) - 1, depth)
 
     def _expression(self, limit: int, depth: int) -> Formula:
-        """Read operands joined by operators no looser than level ``limit``."""
+        """Read operands joined by operators that bind at least as tightly as level ``limit``."""
         left = self._unary(depth)
         joined = -1
         while (strength := self._strength.get(self._tokens.token.text, limit + 1)) <= limit:

@@ -1,8 +1,8 @@
 """``fsm``: finite state machines, as MOP's FSM plugin reads them.
 
-``s0 [ a -> s1, default s0 ] s1 [ b -> s0 ] alias bad = s1``. The first state is the initial one; an event
-without a transition and without a default leads to ``fail``, which no event leaves. Categories are the
-states, the aliases and ``fail``. ``read_state_machine`` also reads ``tfsm``, where a state may have a ``timeout``.
+``s0 [ a -> s1, default s0 ] s1 [ b -> s0 ] alias bad = s1``. The first state is the initial one; an event without a
+transition and without a default leads to ``fail``. No event leaves ``fail``. Categories are the states, the aliases and
+``fail``. ``read_state_machine`` also reads ``tfsm``, where a state may have a ``timeout``.
 """
 
 from dataclasses import dataclass, field

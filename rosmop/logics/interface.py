@@ -6,18 +6,18 @@ returns the categories of the property, whose handlers the caller runs.
 
 Contract for the caller of a run:
 
-1. ``property.start(now)`` gives a fresh run. ``now`` is when monitoring begins, or when ``__RESET;`` took
+1. ``property.start(now)`` returns a fresh run. ``now`` is the time when monitoring begins, or when ``__RESET;`` took
    effect.
-2. Before a step at time ``t``: while ``run.deadline`` is not None and ``run.deadline < t``, call
-   ``run.expire()``. A bound is closed: an event exactly at the deadline is in time. So a deadline expires only
-   when no event at or before it can come any more; the expiry takes effect at the deadline.
-3. ``run.step(event, t)`` returns the categories after the event, in the order of their handlers.
-   After ``expire()`` the handlers of the first returned category run first (``timeout`` before the state entered).
-4. Times are integer nanoseconds and never run backwards; a time before the last one counts as the last one.
-5. A `FormulaRun` can undo a dropped message: call `mark` before the first step of the message, and `take_back` with
-   that mark when it is dropped. The time is not undone. No deadline expires between the two calls.
+2. Before a step at time ``t``: while ``run.deadline`` is not None and ``run.deadline < t``, call ``run.expire()``. A
+   bound is closed: an event exactly at the deadline is in time. So a deadline expires only when no event at or before
+   it can still come. The expiry takes effect at the deadline.
+3. ``run.step(event, t)`` returns the categories after the event, in the order of their handlers. After ``expire()``,
+   handlers run in the order of the returned categories (``timeout`` before the new state).
+4. Times are integer nanoseconds and never decrease: an earlier time than the last counts as the last time.
+5. A `FormulaRun` can undo a dropped message: call `mark` before the first step of the message, and call `take_back`
+   with that mark if the message is dropped. The time is not undone. No deadline expires between the two calls.
 
-A ``FiniteProperty`` and a ``ClockedProperty`` offer their tables as well, so that a module can step them.
+A ``FiniteProperty`` and a ``ClockedProperty`` also offer their tables, so that a module can step them.
 """
 
 from abc import ABC, abstractmethod
@@ -44,14 +44,15 @@ class RunFaultError(Exception):
 
 
 class Run(Protocol):
-    """One run of a property over a trace; see the head of this module for the contract. A copy (`copy.copy`) is an
-    independent run; a run without `__copy__` cannot be copied. `keeps` names the attributes that change
-    (`state_of_runs.py`).
+    """One run of a property over a trace; the head of this module has the contract.
+
+    A copy (`copy.copy`) is an independent run; a run without `__copy__` cannot be copied. `keeps` names the attributes
+    that change (`state_of_runs.py`).
     """
 
     @property
     def as_new(self) -> bool:
-        """Whether the run behaves from here on like a fresh run; False if that is not known."""
+        """Whether the run will behave like a fresh run; False if this is not known."""
 
     @property
     def deadline(self) -> int | None:
@@ -61,21 +62,21 @@ class Run(Protocol):
         """Take the event with this index, received at ``time_ns``; return the property's categories."""
 
     def expire(self) -> Categories:
-        """Let the deadline pass; return the categories then. Call it only while ``deadline`` is not None."""
+        """Let the deadline pass, and return the resulting categories. Call this only while ``deadline`` is not None."""
 
 
 class FormulaRun(Run, Protocol):
     """A run of a property that `suppresses`, whose steps can be undone."""
 
     def mark(self) -> Any:
-        """Return the data with which `take_back` undoes later steps; earlier marks become invalid."""
+        """Return the data that `take_back` needs to undo later steps; earlier marks become invalid."""
 
     def take_back(self, mark: Any) -> None:
-        """Undo the steps since the mark, but keep the time. A mark can be used once."""
+        """Undo the steps since the mark, but keep the time. Each mark can be used once."""
 
 
 def twin(run: Any) -> Any:
-    """Return a copy of a run whose attributes never change in place, for its `__copy__`."""
+    """Return a copy of a run whose attributes never change in place; for use by `__copy__`."""
     made = object.__new__(type(run))
     for name in run.__slots__:
         setattr(made, name, getattr(run, name))
@@ -84,14 +85,14 @@ def twin(run: Any) -> Any:
 
 @dataclass(frozen=True)
 class Source:
-    """A formula as written, and the events (its alphabet) in the order of the specification."""
+    """A formula as written, and its alphabet: the events in the order of the specification."""
 
     logic: str
     text: str
     events: tuple[str, ...]
     origin: Position
     suppresses: bool = False
-    """Whether a dropped message has not happened for the property (`Logic.suppresses`)."""
+    """Whether a dropped message does not count for the property (`Logic.suppresses`)."""
 
     def finding(self, offset: int, text: str) -> Diagnostic:
         """Return an error at the given character of the formula."""
@@ -106,7 +107,7 @@ class CompiledProperty(ABC):
     """A property ready to run. ``categories`` are the names that may have handlers."""
 
     timed = False
-    """Whether verdicts depend on the time of events (a run that is not timed never has a deadline)."""
+    """Whether verdicts depend on the time of events. Without this, no run has a deadline."""
 
     expiry = "deadline"
     """The name of a passed deadline in records (``timeout`` for machines)."""
@@ -116,14 +117,14 @@ class CompiledProperty(ABC):
 
     @property
     def suppresses(self) -> bool:
-        """Whether a dropped message has not happened: its steps are undone."""
+        """Whether a dropped message does not count: its steps are undone."""
         return self.source.suppresses
 
     remedy: str | None = None
     """The function of the specification that publishes the due message at a deadline (`enforced by`)."""
 
     def __new__(cls, *made_of: Any) -> Self:
-        """Keep the arguments of the constructor as `made_of`."""
+        """Store the arguments of the constructor in `made_of`."""
         made = super().__new__(cls)
         made.made_of = made_of
         return made
@@ -140,7 +141,7 @@ class CompiledProperty(ABC):
         """Return a fresh run that begins at ``time_ns``."""
 
     def categories_after(self, event: int) -> frozenset[str]:
-        """Return all categories that a step with this event can lead to; may include others."""
+        """Return all categories that a step with this event can lead to. The result may include other categories."""
         return frozenset(self.categories) if 0 <= event < len(self.events) else frozenset()
 
     def blocking_refused(self, category: str) -> str | None:
@@ -153,8 +154,8 @@ class CompiledProperty(ABC):
 class FiniteProperty(CompiledProperty):
     """A property whose monitor is a finite automaton.
 
-    ``automaton.table[state][event]`` is the next state, ``automaton.verdicts[state]`` the categories after
-    a step into ``state``, ``automaton.initial`` the state of a fresh run.
+    ``automaton.table[state][event]`` is the next state. ``automaton.verdicts[state]`` are the categories after a step
+    into ``state``. ``automaton.initial`` is the state of a fresh run.
     """
 
     def __init__(self, source: Source, categories: Sequence[str], automaton: Automaton) -> None:
@@ -180,7 +181,7 @@ class UntimedRun:
 
     @property
     def as_new(self) -> bool:
-        """Whether the run behaves like a fresh run; False, as that is not known here."""
+        """Return False: whether the run behaves like a fresh run is not known here."""
         return False
 
     def expire(self) -> Categories:
@@ -233,8 +234,9 @@ class Wait(NamedTuple):
 class ClockedProperty(CompiledProperty):
     """A property whose monitor is an automaton with one clock.
 
-    ``moves[state][event]`` is the move at an event, ``late`` the same if more than ``within`` ns have passed since
-    the clock started. ``verdicts`` are the categories after an event that leads to a state, ``waits`` its wait.
+    ``moves[state][event]`` is the move at an event. ``late`` has the same table for events more than ``within`` ns
+    after the clock started. ``verdicts`` are the categories after an event that leads to a state, ``waits`` the wait of
+    each state.
     """
 
     timed = True
@@ -322,10 +324,13 @@ class Logic:
 
     compile: Compiler
     suppresses: bool = False
-    """Whether a dropped message has not happened. Other logics count each event whose action passes the message."""
+    """Whether a dropped message does not count. Other logics count each event whose action passes the message."""
     failure: str | None = None
-    """The category that means failure; `check` warns about a property that fails at every first event."""
+    """The category that means failure.
+
+    `check` warns about a property that fails at the first event, whatever the event is.
+    """
     has_states: bool = False
-    """Whether formulas name states (and may write `default` for all events); coverage counts them."""
+    """Whether formulas name states, which coverage counts, and may write `default` for all events."""
     implicit_events: tuple[str, ...] = ()
-    """Events that a property uses without naming them."""
+    """Events that a property uses although its formula does not name them."""

@@ -39,7 +39,7 @@ class FormulaToken:
 
 
 def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
-    """Return the tokens of a formula, the last one of kind ``end``. The longest matching sign is taken."""
+    """Return the tokens of a formula, followed by a token of kind ``end``. The longest matching sign is taken."""
     if len(source.text) > MAX_CHARACTERS:
         raise source.error(
             0, f"a formula of more than {MAX_CHARACTERS} characters; split it into several properties"
@@ -71,7 +71,7 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
 
 
 def _sign_pattern(sign: str) -> str:
-    """Return the pattern of a sign; one that ends in a letter (``~o``) must end where the word ends."""
+    """Return the pattern of a sign. A sign that ends with a letter (``~o``) must end where the word ends."""
     return re.escape(sign) + (r"(?![A-Za-z_0-9])" if sign[-1].isalnum() else "")
 
 
@@ -88,7 +88,7 @@ def describe(token: FormulaToken) -> str:
 
 
 def suggestion(name: str, known: Sequence[str]) -> str:
-    """Return a suggestion, as the tail of an error."""
+    """Return a suggestion to append to an error."""
     near = get_close_matches(name[:100], known, n=1)
     if near:
         return f"; did you mean `{near[0]}`?"
@@ -117,7 +117,7 @@ class TokenReader:
         return self._tokens[min(self._next + count, len(self._tokens) - 1)]
 
     def take(self) -> FormulaToken:
-        """Read the next token (the end can be read again and again)."""
+        """Read the next token. The end can be read repeatedly."""
         token = self._tokens[self._next]
         if token.kind != "end":
             self._next += 1
@@ -131,7 +131,7 @@ class TokenReader:
         return False
 
     def expect(self, kind: str, what: str) -> FormulaToken:
-        """Read a token of this kind, or reject the formula with ``what`` was expected."""
+        """Read a token of this kind, or reject the formula; the error says that ``what`` was expected."""
         if self.token.kind != kind:
             raise self.unexpected(what)
         return self.take()
@@ -141,7 +141,7 @@ class TokenReader:
         return self.source.error(self.token.offset, f"expected {what}, found {describe(self.token)}")
 
     def note(self, token: FormulaToken, text: str) -> None:
-        """Note an error without stopping, so that one reading finds as many as it can."""
+        """Note an error without stopping, so that one pass finds as many errors as possible."""
         if len(self.findings) < 20:
             self.findings.append(self.source.finding(token.offset, text))
 

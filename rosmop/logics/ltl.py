@@ -1,17 +1,16 @@
-"""``ltl``: future linear temporal logic over infinite traces, as MOP's LTL plugin reads it, with three
-verdicts.
+"""``ltl``: future linear temporal logic over infinite traces, as MOP's LTL plugin reads it, with three verdicts.
 
-Each event is one position, where exactly its own atom holds. The category is ``violation`` once no
-continuation satisfies the formula, ``validation`` once all do; both are for good. (Bauer, Leucker,
+Each event is one position, where exactly its own atom holds. The category is ``violation`` once no continuation
+satisfies the formula, and ``validation`` once all continuations satisfy it. Both are permanent. (Bauer, Leucker,
 Schallhart: LTL3.)
 
-Theory of operation: the normal forms of the formula and of its negation each become a generalised Büchi
-automaton (``buchi``). States without an accepted word are removed; both automata are determinised side by
-side; an empty left side is a violation, an empty right side a validation. The result is minimised.
+Theory of operation. The normal forms of the formula and of its negation each become a generalised Büchi automaton
+(``buchi``). States that accept no word are removed. Both automata are determinised side by side: an empty left side is
+a violation, an empty right side a validation. The result is minimised.
 
-An operator about the past becomes a proposition, whose value is guessed at each position, and a formula about the
-future that only the right guesses satisfy (``_Past``). Every trace has exactly one right guess, so neither the formula
-nor its negation gains or loses a trace. An event is the set of all letters that differ only in the guesses.
+An operator about the past is replaced by a proposition, whose value is guessed at each position. A formula about the
+future is added that only the correct guesses satisfy (``_Past``). Every trace has exactly one correct guess, so the
+formula and its negation keep exactly their traces. An event is the set of all letters that differ only in the guesses.
 """
 
 from rosmop.logics.automaton import TooManyStatesError, explore, letter_classes, spread
@@ -88,7 +87,7 @@ def compile_ltl(source: Source) -> FiniteProperty:
 
 
 def _settled(for_it: Sets, against_it: Sets) -> tuple[Sets, Sets]:
-    """Return a pair of states; once the verdict is certain, the state of the other side is unified."""
+    """Return a pair of states. Once the verdict is certain, the other side gets a common placeholder as its state."""
     if not for_it:
         return frozenset(), _SOMETHING
     if not against_it:

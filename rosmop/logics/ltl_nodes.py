@@ -1,8 +1,8 @@
 """Formulas of linear temporal logic in negation normal form, each stored once and identified by a number.
 
-Atoms and their boolean combinations are one node, ``letters``: the bit set of the letters at which they
-hold, because at each position exactly one letter holds. The other nodes are ``and`` and ``or`` (flat),
-``next``, ``until`` and ``release``.
+At each position exactly one letter holds. Therefore an atom, or a boolean combination of atoms, is one node
+``letters``: the bit set of the letters at which it holds. The other nodes are ``and`` and ``or`` (flat), ``next``,
+``until`` and ``release``.
 """
 
 from collections.abc import Iterable, Mapping
@@ -19,7 +19,7 @@ class FormulaNodes:
         self._nodes: list[tuple[str, tuple[int, ...]]] = []
 
     def __getitem__(self, node: int) -> tuple[str, tuple[int, ...]]:
-        """Return the kind of a node, and its nodes or the bit set of a ``letters`` node."""
+        """Return the kind of a node, and its operands; for a ``letters`` node, the bit set."""
         return self._nodes[node]
 
     def _intern(self, kind: str, parts: tuple[int, ...]) -> int:
@@ -58,7 +58,7 @@ class FormulaNodes:
         return parts.pop() if len(parts) == 1 else self._intern(kind, tuple(sorted(parts)))
 
     def next(self, operand: int) -> int:
-        """Return the node that holds if this one holds at the next position."""
+        """Return the node that holds if ``operand`` holds at the next position."""
         return operand if self._mask(operand) in (0, self.everything) else self._intern("next", (operand,))
 
     def until(self, left: int, right: int) -> int:

@@ -1,10 +1,14 @@
 """``mtl``: metric temporal logic, in words, with closed time bounds.
 
-``once[0,500ms] a``, ``historically[…] a``, ``a since[…] b``, ``previously[…] a``; without bounds an
-operator means ``[0,inf]``. ``eventually[0,500ms] a``, ``always[…] a``, ``a until[…] b``, ``next[…] a``: about the
-future an upper bound is required. The semantics is pointwise: a formula is evaluated only at events, and its operators
-see only events, at their times of reception. The category is ``validation`` where the formula holds at an event,
-``violation`` where not; it comes once it is certain, at the latest when the bounds have passed.
+About the past: ``once[0,500ms] a``, ``historically[…] a``, ``a since[…] b``, ``previously[…] a``. Without bounds,
+these operators mean ``[0,inf]``.
+
+About the future: ``eventually[0,500ms] a``, ``always[…] a``, ``a until[…] b``, ``next[…] a``. These
+operators need an upper bound.
+
+The semantics is pointwise: a formula is evaluated only at events, and its operators see only events, at their times of
+reception. The category is ``validation`` if the formula holds at an event, and ``violation`` if it does not. The
+verdict comes once it is certain, at the latest when the bounds have passed.
 """
 
 from rosmop.logics.bounded import BoundedProperty

@@ -1,24 +1,22 @@
-"""A recogniser for any context-free grammar, which reports after each event whether the trace so far is in the
-language.
+"""Recognise any context-free grammar, and report after each event whether the trace so far is in the language.
 
-Theory of operation. It is Earley's algorithm (with the nullable symbols of Aycock and Horspool) in which an item does
-not name the position where it began but holds a *continuation*: the items that wait for its left side to be completed
-there. Positions are therefore not stored, and an item without a waiting continuation is freed.
+Theory of operation. This is Earley's algorithm with the nullable symbols of Aycock and Horspool. Instead of the
+position where it began, an item holds a *continuation*: the items that wait there for its left side to be completed.
+Positions are therefore not stored, and an item without a waiting continuation is freed.
 
-- A *frame* is an Earley set: a ``EarleyShape`` (items whose continuations are numbered) and the continuations
+- A *frame* is an Earley set: an ``EarleyShape`` (items whose continuations are numbered) and the continuations
   themselves.
-- A continuation is a frame and a symbol: the items of that frame's closure that wait for the symbol. None
-  is the continuation of the whole trace: completing it means that the trace is in the language.
-- If the only thing that completing a symbol does in a frame is to complete one of the frame's own
-  continuations, that one is taken instead (Leo, 1991). So right recursion needs neither memory nor time,
-  and LR grammars need constant time per event on average.
-- What can be computed from shapes alone (scanning an event, completing a symbol, joining two sets of items)
-  is computed once and kept in tables. A deterministic grammar soon finds everything in them; large shapes,
-  which only ambiguous grammars have, are not kept.
+- A continuation is a frame and a symbol: the items of that frame's closure that wait for the symbol. None is the
+  continuation of the whole trace: its completion means that the trace is in the language.
+- If completing a symbol in a frame only completes one of the frame's own continuations, that continuation is used
+  instead (Leo, 1991). So right recursion needs neither memory nor time, and LR grammars need constant time per event on
+  average.
+- Every step that depends on shapes alone (scanning an event, completing a symbol, joining two sets of items) is
+  computed once and stored in tables. A deterministic grammar soon finds every step there. Large shapes, which only
+  ambiguous grammars have, are not stored.
 
-Invariants: continuations of a frame belong to less deep frames, so completing goes from deep to less deep and
-ends; a frame is viable if it has an item, because every symbol of the grammar can be completed
-(``grammar.prepare``).
+Invariants: the continuations of a frame belong to less deep frames, so completing goes from deep to less deep and ends.
+A frame is viable if it has an item, because every symbol of the grammar can be completed (``grammar.prepare``).
 """
 
 from collections.abc import Sequence
@@ -27,9 +25,9 @@ from rosmop.logics.cfg_grammar import Grammar, nullable_symbols
 from rosmop.logics.interface import RunFaultError
 
 MAX_WIDTH = 4_000
-"""The maximum number of continuations of a frame; only ambiguous grammars come near."""
+"""The maximum number of continuations of a frame; only ambiguous grammars come close to it."""
 MAX_STEP_WORK = 300_000
-"""The maximum number of items that one step completes; bounds its time to a fraction of a second."""
+"""The maximum number of items that one step completes, which limits its time to a fraction of a second."""
 MAX_DEPTH = 1_000_000
 """The maximum number of nested frames: the nesting of the trace."""
 KEPT_SHAPE_WIDTH = 8
@@ -61,7 +59,7 @@ Step = tuple[EarleyShape, tuple[int, ...]]
 
 
 class EarleySet:
-    """An Earley set. ``depth`` counts the frames that wait below."""
+    """An Earley set. ``depth`` counts the frames below that wait."""
 
     __slots__ = ("conts", "depth", "shape")
     keeps = __slots__
@@ -72,7 +70,7 @@ class EarleySet:
         self.depth = depth
 
     def resolve(self, references: Sequence[int]) -> "Conts":
-        """Return the continuations that the references of this frame's shape mean."""
+        """Return the continuations that references of this frame's shape refer to."""
         if len(references) == 1:
             only = references[0]
             return (self.conts[only] if only >= 0 else (self, only),)
@@ -85,7 +83,7 @@ Conts = tuple[Continuation, ...]
 
 
 class EarleyRecogniser:
-    """The tables of a prepared grammar, filled as they are needed. Shared by all runs."""
+    """The tables of a prepared grammar, filled on demand and shared by all runs."""
 
     def __init__(self, grammar: Grammar) -> None:
         self._terminals = grammar.terminals
@@ -107,7 +105,7 @@ class EarleyRecogniser:
     # ---- one event
 
     def step(self, frame: EarleySet, event: int) -> tuple[EarleySet, bool] | None:
-        """Return the next frame and whether the trace is in the language; None if no continuation can be."""
+        """Return the next frame and whether the trace is in the language; None if no continuation can be in it."""
         scanned = self._scan(frame.shape, event)
         if scanned is None:
             return None
@@ -214,7 +212,9 @@ class EarleyRecogniser:
         return known
 
     def _closure(self, shape: EarleyShape) -> tuple[dict[int, set[Entry]], dict[int, set[Entry]]]:
-        """Return the items, also predicted ones, that wait for each nonterminal and event, advanced by that symbol."""
+        """Return, for each nonterminal and event, the items (including predicted items) that wait for this symbol,
+        advanced by it.
+        """
         if shape.waiters is not None:
             return shape.waiters
         waiters: dict[int, set[Entry]] = {}
@@ -238,7 +238,7 @@ class EarleyRecogniser:
         return shape.waiters
 
     def _skip_nullable(self, item: int) -> list[int]:
-        """Return the item, and the items after each of the symbols there that may be empty."""
+        """Return the item, and the items after each of its next symbols that may be empty."""
         items = [item]
         while self._next[item] in self._nullable:
             item += 1
@@ -246,7 +246,10 @@ class EarleyRecogniser:
         return items
 
     def _complete(self, shape: EarleyShape, entries: set[Entry]) -> Step:
-        """Return the entries after all completions inside the frame; those outside it are ``done``."""
+        """Return the entries after all completions inside the frame.
+
+        Completed continuations outside the frame are ``done``.
+        """
         waiters, _ = self._closure(shape)
         items: set[Entry] = set()
         done: set[int] = set()
@@ -266,7 +269,7 @@ class EarleyRecogniser:
         return self._canonical(aliased, done)
 
     def _alias(self, shape: EarleyShape, reference: int) -> int:
-        """Return the reference whose completion is the only effect of completing this one (Leo's rule)."""
+        """Return the reference whose completion is the only effect of completing ``reference`` (Leo's rule)."""
         if reference >= 0:
             return reference
         waiters, _ = self._closure(shape)
@@ -304,7 +307,7 @@ class EarleyRecogniser:
 
 
 def _deepest(done: tuple[int, ...], conts: Conts) -> int:
-    """Return the deepest of the completed continuations; it completes only less deep ones."""
+    """Return the deepest of the completed continuations; completing it completes only less deep continuations."""
     deepest, depth = done[0], -2
     if len(done) > 1:
         for index in done:

@@ -1,16 +1,16 @@
 """Monitors for formulas about the past: ptltl, and the past part of mtl (`bounded.py` has the other part).
 
-Theory of operation. A formula becomes a *program*: its distinct subformulas in an order in which each
-follows its operands, whose only temporal operators are ``previously`` and ``since`` (``once b`` is
-``true since b``). A step computes all of them from the event and from the values that the last step
-kept (Havelund and Rosu, 2002):
+Theory of operation. A formula becomes a *program*: its distinct subformulas, each after its operands. The only temporal
+operators are ``previously`` and ``since`` (``once b`` is ``true since b``). A step computes all subformulas from the
+event and from the values that the last step kept (Havelund and Rosu, 2002):
 
-- ``previously``: the value of the operand at the last event;
-- ``since``: its own last value;
-- either with bounds: the intervals of time in which it will hold while the left operand holds (`SinceWindow`).
+- for ``previously``: the value of the operand at the last event;
+- for ``since``: its own last value;
+- for either operator with bounds: the intervals of time in which the operator will hold while its left operand holds
+  (`SinceWindow`).
 
-Each event decides which atoms hold. The program is therefore folded beforehand, for each event, into the operations
-that remain: data (`FoldedProgram`). Without time bounds the values are bits, and the program is a finite automaton,
+Each event determines which atoms hold. Therefore the program is folded in advance, for each event, into the operations
+that remain, as data (`FoldedProgram`). Without time bounds the values are bits and the program is a finite automaton,
 which is built if it is small enough.
 """
 
@@ -47,7 +47,10 @@ FOREVER = 10**30
 
 @dataclass(frozen=True)
 class PastInstruction:
-    """One subformula: ``operands`` are earlier instructions; an ``event`` has an index, others bounds."""
+    """One subformula.
+
+    ``operands`` are the numbers of earlier instructions. An ``event`` has an index, other operators have bounds.
+    """
 
     operator: str
     operands: tuple[int, ...] = ()
@@ -119,22 +122,27 @@ class PastProgram:
 
 
 _OF_ONE = {"once": "since", "historically": "since", "eventually": "until", "always": "until"}
-"""Operators that are another operator with `true` as left operand."""
+"""Operators that equal another operator with `true` as its left operand."""
 
 
 Operation = tuple[str, int, int, int, int]
-"""An operator, and the indexes of its value, its operands and its `SinceWindow`; an `event` has its number there."""
+"""An operator, and the indexes of its value, its operands and its `SinceWindow`.
+
+An `event` has the event's number in place of the first operand.
+"""
 Residue = tuple[tuple[Operation, ...], tuple[int, ...]]
 """The residue at an event: operations, and the places of the requested values."""
 
 
 @dataclass(frozen=True)
 class FoldedProgram:
-    """A program as runs execute it. A run keeps a list of *values*: `False`, `True` (so a place below 2 is a constant),
-    the values kept for the next step, and those used within one step.
+    """A program as runs execute it.
+
+    A run keeps a list of *values*: first `False` and `True`, so a place below 2 is a constant; then the values kept for
+    the next step; then the values used within one step.
 
     ``bounds`` has the bounds of each kept window (None for other kept values), ``abstract`` the places of abstract
-    operators. ``residues`` has a residue for each event, and a last one for events that are not named.
+    operators. ``residues`` has a residue for each event, and a last one for all unnamed events.
     """
 
     bounds: tuple[Bounds | None, ...]
@@ -153,7 +161,7 @@ class FoldedProgram:
         return [False, True, *kept, *[False] * (self.size - 2 - len(kept))]
 
     def take(self, values: list[Any], event: int, now: int) -> tuple[int, ...]:
-        """Compute the values at an event; return the places of the requested ones."""
+        """Compute the values at an event; return the places of the requested values."""
         operations, results = self.residues[event]
         compute(operations, values, event, now)
         return results
@@ -198,7 +206,7 @@ def fold(program: PastProgram, wanted: Sequence[int]) -> FoldedProgram:
 
 
 class _Fold:
-    """Folds instructions for an event (None: any event). ``kept`` are the places of those that look back."""
+    """Folds instructions for an event (None: any event). ``kept`` are the places of instructions that look back."""
 
     def __init__(self, chosen: dict[int, PastInstruction], kept: dict[int, int], event: int | None) -> None:
         self._chosen = chosen
@@ -229,7 +237,7 @@ class _Fold:
         needed, left = {*results}, []
         for operation in reversed(self._operations):
             _, place, *operands, window = operation
-            # A window changes unless its left operand holds and its right one does not.
+            # A window changes unless its left operand holds and its right operand does not.
             if place in needed or place < 2 + len(self._kept) or (window and operands != [1, 0]):
                 left.append(operation)
                 needed.update(operands)
@@ -272,7 +280,9 @@ class _Fold:
 
 
 def compile_past(source: Source, formula: Formula) -> CompiledProperty:
-    """Return the monitor of a past formula: a table if it is finite and small, else the folded program."""
+    """Return the monitor of a past formula: a table if the automaton is finite and small, otherwise the folded
+    program.
+    """
     program = PastProgram(formula, source.events)
     folded = fold(program, [program.result])
     bounds = [found for found in folded.bounds if found is not None]
@@ -293,7 +303,7 @@ def compile_past(source: Source, formula: Formula) -> CompiledProperty:
 
 
 def _table(folded: FoldedProgram, letters: Sequence[int], *, clocked: bool = False) -> Automaton:
-    """Return the automaton over letters; letter ``i`` is the event ``letters[i]`` (-1: any that is not named).
+    """Return the automaton over letters; letter ``i`` is the event ``letters[i]`` (-1: any unnamed event).
 
     With a clock, each letter has a second form for events after the clock has run out. A state whose step restarts the
     clock has `ANEW` after its verdict.
@@ -321,8 +331,10 @@ def _table(folded: FoldedProgram, letters: Sequence[int], *, clocked: bool = Fal
 
 
 class _Clock:
-    """A window in a table that begins at once or never ends (``first``): whether it exists. Its time is only whether
-    more than its bound has passed since its last anchor, or with ``first`` since its first one.
+    """A window in a table that begins at once, or (with ``first``) never ends.
+
+    Its state is whether it exists. The time only matters as whether more than the bound has passed since the window's
+    last anchor, or with ``first`` since its first anchor.
     """
 
     def __init__(self, there: bool, *, first: bool) -> None:
@@ -357,8 +369,8 @@ class ClockedPastProperty(ClockedProperty):
 class SinceWindow:
     """The state of ``since[low,high]``: the intervals of time in which it will hold while the left operand holds.
 
-    Intervals that touch are merged, so there are at most about ``low/(high-low)``, and never more than the number of
-    events within ``low``.
+    Intervals that touch are merged. So there are at most about ``low/(high-low)`` intervals, and never more than the
+    number of events within ``low``.
     """
 
     __slots__ = ("_high", "_intervals", "_low")
@@ -370,7 +382,7 @@ class SinceWindow:
         self._intervals: deque[tuple[int, int]] = deque()
 
     def step(self, unbroken: bool, anchor: bool, now: int) -> bool:
-        """Return the value at ``now``; ``unbroken`` is the left operand, ``anchor`` the right one."""
+        """Return the value at ``now``; ``unbroken`` is the left operand, ``anchor`` the right operand."""
         intervals = self._intervals
         if intervals and not unbroken:
             intervals.clear()

@@ -1,14 +1,13 @@
-"""``pattern``: properties in near-English, scopes and patterns after Dwyer, with the meaning of HPL (Santos
-et al.).
+"""``pattern``: properties in near-English, after Dwyer's scopes and patterns, with the meaning of HPL (Santos et al.).
 
 ``globally: no c``, ``after a: some c within 2s``, ``until b: c causes d``, ``after a until b: c requires d
 within 1s``, ``… c forbids d``.
 
-Scopes. ``globally`` is open from the start, ``until b`` from the start to the first ``b``, ``after a`` from
-the first ``a`` on; ``after a until b`` opens at an ``a``, closes at the next ``b``, and so on. The events
-that open and close a scope are not inside it. An open scope counts at once, even if it is never closed.
+Scopes. ``globally`` is open from the start, ``until b`` from the start to the first ``b``, and ``after a`` from the
+first ``a`` on. ``after a until b`` opens at an ``a``, closes at the next ``b``, and so on. The events that open and
+close a scope are not inside the scope. An open scope counts at once, even if it is never closed.
 
-Patterns, all about events inside one scope; a time bound is closed:
+Patterns concern only events inside one scope. Time bounds are closed:
 
 - ``no c [within t]``: no ``c`` (up to t after the scope opened).
 - ``some c [within t]``: a ``c`` (up to t after the scope opened) before the scope closes.
@@ -18,17 +17,17 @@ Patterns, all about events inside one scope; a time bound is closed:
 
 ``before`` and ``after`` are strict: no event answers, requires or forbids itself.
 
-The category is ``violation`` once the property is certainly violated, ``validation`` once nothing can
-violate it any more. Both are for good. A pattern that waits (``some``, ``causes``) may be silent for ever:
-silence violates nothing unless there is a time bound, and validates nothing.
+The category is ``violation`` once the property is certainly violated, and ``validation`` once nothing can violate it
+any more. Both are permanent. A pattern that waits (``some``, ``causes``) may give no verdict for ever: silence violates
+the pattern only if there is a time bound, and never validates it.
 
-``some c within t enforced by f`` and ``… causes d within t enforced by f``: when the deadline passes, ``f`` publishes
-the due message, which counts as received. The category is then ``enforced``.
+``some c within t enforced by f`` and ``… causes d within t enforced by f``: when the deadline passes, the category is
+``enforced`` and ``f`` publishes the due message, which counts as received.
 
-Theory of operation. A run is in a *mode*: the scope has not opened, is over, or is open and *quiet* or *stirred*. A run
-is stirred for ``some`` and ``requires`` once the good event came, for ``causes`` while an answer is due, for
-``forbids`` once the first event came. The mode and the time of one event are the whole state. Whether a mode settles
-the verdict follows from the modes that are reachable from it.
+Theory of operation. A run is in a *mode*: the scope has not opened, is over, or is open and either *quiet* or
+*stirred*. For ``some`` and ``requires``, a run is stirred once the good event came; for ``causes``, while an answer is
+due; for ``forbids``, once the first event came. The mode and the time of one event are the whole state. Whether a mode
+settles the verdict follows from the modes that are reachable from it.
 """
 
 from dataclasses import dataclass
@@ -53,16 +52,18 @@ UNDECIDED: Categories = ()
 Mode = Literal["waiting", "quiet", "stirred", "over", "violated"]
 MODES: tuple[Mode, ...] = ("waiting", "quiet", "stirred", "over", "violated")
 _DUE: dict[str, Mode] = {"some": "quiet", "causes": "stirred"}
-"""The mode that waits for an event."""
+"""The mode in which the pattern waits for an event."""
 _DONE: dict[str, Mode] = {"some": "stirred", "causes": "quiet"}
-"""The mode after that event."""
+"""The mode after the awaited event."""
 ENFORCED: Categories = ("enforced",)
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """A pattern as written. ``first`` is None for ``no`` and ``some``; events are indexes; ``within_ns``
-    may be None."""
+    """A pattern as written; events are indexes.
+
+    ``first`` is None for ``no`` and ``some``, and ``within_ns`` may be None.
+    """
 
     kind: str
     opens: int | None
@@ -97,7 +98,10 @@ class Pattern:
         return "quiet" if second and self.kind == "causes" else mode
 
     def restarts_clock(self, before: Mode, event: int, mode: Mode) -> bool:
-        """Whether the clock restarts: at the opening, the oldest unanswered event, or the latest event."""
+        """Whether the clock restarts.
+
+        It runs from the opening of the scope, the oldest unanswered event, or the latest event.
+        """
         if before == "waiting":
             return mode == "quiet"
         if mode != "stirred":
@@ -125,9 +129,9 @@ class Pattern:
 
 
 def verdicts(pattern: Pattern, events: int) -> dict[Mode, Categories]:
-    """Return the verdict of each mode: `violation` or `validation` if it is certain.
+    """Return the verdict of each mode: `violation` or `validation` if either is certain.
 
-    A due event can always still come or be published, unless it is the event that closes the scope.
+    A due event can always come or be published later, unless it is the event that closes the scope.
     """
     unmet = {"violated", _DUE.get(pattern.kind, "violated")}
     found: dict[Mode, Categories] = {}
@@ -140,7 +144,7 @@ def verdicts(pattern: Pattern, events: int) -> dict[Mode, Categories]:
 
 
 def _reachable(pattern: Pattern, mode: Mode, events: int) -> set[Mode]:
-    """Return the mode and all modes that events and deadlines can lead to from it."""
+    """Return the mode, and all modes that can be reached from it by events and deadlines."""
     lateness = (False,) if pattern.within_ns is None else (False, True)
     found: set[Mode] = set()
     waiting = [mode]
@@ -159,8 +163,8 @@ def _reachable(pattern: Pattern, mode: Mode, events: int) -> set[Mode]:
 class TimedPattern(ClockedProperty):
     """A property for a pattern with a time bound, as tables; a state is the number of a mode.
 
-    ``expiries[mode]`` is the mode after the deadline, or None where there is none; ``at_expiry`` are the
-    categories then, before the verdict.
+    ``expiries[mode]`` is the mode after the deadline, or None without a deadline. ``at_expiry`` are the categories at
+    the deadline that come before the verdict.
     """
 
     def __init__(self, source: Source, pattern: Pattern, remedy: str | None) -> None:
@@ -198,7 +202,7 @@ class TimedPattern(ClockedProperty):
         return tuple(table)
 
     def blocking_refused(self, category: str) -> str | None:
-        """Return why: a deadline decides without a message."""
+        """Return why a handler cannot drop the message: a deadline may decide the category without a message."""
         super().blocking_refused(category)
         kind = self.pattern.kind
         comes_along = kind == "no" or self.pattern.enforced

@@ -1,10 +1,10 @@
-"""Draw the automata of properties, for Graphviz or as SVG, which needs no installed program.
+"""Draw the automata of properties, for Graphviz or as SVG. SVG needs no installed program.
 
 Colours and sizes are attributes, not styles: they also work on pages whose content security policy forbids
 styles. A style sheet can change the classes `title`, `event`, `state` and `edge`.
 
-The column of a state is its distance from the start. Each pair of states has one curve, with all events that lead
-from one to the other.
+The column of a state is its distance from the start. Each pair of states has one curve, labelled with all events that
+lead from the first state to the second.
 """
 
 from collections import Counter, deque
@@ -32,13 +32,13 @@ class _State:
 
 
 def dot_of(properties: Sequence[CompiledProperty]) -> str | None:
-    """Return the automata in Graphviz's language, one `digraph` after the other, or None."""
+    """Return the automata in Graphviz's language, one `digraph` after the other; None if there are none to draw."""
     graphs = [graph for graph in map(to_dot, properties) if graph is not None]
     return "\n".join(graphs) if graphs else None
 
 
 def svg_of(properties: Sequence[CompiledProperty]) -> str | None:
-    """Return the automata as a picture, one below the other, or None."""
+    """Return the automata as an SVG picture, one below the other; None if there are none to draw."""
     parts: list[str] = []
     top, right = 0, 0
     for compiled in properties:

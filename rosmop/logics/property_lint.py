@@ -1,7 +1,7 @@
-"""Find facts about a property before it runs: handlers that never run, and constant verdicts.
+"""Find facts about a property before it runs, such as handlers that never run and constant verdicts.
 
-Only certain facts are reported. There are none for a grammar that needs a stack, or for a formula with several time
-bounds or with bounds about the future.
+Only certain facts are reported. No facts are found for a grammar that needs a stack, nor for a formula with several
+time bounds or with bounds about the future.
 """
 
 from collections import deque
@@ -21,7 +21,7 @@ TIME = "<time>"
 
 @dataclass(frozen=True)
 class PropertyFact:
-    """Something certain about a property. ``trace`` is a shortest trace that shows it, if there is one."""
+    """A certain fact about a property. ``trace`` is a shortest trace that shows the fact, if such a trace exists."""
 
     kind: Literal["never runs", "never violated", "violated at once"]
     category: str
@@ -126,7 +126,7 @@ def _past_graph(compiled: ClockedPastProperty) -> VerdictGraph:
 
 
 def _machine_graph(compiled: TimedStateMachine) -> VerdictGraph:
-    """Return the graph: each state entered by an event, each entered by a timeout, and the start."""
+    """Return the graph. It has the start, and each state twice: entered by an event, and entered by a timeout."""
     base = compiled.automaton
     size = len(base)
     silent = compiled.silence_ns is not None
@@ -146,7 +146,7 @@ def _machine_graph(compiled: TimedStateMachine) -> VerdictGraph:
 
 
 def _pattern_graph(compiled: TimedPattern) -> VerdictGraph:
-    """Return the graph of the modes; with a remedy, each mode also as entered by the remedy.
+    """Return the graph of the modes. With a remedy, each mode has a second node: entered by the remedy.
 
     In a mode without a deadline, an event may still come too late for the time bound.
     """

@@ -1,17 +1,21 @@
 """``ptcaret``: past-time linear temporal logic with calls and returns, as MOP's PTCaRet plugin reads it.
 
-``ptltl``, and operators about the *abstract* past, in which every call that has returned is one opaque step: after its
-``end``, all events from ``begin`` to ``end``, both included, are invisible. ``(*a) x``, ``<*a> x``, ``[*a]
-x`` and ``x Sa y`` look at that past. Derived from them:
+The logic adds to ``ptltl`` operators about the *abstract* past, where every call that has returned is one opaque step.
+After the call's ``end``, all events from ``begin`` to ``end``, both included, are invisible. ``(*a) x``, ``<*a> x``,
+``[*a] x`` and ``x Sa y`` look at the abstract past. Other operators are derived from these:
 
-- ``@b x``: ``x`` held at the ``begin`` of the innermost open call; ``@c x``: at the event before it;
-- ``x Ss@b y``: ``y`` held at the ``begin`` of an open call, and ``x`` at those since; ``…s@c``, ``…s@bc`` as below;
-- ``<*s@b> x``, ``[*s@b] x``: at some, at every ``begin`` of an open call; ``…s@c``: at the event before it; ``…s@bc``:
-  at an event ``begin`` or ``call`` that is not within a call that has returned. ``[*s@c] x`` is ``!<*s@c> !x``: a
-  ``begin`` that is the first event has no event before it, and violates nothing.
+- ``@b x``: ``x`` held at the ``begin`` of the innermost open call; ``@c x``: ``x`` held at the event before this
+  ``begin``;
+- ``x Ss@b y``: ``y`` held at the ``begin`` of an open call, and ``x`` at each such ``begin`` since;
+  ``…s@c``, ``…s@bc`` as below;
+- ``<*s@b> x``, ``[*s@b] x``: ``x`` held at some, at every ``begin`` of an open call;
+- ``…s@c``: at the event before such a ``begin``;
+- ``…s@bc``: at an event ``begin`` or ``call`` that is not within a call that has returned.
 
-An ``end`` without a ``begin`` restarts the abstract past. Open calls are remembered up to a bound; a ``begin`` beyond
-it is a fault of the specification. (Rosu, Chen and Ball, 2008.)
+``[*s@c] x`` is ``!<*s@c> !x``: a ``begin`` that is the first event has no event before it, and violates nothing.
+
+An ``end`` without a ``begin`` restarts the abstract past. The number of open calls is limited; a ``begin`` beyond the
+limit is a fault of the specification. (Rosu, Chen and Ball, 2008.)
 """
 
 from itertools import zip_longest
@@ -78,7 +82,7 @@ class CaretProperty(CompiledProperty):
 
 
 class CaretRun(UntimedRun):
-    """A run: its values, and those about the abstract past from before each open call."""
+    """A run: its values, and for each open call the values about the abstract past from before the call."""
 
     __slots__ = ("_compiled", "_stack", "_values")
     keeps = ("_stack", "_values")

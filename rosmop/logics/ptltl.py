@@ -1,8 +1,8 @@
 """``ptltl``: past-time linear temporal logic, as MOP's PTLTL plugin reads it.
 
-The category is ``validation`` where the formula holds at this event, ``violation`` where not; it comes
-after each event. At an event that the formula does not name, all its atoms are false. At the first event there is
-no previous one: ``(*) a`` is false there, ``[*] a`` is ``a``.
+The verdict comes after each event: ``validation`` if the formula holds at this event, ``violation`` if it does not. At
+an event that the formula does not name, all its atoms are false. The first event has no previous event: ``(*) a`` is
+false there, and ``[*] a`` is ``a``.
 """
 
 from rosmop.logics.formula import NOT, Level, Syntax, boolean_levels, read_formula

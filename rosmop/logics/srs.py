@@ -1,8 +1,8 @@
 """``srs``: string rewriting systems, as MOP's SRS plugin reads them.
 
 ``hasnext next -> #epsilon . ^ next -> #fail .``: each event is appended to a string, which is then rewritten until no
-rule matches. The rule that matches furthest to the left is applied; if several match there, the one that is written
-first. ``^`` and ``$`` stand for the beginning and the end of the string and are never replaced. A symbol that is not an
+rule matches. The rule that matches furthest to the left is applied; if several rules match there, the first one in the
+text. ``^`` and ``$`` mean the beginning and the end of the string, and are never replaced. A symbol that is not an
 event is an auxiliary symbol of the author. The categories ``#fail`` and ``#succeed`` are permanent.
 
 A run limits the length of its string and the work for one event; exceeding a limit is a fault of the specification.
@@ -19,12 +19,18 @@ MAX_RULES = 1_000
 MAX_STRING = 100_000
 """The maximum number of symbols in a run's string."""
 MAX_WORK = 200_000
-"""The maximum number of rules tried and symbols moved for one event; sixteen comparisons count as one move."""
+"""The maximum number of rules tried and symbols moved for one event.
+
+Sixteen comparisons of symbols count as one move.
+"""
 
 
 @dataclass(frozen=True)
 class RewriteRule:
-    """A rule ``left -> right`` or ``left -> verdict``. ``begins``, ``ends``: only at the string's beginning, end."""
+    """A rule ``left -> right`` or ``left -> verdict``.
+
+    ``begins`` and ``ends``: the rule applies only at the string's beginning or end.
+    """
 
     left: tuple[int, ...]
     right: tuple[int, ...]
@@ -54,7 +60,7 @@ class RewritingProperty(CompiledProperty):
 
 
 class RewritingRun(UntimedRun):
-    """A run: its string, to which no rule applies between two events, or its final verdict."""
+    """A run: its string, or its final verdict. Between two events, no rule applies to the string."""
 
     __slots__ = ("_property", "string", "verdict")
     keeps = ("string", "verdict")
@@ -98,7 +104,7 @@ class RewritingRun(UntimedRun):
 
 
 def _matching(rules: Sequence[RewriteRule], string: list[int], place: int) -> tuple[RewriteRule | None, int]:
-    """Return the first rule that matches at a place, and the work of finding it."""
+    """Return the first rule that matches at a place, and the work that the search took."""
     work = 1
     for rule in rules:
         end = place + len(rule.left)

@@ -1,11 +1,11 @@
 """``tfsm``: state machines with time bounds.
 
 ``s1 [ b -> s0, timeout 2s -> late ]``: after 2 s in ``s1`` without an event the machine moves to ``late``. This move
-has the category ``timeout`` before the categories of the new state. The new state counts as entered at the deadline,
-not when the expiry is noticed. Every event of the specification starts the clock of the state it leads to.
+gives the category ``timeout``, then the categories of the new state. The new state counts as entered at the deadline,
+not when the expiry is noticed. Every event of the specification starts the clock of the state that the event leads to.
 
-A machine without any timeout clause behaves as MOP's: when one second passes after an
-event without another, the category ``timeout`` comes once and the state stays.
+A machine without any timeout clause behaves as in MOP: if no event comes within one second after an event, the category
+``timeout`` comes once, and the machine stays in its state.
 """
 
 from rosmop.logics.automaton import Automaton
@@ -19,9 +19,9 @@ SILENCE_NS = 10**9
 class TimedStateMachine(ClockedProperty):
     """A compiled ``tfsm``.
 
-    ``automaton`` has the transitions on events; ``timeouts[state]`` is (nanoseconds, next state) or None.
-    With ``silence_ns`` set there are no timeout clauses, and the clock runs after each event. Then each state
-    occurs twice: after an event, and (in the second half) while nothing is waited for.
+    ``automaton`` has the transitions on events; ``timeouts[state]`` is (nanoseconds, next state) or None. With
+    ``silence_ns`` set there are no timeout clauses, and the clock runs after each event. Then each state occurs twice:
+    after an event, and (in the second half) while the machine waits for no deadline.
     """
 
     expiry = TIMEOUT
@@ -53,12 +53,18 @@ class TimedStateMachine(ClockedProperty):
             self.waits = (*silent, *[None] * size)
 
     def categories_after(self, event: int) -> frozenset[str]:
-        """Return the categories of the states that this event leads to (``timeout`` needs no event)."""
+        """Return the categories of the states that this event leads to.
+
+        ``timeout`` is not included, because it needs no event.
+        """
         verdicts = self.automaton.verdicts
         return frozenset(name for row in self.automaton.table for name in verdicts[row[event]])
 
     def blocking_refused(self, category: str) -> str | None:
-        """Return why: ``timeout`` comes without a message. An event may stay in a state that only a timeout enters."""
+        """Return why a handler cannot drop the message: ``timeout`` comes without a message.
+
+        Other categories may drop, because an event may stay in a state that only a timeout enters.
+        """
         super().blocking_refused(category)
         if category == TIMEOUT:
             return "`timeout` happens when no message comes, so there is none to drop"
