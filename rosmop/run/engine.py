@@ -5,14 +5,15 @@ Theory of operation:
 1. `MonitorSet.of` takes compiled specifications; `start` gives the variables their first values.
 2. `process` gives a message to the events on its topic (`execution.py`).
 3. The caller gives the time, in nanoseconds, with every message. Ticks and deadlines that are due (`timers.py`) happen
-   before a message; `process` returns them in `before`. While no message comes, the caller calls `advance` at
-   `next_due`; deadlines may move in the meantime.
-4. `lane` returns, for most topics, a lane of the fast path (`fast_path.py`). It processes many messages at once, as
-   long as none has to be recorded or explained. The results are those of `process`.
+   before the message; `process` returns their outcomes in `before`. While no message comes, the caller calls `advance`
+   at `next_due`. Deadlines may change in the meantime.
+4. For most topics, `lane` returns a lane of the fast path (`fast_path.py`). A lane processes many messages at once, as
+   long as no message has to be recorded or explained. The results are the same as those of `process`.
 5. `succeed` replaces another set between two messages. Specifications with the same text keep their variables and runs.
-6. Specifications in shadow mode are in separate sets (`shadows`), one for those that share variables, so that they do
-   not affect others. `tapped` collects copies of their messages. The caller hands these over in order once the message
-   is passed on (`ShadowCopy.give`); the outcome has the actions that they would have taken.
+6. Specifications in shadow mode are in separate sets (`shadows`), so that they do not affect other specifications. Each
+   set has specifications that share variables. `tapped` collects copies of their messages. After a message is passed
+   on, the caller gives its copies in order to the sets (`ShadowCopy.give`). The outcome lists the actions that the
+   specifications would have taken.
 """
 
 import sys
@@ -73,7 +74,7 @@ class ShadowCopy(NamedTuple):
     time: int
 
     def give(self, sender: MessageSender = NOBODY) -> Outcome:
-        """Process the copy, and return the outcome as if they were in force."""
+        """Process the copy, and return the outcome as if the specifications were in force."""
         if self.part is None:
             return self.shadow.process(self.resource, self.data, self.time, sender)
         return self.shadow.process_service(self.resource, self.part, self.data, self.time, sender)
@@ -94,9 +95,10 @@ class MonitorSet:
         deadlines: int = sys.maxsize,
         holder_of: HolderOf = no_holder,
     ) -> None:
-        """`compiled` has all specifications in order; those in shadow mode are in `shadows`. `fast` was compiled from
-        the others; without it the engine processes every message. At most `deadlines` deadlines of slices pass at a
-        time. `holder_of(source)` is charged for slices (`slice_quota.py`).
+        """`compiled` has all specifications in order; `shadows` has those in shadow mode.
+
+        `fast` was compiled from the other specifications; without it the engine processes every message. At most
+        `deadlines` deadlines of slices pass at a time. `holder_of(source)` is charged for slices (`slice_quota.py`).
         """
         shadowed = {name for shadow in shadows for name in shadow.names}
         self.names: tuple[str, ...] = tuple(one.name for one in compiled.specifications)
@@ -117,7 +119,7 @@ class MonitorSet:
         self._guards = guards(compiled)
         self._types = types_of(compiled)
         self._beginnings: dict[str, bytes] = {}
-        """The known initial states of monitors that guard (`shape`)."""
+        """The known initial states of the monitors that guard topics, as returned by `shape`."""
         self.steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
         self._silent: dict[tuple[str, int], BatchOptions] = {}
@@ -150,10 +152,10 @@ class MonitorSet:
         deadlines: int = sys.maxsize,
         holder_of: HolderOf = no_holder,
     ) -> "MonitorSet":
-        """Return the set. With a specification in `shadows`, all that share variables with it are in shadow mode.
+        """Return the set. If a specification is in `shadows`, all that share variables with it are in shadow mode.
 
-        `patience()` is called when something is due; it returns a function that returns whether that takes too long
-        (`shadow_patience` in shadow mode). A parametric specification has at most `slices` slices.
+        When something is due, `patience()` is called (in shadow mode: `shadow_patience()`). It returns a function that
+        returns whether the work takes too long. A parametric specification has at most `slices` slices.
         """
         shadowed = []
         for group in compiled.groups(shadows):
@@ -264,7 +266,7 @@ class MonitorSet:
         return self.compiled.is_stamped(self.type_of(topic, shadowed=True))
 
     def service_type_of(self, service: str, *, shadowed: bool = False) -> str | None:
-        """Return the type of a service with an enabled event, or None. Shadow mode counts only if `shadowed`."""
+        """Return the type of a service with enabled events, or None. Shadow mode counts only if `shadowed`."""
         for part in ("request", "response"):
             for step in self.steps.get(channel_of(service, part), ()):
                 if shadowed or not isinstance(step, _Tap):
@@ -272,7 +274,7 @@ class MonitorSet:
         return None
 
     def limit_time(self, clock: Callable[[], float], seconds: float) -> None:
-        """Bound the processor time of a message, over all monitors, by a clock (seconds).
+        """Bound the processor time that all monitors together spend on one message; `clock` returns seconds.
 
         Exceeding it is a fault. The same bound holds for ticks, deadlines, and monitors in shadow mode.
         """
@@ -280,7 +282,7 @@ class MonitorSet:
             part.interpreter.turn.limit(clock, seconds)
 
     def hurry(self, part: float) -> None:
-        """Set the part of the time from `limit_time` that messages may take."""
+        """Set the fraction of the time from `limit_time` that messages may take."""
         self.interpreter.turn.part = part
 
     @property
@@ -289,14 +291,14 @@ class MonitorSet:
         return self.interpreter.turn.late()
 
     def explain_when(self, asked: Asked, shadowed: Asked) -> None:
-        """Explain only verdicts for which `asked` (in shadow mode: `shadowed`) is true of the message's source."""
+        """Explain a verdict only if `asked` (in shadow mode: `shadowed`) returns true for the message's source."""
         self._execution.asked = asked
         for shadow in self.shadows:
             shadow.explain_when(shadowed, shadowed)
 
     @property
     def area(self) -> memoryview | None:
-        """Return memory to receive frames into, so that lanes need no copy; None without lanes."""
+        """Return memory to receive frames in, so that lanes need no copy; None without lanes."""
         return self._lanes.area
 
     def contexts(self, topic: str) -> tuple[Context, ...]:
@@ -308,8 +310,9 @@ class MonitorSet:
         return self._lanes.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
 
     def lane_ready(self, lane: FastLane, time_ns: int) -> bool:
-        """Return whether the lane may be used: nothing is due, and no monitor waits for its first message or failed to
-        start.
+        """Return whether the lane may be used.
+
+        Nothing may be due, no monitor may wait for its first message, and none may have failed to start.
         """
         return not self._agenda.has_come(time_ns) and not self._broken and lane.ready()
 
@@ -331,11 +334,11 @@ class MonitorSet:
     def start(
         self, time_ns: int, expected: frozenset[str] | None = None, *, restarted: bool = False
     ) -> Outcome:
-        """Start: first values, `init`, timers. The outcome has the output of `init`.
+        """Set the first values, run `init`, and start the timers. The outcome has the output of `init`.
 
-        `expected` are topics that are known to carry messages (in a recording): a specification with events on one of
-        them starts its timers at its first message. With `restarted`, specifications with the modifier `hold` block
-        their topics until `resume`; in shadow mode none does.
+        `expected` are topics that are known to carry messages, as in a recording. A specification with events on such a
+        topic starts its timers at its first message. With `restarted`, specifications with the modifier `hold` block
+        their topics until `resume`, except in shadow mode.
         """
         outcome = self._start(self._monitors, time_ns, expected)
         for monitor in self._monitors if restarted else ():
@@ -343,7 +346,7 @@ class MonitorSet:
         return self._with_shadows(outcome, [shadow.start(time_ns, expected) for shadow in self.shadows])
 
     def state_of(self, group: MonitorGroup) -> bytes:
-        """Return the state of a group as data; if it is too large, the reason why it is not kept."""
+        """Return the state of a group as data. If the state is too large, return the reason why it is not saved."""
         try:
             states = [
                 kept_monitor(monitor, self.interpreter.variables, self._types[monitor.name])
@@ -358,17 +361,18 @@ class MonitorSet:
         return data
 
     def slice_parts(self, group: MonitorGroup) -> list[tuple[str, SliceParts]]:
-        """Return the slices of a group's parametric specifications, to be saved in parts, by name."""
+        """Return, by name, the slices of a group's parametric specifications, to be saved in parts."""
         sliced = [(monitor.name, monitor.slices) for monitor in group.monitors]
         return [(name, SliceParts(slices)) for name, slices in sliced if slices is not None]
 
     def recover(
         self, kept: Sequence[GroupSnapshot], lost: Mapping[str, str], time_ns: int, *, restarted: bool = False
     ) -> Outcome:
-        """Start with the state of earlier processes: `kept` has the state of specifications, of each the last.
+        """Start with the state of earlier processes: for each specification, the last state in `kept`.
 
-        Those whose state is `lost` (with the reason; key "": all) or unusable start again, and hold their topics as
-        `hold_lost` decides. With `restarted`, those with the modifier `hold` always hold them.
+        A specification restarts if its state is `lost` (with the reason; key "": all) or unusable. Then `hold_lost`
+        decides whether it holds its topics. With `restarted`, specifications with the modifier `hold` always hold their
+        topics.
         """
         states, slices, unread = states_of(kept)
         fresh, reasons = [], {**lost, **unread}
@@ -403,8 +407,10 @@ class MonitorSet:
         return self._with_shadows(outcome, [shadow.start(time_ns) for shadow in self.shadows])
 
     def hold_lost(self, monitor: MonitorInstance, why: str) -> None:
-        """Handle the lost state of a monitor that has restarted: it holds its topics if it is declared `hold`, or acts
-        by a state and is not declared `begin`.
+        """Handle the lost state of a monitor that has restarted.
+
+        The monitor holds its topics if it is declared `hold`, or if its actions depend on a state and it is not
+        declared `begin`.
         """
         if monitor.code.hold or (monitor.name in self._guards and not monitor.code.begins):
             monitor.hold(why)
@@ -428,12 +434,13 @@ class MonitorSet:
     def succeed(
         self, before: "MonitorSet", time_ns: int, incomplete: Collection[str] = frozenset()
     ) -> Outcome:
-        """Replace another set and start; `began` names the specifications that start with this one.
+        """Replace another set and start; `began` names the specifications that start with this set.
 
-        Specifications with the same text keep their state, `init` included, unless the definition of a message type
-        that they use has changed. One that restarts goes on holding its topics if it did and is still declared `hold`.
-        A specification that enters or leaves shadow mode keeps its state; in shadow mode it holds no topic. Those in
-        `incomplete` have missed messages in shadow mode: they restart when they leave it.
+        Specifications with the same text keep their state, and `init` does not run again. They restart if the
+        definition of a message type that they use has changed. A specification that restarts continues to hold its
+        topics if it held them and is still declared `hold`. A specification that enters or leaves shadow mode keeps its
+        state; in shadow mode it holds no topic. Specifications in `incomplete` have missed messages in shadow mode, so
+        they restart when they leave it.
         """
         known = {
             monitor.name: (monitor, part.interpreter.variables)
@@ -476,13 +483,13 @@ class MonitorSet:
                 fresh.append(monitor)
         self._index()
         outcome = self._start(fresh, time_ns, None)
-        for monitor in fresh:  # only an operator lets the topics go on
+        for monitor in fresh:  # only an operator may release the topics
             if monitor.name in known and (earlier := known[monitor.name][0]).held:
                 self.hold_lost(monitor, earlier.why_held)
         return outcome
 
     def has_departed(self, monitor: MonitorInstance) -> bool:
-        """Return whether a monitor that guards may have left its initial state."""
+        """Return whether a monitor that guards topics may have left its initial state."""
         if monitor.name not in self._guards:
             return False
         beginning = self._beginnings.get(monitor.name)
@@ -496,7 +503,7 @@ class MonitorSet:
     def switch(self, enabled: Mapping[str, bool], time_ns: int) -> tuple[MonitorInstance, ...]:
         """Enable or disable monitors, ignoring unknown names; return the monitors that changed.
 
-        The time in between does not count: timers and properties with time bounds restart.
+        The time while a monitor is disabled does not count: its timers, and its properties with time bounds, restart.
         """
         changed = [monitor for shadow in self.shadows for monitor in shadow.switch(enabled, time_ns)]
         for monitor in self._monitors:
@@ -559,8 +566,10 @@ class MonitorSet:
         prepare: Callable[[FastLane], BatchOptions],
         fuel: int = MESSAGE_FUEL,
     ) -> Outcome | None:
-        """Process a message on a topic, or `channel_of` a service, if its lane takes it (`FastLane.process_message`,
-        with the options from `prepare` and this fuel); None: nothing was done.
+        """Process a message on a topic, or `channel_of` a service, if its lane accepts the message.
+
+        Return None if nothing was done. The arguments are those of `FastLane.process_message`: the options from
+        `prepare`, and the fuel.
         """
         lane = self.lane(topic)
         if lane is None or not self.lane_ready(lane, time_ns):
@@ -618,7 +627,7 @@ class MonitorSet:
                 step.first = not place or acting[place - 1].monitor is not step.monitor
             for step in found if acting else ():
                 if isinstance(step, _Tap):
-                    step.monitor = acting[0].monitor  # whose state must be copied back to Python
+                    step.monitor = acting[0].monitor  # its state must be copied back to Python
         self._tapped_ways = frozenset(
             channel for channel, found in steps.items() if any(isinstance(step, _Tap) for step in found)
         )
@@ -639,7 +648,7 @@ class MonitorSet:
         resource, part, tapped = event.topic or "", event.part, self.tapped
 
         def tap(message: WireMessage | None) -> bool:
-            assert message is not None  # noqa: S101  no timer stands here
+            assert message is not None  # noqa: S101  taps exist only for messages
             tapped.append(ShadowCopy(shadow, resource, part, bytes(message.buffer), message.time))
             return False
 
@@ -659,7 +668,7 @@ def _groups(compiled: Compiled, monitors: Sequence[MonitorInstance]) -> Iterator
 
 
 def _redefined(before: Definitions, after: Definitions) -> frozenset[str]:
-    """Return the message types that both have with different definitions."""
+    """Return the message types that both sets have with different definitions."""
     if before is after:
         return frozenset()
     both = set(before.message_types) & set(after.message_types)

@@ -1,13 +1,13 @@
 """Processes one message, tick or deadline: events, properties, handlers, faults. No I/O, no clock.
 
-The events of a message happen specification by specification, in source order. After the action of an event that did
-not drop the message, every property of its specification steps, and the handlers of its new categories run. A drop
-stops the processing of the message. A fault also drops it, unless `on_fault="pass"`. In a parametric specification
-each slice of an event takes its turn (`slices.py`).
+The events of a message happen specification by specification, in source order. After the action of an event, unless it
+dropped the message, every property of the specification steps, and the handlers of the new categories run. A drop stops
+the processing of the message. A fault also drops the message, unless `on_fault="pass"`. In a parametric specification,
+the event is processed in each of its slices in turn (`slices.py`).
 
-For properties that are formulas (`CompiledProperty.suppresses`), a dropped message has not happened: all of them, in
-all specifications, undo the steps that they made for it, so that their trace is the one that subscribers saw.
-Variables, output and the other properties keep its effects.
+For properties that are formulas (`CompiledProperty.suppresses`), a dropped message does not count. In all
+specifications, these properties undo the steps that they made for the message, so their trace is the one that
+subscribers saw. Variables, output and other properties keep the effects of the message.
 """
 
 import struct
@@ -33,13 +33,16 @@ OnFault = Literal["drop", "pass"]
 Asked = Callable[[Verdict, int], bool]
 
 EXPLAINED = 3
-"""Most verdicts of slices that are explained for one message, or one call with deadlines: each takes a millisecond."""
+"""The maximum number of slices' verdicts that are explained for one message, or for one call with deadlines.
+
+Each explanation takes a millisecond.
+"""
 
 SLICE_SECONDS = 50e-6
-"""Additional processor time of a message for each slice that it concerns."""
+"""Additional processor time of a message for each slice concerned."""
 
 TICK_BUDGET = 2_000
-"""Instructions of a slice for a tick that concerns several slices."""
+"""The maximum number of instructions of each slice for a tick that concerns several slices."""
 
 
 class MonitorExecution:
@@ -48,7 +51,7 @@ class MonitorExecution:
     def __init__(self, interpreter: Interpreter, on_fault: OnFault) -> None:
         self.on_fault: OnFault = on_fault
         self.asked: Asked | None = None
-        """Chooses the verdicts to explain, given the source of the message; None: all."""
+        """Chooses the verdicts to explain, given the source of the message; None chooses all."""
         self._interpreter = interpreter
         self._turn = interpreter.turn
         self._sender = NOBODY
@@ -57,16 +60,18 @@ class MonitorExecution:
         self._taking_back: dict[int, Callable[[], None]] = {}
         """Undo functions for the steps of the current message, by run or slice."""
         self._trailed: dict[MonitorInstance, int] = {}
-        """Number of entries of the current message in trails."""
+        """The number of trail entries that the current message made."""
         self._copies = False
         """Whether steps in a slice may be undone."""
         self._passed: int | None = None
-        """The deadline of a slice that is passing."""
+        """The deadline that is passing in a slice."""
 
     def begin(self, monitors: Sequence[MonitorInstance], time_ns: int) -> Outcome:
-        """Start monitors in stages (constants, first values, `init`), because one may read another's variables."""
+        """Start monitors in stages (constants, first values, `init`), because a monitor may read another monitor's
+        variables.
+        """
         outcome = Outcome(time=time_ns)
-        self._turn.now, self._turn.until = time_ns, inf  # operators wait for it; instructions bound it
+        self._turn.now, self._turn.until = time_ns, inf  # no time limit: operators wait for it
         for monitor in monitors:
             monitor.context.begin()
             for running in monitor.properties:
@@ -122,7 +127,7 @@ class MonitorExecution:
             outcome.events = (step.name,)
             try:
                 step.function(message)
-            except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
+            except Exception as error:  # noqa: BLE001  any exception is a recorded fault of this action
                 self._fault(error, step.monitor, step.event.position, outcome)
             else:
                 self._step_properties(step, message, time_ns, outcome)
@@ -139,14 +144,15 @@ class MonitorExecution:
     def expire(
         self, monitor: MonitorInstance, running: RunningProperty | None, *, explains: bool
     ) -> list[Outcome]:
-        """Process the deadline of a property, or (None) the first one of a slice; return the outcomes to report. A
-        slice's verdict is explained only if `explains`.
+        """Process the deadline of a property, or, if `running` is None, the first deadline of a slice.
+
+        Return the outcomes to report. A slice's verdict is explained only if `explains`.
         """
         self._sender, self._bound = NOBODY, None
         monitor.move_to_python()
         monitor.touch()
         if running is None:
-            assert monitor.slices is not None  # noqa: S101  only they have deadlines of their own
+            assert monitor.slices is not None  # noqa: S101  only parametric monitors get None
             self._explains = explains
             outcomes = self._expire_in_slice(monitor, monitor.slices.due)
             self._explains = True
@@ -188,7 +194,7 @@ class MonitorExecution:
         return [outcome] if whole else []
 
     def _catch_up(self, monitor: MonitorInstance, behind: Sequence[Slice], outcome: Outcome) -> None:
-        """Process the deadlines of slices before a message, if there were too many to process in time."""
+        """Process the overdue deadlines of slices before a message, after there were too many to process in time."""
         turn, go_on = self._turn, monitor.context.put_off()
         kept = turn.log, turn.published, turn.looked, self._sender, self._bound
         turn.log, turn.published, turn.looked = [], [], {}
@@ -218,7 +224,7 @@ class MonitorExecution:
         """Run an event on the message; return whether it was dropped."""
         try:
             has_happened = step.function(message)
-        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
+        except Exception as error:  # noqa: BLE001  any exception is a recorded fault of this action
             if self._interpreter.had_happened(error):
                 outcome.events = (*outcome.events, step.name)
             self._fault(error, step.monitor, step.event.position, outcome)
@@ -238,10 +244,10 @@ class MonitorExecution:
 
     def _happen_in_slices(self, step: Step, message: WireMessage, outcome: Outcome) -> bool:
         """Run an event of a parametric specification on the message; return whether it was dropped."""
-        assert step.key is not None  # noqa: S101  who asks has looked
+        assert step.key is not None  # noqa: S101  the caller checks this
         try:
             found = step.key(message)
-        except Exception as error:  # noqa: BLE001  the bytes are not of its type
+        except Exception as error:  # noqa: BLE001  the bytes do not fit the message type
             self._fault(error, step.monitor, step.event.position, outcome)
             self._block(message, outcome)
             return message.dropped
@@ -253,7 +259,7 @@ class MonitorExecution:
         key = (True,) if found is True else tuple(found)
         self._bound = Bound(step.index, step.event.binds, key, message.time, self._sender, step.event.creates)
         slices = step.monitor.slices
-        assert slices is not None  # noqa: S101  who has a key has slices
+        assert slices is not None  # noqa: S101  a step with a key has slices
         if step.event.plain and (slice_ := slices.at(key)) is not None:
             self._mark_slice(slices, slice_)
         if step.event.plain and (happened := slices.step(step.index, key)) is not None:
@@ -263,7 +269,7 @@ class MonitorExecution:
             return False
 
         def act(outcome: Outcome, message: WireMessage | None) -> bool:
-            assert message is not None  # noqa: S101  each has one
+            assert message is not None  # noqa: S101  each event here has a message
             if not step.event.plain:
                 return self._happen(step, message, outcome)
             outcome.events = (*outcome.events, step.name)
@@ -283,10 +289,11 @@ class MonitorExecution:
     ) -> None:
         """Run an event in each of its slices, until one has dropped the message.
 
-        A message that exceeds its budget on the way has happened in no slice. At a tick each slice has its own budget.
+        A message that exceeds its budget before the last slice has happened in no slice. At a tick each slice has its
+        own budget.
         """
         monitor, slices, turn = step.monitor, step.monitor.slices, self._turn
-        assert slices is not None  # noqa: S101  who asks has looked
+        assert slices is not None  # noqa: S101  the caller checks this
         found = slices.targets(step.event, key, outcome.time, self._sender.source)
         if slices.behind:
             self._catch_up(monitor, slices.behind, outcome)
@@ -315,7 +322,7 @@ class MonitorExecution:
                 self._copies, self._explains = False, True
                 return
             faults += outcome.faults
-            verdicts += outcome.verdicts  # many slices: a tuple would be copied for each
+            verdicts += outcome.verdicts  # for many slices: a tuple would be copied each time
             if outcome.events is not before:
                 reached += 1
                 events = outcome.events if slices.is_whole(slice_) else events
@@ -431,7 +438,10 @@ class MonitorExecution:
             outcome.changed_at = tuple([sites[site].position for _, at in writers for site in at])
 
     def _first(self, monitor: MonitorInstance, message: WireMessage, outcome: Outcome) -> bool:
-        """Handle a monitor's first message, or a message on a topic that it holds; return whether it was dropped."""
+        """Handle a monitor's first message, or a message on a topic that it holds.
+
+        Return whether the message was dropped.
+        """
         if monitor.held:
             why = f" ({monitor.why_held})" if monitor.why_held else ""
             outcome.reason = f"{monitor.name} holds its topics until it is resumed{why}"
@@ -481,7 +491,7 @@ class MonitorExecution:
         self._trailed[monitor] = self._trailed.get(monitor, 0) + 1
 
     def _take_back(self) -> None:
-        """Undo the steps of formulas at this message, the last one first."""
+        """Undo the steps of formulas at this message, the last step first."""
         for take_back in reversed(self._taking_back.values()):
             take_back()
         for monitor, entries in self._trailed.items():
@@ -498,7 +508,7 @@ class MonitorExecution:
         *,
         in_order_told: bool = False,
     ) -> None:
-        """Run the handlers of these categories, in source order (after a deadline: in the order given)."""
+        """Run the handlers of these categories, in source order, or after a deadline in the given order."""
         handlers = [(category, handler) for category, handler in running.handlers if category in categories]
         if in_order_told:
             handlers.sort(key=lambda pair: categories.index(pair[0]))
@@ -542,12 +552,12 @@ class MonitorExecution:
     ) -> None:
         try:
             handler(message)
-        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this handler and is recorded
+        except Exception as error:  # noqa: BLE001  any exception is a recorded fault of this handler
             self._fault(error, monitor, running.code.property.source.origin, outcome)
             self._block(message, outcome)
 
     def _block(self, message: WireMessage | None, outcome: Outcome) -> None:
-        """Apply the last fault to the message."""
+        """Apply the effect of the last fault to the message."""
         if message is not None and self.on_fault == "drop":
             message.dropped = True
             outcome.fatal = outcome.faults[-1]
@@ -577,22 +587,22 @@ class MonitorExecution:
             for monitor in tuple(beginning):
                 try:
                     self._interpreter.function(monitor.code.start[stage])()
-                except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of its beginning and is recorded
+                except Exception as error:  # noqa: BLE001  any exception is a recorded fault of the start
                     self._fault(error, monitor, monitor.code.position, outcome)
                     monitor.broken = True
                     beginning.remove(monitor)
 
 
 def _fault_of(error: Exception, interpreter: Interpreter, monitor: str, otherwise: Position) -> Fault:
-    """Return the fault for an exception. `otherwise` is its position if no better one is known."""
+    """Return the fault for an exception. `otherwise` is the fault's position if no better position is known."""
     failed = interpreter.failed if error is interpreter.failed.error else LastFailure()
-    interpreter.failed = LastFailure()  # the error refers to its callers, and so to much else
+    interpreter.failed = LastFailure()  # the error refers to its callers, and so to much other data
     site = interpreter.sites[failed.site] if failed.site >= 0 else Site(otherwise)
     values = {}
     for variable in site.variables:
         try:
             value = interpreter.value(variable.code, failed.variables)
-        except KeyError:  # not computed yet
+        except KeyError:  # the variable has no value yet
             continue
         values[variable.name] = showing(variable.type)(value)
     return Fault(monitor, site.position, _text(error), values)

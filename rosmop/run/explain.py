@@ -1,18 +1,20 @@
-"""Explains verdicts: as few of the events so far as give the verdict alone, and the senders of their messages.
+"""Explains verdicts: as few as possible of the past events that give the verdict alone, and the senders of their
+messages.
 
 Theory of operation:
 
-1. For a property with tables, `Exits` stores the event by which each state was left last. From the initial state these
-   lead to the present one, each later than the one before: the trace without its loops. So nothing is cut, however long
-   the trace, and events before `__RESET;` are left out. The module stores the same data in the same place.
-2. For other properties, `Steps` (with a clock `ClockedSteps`, which the module also stores) keeps the last events and
-   the run before them. If the events give the verdict to a new run, they explain it alone; otherwise only together with
-   the run before them (`Explanation.since`). A run about the future cannot be copied: more events are kept, and the run
-   knows at which of them the formula is the one that was decided. From there on they suffice, unless the formula also
-   looks back; then there is no explanation.
-3. For a parametric specification, the last `TRAIL` events are kept with their bindings. The events of the slice explain
-   its verdict alone, or there is no explanation.
-4. Each explanation is tested: the events in it gave the verdict.
+1. For a property with tables, `Exits` stores for each state the event that left it last. From the initial state these
+   events lead to the present state, each later than the previous event: the trace without its loops. So nothing is cut,
+   however long the trace is, and events before `__RESET;` are left out. The module stores the same data in the same
+   memory.
+2. For other properties, `Steps` keeps the last events and the run before them. (With a clock it is `ClockedSteps`,
+   which the module also stores.) If the events give the verdict to a new run, they explain it alone. Otherwise they
+   explain it only together with the run before them (`Explanation.since`). A run about the future cannot be copied. For
+   such runs more events are kept, and the run knows at which event the decided formula was evaluated. The events from
+   there on suffice, unless the formula also looks back; then there is no explanation.
+3. For a parametric specification, the last `TRAIL` events are kept with their bindings. The events of the slice must
+   explain its verdict alone; otherwise there is no explanation.
+4. Each explanation is tested: its events must give the verdict.
 """
 
 import copy
@@ -37,7 +39,7 @@ TRAIL = 4096
 """Events kept for all slices of a parametric specification together."""
 
 KEPT = 64
-"""Events kept for a property without tables, at least; at most twice as many."""
+"""The minimum number of events kept for a property without tables; the maximum is twice this number."""
 
 FUTURE_KEPT = 1024
 """Events kept for `mtl` about the future."""
@@ -46,15 +48,17 @@ ENTRY = struct.Struct("<qqI4x")
 """How a state was left: time (ns); the sender's source, its kind (from bit 24) and the event; the sender's number."""
 
 RUNS, RING = 4, 256
-"""Runs and steps kept for a property with a clock: twice as many as needed. So the entries of a message that the module
-leaves to the engine overwrite no needed one.
+"""Runs and steps kept for a property with a clock.
+
+The numbers are twice those needed, so that the entries of a message that the module leaves to the engine overwrite no
+needed entry.
 """
 
 _COUNT = struct.Struct("<q")
 _RUN = struct.Struct("<qqq")
 _EVENT = 0xFFFFFF
 _LONGEST = 300  # longest path through an automaton that is shortened
-_MOST_STEPS = 5_000  # tried for one explanation: some milliseconds
+_MOST_STEPS = 5_000  # the maximum number of steps tried for one explanation: some milliseconds
 _DEADLINE = -1
 
 CLOCKED_ROOM = _COUNT.size + _RUN.size * RUNS + ENTRY.size * RING
@@ -62,11 +66,11 @@ CLOCKED_ROOM = _COUNT.size + _RUN.size * RUNS + ENTRY.size * RING
 
 
 class Bound(NamedTuple):
-    """An event of a parametric specification that happened: the parameters that it bound (by number), and their values
-    (`key`, after True).
+    """An event of a parametric specification that happened.
 
-    `creates`: a slice may begin with it. `everywhere`: it happened in each of its slices (a `when` may depend on the
-    slice, and a message that one slice drops reaches no other). `passed`: its message was not dropped.
+    `binds` are the parameters that it bound (by number), and `key` has their values, after True. `creates`: a slice may
+    begin with the event. `everywhere`: it happened in each of its slices. (A `when` may depend on the slice, and a
+    message that one slice drops reaches no other slice.) `passed`: its message was not dropped.
     """
 
     event: int
@@ -80,8 +84,9 @@ class Bound(NamedTuple):
 
 
 class Exits:
-    """The history of how each state of an automaton was left last, in `room` (`ENTRY` for each state), which `owner`
-    keeps alive.
+    """The history of how each state of an automaton was left last.
+
+    It is stored in `room` (an `ENTRY` for each state), which `owner` keeps alive.
     """
 
     def __init__(self, automaton: Automaton) -> None:
@@ -107,20 +112,20 @@ class Exits:
         return run.expire()
 
     def begin(self, time_ns: int) -> None:
-        """Do nothing: no path from the initial state has earlier events."""
+        """Do nothing: a path from the initial state never has earlier events."""
 
     def mark(self) -> None:
-        """Return nothing: no path from the initial state has an undone step."""
+        """Return None: a path from the initial state never has an undone step."""
 
     def take_back(self, mark: object) -> None:
-        """Do nothing, as `mark`."""
+        """Do nothing; see `mark`."""
 
     def move(self, owner: object, room: memoryview) -> None:
         """Move the history into the owner's memory."""
         self.room, self.owner = room[: len(self.room)], owner
 
     def forget(self, run: Any, _time_ns: int) -> None:
-        """Forget everything: the run continues that of another process."""
+        """Forget everything: the run continues a run of another process."""
         self._at = run.state
         for state in range(len(self._automaton)):
             ENTRY.pack_into(self.room, ENTRY.size * state, 0, _EVENT, 0)
@@ -168,7 +173,7 @@ class Exits:
 def _shortest(
     automaton: Automaton, way: Sequence[EventOccurrence], category: str
 ) -> Sequence[EventOccurrence]:
-    """Return the fewest events, and of these the latest, that give the category."""
+    """Return the smallest number of events that give the category; if there are several choices, the latest events."""
     best: dict[int, tuple[int, ...]] = {automaton.initial: ()}
     fewest: tuple[int, ...] = ()
     mine: tuple[int, ...] = ()
@@ -209,7 +214,7 @@ class Steps:
         self._following: Run | None = None
 
     def mark(self) -> Any:
-        """Return what `take_back` needs to forget the steps from here on."""
+        """Return the data that `take_back` needs to forget all later steps."""
         return self._started, self._steps, len(self._steps), self._before, self._following
 
     def take_back(self, mark: Any) -> None:
@@ -225,7 +230,7 @@ class Steps:
         return categories
 
     def forget(self, run: Run, time_ns: int) -> None:
-        """Explain from the present state: the run continues that of another process."""
+        """Explain only from the present state on: the run continues a run of another process."""
         self.begin(time_ns)
         self._before = None if isinstance(run, BoundedRun) else copy.copy(run)
 
@@ -244,7 +249,7 @@ class Steps:
         return earlier
 
     def _kept(self) -> tuple[Sequence[EventOccurrence], Run | None]:
-        """Return the last steps, and the run before them if there were earlier ones."""
+        """Return the last steps, and the run before them if there were earlier steps."""
         return self._steps, self._before
 
     def _make_room(self, run: Run) -> None:
@@ -280,8 +285,10 @@ class Steps:
 
 
 class ClockedSteps(Steps):
-    """Like `Steps`, for an automaton with a clock, in `room`, where the module also notes it: the number of steps
-    (i64), the runs before each `KEPT` of them (state, `since` and `now`; the last `RUNS`), and the last `RING` steps.
+    """Like `Steps`, for an automaton with a clock. The data are in `room`, where the module also stores them.
+
+    `room` has the number of steps (i64), the last `RUNS` saved runs, and the last `RING` steps. A run (state, `since`
+    and `now`) is saved before each group of `KEPT` steps.
     """
 
     _compiled: ClockedProperty
@@ -310,7 +317,7 @@ class ClockedSteps(Steps):
         return run.step(event, time_ns)
 
     def forget(self, run: Run, time_ns: int) -> None:
-        """Forget everything: the run continues that of another process."""
+        """Forget everything: the run continues a run of another process."""
         del run
         self.begin(time_ns)
 
@@ -397,7 +404,7 @@ class _Trial:
         return told
 
     def fewest(self, events: list[EventOccurrence]) -> tuple[tuple[EventOccurrence, ...], bool]:
-        """Return as few of the events as suffice, and whether none can be left out."""
+        """Return as few of the events as suffice, and whether every one of these is needed."""
         last = events[-1:] if self._ended is None else []
         some = self._fewer(events[: len(events) - len(last)], last)
         if last and some and self._left > 0 and self.gives(some):
@@ -427,10 +434,10 @@ def of_slice(
     category: str,
     passed: int | None = None,
 ) -> Explanation | None:
-    """Return the events of the verdict in the slice of a binding (parameters by number), whose cause is the last event,
-    or the deadline that has `passed`.
+    """Return the events that caused the verdict in the slice of a binding (parameters by number).
 
-    None if it is unknown whether a needed event happened in this slice.
+    The cause is the last event, or the deadline that has `passed`. Return None if it is unknown whether a needed event
+    happened in this slice.
     """
     own: dict[EventOccurrence, bool] = {}
     happened: list[EventOccurrence] = []

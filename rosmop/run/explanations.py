@@ -1,6 +1,7 @@
-"""The outcome of a message, a tick or a deadline and its causes, as data for a record, for the CLI and for REST.
+"""Describe the outcome of a message, a tick or a deadline, and its causes, as data for a record, for the CLI and for
+REST.
 
-The data are bounded, and in the words of the specification. `who` names the source of a message.
+The data are limited in size, and use the words of the specification. `who` names the source of a message.
 """
 
 import datetime
@@ -11,7 +12,7 @@ from rosmop.run.outcomes import DROPPED, SEQ, EventOccurrence, Fault, Outcome, V
 from rosmop.run.subformulas import deciding
 
 _EACH_END = 5
-"""Number of the first and of the last events that are listed; those between are counted."""
+"""The number of first events, and of last events, that are listed; the events between are only counted."""
 
 Who = Callable[[int], Mapping[str, Any]]
 
@@ -69,7 +70,9 @@ def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, Any]:
 
 
 def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str, Any]:
-    """Return the events (or the timer), the conditions with the values compared, and the verdict of the handler."""
+    """Return the events (or the timer), the conditions with the compared values, and the verdict whose handler
+    acted.
+    """
     return {
         "events": list(outcome.events),
         **({"timer": outcome.timer} if outcome.timer is not None else {}),
@@ -79,7 +82,7 @@ def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str
 
 
 def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
-    """Return `why` of a verdict; empty if it was not requested or is unknown."""
+    """Return the field `why` of a verdict; empty if the explanation was not requested or is unknown."""
     why = verdict.why
     if why is None:
         return {}

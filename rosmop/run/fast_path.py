@@ -1,6 +1,7 @@
 """The interface between the engine and compiled code: the engine uses only the types of this file.
 
-The caller that makes a `MonitorSet` makes the implementation (`rosmop/fast/wasm_runner.py`) and hands it in.
+The caller that makes a `MonitorSet` also makes the implementation (`rosmop/fast/wasm_runner.py`) and passes it to the
+set.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,17 +16,17 @@ from rosmop.runtime.action_context import FUEL_PER_SECOND, LogLine
 from rosmop.runtime.wire import Buffer
 
 MESSAGE_FUEL = FUEL_PER_SECOND // 100
-"""Most instructions for one message, unless `process_one` gets another number."""
+"""The maximum number of instructions for one message, unless `process_one` gets a different number."""
 
 
 class BatchResult(NamedTuple):
     """The result of one batch.
 
-    `position` is the offset of the first message that was not processed, `run` the offset after the last dropped
-    message. `dropped` counts dropped messages for each event of the lane, `told` verdicts for each verdict of the lane;
-    both are empty if there were none. `sooner`: a deadline is earlier than before. `output` has the printed lines, in
-    order, each with the offset of its message. `paused`: the batch used up its fuel; the next one may begin with the
-    message at `position`.
+    `position` is the offset of the first message that was not processed, and `run` is the offset after the last dropped
+    message. `dropped` counts dropped messages for each event of the lane, and `told` counts verdicts for each verdict
+    of the lane. Both are empty if all counts are zero. `sooner`: a deadline is earlier than before. `output` has the
+    printed lines, in order, each with the offset of its message. `paused`: the batch used up its fuel; the next batch
+    may begin with the message at `position`.
     """
 
     position: int
@@ -40,9 +41,9 @@ class BatchResult(NamedTuple):
 class BatchOptions(NamedTuple):
     """The options of all batches of a topic until the state of the engine changes.
 
-    `source` is the sender of the messages. `told`, `enabled` and `counted` are bits for the module; `told` includes
-    whether messages may be changed. Batches count in `changed` the messages that each set of events (see
-    `FastLane.writers`) has changed.
+    `source` is the sender of the messages. `told`, `enabled` and `counted` are bits for the module; `told` also has a
+    bit for whether messages may be changed. Batches count in `changed` how many messages each set of events has changed
+    (see `FastLane.writers`).
     """
 
     source: int
@@ -56,14 +57,14 @@ class NextDue(Protocol):
     """Returns the time of the next tick or deadline (ns; None if there is none)."""
 
     def __call__(self, *, anew: bool) -> int | None:
-        """With `anew`, compute the time again, because there may be an earlier deadline."""
+        """Return the time. With `anew`, compute it again, because there may be an earlier deadline."""
 
 
 class FastLane(Protocol):
     """Processes the messages of one topic, or part of a service, many at a time."""
 
     events: tuple[tuple[str], ...]
-    """For each event: `Outcome.events` if only this one happens."""
+    """For each event: the value of `Outcome.events` if only this event happens."""
 
     monitors: tuple[str, ...]
     """For each event: the name of its monitor."""
@@ -95,8 +96,10 @@ class FastLane(Protocol):
         source: int = 0,
         changed: dict[int, int] | None = None,
     ) -> BatchOptions:
-        """Return the options, valid until the engine does anything. If `loud`, no message may be changed; `told` has
-        the events that may drop none, `counted` the verdicts that are only counted.
+        """Return the options. They are valid until the next action of the engine.
+
+        If `loud`, no message may be changed. `told` lists the events that may not drop a message, `counted` the
+        verdicts that are only counted.
         """
 
     def process_batch(  # noqa: PLR0917  called for every batch: calls and keywords would cost a tenth of it
@@ -108,11 +111,11 @@ class FastLane(Protocol):
         time_ns: int,
         prepared: BatchOptions,
     ) -> BatchResult | None:
-        """Process messages from `position` on, up to the first that needs the engine. Return None if it processed all
-        and all stay in their buffer.
+        """Process messages from `position` on, up to the first message that needs the engine. Return None if all
+        messages were processed and all stay in their buffer.
 
-        Call it only while the lane is `ready` and nothing of the set is due. `view` has whole frames and is writable:
-        the beginning of `Lanes.area`, or other memory. Bytes before a dropped message are appended to `pieces`.
+        Call this only while the lane is `ready` and nothing in the set is due. `view` has whole frames and is writable.
+        It is the beginning of `Lanes.area`, or other memory. Bytes before a dropped message are appended to `pieces`.
         """
 
     def process_one(  # noqa: PLR0917  as `process_batch`
@@ -125,20 +128,23 @@ class FastLane(Protocol):
         prepared: BatchOptions,
         fuel: int = MESSAGE_FUEL,
     ) -> BatchResult:
-        """Process only the message at `position`, with this fuel; `paused` in the result: the fuel was not enough."""
+        """Process only the message at `position`, with this fuel.
+
+        `paused` in the result means that the fuel was not enough.
+        """
 
     def process_message(
         self, message: Buffer, time_ns: int, prepared: BatchOptions, fuel: int = MESSAGE_FUEL
     ) -> Outcome | None:
-        """Process one message; return None if it is left. Verdicts are not explained, positions of changes not
-        reported.
+        """Process one message; return None if it is left to the engine. Verdicts are not explained, and positions of
+        changes are not reported.
 
-        The conditions are those of `process_batch`, with options for this use only; do not call `happened`.
+        The conditions are those of `process_batch`. Use separate options for this method, and do not call `happened`.
         """
 
 
 class Lanes(NamedTuple):
-    """The lanes of a set by topic (see `EventCode.channel`), and the memory to receive frames into, if there is one."""
+    """The lanes of a set by topic (see `EventCode.channel`), and the memory to receive frames in, if there is any."""
 
     of_topic: Mapping[str, FastLane] = MappingProxyType({})
     area: memoryview | None = None
@@ -150,7 +156,8 @@ class FastPath(Protocol):
     def lanes(
         self, compiled: Compiled, interpreter: Interpreter, monitors: Sequence[MonitorInstance], due: NextDue
     ) -> Lanes:
-        """Return the lanes that process messages of these monitors; set `home` of the monitors whose state they take.
+        """Return the lanes that process messages of these monitors. Set `home` of each monitor whose state a lane takes
+        over.
 
         A topic without a lane is processed by the engine.
         """

@@ -1,16 +1,16 @@
-"""The interpreter, which defines the meaning of the form. Every faster way to run it is compared with this one.
+"""The interpreter, which defines the meaning of the form. Every faster implementation is compared with it.
 
-Each expression becomes a Python function from the variables of a call to a value, each statement one that returns how
-it ends its block (None: it does not). There is one method for each kind of node (`STATEMENTS`, `EXPRESSIONS`).
-`runtime/` has the functions of the form, `runtime/values.py` the encoding of values in messages. A function is built on
-its first call. Strings are bytes, vectors and messages lists, times and durations integers; all else is the closest
-Python value. It is one file because it is the definition.
+Each expression becomes a Python function that computes a value from the variables of a call. Each statement becomes a
+function that returns how it ends its block (None: it does not). There is one method for each kind of node
+(`STATEMENTS`, `EXPRESSIONS`). `runtime/` has the functions of the form, `runtime/values.py` the encoding of values in
+messages. A function is built on its first call. Strings are bytes, vectors and messages are lists, times and durations
+are integers; every other value has the closest Python type. This is one file because it is the definition.
 
 Invariants:
 
-1. A name is a variable of the set (`g…`), or of one call: only the former, and what they refer to, outlive a call. In a
-   call `m` is the message, `b` its original bytes, `p` the start of an element that is skipped, `n` the depth of a
-   recursion.
+1. A name is a variable of the set (`g…`) or of one call. Only variables of the set, and the values they refer to,
+   outlive a call. In a call, `m` is the message, `b` its original bytes, `p` the start of an element that is skipped,
+   and `n` the depth of a recursion.
 2. `_site` is the site of the running statement. A fault stops the function and all its callers.
 """
 
@@ -34,7 +34,7 @@ from rosmop.types.messages import MessageTypes
 from rosmop.types.value_types import Type
 from roswire.definitions import Definitions
 
-_FRAMES = 40_000  # Python's frames for `MAX_CALLS` calls, each deep in expressions
+_FRAMES = 40_000  # Python frames for `MAX_CALLS` nested calls, each within deep expressions
 
 _CALCULATED: Mapping[str, Callable[[Any, Any], Any]] = MappingProxyType(
     {
@@ -61,13 +61,15 @@ Variables = dict[str, Any]
 _Value = Callable[[Variables], Any]
 _Run = Callable[[Variables], str | None]
 
-_BREAK, _CONTINUE, _LEAVE = "break", "continue", "leave"  # how a block can end before its end
+_BREAK, _CONTINUE, _LEAVE = "break", "continue", "leave"  # how a block can end early
 _RESULT = "result"
 
 
 @dataclass(frozen=True)
 class LastFailure:
-    """The last error: its site (-1: unknown), the variables of the call, whether the event had happened before it."""
+    """The last error: its site (-1: unknown), the variables of the call, and whether the event had happened before the
+    error.
+    """
 
     error: Exception | None = None
     site: int = -1
@@ -78,7 +80,7 @@ class LastFailure:
 class Interpreter:
     """The interpreter of one set's functions, with its own values.
 
-    `variables` are the values of the variables of the set by name, `contexts` the budgets by name.
+    `variables` has the values of the set's variables by name, `contexts` the budgets by name.
     """
 
     def __init__(
@@ -121,7 +123,7 @@ class Interpreter:
     def function(self, name: str) -> Callable[..., Any]:
         """Return a function that takes a message, or None without one; for its result see `nodes.Function`.
 
-        It raises whatever stops it; `failed` has the details.
+        The function raises the error that stops it; `failed` has the details.
         """
         deep = any(isinstance(node, nodes.Invoke) for node in nodes.walk(self._functions[name].body))
 
@@ -162,7 +164,7 @@ class Interpreter:
                 if error is not self.failed.error:
                     site = error.site if isinstance(error, FaultError) and error.site >= 0 else self._site
                     self.failed = LastFailure(error, site, variables, happened)
-                elif events:  # it came from a called function
+                elif events:  # the error came from a called function
                     self.failed = replace(self.failed, happened=happened)
                 raise
             finally:
@@ -201,7 +203,7 @@ class _Maker:
             for write in statement.writes
         )
         self._marks: list[int] = []  # sites that assign to fields of the message
-        self._at = -1  # the site of the statement that is made
+        self._at = -1  # the site of the statement that is being built
 
     # Statements
 
@@ -278,7 +280,7 @@ class _Maker:
         return run if node.no else run_yes
 
     def _branch(self, site: int, statements: Sequence[nodes.Statement]) -> _Run:
-        """Build a branch; its condition is noted if the branch drops, changes or publishes a message."""
+        """Build a branch. Its condition is noted if the branch drops, changes or publishes a message."""
         block = self.block(statements)
         if not any(isinstance(node, nodes.Drop | nodes.Publish) or self._marks_field(node)
                    for node in nodes.walk(tuple(statements))):  # fmt: skip
@@ -292,7 +294,7 @@ class _Maker:
         return run
 
     def _look(self, site: int) -> _Run:
-        """Note the values that a met condition has compared."""
+        """Note the values that were compared by a condition that was met."""
         turn = self._interpreter.turn
         compared = [self._variable(variable.code) for variable in self._interpreter.sites[site].compared]
 
@@ -536,7 +538,10 @@ class _Maker:
         return lambda _: None
 
     def _write_back(self, node: nodes.WriteBack) -> _Run:
-        """Encode fields of variable size, which can fault, before the first byte is written."""
+        """Build the write of all fields.
+
+        Fields of variable size can fault, so they are encoded before the first byte is written.
+        """
         marks, writes = tuple(self._marks), []
         for write in sorted(node.writes, key=lambda write: write.end is None):
             value, encode = self.value(write.value), self._values.encoder(write.value.type)
@@ -603,7 +608,10 @@ class _Maker:
         return isinstance(value, nodes.Literal) and value.value is True
 
     def _assigned(self, node: nodes.Assign) -> _Value:
-        """Build the assigned value; for the flag of a field, the sites that have assigned to it, as bits."""
+        """Build the assigned value.
+
+        For the flag of a field, the value is the set of sites that have assigned to the field, as bits.
+        """
         if not self._marks_field(node):
             return self.value(node.value)
         if self._at not in self._marks:
@@ -749,7 +757,7 @@ class _Maker:
                 # A message may have more nanoseconds than a second has: the seconds overflow their type.
                 return self._then(value, wrapping(node.type))
             return value
-        if len(arguments) == 2:  # for speed: as below
+        if len(arguments) == 2:  # a faster form of the code below
             one, other = arguments
             if after:
                 return lambda v: function(one(v), other(v), site)
@@ -757,7 +765,7 @@ class _Maker:
         return lambda v: function(*[argument(v) for argument in arguments], *after)
 
     def _accumulate(self, node: nodes.Accumulate) -> _Value:
-        assert isinstance(node.vector.type, value_types.VectorType)  # noqa: S101  of which there are sums
+        assert isinstance(node.vector.type, value_types.VectorType)  # noqa: S101  only vectors are summed
         context, site, wide = self._context, node.site, node.wide
         widened, added = _converting(node.type, wide), _converting(node.vector.type.element, wide)
         wrapped = wrapping(wide) if isinstance(wide, value_types.IntegerType) else float
@@ -845,7 +853,7 @@ def conversion(  # noqa: PLR0911  one for each kind
         if target.bits == 64:
             return float
         return numbers.f32_of_integer if isinstance(source, value_types.IntegerType) else numbers.f32
-    assert isinstance(target, value_types.IntegerType)  # noqa: S101  numbers are one of the three
+    assert isinstance(target, value_types.IntegerType)  # noqa: S101  a number has one of three types
     if isinstance(source, value_types.FloatingType):
         least, most = target.least, target.most
         return lambda value: numbers.truncate(value, least, most)

@@ -1,4 +1,4 @@
-"""How close comparisons of numbers came while a recording was replayed; monitors in force do not note it."""
+"""How close comparisons of numbers came during the replay of a recording. Monitors in force do not measure this."""
 
 import math
 from collections.abc import Iterator
@@ -11,8 +11,8 @@ from rosmop.run.engine import MonitorSet
 class Margin(NamedTuple):
     """The two sides of a comparison when they were closest, while it was true (`holds`) or while it was false.
 
-    `number` counts the monitor's comparisons in the order of the text; `threshold` is the side that is a constant, 0
-    or 1 (None: neither is).
+    `number` counts the monitor's comparisons in the order of the text. `threshold` is the constant side, 0 or 1 (None:
+    neither side is a constant).
     """
 
     monitor: str
@@ -30,12 +30,12 @@ class Margin(NamedTuple):
 
     @property
     def threshold_at(self) -> float | None:
-        """Return the constant at which it would have been reached; None if neither side is a constant."""
+        """Return the constant at which the result would have changed; None if neither side is a constant."""
         return None if self.threshold is None else (self.right, self.left)[self.threshold]
 
 
 class MarginReader:
-    """A reader of the margins of a set that was compiled with `margins`; make it before the set starts."""
+    """A reader of the margins of a set that was compiled with `margins`. Create the reader before the set starts."""
 
     def __init__(self, monitors: MonitorSet) -> None:
         self._monitors = monitors

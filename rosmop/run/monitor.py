@@ -18,14 +18,14 @@ from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import WireMessage
 
 FAILING_AFTER = 10
-"""Faults after which a monitor is shown as failing."""
+"""The number of faults after which a monitor is shown as failing."""
 
 
 class CellNames(msgspec.Struct, frozen=True, array_like=True):
     """The layout of a group's state in a module.
 
-    First the states of properties (monitor, number), then the variables (monitor, name; None if it is not state) with
-    their `struct` codes, then the clocks of the properties with these numbers.
+    First come the states of properties (monitor, number). Then come the variables (monitor, name; None if the cell is
+    not part of the state) with their `struct` codes, then the clocks of the properties with these numbers.
     """
 
     properties: list[tuple[str, int]] = []
@@ -47,14 +47,16 @@ class StateHolder(Protocol):
         """Copy the state to Python."""
 
     size: int
-    """Size of `cells`; 0 if the state is more than numbers."""
+    """Size of `cells` in bytes; 0 if the state does not consist only of numbers."""
 
     left: bool
     """Whether the state has been in Python since it was last saved."""
 
     def cells(self) -> bytes | None:
-        """Return the state in the module's memory if it is only numbers; empty if Python has had it since it was last
-        saved; None if the state must be saved as Python has it.
+        """Return the state in the module's memory, if it consists only of numbers.
+
+        The result is empty if the state has been in Python since the last save. It is None if the state must be saved
+        from Python.
         """
 
 
@@ -62,8 +64,8 @@ class StateHolder(Protocol):
 class MonitorGroup:
     """Monitors that share topics or variables, so that a message changes the state of at most one group.
 
-    `channels` are their topics and parts of services. `changed`: the state may have changed outside the module since
-    it was last saved.
+    `channels` are the topics and parts of services. `changed`: the state may have changed outside the module since it
+    was last saved.
     """
 
     monitors: tuple["MonitorInstance", ...]
@@ -77,8 +79,8 @@ Handler = Callable[[WireMessage | None], None]
 
 @dataclass(eq=False, slots=True)
 class RunningProperty:
-    """A property of a running specification: its run, the history that explains verdicts, and its handlers in source
-    order.
+    """A property of a running specification: its run, its handlers in source order, and the history that explains
+    verdicts.
     """
 
     index: int
@@ -93,7 +95,7 @@ class RunningProperty:
         self.history.begin(time_ns)
 
     def mark(self) -> Callable[[], None]:
-        """Return a function that undoes everything after this call except the passing of time."""
+        """Return a function that undoes everything since this call, except the passing of time."""
         run = cast("FormulaRun", self.run)
         before, history = run.mark(), self.history.mark()
 
@@ -109,7 +111,7 @@ class RunningProperty:
 class Step:
     """One event's processing of a message: its function, then its properties.
 
-    `past` counts how often since `told` the event did not happen because an index was past the end.
+    `past` counts how often the event did not happen because an index was past the end, since the last report (`told`).
     """
 
     monitor: "MonitorInstance"
@@ -118,7 +120,7 @@ class Step:
     name: str
     function: Callable[[WireMessage | None], bool]
     first: bool = False
-    """Whether it is the first of its monitor on its topic."""
+    """Whether it is the first step of its monitor on its topic."""
     past: int = 0
     told: int | None = None
     key: Callable[[WireMessage], Any] | None = None
@@ -147,14 +149,14 @@ class MonitorInstance:
     enabled: bool = True
     held: bool = False
     why_held: str = ""
-    """Why its state was lost, if it holds its topics for that."""
+    """Why its state was lost, if it holds its topics for that reason."""
     broken: bool = False
     """Whether its first values or `init` faulted, so that it has no valid state."""
     faults: int = 0
     seen: bool = False
-    """Whether a message of one of its events has come."""
+    """Whether a message for any of its events has come."""
     home: StateHolder | None = None
-    """The holder of its state, if that may be in a module."""
+    """The holder of its state, if the state may be in a module."""
     slices: Slices | None = None
     """The slices of a parametric specification. `properties` has the runs of the slice used last."""
     slice: Slice | None = None
@@ -171,7 +173,7 @@ class MonitorInstance:
 
     @property
     def failing(self) -> bool:
-        """Whether it failed to start, or has faulted often."""
+        """Whether the monitor failed to start or has faulted often."""
         return self.broken or self.faults >= FAILING_AFTER
 
     def hold(self, why: str = "") -> None:
@@ -188,7 +190,10 @@ class MonitorInstance:
             self.group.changed = True
 
     def move_to_python(self) -> None:
-        """Move its state to Python, before Python reads the state of this monitor or of others on its topics."""
+        """Move the state to Python.
+
+        Call this before Python reads the state of this monitor, or of other monitors on its topics.
+        """
         if self.home is not None:
             self.home.leave()
 

@@ -18,7 +18,10 @@ DROPPED = -1
 
 
 class MessageSender(NamedTuple):
-    """The source of a message (a number chosen by the caller; 0: none), and its sequence number, of this `kind`."""
+    """The source of a message (a number chosen by the caller; 0: none), and a sequence number of the given `kind`.
+
+    `kind` says which sequence number the message has.
+    """
 
     source: int = 0
     number: int = 0
@@ -40,9 +43,10 @@ class EventOccurrence(NamedTuple):
 
 
 class Explanation(NamedTuple):
-    """Events that alone give a verdict. If they are the `fewest`, none of them can be left out.
+    """Events that alone give a verdict. `fewest`: none of them can be left out.
 
-    With `since` (ns), they lead from the property's state at that time to the verdict; earlier events are not kept.
+    With `since` (ns), the events lead to the verdict from the property's state at that time; earlier events are not
+    kept.
     """
 
     events: tuple[EventOccurrence, ...]
@@ -93,25 +97,27 @@ def bound(verdict: Verdict) -> str:
 class Outcome:
     """The result of processing a message, and all events on the way.
 
-    `buffer` is the message to relay: the buffer that came in (changed in place where that was possible), or another.
+    `buffer` is the message to relay: the buffer that came in (changed in place where possible), or another buffer.
     `events` are named `specification.event`. `timer` names the source of a tick or deadline (`specification.tick`,
-    `specification.timeout`, `specification.deadline`); `time` is in nanoseconds. `before` are ticks and deadlines that
-    were due before this message. `shadowed` are the outcomes of the sets in shadow mode when a set starts.
+    `specification.timeout`, `specification.deadline`). `time` is in nanoseconds. `before` has the outcomes of ticks and
+    deadlines that were due before this message. `shadowed` has the outcomes of the sets in shadow mode when a set
+    starts.
 
-    `changed_by` are the events whose actions changed bytes of the message, in order; empty unless the result is
+    `changed_by` are the events whose actions changed bytes of the message, in order. It is empty unless the result is
     `changed`. `changed_at` are the positions of the statements that assigned to the changed fields. An event that
-    assigned nothing, or the same value, is not included. `dropped_by` is the specification that dropped the message:
-    at its last event, after a fault (`fatal`), or for `reason` (the topic is held, or the start failed).
-    `dropped_at` is the position of the statement, the action or the specification. `handling` has the verdicts whose
-    handlers dropped the message (under `DROPPED`) or published messages (under their places in `published`).
+    assigned nothing, or the same value, is not included. `dropped_by` is the specification that dropped the message: at
+    its last event, after a fault (`fatal`), or for `reason` (the topic is held, or the start failed). `dropped_at` is
+    the position of the statement, the action or the specification. `handling` has the verdicts whose handlers dropped
+    the message (key `DROPPED`) or published messages (keys: their indices in `published`).
 
-    `looked` are the conditions that were met on the way, by their sites, with the values that they compared: each
-    `when` of an event that happened, each `if` around a statement that dropped or changed the message, or published.
+    `looked` are the conditions that were met during processing, by site, with the values that they compared. They are
+    each `when` of an event that happened, and each `if` around a statement that dropped, changed or published a
+    message.
 
-    `overwritten` has, for a dropped message, the original bytes of the buffer that actions overwrote (place and bytes,
-    in order): `restore` writes them again.
+    For a dropped message, `overwritten` has the original bytes of the buffer that actions overwrote (position and
+    bytes, in order). `restore` writes these bytes again.
 
-    Most messages have none of this, so only the object itself is made for them.
+    Most messages have none of these, so only the object itself is created for them.
     """
 
     result: Result = "passed"

@@ -20,8 +20,10 @@ def no_holder(_source: int) -> Holder:
 
 
 class Quota(Generic[Thing]):
-    """The holdings of a bounded resource. A holder has at most as much as is free, so a later holder finds room, and no
-    other loses anything for it. The holder None is only bounded by the whole.
+    """The holdings of a bounded resource.
+
+    A holder may have at most as much as is still free, so that a later holder finds room and no other holder loses
+    anything. The holder None is limited only by the total.
     """
 
     def __init__(self, whole: int) -> None:
@@ -34,7 +36,7 @@ class Quota(Generic[Thing]):
         return len(self._of.get(holder, ()))
 
     def fits(self, holder: Holder, more: int) -> bool:
-        """Return whether the holder may have this number more."""
+        """Return whether the holder may have this many more things."""
         left = self.whole - self.total - more
         return left >= 0 and (holder is None or self.held(holder) + more <= max(left, 1))
 
@@ -56,7 +58,7 @@ class Quota(Generic[Thing]):
         return next(iter(self._of[holder]))
 
     def all(self) -> Iterator[tuple[Holder, Thing]]:
-        """Return all things with their holders, those of each the oldest first."""
+        """Yield all things with their holders; the things of each holder are sorted, oldest first."""
         return ((holder, thing) for holder, things in self._of.items() for thing in things)
 
     def clear(self) -> None:
@@ -65,5 +67,5 @@ class Quota(Generic[Thing]):
         self.total = 0
 
     def take_over(self, other: "Quota[Thing]") -> None:
-        """Take over the counts of another quota, with the bound of this one."""
+        """Take over the counts of another quota, but keep the limit of this quota."""
         self._of, self.total = other._of, other.total

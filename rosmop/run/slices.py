@@ -1,30 +1,31 @@
 """The slices of a running parametric specification (Chen and Roşu, "Parametric trace slicing and monitoring", 2012).
 
-A *binding* gives some or all of the parameters a value. The *slice* of a binding has the events that bind nothing
-beyond it, from the first `creation event` on (if there are none: from the first event on). Each slice whose events bind
-all parameters is monitored like a specification of its own.
+A *binding* gives a value to some or all of the parameters. The *slice* of a binding has the events whose bindings are
+part of it, from the first `creation event` on. Without creation events, the slice begins with the first event. Each
+slice whose events bind all parameters is monitored like a separate specification.
 
 Theory of operation:
 
-1. `targets` returns the slices of an event: those whose bindings agree with the event's, joined with it. A new slice
-   starts with the state of the largest known binding within it; that is unique, because the union of two known
-   bindings that agree is also known. Slices that lack a parameter (`seeds`) are kept for this, without output of their
-   actions and handlers.
-2. The engine loads each slice in turn into the monitor (`select`), steps it like any other, and stores the state again
-   (`settle`): tables, functions and handlers are those of specifications without parameters. If an event only changes
-   the states of automata, `step` and `quiet` do so directly.
-3. Each slice has its own clocks. `deadline` is the first deadline of all slices (a heap), `due` its slice. A slice has
-   one valid entry in the heap (`Slice.due`), which may be too early, but never too late.
-4. A slice ends when it cannot act any more: no event and no deadline leads to a handler, and actions only change its
-   own variables. Its binding is remembered, so that it does not start again. A slice in its initial state that any
-   relevant event would create again is forgotten at once.
-5. There are at most `limit` slices, and no host (*holder*) has more than are left for all others (`slice_quota.py`). At
-   its bound a host pays itself. If the specification only observes, the host's oldest slice is forgotten; if it acts on
-   messages or publishes, the new binding is `refused`, so that no host can get rid of an obligation. A host never
-   causes the removal of another host's slice. Ended bindings are remembered under the same rule. No binding has more
-   than `MAX_BINDING` bytes.
-6. These numbers bound the cost of one message. An event that does not bind all parameters may concern all slices; then
-   there are at most `TOGETHER_LIMIT`.
+1. `targets` returns the slices of an event: every known binding that agrees with the event's binding, joined with it. A
+   new slice starts with the state of the largest known binding within its own binding. That binding is unique, because
+   the union of two known bindings that agree is also known. Slices that lack a parameter (`seeds`) are kept for this
+   purpose; their actions and handlers have no output.
+2. The engine loads each slice in turn into the monitor (`select`), steps the monitor as usual, and stores the state
+   again (`settle`). Tables, functions and handlers are the same as without parameters. If an event only changes the
+   states of automata, `step` and `quiet` do so directly.
+3. Each slice has its own clocks. `deadline` is the first deadline of all slices (in a heap), and `due` is the slice
+   with that deadline. A slice has one valid entry in the heap (`Slice.due`), whose time may be too early, but never too
+   late.
+4. A slice ends when it cannot act any more: no event and no deadline leads to a handler, and its actions only change
+   its own variables. Its binding is remembered, so that the slice does not start again. A slice in its initial state is
+   forgotten at once if any relevant event would create it again.
+5. There are at most `limit` slices, and no host (*holder*) has more slices than are left for all other hosts
+   (`slice_quota.py`). A host at its limit pays with its own slices. If the specification only observes, the host's
+   oldest slice is forgotten. If the specification acts on messages or publishes, the new binding is `refused`, so that
+   no host can get rid of an obligation. A host never causes the removal of another host's slice. Ended bindings are
+   remembered under the same rule. No binding has more than `MAX_BINDING` bytes.
+6. These limits bound the cost of one message. An event that does not bind all parameters may concern all slices; then
+   the limit is `TOGETHER_LIMIT`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -51,16 +52,19 @@ from rosmop.runtime.action_context import FOLDED_NS
 from rosmop.types import value_types
 
 LIMIT = 100_000
-"""Default limit of slices of one specification."""
+"""The default limit for the slices of one specification."""
 
 GROWING_LIMIT = 1_000
-"""Limit if a run is more than the state of an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
+"""The limit if a run needs more than the state of an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
 
 TOGETHER_LIMIT = 250
-"""Limit if an event, or a tick, may concern all slices at once: 2 µs each, 20 µs with a verdict, in one turn."""
+"""The limit if an event, or a tick, may concern all slices at once.
+
+Each slice then takes 2 µs, or 20 µs with a verdict.
+"""
 
 MAX_BINDING = 256
-"""Most bytes of the strings in a binding."""
+"""The maximum number of bytes of all strings in a binding."""
 
 Key = tuple[Any, ...]
 """A binding: True, and the values of its parameters, in their order."""
@@ -68,14 +72,14 @@ Key = tuple[Any, ...]
 Binding = tuple[int, Key]
 """The bound parameters, as a set of bits, and their values."""
 
-_NAN = float("nan")  # this one object is found again, although NaN is not equal to itself
+_NAN = float("nan")  # dictionaries find this one object again, although NaN is not equal to itself
 
 
 @dataclass(eq=False, slots=True)
 class Slice:
     """One slice: the parameters of its binding (a set of bits), their values, its state, and the host that made it.
 
-    It is `kept` once an event has happened in it, and `gone` once it has ended or was forgotten.
+    The slice is `kept` once an event has happened in it, and `gone` once it has ended or was forgotten.
     """
 
     domain: int
@@ -88,7 +92,7 @@ class Slice:
     due: int | None = None
     """The time of its valid entry in the heap of deadlines."""
     turn: int = 0
-    """The number of that entry; at equal times the smallest comes first."""
+    """The number of that entry; at equal times, the smallest number comes first."""
 
     @property
     def deadline(self) -> int | None:
@@ -99,14 +103,14 @@ class Slice:
     def stand(self, states: Sequence[int]) -> None:
         """Set the states of its automata."""
         for run, state in zip(self.runs, states, strict=True):
-            run.state = state  # type: ignore[attr-defined]  # of tables
+            run.state = state  # type: ignore[attr-defined]  # runs over tables
 
 
 @dataclass(eq=False, slots=True)
 class _Known:
-    """The slices whose bindings have the same parameters; None for one that has ended.
+    """The slices whose bindings have the same parameters. The value is None for a slice that has ended.
 
-    `parts` has the same keys by the values of some of the parameters, for each set of parameters in use.
+    For each set of parameters in use, `parts` groups the same keys by the values of these parameters.
     """
 
     slices: dict[Key, Slice | None] = field(default_factory=dict)
@@ -124,7 +128,7 @@ class Slices:
         holder_of: HolderOf,
     ) -> None:
         """`holder_of(source)` is charged for the slices that messages of this source make."""
-        assert code.slicing is not None  # noqa: S101  who asks has looked
+        assert code.slicing is not None  # noqa: S101  the caller checks this
         properties = [declared.property for declared in code.properties]
         self._all = (1 << len(code.slicing.parameters)) - 1
         self.limit = limit
@@ -138,11 +142,11 @@ class Slices:
         self.refused: Mapping[str, object] | None = None
         """The binding of the last event that cannot have a slice."""
         self.why = ""
-        """The reason."""
+        """The reason why it cannot."""
         self.changed: dict[Binding, Holder] | None = None
         """Bindings whose state has changed since it was last saved, with their hosts; None if it is not saved."""
         self.behind: list[Slice] = []
-        """Slices of the last event with earlier deadlines that are not processed yet."""
+        """Slices of the last event whose earlier deadlines are not processed yet."""
         self._code = code
         self._holder_of = holder_of
         self._namespace = namespace
@@ -178,7 +182,7 @@ class Slices:
         return self.quota.total
 
     def _look_at(self, properties: Sequence[PropertyCode]) -> None:
-        """Compute the states of automata in which a slice is over, counts as absent, or is only a state."""
+        """Compute in which states of automata a slice is over, counts as absent, or consists only of its state."""
         self._properties, events = properties, self._code.events
         finite = [declared for declared in properties if isinstance(declared.property, FiniteProperty)]
         every = len(finite) == len(properties)
@@ -197,7 +201,7 @@ class Slices:
         ]
 
     def begin(self, properties: Sequence[PropertyCode], runs: tuple[Run, ...]) -> None:
-        """Start without slices; new ones begin with the present state of the specification."""
+        """Start without slices. New slices begin with the present state of the specification."""
         self._look_at(properties)
         zero = tuple(self._namespace[code] for _, code, _ in self._parameters)
         values = self.own()
@@ -223,7 +227,8 @@ class Slices:
     def step(self, event: int, key: Key) -> bool | None:
         """Step the slice of an event that binds all parameters, if the only effect is new states.
 
-        Return whether it happened (False if the slice is over). None: there is more to do, and nothing is done.
+        Return whether the event happened (False if the slice is over). Return None, and do nothing, if the event has
+        other effects.
         """
         if key not in self._whole:
             return None
@@ -263,9 +268,10 @@ class Slices:
         self._note(slice_)
 
     def targets(self, event: EventCode, key: Key, time_ns: int, source: int) -> Sequence[Slice]:
-        """Return the slices of an event: first those with all parameters, in the order in which they began.
+        """Return the slices of an event, in the order in which they began, but slices with all parameters first.
 
-        New slices begin at this time, and belong to the host of `source`. `refused` is set if there would be more.
+        New slices begin at this time, and belong to the host of `source`. `refused` is set if a slice cannot be
+        created.
         """
         self.refused = None
         self.behind = []
@@ -304,7 +310,7 @@ class Slices:
         return slice_
 
     def _with(self, domain: int, part: int, key: Key) -> Sequence[Key]:
-        """Return the keys of this domain with these values of the parameters in `part`."""
+        """Return the keys of this domain in which the parameters in `part` have these values."""
         known = self._known[domain]
         if part == domain:
             return (key,) if key in known.slices else ()
@@ -329,7 +335,7 @@ class Slices:
         return [slice_ for slice_ in found if slice_ is not None]
 
     def _derived(self, domain: int, key: Key, most: int) -> Slice | None:
-        """Return a slice with the state of the largest known binding within this one; None if that has ended."""
+        """Return a slice with the state of the largest known binding within `key`; None if that slice has ended."""
         values = dict(zip(_members(domain), key[1:], strict=True))
         parent: Slice | None = self._first
         for other in sorted(self._known, key=int.bit_count, reverse=True):
@@ -362,7 +368,7 @@ class Slices:
         return f"its host has {held} of {self.limit} slices, as many as are left for all other hosts"
 
     def _has_room(self, most: int) -> bool:
-        """Return whether the host may have this number of slices more, or can forget some of its own."""
+        """Return whether the host may have this many more slices, or can forget some of its own."""
         return self.quota.fits(self._holder, most) or (self._forgets and self.quota.held(self._holder) > 0)
 
     def _refuse(self, domain: int, key: Key, why: str) -> None:
@@ -371,7 +377,7 @@ class Slices:
     # The state of the monitor
 
     def select(self, slice_: Slice) -> tuple[Run, ...]:
-        """Load the values of variables of this slice; return its runs, for the properties."""
+        """Load the variables of this slice, and return its runs for the properties."""
         namespace = self._namespace
         if slice_.domain == self._all:
             for (_, code, _), value in zip(self._parameters, slice_.key[1:], strict=True):
@@ -391,7 +397,7 @@ class Slices:
     def settle(
         self, slice_: Slice, runs: tuple[Run, ...], values: tuple[Any, ...], *, happened: bool
     ) -> None:
-        """Store the state in the slice; a slice that begins with this event stays only if the event `happened`."""
+        """Store the state in the slice. A slice that begins with this event is kept only if the event `happened`."""
         slice_.runs, slice_.values = runs, values
         if slice_.gone:
             return
@@ -410,7 +416,10 @@ class Slices:
             self._await(slice_)
 
     def forgotten(self, time_ns: int) -> str:
-        """Return the number of slices forgotten for others of their host, as text; only now and then, else empty."""
+        """Return as text how many slices were forgotten for newer slices of the same host.
+
+        The text is empty if there are none, or if the last report was less than `FOLDED_NS` ago.
+        """
         number = self._forgotten
         if not number or (self._told is not None and time_ns - self._told < FOLDED_NS):
             return ""
@@ -445,7 +454,7 @@ class Slices:
         return self._deadlines[0][2]
 
     def _await(self, slice_: Slice) -> None:
-        """Ensure that the deadline of a slice, or an earlier time, is in the heap."""
+        """Ensure that the heap has an entry for the slice, at its deadline or earlier."""
         deadline = slice_.deadline
         if deadline is None or (slice_.due is not None and slice_.due <= deadline):
             return
@@ -456,7 +465,7 @@ class Slices:
             self._tidy()
 
     def _tidy(self) -> None:
-        """Remove invalid entries, which are most of them."""
+        """Remove the invalid entries of the heap, which are most of its entries."""
         self._deadlines = [one for one in self._deadlines if one[0] == one[2].due and not one[2].gone]
         heapify(self._deadlines)
 
@@ -477,7 +486,7 @@ class Slices:
     # State
 
     def keep(self) -> None:
-        """Track changed bindings from now on, starting with all present ones."""
+        """Track changed bindings from now on, starting with all present bindings."""
         self.changed = {
             (domain, key): None if slice_ is None else slice_.holder
             for domain, known in self._known.items()
@@ -534,8 +543,9 @@ class Slices:
         return slice_.domain == self._all
 
     def mark(self, slice_: Slice) -> Callable[[], None]:
-        """Return a function that undoes everything in the formulas of a slice from here on, except time. With formulas
-        only, it also undoes the beginning of a slice.
+        """Return a function that undoes all later changes to the formulas of a slice, except the passing of time.
+
+        If the slice has only formulas, the function also undoes the beginning of the slice.
         """
         runs = slice_.runs
         begun = not slice_.kept and all(self._formulas)
@@ -567,7 +577,7 @@ class Slices:
         binding = (slice_.domain, slice_.key)
         known = self._known[slice_.domain].slices
         if known.get(slice_.key) is not None:
-            return  # another slice has begun since
+            return  # another slice has begun since then
         if slice_.key in known:
             self._ended.give_back(slice_.holder, binding)
         slice_.gone = False
@@ -602,7 +612,7 @@ class Slices:
         self._put(slice_.domain, slice_.key, slice_)
 
     def _leave(self, slice_: Slice) -> None:
-        """Remove a slice from the live ones."""
+        """Remove a slice from the live slices."""
         slice_.gone = True
         self.quota.give_back(slice_.holder, (slice_.domain, slice_.key))
 
@@ -617,7 +627,7 @@ class Slices:
             self._note(slice_)
 
     def _remember(self, domain: int, key: Key, holder: Holder) -> None:
-        """Remember that this binding has ended, until the host has too many of these."""
+        """Remember that this binding has ended, until the host has too many ended bindings."""
         while not self._ended.fits(holder, 1):
             if not self._ended.held(holder):
                 if key in self._known[domain].slices:
@@ -651,7 +661,7 @@ def of_nan(key: Key) -> Key:
 
 def _states(runs: Sequence[Run]) -> list[int]:
     """Return the states of automata."""
-    return [run.state for run in runs]  # type: ignore[attr-defined]  # of tables
+    return [run.state for run in runs]  # type: ignore[attr-defined]  # runs over tables
 
 
 def _domain(event: EventCode) -> int:
@@ -667,7 +677,7 @@ def _key(values: Mapping[int, Any], domain: int) -> Key:
 
 
 def _joined(domains: Iterator[int]) -> list[int]:
-    """Return the possible sets of bound parameters: those of one event, or of several together."""
+    """Return the possible sets of bound parameters: the parameters of one event, or of several events together."""
     found: set[int] = set()
     for domain in domains:
         found |= {domain, *(domain | other for other in found)}
@@ -676,7 +686,7 @@ def _joined(domains: Iterator[int]) -> list[int]:
 
 def _calm(code: PropertyCode, event: int, lost: frozenset[int], renews: bool) -> list[int]:
     """Return the state after an event for each state; -1 if a handler runs or the slice may end."""
-    assert isinstance(code.property, FiniteProperty)  # noqa: S101  who asks has looked
+    assert isinstance(code.property, FiniteProperty)  # noqa: S101  the caller checks this
     automaton, handled = code.property.automaton, {*code.order}
     return [
         -1
@@ -709,7 +719,7 @@ def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
     if isinstance(compiled, FiniteProperty):
         automaton = compiled.automaton
         return [[(target, automaton.verdicts[target]) for target in row] for row in automaton.table]
-    assert isinstance(compiled, ClockedProperty)  # noqa: S101  who asks has looked
+    assert isinstance(compiled, ClockedProperty)  # noqa: S101  the caller checks this
     verdicts = compiled.verdicts
     found = []
     for early, late, wait in zip(compiled.moves, compiled.late, compiled.waits, strict=True):
@@ -719,7 +729,9 @@ def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
 
 
 def _renews(events: Sequence[EventCode], properties: Sequence[PropertyCode], everything: int) -> bool:
-    """Return whether a slice in its initial state may be forgotten: each event begins one, or does not change it."""
+    """Return whether a slice in its initial state may be forgotten: each event either creates a slice or does not
+    change it.
+    """
     return all(
         _domain(event) == everything
         and (event.creates or (event.plain and all(_stays(one, number) for one in properties)))

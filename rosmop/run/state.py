@@ -1,11 +1,11 @@
-"""The state of monitors as data that outlives their process: written group by group, read back under limits.
+"""The state of monitors as data that outlives their process. It is written group by group, and read back under limits.
 
 A group has the specifications that share topics or variables, so a message changes the state of at most one group. The
-saved state is everything that affects the next message: variables, runs of properties, timers, and whether a monitor
+saved state is everything that affects later messages: variables, runs of properties, timers, and whether a monitor
 holds its topics. The events that explain a verdict, and the times of throttled output, are not saved.
 
-The state of a group whose variables are numbers is saved as the bytes in the module's memory (`CellNames` describes
-them), which keeps the common path cheap. Times are those of the caller's clock, which the next process continues.
+If the variables of a group are numbers, its state is saved as the bytes in the module's memory, which `CellNames`
+describes. This keeps the common case cheap. Times are those of the caller's clock, which the next process continues.
 """
 
 import hashlib
@@ -27,7 +27,10 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 MOST_BYTES = 64 << 10
-"""Most bytes of a group's state, without slices. It is written with each batch that changes it."""
+"""The maximum number of bytes of a group's state, without slices.
+
+The state is written with each batch that changes it.
+"""
 
 _CLOCK = struct.Struct("<qq")
 
@@ -67,20 +70,20 @@ def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
 
 
 def refused(why: str) -> bytes:
-    """Return the bytes that are written instead of a state that is not kept."""
+    """Return the bytes that are written instead of a state that cannot be saved."""
     return msgspec.msgpack.encode(why)
 
 
 GroupSnapshot = tuple[Sequence[str], bytes, bytes, bytes | None]
 """The saved state of a group: the names of its monitors, the layout of its cells (`CellNames` as MessagePack), their
-state (`encoded`, `refused`), and the cells of the module if these are later.
+state (`encoded`, `refused`), and the cells of the module if they are newer.
 """
 
 
 def states_of(
     groups: Sequence[GroupSnapshot],
 ) -> tuple[dict[str, MonitorSnapshot], dict[str, list[SliceSnapshot]], dict[str, str]]:
-    """Return the saved states (for each monitor the last), their slices, and why others are lost."""
+    """Return the last saved state of each monitor, the slices, and the reasons why other states are lost."""
     found: dict[str, MonitorSnapshot] = {}
     slices: dict[str, list[SliceSnapshot]] = {}
     lost: dict[str, str] = {}
@@ -176,7 +179,7 @@ def restore(
     *,
     time_ns: int,
 ) -> None:
-    """Restore the state of a new monitor. Raises `ValueError`; the monitor must then start."""
+    """Restore the state of a new monitor. If this raises `ValueError`, the monitor must be started."""
     code, values, types = monitor.code, state.variables, compiled.types
     fits = partial(_fits, ValueCodec(compiled.messages))
     properties = monitor.properties if monitor.slices is None else ()
@@ -218,7 +221,7 @@ _HELD: Mapping[type, type | tuple[type, ...]] = MappingProxyType(
 
 
 def _fits(known: ValueCodec, kind: Type, value: Any) -> bool:
-    """Return whether a value has a type, as variables hold it."""
+    """Return whether a value is valid for a variable of a type."""
     if isinstance(kind, value_types.VectorType):
         return (
             isinstance(value, list)
@@ -266,7 +269,7 @@ def guards(compiled: Compiled) -> frozenset[str]:
             elif isinstance(node, nodes.Assign) or (
                 isinstance(node, nodes.Read)
                 and isinstance(node.type, value_types.VectorType | value_types.RecordType)
-            ):  # the contents of a vector or message may change in place
+            ):  # the content of a vector or message may change in place
                 used.add(node.name)
     return frozenset(
         code.name

@@ -1,8 +1,8 @@
 """Runs of properties as plain data that outlives a process, and back.
 
-A run names the attributes that change (`keeps`). Their values become numbers, strings and arrays of MessagePack: a
-container is `[tag, item, …]`, an object with several references `["o", number]`, with its fields in the entry of that
-number in a table. Reading creates only objects of the classes below.
+A run names the attributes that change (`keeps`). Their values become numbers, strings and arrays of MessagePack. A
+container is `[tag, item, …]`. An object with several references is `["o", number]`; the table entry with that number
+has its fields. Reading creates only objects of the classes below.
 """
 
 from collections import deque
@@ -16,7 +16,7 @@ from rosmop.logics.interface import ClockedRun, CompiledProperty, FiniteRun, Run
 from rosmop.logics.parsing import EarleySet, EarleyShape
 
 MOST_PARTS = 5_000
-"""Most objects of one run: more than a hundred times the usual number."""
+"""The maximum number of objects of one run: more than a hundred times the usual number."""
 
 _CONTAINERS: Mapping[str, Callable[[list[Any]], Any]] = MappingProxyType(
     {"l": list, "t": tuple, "d": deque, "s": set}
@@ -50,7 +50,7 @@ def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
 
 
 class _Writer:
-    """A writer of the parts of one run, each once."""
+    """A writer of the parts of one run, each part once."""
 
     def __init__(self, run: Any) -> None:
         self._run = run
@@ -68,7 +68,7 @@ class _Writer:
             for name in self._run.keeps
         ]
         parts: list[Any] = []
-        for part in self._parts:  # which grows while parts refer to others
+        for part in self._parts:  # the list grows while parts refer to other parts
             if len(parts) >= MOST_PARTS:
                 raise StateTooLargeError(f"a property has more than {MOST_PARTS} parts")
             parts.append(self._part(part))

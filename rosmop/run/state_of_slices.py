@@ -1,8 +1,8 @@
-"""The slices of a running parametric specification as data: only what a message changes is written.
+"""The slices of a running parametric specification as data. Only the parts that a message changes are written.
 
-The slices are divided by their bindings into `BUCKETS` parts. A part is written as a whole when one of its slices has
-changed. So a message costs as much as a part, a hundredth of all slices, and a part is written completely or not at
-all.
+The slices are divided by their bindings into `BUCKETS` parts. If one slice of a part has changed, the whole part is
+written. So a message costs the writing of one part, a hundredth of all slices, and a part is written completely or not
+at all.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +21,7 @@ BUCKETS = 128
 class SliceSnapshot(msgspec.Struct, frozen=True, array_like=True):
     """A slice: the parameters of its binding (a set of bits), their values, the host that is charged for it, its state.
 
-    `number` counts in the order in which they began, or ended. One that has `ended` has no state.
+    `number` counts the slices in the order in which they began or ended. A slice that has `ended` has no state.
     """
 
     number: int
@@ -108,8 +108,9 @@ def restore_slices(
     fits: Callable[[Type, Any], bool],
     time_ns: int,
 ) -> None:
-    """Give a new specification these slices; `first` has the initial values of parameters and of the slices' own
-    variables. Raises `ValueError`.
+    """Give a new specification these slices. Raises `ValueError`.
+
+    `first` has the initial values of parameters and of the slices' own variables.
     """
     assert code.slicing is not None  # noqa: S101  it is parametric
     parameters = [kind for _, _, kind in code.slicing.parameters]

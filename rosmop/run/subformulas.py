@@ -1,4 +1,4 @@
-"""Finds the sub-formulas that decide a past-time formula over the events that explain a verdict.
+"""Finds the subformulas that decide a past-time formula over the events that explain a verdict.
 
 An explanation has few events, so the formula is evaluated by its definition, position by position.
 """
@@ -26,9 +26,9 @@ _MOST = 8
 
 
 def deciding(source: Source, why: Explanation) -> list[str]:
-    """Return the sub-formulas that decide the formula at the last of the events, with their values there.
+    """Return the subformulas that decide the formula at the last event, with their values there.
 
-    Empty for other logics, for formulas about the future, and if earlier events also matter.
+    The result is empty for other logics, for formulas about the future, and if earlier events also matter.
     """
     syntax = _SYNTAXES.get(source.logic)
     if syntax is None or why.since is not None or not 0 < len(why.events) <= _MOST_EVENTS:
@@ -109,7 +109,7 @@ class Meaning:
         )
 
     def _past(self, operator: str, formula: Formula, places: list[int], *, dual: bool) -> bool:
-        """Evaluate an operator over these positions; `dual` negates operands and result."""
+        """Evaluate an operator over these positions; `dual` negates the operands and the result."""
         low, high = formula.bounds or (0, None)
         *first, last = formula.operands
         now = self._times[places[-1]]

@@ -1,11 +1,12 @@
 """Ticks (`every`) and deadlines, in the order of their times.
 
-The caller gives the time, in nanoseconds. Ticks up to and including a time happen, and deadlines before it. Ticks that
-take longer than the caller's `patience` are skipped, which is logged; deadlines wait for the next call.
+The caller gives the time, in nanoseconds. At a given time, all ticks up to and including that time happen, and all
+deadlines before it. Ticks beyond the caller's `patience` are skipped, which is logged. Deadlines wait for the next
+call.
 
-Slices of parametric specifications have their own deadlines. Senders choose the bindings, and so how many deadlines
-pass at one time. Therefore `advance` processes at most `most` of them; the others are due again at once. A slice takes
-no message before its own deadlines have passed (`MonitorExecution`).
+Slices of parametric specifications have their own deadlines. Senders choose the bindings, and thereby how many
+deadlines pass at one time. Therefore `advance` processes at most `most` deadlines; the others stay due. A slice
+processes no message before its own deadlines have passed (`MonitorExecution`).
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +18,10 @@ from rosmop.run.outcomes import Outcome
 Patience = Callable[[], Callable[[], bool]]
 
 MAX_TICKS = 100_000
-"""Most ticks of one timer between two messages; after a larger jump of the clock the rest is skipped and reported."""
+"""The maximum number of ticks of one timer between two messages.
+
+After a larger jump of the clock the rest is skipped and reported.
+"""
 
 
 class Agenda:
@@ -26,7 +30,9 @@ class Agenda:
     def __init__(
         self, monitors: Sequence[MonitorInstance], execution: MonitorExecution, patience: Patience, most: int
     ) -> None:
-        """`patience()` is called when something is due; its result returns whether that takes too long."""
+        """`patience()` is called when something is due; it returns a function that returns whether the work takes too
+        long.
+        """
         self.due: int | None = None
         """Time of the next tick or deadline; None if there is none."""
         self._monitors = monitors
@@ -59,7 +65,10 @@ class Agenda:
         self.due = min(times, default=None)
 
     def when_due(self, *, anew: bool) -> int | None:
-        """Return the next time that something is due; with `anew`, compute it: lanes may have moved deadlines."""
+        """Return the next time that something is due.
+
+        With `anew`, compute it again, because lanes may have moved deadlines.
+        """
         if anew:
             self.schedule()
         return self.due
@@ -134,7 +143,10 @@ class Agenda:
     def _next_deadline(
         self, *, slices: bool = True
     ) -> tuple[int, MonitorInstance, RunningProperty | None] | None:
-        """Return the next deadline and its property (None: it is a slice's; only with `slices`)."""
+        """Return the next deadline and its property.
+
+        The property is None for a slice's deadline (only with `slices`).
+        """
         found: tuple[int, MonitorInstance, RunningProperty | None] | None = None
         for monitor in self._monitors:
             if monitor.enabled and monitor.slices is not None:

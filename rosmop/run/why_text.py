@@ -5,7 +5,7 @@ from typing import Any
 
 
 def lines_of_why(why: Mapping[str, Any]) -> Iterator[str]:
-    """Return a line for each event of an explanation, and one on how far they explain it."""
+    """Yield a line for each event of an explanation, and a line that says how far the events explain the verdict."""
     events = list_of(why.get("events"))
     if not why:
         return
@@ -40,10 +40,10 @@ def named(event: Mapping[str, Any]) -> str:
 
 
 def mapping_of(value: object) -> Mapping[str, Any]:
-    """Return the value if it is a mapping, else an empty one."""
+    """Return the value if it is a mapping, otherwise an empty mapping."""
     return value if isinstance(value, dict) else {}
 
 
 def list_of(value: object) -> list[Any]:
-    """Return the value if it is a list, else an empty one."""
+    """Return the value if it is a list, otherwise an empty list."""
     return value if isinstance(value, list) else []
