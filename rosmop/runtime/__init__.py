@@ -1,5 +1,5 @@
 """The functions that specifications call: arithmetic as in C++, strings, vectors, output, bounds.
 
-They do no I/O: each message brings the time, and output is returned as values. The last argument of a function that
-can fault is the number of the *site* (a position in the specification).
+They do no I/O: the time comes with each message, and output is returned as values. If a function can fault, its last
+argument is the number of the *site* (a position in the specification).
 """

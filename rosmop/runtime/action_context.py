@@ -3,8 +3,8 @@
 Invariants:
 
 1. Between two calls of `begin` a specification spends at most its budget of instructions. Loops, calls, copies of long
-   values and reading many elements of a message are charged first. If processor time is bounded (`Turn.limit`), it is
-   read every `STEP` instructions, and every `PART` elements of a loop or copy.
+   values, and reads of many elements are charged before they run. If processor time is bounded (`Turn.limit`), the
+   clock is read every `STEP` instructions, and every `PART` elements of a loop or copy.
 2. The values of a specification never exceed `MAX_BYTES` plus `UNMEASURED` bytes. Code that makes long values calls
    `allocate`; after `UNMEASURED` bytes the live values are measured.
 """
@@ -29,7 +29,7 @@ STEP = 250
 PART = 250
 """Elements read or made between two readings of the processor time."""
 
-_AT_ONCE = 10e-9  # minimum seconds of an instruction, for many that are charged in advance
+_AT_ONCE = 10e-9  # seconds: the least that an instruction takes, where many are charged in advance
 
 MAX_BYTES = 16 << 20
 """The maximum size in bytes of all values of a specification together."""
@@ -42,7 +42,7 @@ MAX_CALLS = 100
 
 BYTES_PER_INSTRUCTION = 64
 OUTPUT_COST = 100  # instructions for a line of output or a published message
-# an event that does not happen because of an index past the end is reported once in this time
+# An event that does not happen because an index is past the end is reported at most once in this time.
 FOLDED_NS = 60 * 10**9
 
 Measure = Callable[[object], int]
@@ -71,12 +71,12 @@ class LogLine:
 
 
 def line_of(level: str, text: bytes, monitor: str) -> LogLine:
-    """Return a line of output; U+FFFD replaces bytes that are not UTF-8."""
+    """Return a line of output. U+FFFD replaces bytes that are not UTF-8."""
     return LogLine(level, text.decode("utf-8", "replace").rstrip("\n"), monitor)
 
 
 class Published(NamedTuple):
-    """A message that a monitor publishes; `site` is that of the statement."""
+    """A message that a monitor publishes; `site` is the site of the statement."""
 
     monitor: str
     topic: str
@@ -93,18 +93,18 @@ class Turn:
     log: list[LogLine] = field(default_factory=list)
     published: list[Published] = field(default_factory=list)
     looked: dict[int, tuple[Any, ...]] = field(default_factory=dict)
-    reset: bool = False  # `__RESET;` ran, for the property whose handlers run
-    clock: Callable[[], float] | None = None  # returns seconds of processor time; None: no bound
+    reset: bool = False  # set by `__RESET;` for the property whose handlers run
+    clock: Callable[[], float] | None = None  # returns seconds of processor time; None: unlimited
     seconds: float = inf
-    part: float = 1.0  # of `seconds`
+    part: float = 1.0  # the usable fraction of `seconds`
     until: float = inf
 
     def limit(self, clock: Callable[[], float], seconds: float) -> None:
-        """Limit the processor time of each message, tick or deadline from the next one on."""
+        """Limit the processor time of each message, tick or deadline, starting with the next."""
         self.clock, self.seconds = clock, seconds
 
     def begin(self) -> None:
-        """Start the processor time of a message, a tick or a deadline."""
+        """Start to measure the processor time of a message, a tick or a deadline."""
         if self.clock is not None:
             self.until = self.clock() + self.seconds * self.part
 
@@ -159,12 +159,14 @@ class Context:
         measures: Mapping[str, Measure],
         live: Callable[[], Sequence[Mapping[str, object]]],
     ) -> None:
-        """`live` returns the values of the set's and each call's variables; `measures` has a function for each name."""
+        """`live` returns the values of the set's variables and of all calls' variables; `measures` has a function for
+        each name.
+        """
         self.monitor = monitor
         self.turn = turn
         self.most = BUDGET
-        self.budget = BUDGET  # until the processor time is read again
-        self._left = 0  # of the budget after that
+        self.budget = BUDGET  # instructions until the processor time is read again
+        self._left = 0  # the rest of the budget after that
         self.throttled: dict[int, int] = {}
         self._allocated = 0
         self._measures = measures
@@ -193,7 +195,7 @@ class Context:
             self._go_on(site, "; is there an endless loop?")
 
     def walk(self, elements: int) -> None:
-        """Charge for reading elements of arrays one by one, to reach a field after them."""
+        """Charge for reading array elements one by one to reach a later field."""
         self.budget -= elements
         if self.budget < 0:
             self._go_on(-1, ": too many elements precede a field")
@@ -212,7 +214,7 @@ class Context:
         self.budget += given
 
     def allocate(self, size: int, site: int, replaced: int = 0) -> None:
-        """Charge for making or copying `size` bytes, which replace `replaced` bytes of a variable."""
+        """Charge for `size` new or copied bytes, which replace `replaced` bytes of a variable."""
         if size > MAX_BYTES:
             raise FaultError(site, f"{_TOO_LARGE}: a value of {size} bytes")
         self.spend(size // BYTES_PER_INSTRUCTION, site)

@@ -1,7 +1,7 @@
 """The functions that the form may call, by name.
 
-A first parameter `context` gets the context of the running specification, to charge it; a last parameter `site` gets
-the position of a fault.
+If the first parameter is `context`, it gets the context of the running specification, to charge the call to it. If the
+last parameter is `site`, it gets the position to report for a fault.
 """
 
 import inspect

@@ -7,12 +7,12 @@ _LONG = 1024  # bytes; shorter text is not charged in advance
 
 
 def to_text_integer(value: int) -> bytes:
-    """Return `std::to_string` of an integer, and `<<` of one."""
+    """Return the text of an integer as printed by `std::to_string` and by `<<`."""
     return b"%d" % value
 
 
 def to_text_streamed(value: float) -> bytes:
-    """Return the text of `std::cout << value`: six digits in all."""
+    """Return the text of `std::cout << value`: six significant digits."""
     return b"%g" % value
 
 
@@ -36,7 +36,7 @@ def to_text_character(value: int) -> bytes:
 
 
 def to_text_alternate(template: bytes, value: int) -> bytes:
-    """Return the text of `printf` with the flag `#`: octal begins with a 0, hexadecimal with 0x unless it is zero."""
+    """Return the text of `printf` with the flag `#`: octal begins with 0, and nonzero hexadecimal with 0x."""
     if not value:
         return template % value
     if template[-1:] != b"o":
@@ -77,7 +77,7 @@ def join_all(context: Context, pieces: tuple[bytes, ...], site: int) -> bytes:
 def formatted(
     context: Context, template: bytes, arguments: tuple[object, ...], size: int, site: int
 ) -> bytes:
-    """Return `template % arguments`, charged in advance; `size` is its length without strings."""
+    """Return `template % arguments`, charged in advance. `size` is the length of the text without its strings."""
     size += sum(len(argument) for argument in arguments if isinstance(argument, bytes))
     if size > _LONG:
         context.allocate(size, site)

@@ -22,8 +22,9 @@ def f32(value: float) -> float:
 
 
 def f32_of_integer(value: int) -> float:
-    """Return the nearest 32-bit float. The low bits of an integer beyond 2**53, which a double cannot hold, are first
-    merged into one bit, so that it is rounded only once.
+    """Return the nearest 32-bit float, rounded only once.
+
+    A double cannot hold an integer beyond 2**53, so the low bits of such an integer are first merged into one bit.
     """
     if -_EXACT <= value <= _EXACT:
         return f32(value)
@@ -75,7 +76,7 @@ def ratio(left: float, right: float) -> float:
 
 
 def _total(function: Callable[..., float]) -> Callable[..., float]:
-    """Return the function with C's results where Python's function raises."""
+    """Return the function with C's results wherever Python's function raises."""
 
     def answer(*arguments: float) -> float:
         try:
@@ -140,7 +141,7 @@ def trunc(value: float) -> float:
 
 
 def fma(left: float, right: float, added: float) -> float:
-    """Return C's `fma`: rounded once."""
+    """Return C's `fma`, which rounds only once."""
     if not (math.isfinite(left) and math.isfinite(right)):
         return left * right + added
     if not math.isfinite(added):
@@ -164,12 +165,12 @@ def _inverse_hyperbolic_tangent(value: float) -> float:
 
 
 def fmin(left: float, right: float) -> float:
-    """Return C's `fmin`: a number wins over NaN."""
+    """Return C's `fmin`: if one value is NaN, the result is the other."""
     return right if left != left or right < left else left  # noqa: PLR0124  NaN
 
 
 def fmax(left: float, right: float) -> float:
-    """Return C's `fmax`: a number wins over NaN."""
+    """Return C's `fmax`: if one value is NaN, the result is the other."""
     return right if left != left or right > left else left  # noqa: PLR0124  NaN
 
 
@@ -237,7 +238,7 @@ def _of_floats(name: str, count: int) -> Callable[..., float]:
     function = getattr(ctypes.CDLL("libm.so.6"), f"{name}f")
     function.argtypes, function.restype = [ctypes.c_float] * count, ctypes.c_float
 
-    def call(*values: float) -> float:  # hides the other attributes of the library's object
+    def call(*values: float) -> float:  # this wrapper hides the other attributes of the library's object
         result: float = function(*values)
         return result
 

@@ -44,7 +44,7 @@ def repeat(context: Context, count: int, character: int, site: int) -> bytes:
 
 
 def character(text: bytes, index: int, site: int) -> int:
-    """Return `text[index]`, a signed char; the one after the last is 0."""
+    """Return `text[index]`, a signed char. The character after the last is 0."""
     if 0 <= index < len(text):
         value = text[index]
         return value - 256 if value > 127 else value
@@ -54,7 +54,7 @@ def character(text: bytes, index: int, site: int) -> int:
 
 
 def member(text: bytes, index: int, site: int) -> int:
-    """Return `text.at(index)`, `front` or `back`: like `character`, but the one after the last is a fault."""
+    """Return `text.at(index)`, `front` or `back`. Unlike in `character`, the index after the last is a fault."""
     if index == len(text):
         raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
     return character(text, index, site)
@@ -205,7 +205,7 @@ def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> i
         raise FaultError(site, "the string does not begin with a number")
     value = int(b"".join(found.groups()), base)
     if not least and -most <= value < 0:
-        return value + most + 1  # C++ wraps a negative number where an unsigned one is wanted
+        return value + most + 1  # C++ wraps a negative number if the result is unsigned
     if not least <= value <= most:
         raise FaultError(site, f"the number does not fit; it must be from {least} to {most}")
     return value
@@ -224,12 +224,12 @@ def parse_floating(text: bytes, bits: int, site: int) -> float:
 
 
 def lenient_integer(text: bytes) -> int:
-    """Return `atoi`: 0 for text that is not a number."""
+    """Return `atoi(text)`: 0 for text that is not a number."""
     found = re.match(rb"\s*[+-]?[0-9]{1,18}", text[:1000])
     return int(found[0]) if found else 0
 
 
 def lenient_floating(text: bytes) -> float:
-    """Return `atof`: 0 for text that is not a number."""
+    """Return `atof(text)`: 0 for text that is not a number."""
     found = _FLOATING.match(text[:1000])
     return float(found[1]) if found else 0.0

@@ -11,21 +11,21 @@ MAX_DURATION = (1 << 31) * BILLION - 1
 
 
 def time(nanoseconds: int, site: int) -> int:
-    """Return a time; fault where C++ throws."""
+    """Return the time if messages can hold it; fault where C++ throws."""
     if 0 <= nanoseconds <= MAX_TIME:
         return nanoseconds
     raise FaultError(site, "the time is out of range: from 0 to 2^32 seconds")
 
 
 def duration(nanoseconds: int, site: int) -> int:
-    """Return a duration; fault where C++ throws."""
+    """Return the duration if messages can hold it; fault where C++ throws."""
     if MIN_DURATION <= nanoseconds <= MAX_DURATION:
         return nanoseconds
     raise FaultError(site, "the duration is out of range: 2^31 seconds")
 
 
 def nanoseconds(seconds: float, site: int) -> int:
-    """Return seconds as nanoseconds, rounded as in ROS: whole seconds first."""
+    """Return seconds as nanoseconds, rounded as in ROS, which splits off the whole seconds first."""
     if not math.isfinite(seconds) or abs(seconds) > 1 << 33:
         raise FaultError(site, f"{seconds} seconds are out of range")
     whole = math.floor(seconds)

@@ -30,7 +30,10 @@ BILLION = 1_000_000_000
 
 
 def struct_code(kind: Type) -> str | None:
-    """Return the `struct` code of a type of fixed size (two for seconds and nanoseconds of a time), or None."""
+    """Return the `struct` code of a type of fixed size, or None.
+
+    A time has two codes: for seconds and for nanoseconds.
+    """
     if isinstance(kind, value_types.BoolType):
         return "?"
     if isinstance(kind, value_types.IntegerType):
@@ -49,7 +52,7 @@ class ValueCodec:
     """Encodes, decodes, copies and measures values of a set of definitions; functions are cached by type."""
 
     def __init__(self, messages: MessageTypes, check: Callable[[], None] = lambda: None) -> None:
-        """`check` is called now and then while many elements are decoded; it may raise to stop the decoding."""
+        """`check` is called from time to time while many elements are decoded. It may raise to stop the decoding."""
         self._messages = messages
         self._check = check
         self._made: dict[tuple[Callable[[ValueCodec, Any], Any], Type], Callable[..., Any]] = {}
@@ -68,7 +71,7 @@ class ValueCodec:
     # Sizes
 
     def width(self, kind: Type) -> int:
-        """Return the size of a value in C++ (without the memory of strings and vectors)."""
+        """Return the size of a value in C++, without the contents of strings and vectors."""
         if isinstance(kind, value_types.IntegerType | value_types.FloatingType):
             return kind.bits // 8
         if isinstance(kind, value_types.RecordType):
@@ -84,7 +87,7 @@ class ValueCodec:
         )
 
     def least(self, kind: Type) -> int:
-        """Return the encoded size of the shortest value."""
+        """Return the encoded size of the shortest value of a type."""
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
@@ -119,7 +122,7 @@ class ValueCodec:
     # Zeros and copies
 
     def maker(self, kind: Type) -> Callable[[], Any]:
-        """Return a function that makes a zero value (of void: None)."""
+        """Return a function that makes a zero value (None for void)."""
         return self._once(ValueCodec._maker, kind)
 
     def _maker(self, kind: Type) -> Callable[[], Any]:
@@ -155,7 +158,7 @@ class ValueCodec:
     # In a message
 
     def decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
-        """Return a function that decodes the value at a position, and returns its end."""
+        """Return a function that decodes the value at a position, and returns the value and its end."""
         return (
             wire.text if isinstance(kind, value_types.StringType) else self._once(ValueCodec._decoder, kind)
         )
@@ -265,7 +268,7 @@ class ValueCodec:
 
 
 def zero_of(kind: Type) -> bool | float | bytes | None:
-    """Return the zero of a type with immutable values; None for void."""
+    """Return the zero value of a type whose values are immutable; None for void."""
     if isinstance(kind, value_types.BoolType):
         return False
     if isinstance(kind, value_types.FloatingType):
@@ -292,7 +295,7 @@ def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequenc
 
 
 def packer(codes: Sequence[str]) -> Callable[[Sequence[Any]], bytes]:
-    """Return a function that encodes such numbers."""
+    """Return a function that encodes numbers with these `struct` codes; two codes are nanoseconds."""
     pack = struct.Struct("<" + "".join(codes)).pack
     if all(len(code) == 1 for code in codes):
         return lambda values: pack(*values)

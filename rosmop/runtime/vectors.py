@@ -1,6 +1,6 @@
-"""Operations on vectors, which are Python lists. Functions that make long values charge first.
+"""Operations on vectors, which are Python lists. Functions that make long values charge for them first.
 
-`width` is the size of an element in C++, in bytes; it counts for the limit on memory.
+`width` is the size of an element in C++, in bytes. It counts towards the memory limit.
 """
 
 from collections.abc import Callable
@@ -47,7 +47,7 @@ def append_text(context: Context, values: Values, value: bytes, width: int, site
 
 
 def weighed(context: Context, values: Values, measure: Callable[[Values], int], site: int) -> Values:
-    """Charge for reading all of a vector or message, and return it; `measure` returns its size."""
+    """Charge for reading a whole vector or message, and return it. `measure` returns its size."""
     size = measure(values)
     if size > LARGE:
         context.spend(size // BYTES_PER_INSTRUCTION, site)
@@ -83,13 +83,13 @@ def copied_deep(context: Context, values: Values, width: int, copy: Callable[...
 
 
 def recast(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
-    """Convert a vector of bytes to one of bytes of another kind."""
+    """Convert a vector of bytes to a vector of another type of bytes."""
     context.allocate(len(values), site)
     return convert(values)
 
 
 def recast_each(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
-    """Do the same for each vector in a vector."""
+    """Convert each vector in a vector as `recast` does."""
     context.allocate(len(values), site)
     return [convert(value) for value in values]
 
@@ -110,7 +110,7 @@ def truths(values: Values) -> Values:
 
 
 def filled(context: Context, count: int, make: Callable[[], Any], width: int, site: int) -> Values:
-    """Return `count` new elements."""
+    """Return a vector of `count` new elements."""
     context.allocate(count * width, site)
     context.spend(count // 4, site)
     return _made(context, count, make)

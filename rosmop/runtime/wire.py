@@ -1,7 +1,7 @@
 """Decode and encode the parts of messages.
 
-`buffer` is anything with the buffer interface that indexes bytes (bytes, bytearray, memoryview); positions count
-from its start. Reading past the end raises `MalformedError` or `struct.error`.
+`buffer` is any object with the buffer interface that indexes bytes (bytes, bytearray, memoryview). Positions count from
+its start. Reading past the end raises `MalformedError` or `struct.error`.
 """
 
 import struct
@@ -17,8 +17,8 @@ _LENGTH = struct.Struct("<I")
 MAX_EMPTY = 1_000_000
 """The maximum number of elements of an array whose elements have no bytes."""
 
-_MAX_DECODED = 1_000_000  # elements that are decoded one by one
-FEW = 64  # elements that together take less time than one instruction
+_MAX_DECODED = 1_000_000  # the maximum number of elements that are decoded one by one
+FEW = 64  # this number of elements takes less time than one instruction
 
 
 def text(buffer: Buffer, start: int) -> tuple[bytes, int]:
@@ -66,7 +66,7 @@ def elements(
     decode: Callable[[Buffer, int], tuple[Any, int]],
     check: Callable[[], None],
 ) -> tuple[list[Any], int]:
-    """Return `number` values decoded with `decode`, and their end; `check` is called now and then."""
+    """Return `number` values decoded with `decode`, and their end. `check` is called from time to time."""
     if number > _MAX_DECODED:
         raise MalformedError(
             f"an array of {number} elements; at most {_MAX_DECODED} that are not numbers are read"
@@ -90,7 +90,10 @@ def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], i
 def skip_inner(
     buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context
 ) -> int:
-    """Do the same as `skip` within a skipped element: there may be many, so even a few elements are charged."""
+    """Do the same as `skip`, but within a skipped element.
+
+    There may be many such calls, so even a few elements are charged.
+    """
     context.walk(number + 1)
     return _skipped(buffer, start, number, end, context)
 
@@ -127,9 +130,9 @@ def put_moments(values: list[int], code: str, out: bytearray) -> None:
 class WireMessage:
     """The message of an event: its bytes with all changes so far, and whether it is dropped.
 
-    Numbers are written in place, and only the replaced bytes are kept, so that an image is not copied for a changed
-    stamp. `touched` has a bit for each statement, at the sites `marks`, whose write changed bytes; it is cleared after
-    each event. `cause` is the site of the statement that dropped it.
+    Numbers are written in place, and only the replaced bytes are kept. So a large image, for example, is not copied
+    when its stamp changes. `touched` has a bit for each statement (of the sites in `marks`) whose write changed bytes;
+    it is cleared after each event. `cause` is the site of the statement that dropped the message.
     """
 
     __slots__ = (
@@ -147,8 +150,8 @@ class WireMessage:
     def __init__(self, buffer: Buffer, time: int) -> None:
         self.buffer = buffer
         self.time = time
-        self.written: list[tuple[int, bytes]] | None = None  # where bytes changed, and the old ones, in order
-        self._replaced: bytes | None = None  # the bytes as received, once another buffer is used
+        self.written: list[tuple[int, bytes]] | None = None  # positions and old bytes of changes, in order
+        self._replaced: bytes | None = None  # the received bytes, once another buffer is used
         self.dropped = False
         self.cause: int | None = None
         self.touched = 0
@@ -157,17 +160,17 @@ class WireMessage:
 
     @property
     def changed(self) -> bool:
-        """Whether the bytes differ from those received."""
+        """Whether the bytes differ from the received bytes."""
         if self._replaced is not None:
             return bytes(self.buffer) != self._replaced
         if self.written is None:
             return False
         ends = -1
         for start, old in sorted(self.written):
-            if start < ends:  # written twice: the bytes may be as received
+            if start < ends:  # bytes written twice may again equal the received bytes
                 return bytes(self.buffer) != self._original()
             ends = start + len(old)
-        return True  # `patch` has compared them
+        return True  # `patch` compares old and new bytes
 
     @property
     def overwritten(self) -> Sequence[tuple[int, bytes]]:
@@ -175,7 +178,7 @@ class WireMessage:
         return self.written or ()
 
     def patch(self, start: int, new: bytes, by: int = 1) -> None:
-        """Replace bytes with the same number of bytes; if they differ, `touched` gets the bits `by`."""
+        """Replace bytes with the same number of new bytes. If they differ, `touched` gets the bits `by`."""
         end = start + len(new)
         old = self.buffer[start:end]
         if old == new:
@@ -209,7 +212,7 @@ class WireMessage:
         self.buffer = bytearray(b"".join(pieces))
 
     def _original(self) -> bytes:
-        """Return the bytes as received, while the buffer has the same length."""
+        """Return the received bytes, while the buffer has the same length."""
         if not self.written:
             return bytes(self.buffer)
         original = bytearray(self.buffer)
@@ -237,7 +240,7 @@ def whole(
 def _set(value: list[Any], path: tuple[int | str, ...], new: Any, site: int) -> None:
     *above, last = path
     for index in above[:-1] if isinstance(last, str) else above:
-        value = value[index]  # type: ignore[index]  # only the last is the part of a time
+        value = value[index]  # type: ignore[index]  # only the last item is a part of a time
     if isinstance(last, str):
         place = above[-1]
         value[place] = with_part(value[place], last.encode(), new, site)  # type: ignore[index]  # as above
