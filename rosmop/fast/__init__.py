@@ -1,1 +1,3 @@
-"""Events as WebAssembly: code generation, the running instance, and the state that moves in and out of it."""
+"""Events as WebAssembly: code generation, the running instance, and the state that moves between the instance and
+Python.
+"""

@@ -15,18 +15,19 @@ from rosmop.types.value_types import Type
 from roswire.definitions import Definitions
 
 POSITION, UNDO, SAID, NOW, SURE, REST, FIRST = 0, 8, 12, 16, 24, 32, 40
-"""Addresses of: the current frame, the ends of the log and of the lines, the time, the end of the lines of earlier
-messages, the bytes of the message beyond those that are shown (i64). Memory is allocated from `FIRST` on.
+"""Addresses of: the current frame; the ends of the log and of the lines; the time; the end of the lines of earlier
+messages; the number (i64) of bytes of the message that are not shown to the module. Memory is allocated from `FIRST`
+on.
 """
 
 MOST_KEPT = 1024
-"""Most bytes of a string that a variable of the module keeps."""
+"""The maximum number of bytes of a string that a variable of the module keeps."""
 
 BEYOND = 0xFFFFFFFF
-"""Replaces the length of a longer string."""
+"""Replaces the length of a string that is longer than `MOST_KEPT`."""
 
 AREA = 512 << 10
-"""Bytes of frames in one batch, as many as one read takes."""
+"""The bytes of frames in one batch; one read takes the same number."""
 
 LEFT = 1 << 62
 SOONER = 1 << 61
@@ -37,14 +38,14 @@ LOUD = 1 << 63
 @dataclass
 class Cells:
     """Addresses of the state of specifications that share topics or variables: 8 bytes for each property's state, then
-    for each variable that is used. Variables that are only `noted` are not undone.
+    8 bytes for each variable in use. Variables that are only `noted` are not undone.
     """
 
     base: int
     properties: int
     source: int = 0
-    """Address of three i64: the sender (`MessageSender.source` from bit 32 on), the events whose effects are recorded,
-    and the enabled specifications (see `batch_codegen.py`).
+    """Address of four i64 (see `batch_codegen.py`): the sender (`MessageSender.source` from bit 32 on), the events
+    whose effects are left to Python, the enabled specifications, and the verdicts that are only counted.
     """
     noted: Sequence[str] = ()
     exits: dict[int, int] = field(default_factory=dict)
@@ -52,14 +53,14 @@ class Cells:
     clocks: dict[int, int] = field(default_factory=dict)
     """Addresses of the start and the time of a property's clock (`ClockedRun`), by its number."""
     until: int = 0
-    """Address (i64) of the time when Python's next timer is due; the module reports earlier deadlines."""
+    """Address of the time (i64) when Python's next timer is due. The module reports earlier deadlines."""
     variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
     """Address and type of each variable, in the order of addresses."""
     texts: dict[int, int] = field(default_factory=dict)
-    """Addresses for strings while the number (i32) at `generation` is 0, by the address of the variable."""
+    """By the address of a variable: where its string is stored while the number (i32) at `generation` is 0."""
     generation: int = 0
     settle: int = 0
-    """The number of the function that copies strings there."""
+    """The number of the function that copies strings to these addresses."""
 
     @property
     def kept(self) -> Sequence[int]:
@@ -69,13 +70,13 @@ class Cells:
 
 @dataclass(frozen=True)
 class TopicCode:
-    """The code for one topic: its export, whether it may drop or change messages, the address of the counters of
+    """The code for one topic: its export, whether it may drop or change messages, and the address of the counters of
     events.
 
-    `verdicts` are the indices of an event, of its step of a property, and of the handler. `log` is the address of the
-    log of patches; `undo` has the addresses of variables and of their values before the current message. `brief`: it
-    has no loops. `functions` are the numbers of the functions of events in the module. `says`: it may print lines;
-    those before the address at `SURE` are final.
+    `verdicts` has for each verdict the indices of an event, of its step of a property, and of the handler. `log` is the
+    address of the log of patches. `undo` has the addresses of variables, and the addresses of their values before the
+    current message. `brief`: the code has no loops. `functions` are the numbers of the functions of events in the
+    module. `says`: the code may print lines; the lines before the address stored at `SURE` are final.
     """
 
     name: str
@@ -89,7 +90,7 @@ class TopicCode:
     functions: Sequence[int]
     says: bool
     settle: str
-    """The export to call after undoing the message that was left; empty if there is none."""
+    """The export to call after a message that was left is undone; empty if there is no such export."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class CompiledModule:
     """A module: its machine code (`translated`), the size of its memory, the addresses of frames and effects, its
     topics, and the state of each component.
 
-    `throttles`: addresses of the time (i64, ns) when output at a site was last due, by context and site.
+    `throttles` has, by context and site, the address of the time (i64, ns) when output at the site was last due.
     """
 
     code: bytes
@@ -109,12 +110,12 @@ class CompiledModule:
     throttles: Mapping[tuple[str, int], int]
     lines: Sequence[OutputLine]
     said: int
-    """Address of the lines of output, which are noted by their index in `lines`."""
+    """Address of the lines of output. Each is stored by its index in `lines`."""
 
 
 @dataclass(frozen=True, eq=False)
 class SetPart:
-    """The specifications of a set that one process runs, and the module of those that are not in shadow mode."""
+    """The specifications of a set that one process runs, and the module for those that are not in shadow mode."""
 
     compiled: Compiled
     module: CompiledModule

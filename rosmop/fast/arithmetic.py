@@ -105,7 +105,7 @@ class ArithmeticCodegen(FunctionBuilder):
             return code + constant(one, 0) + compare(one, "!=")
         if isinstance(target, value_types.FloatingType):
             return code + to_floating(one, other, signed=is_signed(source))
-        assert isinstance(target, value_types.IntegerType)  # noqa: S101  numbers are one of the three
+        assert isinstance(target, value_types.IntegerType)  # noqa: S101  a number has one of three types
         if isinstance(source, value_types.FloatingType):
             return self._truncated(code + (F64_PROMOTE_F32 if one == F32 else b""), target)
         if one == other:
@@ -198,7 +198,10 @@ class ArithmeticCodegen(FunctionBuilder):
         return compared + (I32_EQZ if operator.startswith("!") else b"")
 
     def _least(self, node: nodes.Call) -> bytes:
-        """Choose as `std::min` and `std::max` do; for `fmin` and `fmax`, the second also if the first is NaN."""
+        """Choose as `std::min` and `std::max` do.
+
+        For `fmin` and `fmax`, also choose the second value if the first is NaN.
+        """
         machine = machine_type(node.type)
         one, other = (f"{side} {machine} {len(self._locals)}" for side in ("first", "second"))
         code = b"".join(
@@ -225,7 +228,7 @@ class ArithmeticCodegen(FunctionBuilder):
         )
 
     def _of_parts(self, seconds: bytes, nanoseconds: bytes) -> bytes:
-        """Combine seconds and nanoseconds (64 bits); leave the message if the sum would not be exact."""
+        """Combine seconds and nanoseconds (64 bits). Leave the message if the sum would not be exact."""
         code, names = b"", [f"{part} {len(self._locals)}" for part in ("seconds", "nanoseconds")]
         for name, value, most in zip(names, (seconds, nanoseconds), (1 << 32, 1 << 61), strict=True):
             code += value + self._set(name, I64)
@@ -258,7 +261,7 @@ class ArithmeticCodegen(FunctionBuilder):
         return self._limited(node.type, self._of_parts(old + self._seconds(), value))
 
     def _nanoseconds(self) -> bytes:
-        """Push the nanoseconds of a time, which are never negative."""
+        """Push the nanoseconds part of a time, which is never negative."""
         code, value = self._set("moment", I64), self._get("moment", I64)
         whole = self._get("whole", I64)
         code += value + constant(I64, BILLION) + I64_REM_S + self._set("whole", I64)
@@ -271,8 +274,10 @@ class ArithmeticCodegen(FunctionBuilder):
         return rest + whole + constant(I64, BILLION) + I64_DIV_S
 
     def _in_seconds(self) -> bytes:
-        """Convert a time to seconds as a double, rounded once: more than 53 bits are divided by 5^9 with 40 bits after
-        the point, of which the last is set if there is a remainder, and then by 2^9.
+        """Convert a time to seconds as a double, rounded only once.
+
+        A time of more than 53 bits is divided by 5^9, with 40 bits after the point. The last of these bits is set if
+        there is a remainder. Then the result is divided by 2^9.
         """
         code, value = self._set("moment", I64), self._get("moment", I64)
         size = self._get("whole", I64)
@@ -292,7 +297,7 @@ class ArithmeticCodegen(FunctionBuilder):
         return code + result + F64_NEG + result + negative + SELECT
 
     def _parts_of(self, kind: Type, moment: bytes) -> tuple[bytes, bytes]:
-        """Return code that splits a time, and the 64 bits of seconds and nanoseconds as in a message."""
+        """Return code that splits a time, and code for the 64 bits of its seconds and nanoseconds as in a message."""
         code = self._limited(kind, moment) + self._seconds() + self._set("whole", I64)
         low = self._get("whole", I64) + constant(I64, 0xFFFFFFFF) + I64_AND
         return code, low + self._get("rest", I64) + constant(I64, 32) + I64_SHL + I64_OR

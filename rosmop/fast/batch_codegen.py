@@ -1,21 +1,24 @@
-"""Writes the module of a set as WebAssembly: a loop over the frames of a read that runs the events of every message.
+"""Writes the module of a set as WebAssembly: a loop over the frames of one read that runs the events of every message.
 
-For each topic the module exports `feed(at, end, now)`. It takes the frames (4 bytes of length, little-endian, and the
-message) from `at` to before `end` in the memory. It returns the address of the first frame that it leaves (i64: the low
-32 bits), the number of effects (the next 24), and `LEFT` if that frame is for the interpreter.
+For each topic the module exports `feed(at, end, now)`. It processes the frames from `at` to before `end` in the memory;
+a frame is a length (4 bytes, little-endian) and the message. The result has three parts: the address of the first frame
+that is left (i64: the low 32 bits), the number of effects (the next 24 bits), and `LEFT` if that frame is for the
+interpreter.
 
-- A message is either processed, with all consequences, or left; `TopicCode.undo` lists what to restore then. After a
-  trap the message that is left begins at the address stored at `POSITION`; if that is 0, no message had begun.
+- A message is either processed, with all consequences, or left. `TopicCode.undo` lists the data to restore for a
+  message that is left. After a trap, that message begins at the address stored at `POSITION`. If the address is 0, no
+  message had begun.
 - A dropped message does not change the states of properties that suppress it (`nodes.Advance.suppresses`).
-- The options for all messages are at `Cells.source`: their sender; the events (bit N for the topic's event N) whose
-  drops are left, and with `LOUD` all changes (*told*); bits of the topic's enabled specifications (*enabled*); and the
-  verdicts (bit N for `TopicCode.verdicts[N]`) that are only counted (*counted*). Other verdicts leave the message.
-- An effect is 16 bytes: a set of events (i64) and the number of consecutive messages that it changed (i64), or -1 and
-  the start and end (i32, i32) of frames that were dropped.
-- Where a message gives a property with a clock a deadline before the time at `Cells.until`, the loop ends behind it
-  with `SOONER`.
-- Events that happened are counted at `TopicCode.counters`, followed by the drops of each event and the verdicts; with
-  `TOLD` there were verdicts.
+- The options for all messages are stored at `Cells.source`, in this order: their sender; *told*, the events (bit N for
+  the topic's event N) whose drops are left, and with `LOUD` also all changes; *enabled*, bits of the topic's enabled
+  specifications; *counted*, the verdicts (bit N for `TopicCode.verdicts[N]`) that are only counted. A message with any
+  other verdict is left.
+- An effect is 16 bytes: a set of events (i64) and the number (i64) of consecutive messages that they changed. For
+  dropped frames it is -1 and their start and end (i32, i32).
+- If a message gives a property with a clock a deadline before the time at `Cells.until`, the loop ends after this
+  message with `SOONER`.
+- `TopicCode.counters` counts the events that happened, then the drops of each event, then the verdicts. `TOLD` is set
+  if there were verdicts.
 """
 
 import struct
@@ -114,18 +117,18 @@ from rosmop.runtime.action_context import BUDGET
 from rosmop.runtime.values import ValueCodec
 
 EFFECT = 4
-"""Address of the address of the last effect."""
+"""The address where the address of the last effect is stored."""
 
 MAX_EVENTS = 63
 MAX_VERDICTS = 63
 MAX_EFFECTS = 4096
 MAX_TABLES = 8 << 20
-"""Most bytes for the tables of all properties of a set."""
+"""The maximum number of bytes for the tables of all properties of a set."""
 
 PAGE = 1 << 16
 """Bytes of a page of memory."""
 
-_SLACK = 16  # bytes behind the frames that may be looked at
+_SLACK = 16  # bytes after the frames that may be read
 
 
 @dataclass(frozen=True)
@@ -137,15 +140,15 @@ class WasmModule(CompiledModule):
     strings: Mapping[bytes, int]
     """Addresses of constant strings."""
     references: Sequence[range]
-    """Addresses of the values of references that functions return."""
+    """Addresses of memory for the values of references that functions return."""
     handlers: Mapping[str, Sequence[int]]
     """Numbers of the handlers of each topic's verdicts (`TopicCode.verdicts`)."""
     functions: int
-    """Number of functions other than those exported for topics."""
+    """The number of functions that are not exported for topics."""
     refused: Mapping[str, NotCompiledError]
     """Topics that are not in the module, with the reason."""
     left: Mapping[str, Sequence[NotCompiledError]]
-    """Places at which a function leaves a message to the interpreter, by function."""
+    """By function: the places at which it leaves a message to the interpreter."""
 
 
 def written(
@@ -184,7 +187,7 @@ def written(
             refused[topic] = reason_of(error)
             continue
         feeds[topic] = walk.feed(f"feed {len(feeds)}")
-    frames = -(-writer.take(0) // PAGE) * PAGE  # the kernel copies faster from and to what is aligned
+    frames = -(-writer.take(0) // PAGE) * PAGE  # the kernel copies aligned memory faster
     memory = -(-(frames + AREA + _SLACK) // PAGE) * PAGE
     wholes = [(one.parameters, one.result, one.code) for one in writer.written]
     exports = {f"settle {number}": number for number in settled}
@@ -223,7 +226,7 @@ def _assembled(
     constants: Mapping[bytes, int],
     memory: int,
 ) -> bytes:
-    """Return the module of functions (parameter types, result type, code), with exports by name, constant bytes by
+    """Assemble a module from functions (parameter types, result type, code), exports by name, constant bytes by
     address, and the size of its memory.
     """
     types = [function_type(given, result) for given, result, _ in functions]
@@ -244,7 +247,7 @@ def _assembled(
 
 
 class _Tables:
-    """Places the tables of properties: 2 bytes for each state; 8 for times."""
+    """Allocates the tables of properties: 2 bytes for each state, 8 bytes for each time."""
 
     def __init__(self, writer: ModuleCodegen) -> None:
         self._writer = writer
@@ -360,7 +363,10 @@ class TopicCodegen:
         return any(written.drops for written in (self._written[number], *run))
 
     def _table(self, number: int, place: int) -> int | None:
-        """Return the address of the table of a step (-1: a handler that is not compiled); None if it does nothing."""
+        """Return the address of the table of a step.
+
+        Return None if the step does nothing. In the table, -1 marks a handler that is not compiled.
+        """
         advance = self._events[number].advances[place]
         left: set[int] = set()
         for index, handled in enumerate(advance.handlers):
@@ -439,13 +445,16 @@ class TopicCodegen:
                 yield number, local + place, at
 
     def _begin(self) -> bytes:
-        """Mark the current frame as untouched: the runtime stops only at calls and at the start of loops."""
+        """Mark the current frame as untouched.
+
+        No mark is needed elsewhere, because the runtime stops only at calls and at the start of loops.
+        """
         code = store(I32, POSITION, local_get(_AT)) + store(I32, UNDO, constant(I32, self._log))
         code += store(I32, SURE, load(I32, SAID)) if self._says else b""
         return code + b"".join(store(I64, kept, load(I64, address)) for address, kept in self._undo)
 
     def _frame(self) -> bytes:
-        """Leave unless the whole frame is there, and room for an effect."""
+        """Leave unless there is a whole frame, and memory for an effect."""
         room = local_get(_END) + local_get(_AT) + I32_SUB
         stop = br_if(1)
         code = room + constant(I32, 4) + I32_LT_U + stop
@@ -459,7 +468,7 @@ class TopicCodegen:
         return code + b"".join(_set(_FIRST + number, constant(I32, 0)) for number in range(len(self._events)))
 
     def _event(self, number: int) -> bytes:
-        """Blocks from here: the `if`, dropped (1), done (2), the loop (3), out (4), left (5)."""
+        """Run an event. Blocks from here: the `if`, dropped (1), done (2), the loop (3), out (4), left (5)."""
         event, written, bits = self._events[number], self._written[number], _FIRST + number
         left = br_if(5)
         enabled = local_get(_ENABLED) + constant(I64, 1 << event.specification) + I64_AND
@@ -498,7 +507,7 @@ class TopicCodegen:
         return local_get(bits) + constant(I32, which) + I32_AND
 
     def _advance(self, advance: nodes.Advance, table: int) -> bytes:
-        left = 6  # the block that is left
+        left = 6  # the number of the block "left"
         if advance.property is None:
             return br(left)
         if advance.clock is not None:
@@ -519,7 +528,7 @@ class TopicCodegen:
         return code + self._handle(advance, state) if self._handled(advance) else code
 
     def _handle(self, advance: nodes.Advance, state: int) -> bytes:
-        """Run the handlers of the state that was entered, in their order; then the property may restart.
+        """Run the handlers of the entered state, in their order; then the property may restart.
 
         Blocks from here: the `if` of the event's steps and of the event, ..., left (6).
         """
@@ -593,9 +602,10 @@ class TopicCodegen:
         return store(I64, address, load(I64, address) + more + I64_EXTEND_I32_U + I64_ADD)
 
     def _changed(self) -> bytes:
-        """Note the events that changed the message. After several changes its bytes may be the original ones, so the
-        message is left to the engine unless the first changed word differs. (Blocks: dropped, done, the loop, out,
-        left.)
+        """Note the events that changed the message. (Blocks: dropped, done, the loop, out, left.)
+
+        After several changes the bytes may again be the original bytes. The message is then left to the engine, unless
+        the first changed word differs.
         """
         entry = self._log
         size = constant(I64, 64) + load(I64, entry) + constant(I64, 32) + I64_SHR_U
@@ -615,7 +625,7 @@ class TopicCodegen:
         return more + store(I32, EFFECT, local_get(_LAST))
 
     def _dropped(self) -> bytes:
-        """Note the dropped bytes, and restore the states of properties that suppress."""
+        """Note the dropped bytes, and restore the states of the properties that suppress dropped messages."""
         last = local_get(_LAST)
         same = last + i64_load(0) + constant(I64, -1) + I64_EQ
         same += last + i32_load(12) + local_get(_AT) + I32_EQ + I32_AND

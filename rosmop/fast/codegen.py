@@ -1,20 +1,20 @@
 """Writes functions of the form as WebAssembly: numbers, conditions, loops, message fields, drops.
 
-Strings, vectors and messages within the current message are read in place if everything in them has a fixed size
-(`codegen_access.py`); strings can be kept (`strings_codegen.py`). `ModuleCodegen` writes the functions of events and
-handlers and what they call; `batch_codegen.py` writes the loop over the frames of a read.
+Strings, vectors and messages within the current message are read in place if all of their parts have a fixed size
+(`codegen_access.py`). Strings can be kept (`strings_codegen.py`). `ModuleCodegen` writes the functions of events and
+handlers, and the functions that they call. `batch_codegen.py` writes the loop over the frames of a read.
 
 - The function of an event or handler takes the address of the message and its size (i32, i32), and returns bits (i32):
   `HAPPENED`, `DROPPED`, `CHANGED` (bytes differ), `ELSEWHERE`, `RESET`.
-- `ELSEWHERE` leaves the message to the interpreter, and its effects are undone: at each fault, and where the form has
-  something that is not compiled. Functions that are called trap instead. An event is not compiled at all if every
-  message would reach such a place; `NotCompiledError` has the reason. The rows `STATEMENTS` and `EXPRESSIONS` list what
-  is not compiled.
-- A line of output is stored after those before, at the address in `SAID`; the current message is at `POSITION`
+- `ELSEWHERE` leaves the message to the interpreter, and its effects are undone. `ELSEWHERE` is returned at each fault,
+  and where the form has a node that is not compiled. Called functions trap instead. An event is not compiled at all if
+  every message would reach such a place; `NotCompiledError` has the reason. The rows `STATEMENTS` and `EXPRESSIONS`
+  list the nodes that are not compiled.
+- A line of output is stored after the earlier lines, at the address in `SAID`; the current message is at `POSITION`
   (`deferred_output.py`).
 - Before a field is written, the old bytes are appended to the log that `UNDO` points into (address, size, bytes; 16
   bytes each).
-- The charges of the form are taken from the budget of its specification, as in the interpreter.
+- The charges of the form are taken from the budget of the specification, as in the interpreter.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -109,16 +109,16 @@ _MOVES = {
 HAPPENED, DROPPED, CHANGED, RESET = 1, 2, 4, 16
 
 EARLY = 16
-"""Bytes of a message in which a header's fields begin."""
+"""The first bytes of a message, in which the fields of a header begin."""
 
 
 @dataclass(frozen=True)
 class WasmFunction:
-    """A function of the module: types and code, the variables that it assigns, its writes to fields, whether it drops.
+    """A function of the module: types, code, the variables that it assigns, its writes to fields, and whether it drops.
 
     `brief`: it has no loops. `passes`: some message reaches its end. `says`: it may print lines. `early`: it may write
-    to the first bytes of the message, where a header is. `references`: addresses of the values of its references after
-    the return.
+    to the first bytes of the message, where a header is. `references` has the addresses of the values of its references
+    after the return.
     """
 
     number: int
@@ -145,7 +145,7 @@ class ModuleCodegen(MemoryLayout):
         self.written: list[WasmFunction] = []
         self._numbers: dict[tuple[object, ...], WasmFunction] = {}
         self.left: dict[str, list[NotCompiledError]] = {}
-        """By function: the places at which it leaves the message to the interpreter."""
+        """By function: the places where it leaves the message to the interpreter."""
 
     def leave(self, function: str, error: NotCompiledError) -> None:
         """Note a place at which a function leaves the message."""
@@ -163,7 +163,7 @@ class ModuleCodegen(MemoryLayout):
         result: int,
         context: str,
     ) -> WasmFunction:
-        """Return a function, written on first use; `context` names the budget that it is charged to."""
+        """Return a function, which is written on first use. `context` names the budget that pays for it."""
         key = (function.name, tuple(parameters), result, context)
         if key not in self._numbers:
             written = _FunctionCodegen(self, function, parameters, result, context).written()
@@ -172,13 +172,16 @@ class ModuleCodegen(MemoryLayout):
         return self._numbers[key]
 
     def routine(self, key: tuple[object, ...], parameters: int, write: Callable[[], bytes]) -> int:
-        """Return the number of a function with this number of addresses, which is written once."""
+        """Return the number of a function that takes this number of addresses. The function is written only once."""
         if key not in self._numbers:
             self._numbers[key] = self._added((I32,) * parameters, write())
         return self._numbers[key].number
 
     def settling(self, cells: Cells) -> int:
-        """Return the number of the function that copies the strings of variables, which must all be known."""
+        """Return the number of the function that copies the strings of variables.
+
+        All variables must be known before.
+        """
         cells.settle = self._added((), settling(self, cells)).number
         return cells.settle
 
@@ -210,9 +213,9 @@ class _FunctionCodegen(StringCodegen):
         self._references: dict[str, int] = {}
         """Addresses of the values of references after the return."""
         self._result = result
-        self._is_handler = answers and function.happens is None  # type: ignore[union-attr]  # has looked
+        self._is_handler = answers and function.happens is None  # type: ignore[union-attr]  # was checked
         self._types = tuple(parameters.values())
-        self._depends = False  # whether messages may have left before this place
+        self._depends = False  # whether messages may be left before this place
         self._writes = 0
         self._drops = False
         self._says = False
@@ -327,7 +330,7 @@ class _FunctionCodegen(StringCodegen):
         for wanted, index in node.table:
             test = self._get(value, machine) + constant(machine, wanted) + compare(machine, "==")
             chosen = constant(I32, index) + self._set(node.name)
-            code += self._when(test, lambda chosen=chosen: chosen)  # type: ignore[misc]  # the row of this turn
+            code += self._when(test, lambda chosen=chosen: chosen)  # type: ignore[misc]  # the row of this iteration
         return code
 
     def _leave(self, node: nodes.Leave) -> bytes:
@@ -347,7 +350,7 @@ class _FunctionCodegen(StringCodegen):
         return self._when(many, lambda: self._allocated(self._length()))
 
     def _pending(self, _node: nodes.Pending) -> bytes:
-        """Do nothing: only `Whole` uses it, which is not compiled."""
+        """Do nothing: only `Whole` uses this list, and `Whole` is not compiled."""
         return b""
 
     def _drop(self, _node: nodes.Drop) -> bytes:
@@ -394,7 +397,7 @@ class _FunctionCodegen(StringCodegen):
         return code
 
     def _put_field(self, write: nodes.Write, site: int) -> bytes:
-        """Write a number if its bits differ. Python writes NaNs, strings and arrays."""
+        """Write a number if its bits differ. NaNs, strings and arrays are left to Python."""
         try:
             return self._put_number(write)
         except NotCompiledError as error:
@@ -423,7 +426,7 @@ class _FunctionCodegen(StringCodegen):
         return code + self._put_bits(self._get("at") + base, write.at.offset, size, value)
 
     def _put_bits(self, place: bytes, offset: int, size: int, bits: bytes) -> bytes:
-        """Write bytes if they differ, and log the old ones."""
+        """Write bytes if they differ, and log the old bytes."""
         whole = I64 if size == 8 else I32
         get, overwrite = (instruction(offset) for instruction in _MOVES[size])
         new, mask = f"new {whole}", constant(I32, (1 << 8 * size) - 1) + I32_AND if size < 4 else b""
@@ -508,7 +511,9 @@ class _FunctionCodegen(StringCodegen):
         return code
 
     def _slot(self, node: nodes.Expression, name: str, at: int) -> tuple[bytes, bytes, bytes]:
-        """Return code to run first, code that stores a value in the line (a string: address, length), and its cost."""
+        """Return code to run first, code that stores a value in the line (for a string: address and length), and the
+        value's cost.
+        """
         line = self._get("line")
         if is_text(node):
             first, place, count = self._elements(node)
@@ -526,7 +531,7 @@ class _FunctionCodegen(StringCodegen):
         return first, line + value + wide + i64_store(at), b""
 
     def _throttle(self, node: nodes.Throttle) -> bytes:
-        """Skip output that is not due yet; for output that is due, leave the message to Python."""
+        """Skip output that is not due yet. For output that is due, leave the message to Python."""
         seconds = self._value(node.seconds) + to_floating(
             machine_type(node.seconds.type), F64, signed=is_signed(node.seconds.type)
         )
@@ -609,8 +614,9 @@ class _FunctionCodegen(StringCodegen):
         return self._called(node)[0]
 
     def _called(self, node: nodes.Invoke) -> tuple[bytes, tuple[tuple[str, int], ...]]:
-        """Return the code of a call, and the addresses of the values of its references. A returned string or vector is
-        its address (32 bits) and length.
+        """Return the code of a call, and the addresses of the values of its references.
+
+        The code returns a string or vector as address (32 bits) and length.
         """
         if node.depth is not None:
             raise NotCompiledError("calls a recursive function")
@@ -665,7 +671,7 @@ class _FunctionCodegen(StringCodegen):
         return code + answer + RETURN
 
     def _handed(self, name: str, node: nodes.Expression) -> bytes:
-        """Call a function with references; its value and those of the references are in numbered local variables."""
+        """Call a function with references. Numbered local variables get its value and the values of the references."""
         if not isinstance(node, nodes.Invoke):
             raise NotCompiledError.of(node.type)
         code, references = self._called(node)
@@ -717,7 +723,7 @@ def _has_place(kind: Type) -> bool:
 
 def _part_of(node: nodes.Item) -> nodes.Read:
     """Return the local variable for a part of a function's result."""
-    assert isinstance(node.base, nodes.Read)  # noqa: S101  as the form has it
+    assert isinstance(node.base, nodes.Read)  # noqa: S101  the form guarantees this
     return nodes.Read(node.type, f"{node.base.name} {node.number}")
 
 

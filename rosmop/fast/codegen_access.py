@@ -1,7 +1,7 @@
 """Code that reads a message: positions, numbers, and strings, arrays and messages in place.
 
-A local variable has the address and the number of elements. For an array of strings it has the address of a table with
-the address of each.
+Local variables hold the address and the number of elements. For an array of strings, the address is that of a table
+with the address of each string.
 """
 
 from collections.abc import Iterator
@@ -45,7 +45,7 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 MOST_TEXTS = 256
-"""Most strings of an array; a message with more is left to the interpreter."""
+"""The maximum number of strings in an array. A message with more strings is left to the interpreter."""
 
 _LOADS = {
     "?": i32_load8_u, "b": i32_load8_s, "B": i32_load8_u, "h": i32_load16_s, "H": i32_load16_u,
@@ -82,7 +82,7 @@ class MessageAccess(ArithmeticCodegen):
         return self._within(node.at, 4) + end + self._set(node.name, I64)
 
     def _count(self, node: nodes.Count) -> bytes:
-        """Store the number of elements, in 64 bits; leave the message if it has fewer."""
+        """Store the number of elements, in 64 bits. Leave the message if it is too short for this number."""
         code = self._within(node.at, 4) + self._length_at(node.at)
         number = self._get(node.name, I64)
         room = self._get("size") + I64_EXTEND_I32_U + self._position(node.at.plus(4)) + I64_SUB
@@ -146,7 +146,7 @@ class MessageAccess(ArithmeticCodegen):
         return code + self._times(left, each) + table + self._set(f"place of {node.name}")
 
     def _text_at(self, entry: bytes) -> tuple[bytes, bytes, bytes]:
-        """Like `_elements`, for the string whose address is in an entry of a table."""
+        """Do the same as `_elements` for the string whose address is in an entry of a table."""
         name = f"text {len(self._locals)}"
         first = entry + i32_load(0) + self._set(name)
         length = self._get(name) + i32_load(0) + I64_EXTEND_I32_U
@@ -193,7 +193,7 @@ class MessageAccess(ArithmeticCodegen):
 
     @contextmanager
     def _apart(self, *looked_at: nodes.Expression) -> Iterator[None]:
-        """Raise `NotCompiledError` if the code written within changes the values that are read."""
+        """Raise `NotCompiledError` if code that is written in the `with` block changes the values that are read."""
         names = {
             root_of(node)
             for node in looked_at
@@ -240,7 +240,7 @@ def loaded(place: bytes, offset: int, kind: Type) -> bytes:
 
 
 def root_of(node: nodes.Expression) -> str:
-    """Return the variable that a value is, belongs to, or was copied from; empty if unknown."""
+    """Return the variable whose value, part or copy `node` is; empty if unknown."""
     while not isinstance(node, nodes.Read | nodes.Assign):
         if isinstance(node, nodes.Copy):
             node = node.value

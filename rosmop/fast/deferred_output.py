@@ -1,8 +1,8 @@
 """Lines of output: the module stores their values, and Python formats them later.
 
-A line is stored in the module's memory as its number among those of the module, the address of the frame (i32 each),
-and 8 bytes for each value: an integer, a double, or a string's address (the low 32 bits) and length. Its highest
-possible cost is charged, because text is not made before it is paid for.
+A line is stored in the module's memory: its number among the module's lines, the address of the frame (i32 each), and 8
+bytes for each value. A value is an integer, a double, or a string's address (the low 32 bits) and length. The highest
+possible cost of the line is charged, because a text must be paid for before it is made.
 """
 
 import struct
@@ -21,16 +21,16 @@ HEAD = struct.Struct("<II")
 """The number of a line and the address of its frame."""
 
 BYTES = BYTES_PER_INSTRUCTION // 4
-"""Bytes of a string that cost one instruction."""
+"""The number of bytes of a string that cost one instruction."""
 
 _ADDRESS = 0xFFFFFFFF
-_PIECE = 512  # bytes that a number may take
-_SHORT = 1024  # bytes of a text whose size is not charged
+_PIECE = 512  # the maximum number of bytes that a formatted number takes
+_SHORT = 1024  # the maximum number of bytes of a text that is not charged
 _Make = Callable[[Sequence[object]], object]
 
 
 class OutputLine(msgspec.Struct, tag=True, array_like=True, dict=True):
-    """A line that can be serialized: its `values`, and the most bytes that it has besides those of strings."""
+    """A line that can be serialized: its `values`, and the maximum number of its bytes besides strings (`longest`)."""
 
     context: str
     node: nodes.Log
@@ -45,8 +45,12 @@ class OutputLine(msgspec.Struct, tag=True, array_like=True, dict=True):
 
     @property
     def cost(self) -> int:
-        """Return the cost in instructions; with one for each `BYTES` of its strings, at least what the form charges."""
-        return OUTPUT_COST + 3 * (self.longest // BYTES_PER_INSTRUCTION + 1)  # formatted, joined and put out
+        """Return the cost in instructions without strings.
+
+        Plus one instruction for each `BYTES_PER_INSTRUCTION` bytes of its strings, it is at least the cost that the
+        form charges.
+        """
+        return OUTPUT_COST + 3 * (self.longest // BYTES_PER_INSTRUCTION + 1)  # formatting, joining, output
 
     def put_out(self, memory: memoryview, at: int, monitor: str) -> LogLine:
         """Return the line that is stored at an address."""
@@ -55,7 +59,7 @@ class OutputLine(msgspec.Struct, tag=True, array_like=True, dict=True):
             where, length = values[place] & _ADDRESS, values[place] >> 32
             values[place] = bytes(memory[where : where + length])
         text = self._make(values)
-        assert isinstance(text, bytes)  # noqa: S101  as its type says
+        assert isinstance(text, bytes)  # noqa: S101  the type says so
         return line_of(self.node.level, text, monitor)
 
     def _made(self, node: nodes.Expression) -> _Make:

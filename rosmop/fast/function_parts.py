@@ -37,7 +37,10 @@ ELSEWHERE = 8
 
 
 class FunctionBuilder(ABC):
-    """Writes one function. `context` names the budget that it is charged to; `answers`: it is an event or handler."""
+    """Writes one function.
+
+    `context` names the budget that pays for it. `answers`: the function is an event or handler.
+    """
 
     def __init__(
         self, layout: MemoryLayout, parameters: Mapping[str, int], context: str, *, answers: bool
@@ -46,8 +49,8 @@ class FunctionBuilder(ABC):
         self._context = context
         self._answers = answers
         self._locals = {name: (index, kind) for index, (name, kind) in enumerate(parameters.items())}
-        self._depth = 0  # blocks that are open
-        self._loops: list[int] = []  # at which depth the block of each loop is
+        self._depth = 0  # the number of open blocks
+        self._loops: list[int] = []  # the depth of each loop's block
         self._assigned: set[str] = set()  # variables of the set, and local vectors and messages
         self._brief = True
 
@@ -57,11 +60,11 @@ class FunctionBuilder(ABC):
 
     @abstractmethod
     def _value(self, node: nodes.Expression) -> bytes:
-        """Push the value of an expression of numbers. Raises `NotCompiledError` for another."""
+        """Push the value of an expression of numbers. Raises `NotCompiledError` for any other expression."""
 
     @abstractmethod
     def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
-        """Call a function with this number of addresses (i32), which `write` writes from the arguments `given`."""
+        """Call a function that takes this number of addresses (i32). `write` writes it from the arguments `given`."""
 
     def _local(self, name: str, machine: int) -> int:
         number, known = self._locals.setdefault(name, (len(self._locals), machine))
@@ -90,7 +93,10 @@ class FunctionBuilder(ABC):
         return left + self._when(load(I64, budget) + constant(I64, 0) + I64_LT_S, self._elsewhere)
 
     def _allocated(self, size: bytes) -> bytes:
-        """Charge for the bytes (i64) of a new value; leave the message if the specification's memory is measured."""
+        """Charge for the bytes (i64) of a new value.
+
+        Leave the message if the specification's memory must be measured.
+        """
         many = size + constant(I64, UNMEASURED) + I64_GT_U
         spent = size + constant(I64, BYTES_PER_INSTRUCTION) + I64_DIV_U
         return self._when(many, self._elsewhere) + self._spend(spent)

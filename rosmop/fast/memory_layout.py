@@ -11,11 +11,14 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 LINES = 64 << 10
-"""Bytes for lines of output; a message whose line has no room is left."""
+"""The number of bytes for lines of output. A message whose line does not fit is left."""
 
 
 class NotCompiledError(Exception):
-    """A function, or a place in it, cannot be compiled: the reason, and the site (-1: of the whole function)."""
+    """A function, or a place in it, cannot be compiled.
+
+    The error has the reason and the site (-1: the whole function).
+    """
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -34,14 +37,14 @@ class NotCompiledError(Exception):
 
 
 def reason_of(error: NotCompiledError | RecursionError) -> NotCompiledError:
-    """Return the error with the reason why something cannot be compiled."""
+    """Return an error that names the reason why something cannot be compiled."""
     return (
         error if isinstance(error, NotCompiledError) else NotCompiledError("has expressions nested too deep")
     )
 
 
 def machine_type(kind: Type) -> int:
-    """Return the type of the machine for one of the language. Raises `NotCompiledError`."""
+    """Return the machine type for a type of the language. Raises `NotCompiledError`."""
     if isinstance(kind, value_types.BoolType) or (
         isinstance(kind, value_types.IntegerType) and kind.bits <= 32
     ):
@@ -72,13 +75,13 @@ class MemoryLayout:
         self.shared = shared
         self.budgets: dict[str, int] = {}
         self.throttles: dict[tuple[str, int], int] = {}
-        """Addresses of the time when output at a site of a specification was last due."""
+        """By specification and site: the address of the time when output was last due."""
         self.constants: dict[bytes, int] = {}
         """Addresses of constant bytes."""
         self.strings: set[bytes] = set()
         """The constants that are strings."""
         self.references: list[range] = []
-        """Addresses of the values of references that functions return."""
+        """Addresses of memory for the values of references that functions return."""
         self.lines: list[OutputLine] = []
         self._used = FIRST
         self.said = self.take(LINES)
@@ -110,7 +113,8 @@ class MemoryLayout:
         return sum(map(self.size, self._values.fields(kind)[:number]))
 
     def element(self, kind: Type) -> tuple[Type, int]:
-        """Return the type of the elements of a string or vector, and their distance (of strings: in the table).
+        """Return the type of the elements of a string or vector, and their distance in bytes. For strings, the distance
+        is that in the table.
 
         Raises `NotCompiledError`.
         """

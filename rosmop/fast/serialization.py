@@ -94,11 +94,11 @@ def decoded(data: bytes) -> Compiled:
 
 
 def encoded_part(part: SetPart) -> bytes:
-    """Serialize what one process runs; equal parts give equal bytes."""
+    """Serialize the part of a set that one process runs; equal parts give equal bytes."""
     return msgspec.msgpack.encode((msgspec.Raw(encoded(part.compiled)), part.module))
 
 
 def decoded_part(data: bytes) -> SetPart:
-    """Deserialize what one process runs. Raises `msgspec.ValidationError`."""
+    """Deserialize the part of a set that one process runs. Raises `msgspec.ValidationError`."""
     compiled, module = _PARTS.decode(data)
     return SetPart(_DECODER.decode(compiled), module)

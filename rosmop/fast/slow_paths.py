@@ -15,8 +15,9 @@ from rosmop.logics.interface import ClockedProperty, FiniteProperty
 class SlowPath:
     """Messages that the interpreter processes.
 
-    `topic` is a topic, or a service with `request` or `response`. `code` is the event or handler that leaves them, and
-    is empty if no message of the topic is compiled. `position` is the place in the text that cannot be compiled.
+    `topic` is a topic, or a service with `request` or `response`. `code` is the event or handler that leaves the
+    messages. It is empty if no message of the topic is compiled. `position` is the place in the text that cannot be
+    compiled.
     """
 
     topic: str
@@ -26,7 +27,10 @@ class SlowPath:
 
 
 def slow_paths(compiled: Compiled) -> list[SlowPath]:
-    """Return the messages that a set leaves to the interpreter, by topic. Faults and due output always are."""
+    """Return the messages that a set leaves to the interpreter, by topic.
+
+    Messages with a fault or with due output are always left.
+    """
     module = written_of(compiled)
     found: dict[SlowPath, None] = {}
     channels = dict.fromkeys(
@@ -54,7 +58,7 @@ def _partly(
     channel: str,
     specification: SpecificationCode,
 ) -> Iterator[SlowPath]:
-    """Yield the messages of a compiled topic that one specification leaves."""
+    """Yield the messages of a compiled topic that one specification leaves to the interpreter."""
     codes = [
         (f"event {specification.name}.{event.name}", event.function)
         for event in specification.events
@@ -86,7 +90,7 @@ def _of_property(code: PropertyCode) -> str:
 
 
 def _called(compiled: Compiled, function: str) -> list[str]:
-    """Return the names of a function, the functions that it calls, and those that skip elements for it."""
+    """Return the names of a function, of the functions that it calls, and of the skippers that it uses."""
     names = [function]
     for name in names:
         body = compiled.functions[name].body if name in compiled.functions else ()

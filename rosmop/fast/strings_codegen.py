@@ -1,12 +1,12 @@
 """Generate code for strings: constants, strings of the message, and strings in variables of the set.
 
-A variable is 8 bytes: the address of the string and its length (4 bytes each). While a batch is processed, the string
-may be in a message, in a constant, or in the former place of another variable, so that assignments copy nothing. At the
-end of a batch all strings are copied together (`settling`). Each variable has two places, used by batches in turn,
+A variable is 8 bytes: the address and the length of its string (4 bytes each). While a batch is processed, the string
+may be in a message, in a constant, or in the former memory of another variable. So assignments copy nothing. At the end
+of a batch all strings are copied together (`settling`). Each variable has two buffers, which batches use in turn,
 because lines of output may still read the strings of the last batch.
 
-Strings longer than `MOST_KEPT` are not kept: the message that brings one is left to the interpreter, the variable is
-marked `BEYOND`, and messages that read this variable are also left to the interpreter.
+Strings longer than `MOST_KEPT` are not kept. The message that brings such a string is left to the interpreter, and the
+variable is marked `BEYOND`. Messages that read this variable are also left to the interpreter.
 """
 
 from rosmop.fast.abi import MOST_KEPT, Cells
@@ -61,7 +61,7 @@ from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION
 from rosmop.types import value_types
 
 _LOADS = {1: (I32, i32_load8_u), 2: (I32, i32_load16_u), 4: (I32, i32_load), 8: (I64, i64_load)}
-"""Type and load instruction for a number of bytes."""
+"""The type and the load instruction for a number of bytes."""
 
 
 class StringCodegen(MessageAccess):
@@ -88,7 +88,7 @@ class StringCodegen(MessageAccess):
         return super()._elements(node)
 
     def _noted(self, span: bytes, most: int | None = None) -> tuple[bytes, bytes, bytes]:
-        """Pop address and length into local variables; leave the message if the length exceeds `most`."""
+        """Pop address and length into local variables. Leave the message if the length exceeds `most`."""
         place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
         code = span + self._set(count, I64) + self._set(place)
         if most is not None:
@@ -197,10 +197,10 @@ def mismatch() -> bytes:
 
 
 def settling(layout: MemoryLayout, cells: Cells) -> bytes:
-    """Write a function that copies the strings of all variables to one of their two places, in turn.
+    """Write a function that copies the strings of all variables to one of their two buffers, in turn.
 
-    The switch of places is stored last: if the function is stopped, it runs again after the current message is undone.
-    It returns 0 (i32).
+    The number of the current buffer is stored last. If the function is stopped, it runs again after the current message
+    is undone. It returns 0 (i32).
     """
     cells.generation = layout.take(8)
     cells.texts = {at: layout.take(2 * MOST_KEPT) for at in cells.kept}

@@ -1,7 +1,7 @@
 """Encode a WebAssembly module as bytes: numbers, names, rows, and instructions.
 
-This is the only file of the writer with opcodes. Instructions have the names of the specification: those without an
-operand are constants, the others are functions of it.
+This is the only file of the writer with opcodes. Instructions have the names of the specification. Instructions without
+an operand are constants; the others are functions of their operand.
 """
 
 import struct
@@ -117,7 +117,7 @@ br, br_if, call = (
 )
 local_get, local_set = partial(_instruction, b"\x20"), partial(_instruction, b"\x21")
 
-# Loads and stores, by their offset; none promises an alignment.
+# Loads and stores, by their offset, without a promised alignment.
 i32_load, i64_load = partial(_instruction, b"\x28\x00"), partial(_instruction, b"\x29\x00")
 f32_load, f64_load = partial(_instruction, b"\x2a\x00"), partial(_instruction, b"\x2b\x00")
 i32_load8_s, i32_load8_u = partial(_instruction, b"\x2c\x00"), partial(_instruction, b"\x2d\x00")
@@ -151,7 +151,7 @@ def load(machine: int, address: int) -> bytes:
 
 
 def store(machine: int, address: int, value: bytes) -> bytes:
-    """Put a number at a fixed address."""
+    """Store a number at a fixed address."""
     return constant(I32, 0) + value + _STORES[machine](address)
 
 

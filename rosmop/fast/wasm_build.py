@@ -12,9 +12,9 @@ from rosmop.form.compiled import Compiled
 
 
 def part_of(compiled: Compiled, names: Collection[str], shadows: Collection[str]) -> SetPart:
-    """Return the part of a set with these specifications, independent of the rest; `shadows` are in shadow mode.
+    """Return the part of a set with these specifications, independent of the rest. `shadows` are in shadow mode.
 
-    Raises `StepDiffersError` if the module does not do what the automata do: that is a defect.
+    Raises `StepDiffersError` if the steps of the module differ from the automata, which is a defect.
     """
     alone = compiled.alone(names)
     acting = alone.without(shadows)
@@ -24,7 +24,7 @@ def part_of(compiled: Compiled, names: Collection[str], shadows: Collection[str]
 
 
 def fast_path_of(compiled: Compiled) -> WasmFastPath:
-    """Return the fast path of all of these specifications, for `MonitorSet`."""
+    """Return the fast path of all specifications of a set, for `MonitorSet`."""
     return WasmFastPath(_translated(written_of(compiled)))
 
 

@@ -2,14 +2,15 @@
 
 Theory of operation:
 
-- Work is bounded by *fuel*: about one unit for an instruction or a copied byte, the same on every machine. Memory is
-  bounded by a limit. Exceeding either raises `WasmTrap`.
-- The addresses of the whole limit are reserved at the start and the memory grows in place, so an older view of it is
-  only shorter. A view keeps the memory alive after the instance is closed.
+- Work is bounded by *fuel*: about one unit for each instruction or copied byte, the same on every machine. Memory is
+  bounded by a limit. Exceeding either bound raises `WasmTrap`.
+- Addresses for the whole limit are reserved at the start, and the memory grows in place. So an older view of the memory
+  stays valid; it is only shorter. A view keeps the memory alive after the instance is closed.
 - One process translates a module into machine code (`translated`). Others run it (`WasmInstance`) and compile nothing.
-- The library of the package `wasmtime` is called by its C functions (0.4 µs a call; 20 µs by its Python) under Python's
-  lock, so no other thread runs in an instance. The relay cannot load its Python: it has functions that C calls, for
-  which libffi needs memory that is writable and executable. For the same reason a module has no imports.
+- The library of the package `wasmtime` is called through its C functions (0.4 µs a call, instead of 20 µs through its
+  Python code). Calls hold Python's lock, so no other thread runs in an instance. The relay cannot load wasmtime's
+  Python code: it has functions that C calls, for which libffi needs memory that is writable and executable. For the
+  same reason a module has no imports.
 - Traps come without signals, so a handler of SIGSEGV (`faulthandler`) does not interfere.
 """
 
@@ -28,12 +29,12 @@ PAGE = 1 << 16
 """Memory grows in steps of this size."""
 
 VERSION = "50."
-"""Start of the versions of wasmtime with these functions and layouts."""
+"""The first part of the version numbers of wasmtime that have these functions and layouts."""
 
 _FUEL_AT_START = 1_000_000
 _TABLE_ELEMENTS = 10_000
 _FUNCTION, _MEMORY = 0, 3  # kinds of exports
-_KINDS = {0: "i", 1: "q"}  # of values: integers of 32 and 64 bits
+_KINDS = {0: "i", 1: "q"}  # kinds of values: integers of 32 and 64 bits
 _REASONS = ("stack overflow", "memory out of bounds", "misaligned access", "table out of bounds",
             "indirect call to null", "bad signature", "integer overflow", "integer division by zero",
             "bad conversion to integer", "unreachable", "interrupt", "out of fuel")  # fmt: skip
@@ -41,15 +42,15 @@ _OFF = ("component_model", "custom_page_sizes", "exceptions", "function_referenc
         "relaxed_simd", "simd", "stack_switching", "tail_call", "threads", "wide_arithmetic")  # fmt: skip
 
 Call = Callable[..., int | None]
-"""A function of integers; it uses the remaining fuel (`WasmInstance.refuel`)."""
+"""A function of integers. It uses the remaining fuel (`WasmInstance.refuel`)."""
 
 
 class WasmError(Exception):
-    """An instance or function cannot be made; the text says why."""
+    """An instance or function cannot be created; the text says why."""
 
 
 class WasmTrap(Exception):  # noqa: N818  its name in WebAssembly
-    """A call was stopped; its writes to memory stay.
+    """A call was stopped. Its writes to memory stay.
 
     `reason` says why ("integer division by zero", "out of fuel").
     """
@@ -100,12 +101,15 @@ class WasmInstance:
 
     @property
     def memory(self) -> memoryview:
-        """Return the whole memory, writable; get it again after it has grown. Raises `WasmError` when closed."""
+        """Return the whole memory, writable.
+
+        Call this again after the memory has grown. Raises `WasmError` if closed.
+        """
         asked = self._asked()
         size = load().wasmtime_memory_data_size(*asked)
         if size != len(self._view):
             found = (ctypes.c_ubyte * size).from_address(load().wasmtime_memory_data(*asked))
-            found.keeps = self._store  # while there is a view
+            found.keeps = self._store  # as long as a view exists
             self._view = memoryview(found).cast("B")
         return self._view
 
@@ -121,9 +125,9 @@ class WasmInstance:
     def call(self, name: str | int, *arguments: int, fuel: int) -> int | None:
         """Call an exported function of integers (signed) by its name or number, and return the result.
 
-        Each argument is a signed 64-bit integer; if the function takes 32 bits, the low ones are given. Raises
-        `WasmTrap`; `WasmError` where there is no such function or the instance is closed; `struct.error` where the
-        arguments are not as many as it takes or too large.
+        Each argument is a signed 64-bit integer; a 32-bit parameter gets its low bits. Raises `WasmTrap`. Raises
+        `WasmError` if the function does not exist or the instance is closed. Raises `struct.error` for a wrong number
+        of arguments, or for an argument that is too large.
         """
         function = self.function(name)
         self.refuel(fuel)
@@ -138,11 +142,11 @@ class WasmInstance:
             raise WasmError(f"the module has no function {name!r} of integers") from None
 
     def refuel(self, fuel: int) -> None:
-        """Set the remaining fuel. Raises `WasmError` when closed."""
+        """Set the remaining fuel. Raises `WasmError` if closed."""
         _check(load().wasmtime_context_set_fuel(self._asked()[0], fuel))
 
     def close(self) -> None:
-        """Free the module; its memory is freed with the last view of it."""
+        """Free the module. Its memory is freed with the last view of the memory."""
         self._functions, self._view, self._store = {}, memoryview(b""), None
 
     def _asked(self) -> tuple[int, Any]:
@@ -230,7 +234,7 @@ def load() -> ctypes.PyDLL:
     folder = f"linux-{os.uname().machine}"
     file = str(Path(package.origin).with_name(folder) / "_libwasmtime.so")
     library = ctypes.PyDLL(file)
-    # Takes seconds for a large set: without Python's lock, the process still answers its supervisor.
+    # This takes seconds for a large set. Without Python's lock, the process still answers its supervisor.
     library.__dict__["wasmtime_module_new"] = ctypes.CDLL(file).wasmtime_module_new
     for name, (result, *given) in _C.items():
         function = getattr(library, name)
@@ -264,9 +268,9 @@ def _engine(bits: int) -> int:
 
 
 def _bound(store: _Store, export: _Export) -> Call | None:
-    """Wrap a function for Python; None if it has arguments or results other than integers.
+    """Wrap a function for Python. Return None if it has arguments or results other than integers.
 
-    Arguments and result are in slots of 16 bytes; a trap or error that comes back is ours to free.
+    Arguments and result are in slots of 16 bytes. The wrapper must free a returned trap or error.
     """
     c = load()
     native = _Export.from_buffer_copy(export)
@@ -276,11 +280,11 @@ def _bound(store: _Store, export: _Export) -> Call | None:
     c.wasm_functype_delete(kind)
     if len(gives) > 1 or None in (*takes, *gives):
         return None
-    # Without argument types, which would be checked at each call.
+    # No argument types are set, because ctypes would check them at each call.
     invoke = c["wasmtime_func_call_unchecked"]
     invoke.restype = ctypes.c_void_p
     slots = (ctypes.c_uint64 * (2 * max(len(takes), 1)))()
-    slots.keeps = store, native  # type: ignore[attr-defined]  # until the call is over, even if the instance is closed
+    slots.keeps = store, native  # type: ignore[attr-defined]  # kept alive until the call ends
     room = memoryview(slots).cast("B")
     fill = struct.Struct("<" + "q8x" * len(takes)).pack_into
     read = room.cast(gives[0]) if gives else (None,)

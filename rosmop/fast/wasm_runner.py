@@ -1,14 +1,17 @@
-"""Runs the module of a set: decides when a lane of a topic, or part of a service, may be used, and processes batches.
+"""Runs the module of a set: decides when the lane of a topic, or of a part of a service, may be used, and processes
+batches.
 
 Invariants:
 
 - A batch ends before the first message that the module leaves to the engine; nothing of that message has happened.
-- The effect on the messages before is that of `MonitorSet.process` on each of them, at the time of the batch: bytes,
-  variables, states of properties, events.
-- The state of specifications that share topics or variables is in one place: in the module's memory from the first
-  batch on (`ModuleState.prepare`), in Python before that, and again before Python reads it (`ModuleState.leave`).
-- Frames that were received into the module's memory (`Lanes.area`) are read and changed in place. For other frames the
-  beginning is copied, and back if it was changed; code that reads further leaves the message to the engine.
+- The earlier messages have the same effect as if `MonitorSet.process` had processed each message at the time of the
+  batch: bytes, variables, states of properties, events.
+- The state of specifications that share topics or variables is in one place at a time. From the first batch on it is in
+  the module's memory (`ModuleState.prepare`). Before that, and whenever Python reads it, it is in Python
+  (`ModuleState.leave`).
+- Frames that were received into the module's memory (`Lanes.area`) are read and changed in place. The beginning of any
+  other frame is copied to the module, and copied back if it was changed. Code that reads further leaves the message to
+  the engine.
 """
 
 import struct
@@ -49,14 +52,16 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 FUEL = FUEL_PER_SECOND // 1000
-"""Most instructions of one call: about a millisecond. The fuel that a call leaves is for the next ones, because setting
-it costs a quarter of a call. When it is used up, the batch pauses before the current message.
+"""The maximum number of instructions of one call: about a millisecond.
+
+The fuel that a call leaves is used by the next calls, because setting the fuel costs a quarter of a call. When the fuel
+is used up, the batch pauses before the current message.
 """
 
 BEGINNING = 8192
-"""Bytes that are copied of a frame that was not received into the module's memory."""
+"""The maximum number of bytes that are copied from a frame outside the module's memory."""
 
-_FIRST = 512  # shown if they suffice: a large frame leaves cold caches
+_FIRST = 512  # bytes that are copied if they suffice: a large frame leaves cold caches
 
 _NO_FUEL = "out of fuel"
 _ADDRESS = 0xFFFFFFFF
@@ -67,7 +72,7 @@ _LOG = struct.Struct("<II8s")
 _PREPARED = struct.Struct("<4q")
 _TIME = struct.Struct("<q")
 _CLOCK = struct.Struct("<qq")
-_NEVER = (1 << 63) - 1  # comes after every time, so that output is due
+_NEVER = (1 << 63) - 1  # later than every time, so that output is due
 
 
 class ModuleState:
@@ -85,8 +90,9 @@ class ModuleState:
         properties: Sequence[tuple[str, int]] = (),
         known: Mapping[str, tuple[str, str]] = MappingProxyType({}),
     ) -> None:
-        """`throttles`: specification, site, and address of the time when output there was last due. `properties` are
-        those of `running` by monitor and number, `known` the variables by monitor and name.
+        """`throttles` has specification, site, and the address of the time when output there was last due.
+
+        `properties` has the properties of `running` by monitor and number, `known` the variables by monitor and name.
         """
         self.machine = machine
         self._memory = machine.memory
@@ -144,8 +150,10 @@ class ModuleState:
         self._inside = True
 
     def cells(self) -> bytes | None:
-        """Return the state in the module's memory if it is only numbers; empty if Python has had it since it was last
-        saved; None if the state must be saved as Python has it.
+        """Return the state in the module's memory, if it consists only of numbers.
+
+        The result is empty if the state has been in Python since the last save. It is None if the state must be saved
+        from Python.
         """
         if not self._inside and not self.left:
             return b""
@@ -158,7 +166,7 @@ class ModuleState:
         return cells
 
     def hasten(self) -> None:
-        """Compute the next timer again, because there is an earlier deadline."""
+        """Compute the time of the next timer again, because there is an earlier deadline."""
         self.leave()
         self._due(anew=True)
 
@@ -178,7 +186,7 @@ class ModuleState:
             return
         values = self._cells.unpack_from(self._memory, self._base)
         for running, state in zip(self._running, values, strict=False):
-            running.run.state = state  # type: ignore[attr-defined]  # of tables
+            running.run.state = state  # type: ignore[attr-defined]  # runs over tables
         for running, address in self._clocks:
             run: Any = running.run
             run.since, run.now = _CLOCK.unpack_from(self._memory, address)
@@ -198,7 +206,10 @@ def _entered(memory: memoryview, value: bytes, buffer: int) -> int:
 
 
 def _left(memory: memoryview, word: int, before: bytes) -> bytes:
-    """Read the string of such a number; `before` if the module does not keep it."""
+    """Read the string whose address and length are in `word`.
+
+    Return `before` if the module does not keep the string.
+    """
     at, count = word & _ADDRESS, word >> 32
     return before if count == BEYOND else bytes(memory[at : at + count])
 
@@ -377,7 +388,7 @@ class WasmLane:
             )
         if walked is not None:
             outcome.log = [line for _, line in walked.output]
-            counts = zip(self.verdicts, walked.told, strict=False)  # none is counted where there is none
+            counts = zip(self.verdicts, walked.told, strict=False)  # `told` may be empty
             outcome.verdicts = tuple(verdict for verdict, count in counts for _ in range(count))
         return outcome
 
@@ -424,7 +435,7 @@ class WasmLane:
     def _process_beginning(
         self, frame: memoryview, shown: int, time_ns: int, prepared: BatchOptions
     ) -> BatchResult | None:
-        """Process one frame of which the module gets the first `shown` bytes."""
+        """Process one frame; the module gets only its first `shown` bytes."""
         size, before = min(len(frame), shown), prepared.changed.copy()
         area = self._memory[self._frames : self._frames + size]
         area[4:] = frame[4:size]
@@ -448,9 +459,10 @@ class WasmLane:
             at += line.size
 
     def _stopped(self, *call: int) -> int:
-        """Return what the module would have returned where it was stopped: the current message is left.
+        """Return the result that the module would have returned at the point where it was stopped: the current message
+        is left.
 
-        If no message had begun, it is called again: earlier calls have used up the fuel.
+        If no message had begun, earlier calls have used up the fuel, so the module is called again.
         """
         self._home.machine.refuel(FUEL)
         at, effect = _POSITION.unpack_from(self._memory, POSITION)
