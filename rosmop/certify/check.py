@@ -2,11 +2,11 @@
 
 The check follows the formula and the automaton side by side, event by event, from the start. A pair is the remaining
 obligation of the definition and the state of the automaton. There are finitely many pairs, and the check visits each
-with every event, so a property of all pairs holds after every trace. The names of states do not matter, nor how the
-automaton was built or minimised.
+pair with every event. Therefore a result for all pairs holds after every trace. The names of states do not matter, nor
+how the automaton was built or minimised.
 
-Properties that are not certified are reported with the reason: time bounds and grammars (their monitors are not finite
-automata), and properties that exceed the work limit.
+Properties that are not certified are reported with the reason: time bounds and grammars, whose monitors are not finite
+automata, and properties that exceed the work limit.
 """
 
 import itertools
@@ -26,7 +26,10 @@ from rosmop.certify.words import ExpressionDerivatives
 MOST_STEPS = 200_000
 """The maximum number of (pair, event) combinations for one property."""
 MOST_WORK = 400_000
-"""Clauses, or parts of expressions, that may be made for one formula. Each of the two is some tenths of a second."""
+"""The maximum number of clauses, or of parts of expressions, for one formula.
+
+Reaching either limit takes some tenths of a second.
+"""
 
 S = TypeVar("S", bound=Hashable)
 Verdicts = tuple[str, ...]
@@ -34,20 +37,21 @@ Verdicts = tuple[str, ...]
 
 @dataclass(frozen=True)
 class AutomatonTables:
-    """An automaton to certify; columns are events in order, `verdicts[s]` hold after a step into `s`."""
+    """An automaton to certify. Columns are events in order; `verdicts[s]` hold after a step into `s`."""
 
     initial: int
     table: Sequence[Sequence[int]]
     verdicts: Sequence[Verdicts]
     timeouts: Sequence[tuple[int, int] | None] = ()
-    """For each state of a `tfsm`: after how many nanoseconds it is left, and for which state."""
+    """For each state of a `tfsm`: the nanoseconds after which the automaton leaves it, and the next state."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """The result for one property. `proved`: every trace's verdict is that of the definition; `text` states the check.
+    """The result for one property.
 
-    `wrong`: it is not, and `text` has a trace. Neither: it was not certified, and `text` says why.
+    `proved`: every trace's verdict is that of the definition; `text` describes the check. `wrong`: some trace's verdict
+    differs; `text` has such a trace. Neither: the property was not certified; `text` has the reason.
     """
 
     proved: bool
@@ -78,7 +82,8 @@ def certify(logic: str, formula: str, events: Sequence[str], tables: AutomatonTa
 
 
 def _look_at_form(logic: str, events: Sequence[str], tables: AutomatonTables) -> None:
-    """Raise for tables that are not an automaton. Python would index a negative state from the end.
+    """Raise an error for tables that are not an automaton. A negative state is invalid, because Python would index it
+    from the end.
 
     Only `tfsm` has time limits.
     """
@@ -144,7 +149,7 @@ def _follow(
             reach((after, target), pair, event)
         left = silently(before, state)
         if left is not None:
-            reach((left, tables.timeouts[state][1]), pair, "(a time limit)")  # type: ignore[index]  # it was looked at
+            reach((left, tables.timeouts[state][1]), pair, "(a time limit)")  # type: ignore[index]  # was checked
     return len(waiting)
 
 
@@ -182,7 +187,7 @@ def _check_past(
 
 
 def _check_words(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
-    """Check that `fail` is given once no continuation matches: no later derivative contains the empty word."""
+    """Check that the verdict is `fail` once no continuation matches: no later derivative contains the empty word."""
     words = ExpressionDerivatives(formula_reader.expression(formula, events), MOST_WORK)
     dead: dict[int, bool] = {}
 
@@ -198,7 +203,7 @@ def _check_words(formula: str, events: Sequence[str], tables: AutomatonTables) -
 
 
 def _dead(words: ExpressionDerivatives, start: int, events: Sequence[str]) -> dict[int, bool]:
-    """Return for each reachable derivative whether nothing matches any more."""
+    """Return, for each reachable derivative, whether no continuation can match."""
     leading: dict[int, set[int]] = {start: set()}
     waiting = [start]
     for state in waiting:
@@ -225,7 +230,7 @@ def _check_future(formula: str, events: Sequence[str], tables: AutomatonTables) 
 
 
 def _check_pattern(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
-    """Check a pattern. Endless silence is possible: an event that the pattern does not name."""
+    """Check a pattern. An event that the pattern does not name stands for endless silence."""
     return _check_endless(patterns.meaning(formula, events), events, [*events, _SILENCE], tables)
 
 
@@ -235,7 +240,9 @@ _SILENCE = "(silence)"
 def _check_endless(
     formula: formula_reader.Node, events: Sequence[str], letters: Sequence[str], tables: AutomatonTables
 ) -> int:
-    """Check `violation` once no endless continuation makes it true, `validation` once none makes it false."""
+    """Check for `violation` once no endless continuation makes the formula true, and for `validation` once none makes
+    it false.
+    """
     guesses = PastGuesses(formula, letters)
     future = FutureFollower(guesses.count, MOST_WORK)
     sides = (guesses.formula, ("not", guesses.formula))
@@ -253,7 +260,7 @@ def _check_endless(
 
 
 def _check_machine(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
-    """Check a state machine; time limits must be as written and lead to the written states."""
+    """Check a state machine. Time limits, and the states they lead to, must be as written."""
     machine = StateMachineFollower(formula, events)
 
     def silently(before: str, state: int) -> str | None:

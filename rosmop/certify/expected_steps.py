@@ -1,4 +1,6 @@
-"""The expected effect of a walk on messages: the order and effects of `run/execution.py`, over certified automata."""
+"""Compute the expected effect of a walk on messages: the order and effects of `run/execution.py`, over certified
+automata.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +17,7 @@ HAPPENED, DROPPED, CHANGED, ELSEWHERE, RESET = 1, 2, 4, 8, 16
 NEVER, BEGAN = (1 << 63) - 1, 1_000
 
 States = dict[int, Any]
-"""The state of each property by its number; for one with a clock also its start and its time."""
+"""The state of each property by its number. A property with a clock also has the clock's start and time."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class StepCase:
     counted: int = -1
     until: int = NEVER
     beside: tuple[int, int] | None = None
-    """The number of another property, and the state that it is in."""
+    """The number and the state of another property."""
 
 
 @dataclass
@@ -41,7 +43,7 @@ class ExpectedResult:
     position: int = 0
     effects: list[tuple[int, int]] = field(default_factory=list)
     calls: list[tuple[int, int]] = field(default_factory=list)
-    """Numbers of functions, and in which frame each was called."""
+    """The numbers of the called functions, and the frame of each call."""
     happened: list[int] = field(default_factory=list)
     dropped: list[int] = field(default_factory=list)
     verdicts: list[int] = field(default_factory=list)
@@ -61,7 +63,7 @@ class LeftToEngineError(Exception):
 
 @dataclass(frozen=True)
 class ExpectedHandler:
-    """A handler: its category, its verdict and function in the walk (None: not compiled), and whether it may drop."""
+    """A handler: its category, its verdict (None: not compiled) and function in the walk, and whether it may drop."""
 
     category: str
     verdict: int | None
@@ -71,7 +73,7 @@ class ExpectedHandler:
 
 @dataclass(frozen=True)
 class PropertyStep:
-    """A property that an event steps: its number (None: the module has none), automaton and handlers."""
+    """A property that an event steps: its number (None if it is not in the module), its automaton and its handlers."""
 
     number: int | None
     compiled: CompiledProperty
@@ -82,7 +84,7 @@ class PropertyStep:
     def states(self) -> int:
         """Return the number of states."""
         tables = self.compiled
-        assert isinstance(tables, FiniteProperty | ClockedProperty)  # noqa: S101  it has a number
+        assert isinstance(tables, FiniteProperty | ClockedProperty)  # noqa: S101  a property with a number has tables
         return len(tables.automaton) if isinstance(tables, FiniteProperty) else len(tables.verdicts)
 
 
@@ -130,7 +132,7 @@ class ExpectedTopic:
         return dict(self._begun)
 
     def walk(self, states: States, case: StepCase) -> ExpectedResult:
-        """Return the expected result of a number of frames."""
+        """Return the expected result for the frames of a case."""
         result = ExpectedResult(states)
         for frame in range(case.frames):
             before = len(result.happened), len(result.dropped), len(result.verdicts)
@@ -146,7 +148,7 @@ class ExpectedTopic:
             result.states, result.position = after, frame + 1
             if len(result.dropped) > before[1]:
                 if result.effects and result.effects[-1][1] == frame:
-                    frame, _ = result.effects.pop()  # noqa: PLW2901  what is dropped on end is one effect
+                    frame, _ = result.effects.pop()  # noqa: PLW2901  consecutive drops are one effect
                 result.effects.append((frame, result.position))
             if result.sooner:
                 break
@@ -181,7 +183,7 @@ class ExpectedTopic:
     def _step(
         self, one: PropertyStep, states: States, case: StepCase, frame: int, result: ExpectedResult
     ) -> bool:
-        """Step a property and run its handlers; whether one has dropped the message."""
+        """Step a property and run its handlers. Return whether a handler dropped the message."""
         if one.number is None:
             raise LeftToEngineError
         if isinstance(one.compiled, ClockedProperty):
@@ -194,7 +196,7 @@ class ExpectedTopic:
             if any(handled.category in categories for handled in one.handlers):
                 raise LeftToEngineError
             return False
-        assert isinstance(one.compiled, FiniteProperty)  # noqa: S101  it has a number
+        assert isinstance(one.compiled, FiniteProperty)  # noqa: S101  a property with a number has tables
         automaton = one.compiled.automaton
         state = states[one.number] = automaton.table[states[one.number]][one.event]
         run_now = [handled for handled in one.handlers if handled.category in automaton.verdicts[state]]
@@ -213,15 +215,15 @@ class ExpectedTopic:
 
 
 def _initial(property_: CompiledProperty) -> int:
-    assert isinstance(property_, FiniteProperty | ClockedProperty)  # noqa: S101  it has a number
+    assert isinstance(property_, FiniteProperty | ClockedProperty)  # noqa: S101  a property with a number has tables
     return property_.automaton.initial if isinstance(property_, FiniteProperty) else property_.initial
 
 
 def begun_in(one: PropertyStep, state: int) -> Any:
-    """Return a property's state, with a clock that begins at `BEGAN` if it has one."""
+    """Return a property's state. If the property has a clock, the clock begins at `BEGAN`."""
     return state if isinstance(one.compiled, FiniteProperty) else (state, BEGAN, BEGAN)
 
 
 def _drops(compiled: Compiled, function: str) -> bool:
-    """Whether a function may drop the message, as its form says."""
+    """Whether a function may drop the message, according to its form."""
     return any(isinstance(node, nodes.Drop) for node in nodes.walk(compiled.functions[function]))

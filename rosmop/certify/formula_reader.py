@@ -1,7 +1,7 @@
-"""Parse a formula into nested tuples, with no code of the compilers.
+"""Parse a formula into nested tuples, without using code of the compilers.
 
-A node is (operator, operand, …); ("event", name), ("true",), ("false",). An unknown form raises
-`UnsupportedFormulaError`: the property is then not certified.
+A node is (operator, operand, …), ("event", name), ("true",) or ("false",). A formula that the certifier does not know
+raises `UnsupportedFormulaError`; the property is then not certified.
 """
 
 import re
@@ -31,7 +31,7 @@ _SECONDS = {"m": 60, "min": 60, "h": 3600}
 
 
 class WordReader:
-    """The words and signs of a text in order; `signs` may have several characters."""
+    """The words and signs of a text, in order. Each of `signs` may have several characters."""
 
     def __init__(self, text: str, signs: Sequence[str]) -> None:
         self._signs = sorted(signs, key=len, reverse=True)
@@ -41,10 +41,10 @@ class WordReader:
         self.take()
 
     def take(self) -> str:
-        """Return the next word and go on to the one after it; empty at the end."""
+        """Return the next word and advance; return an empty string at the end."""
         before = self.word
         match = _TOKEN.match(self._text, self._at)
-        if match is None:  # the pattern matches everything
+        if match is None:  # the pattern matches any text
             raise UnsupportedFormulaError(self._text[self._at : self._at + 10])
         name, start = match.group(1), match.end()
         if match.group(2) is not None:
@@ -73,7 +73,7 @@ class WordReader:
         return True
 
     def expect(self, word: str) -> None:
-        """Take this word; raises `UnsupportedFormulaError` for another one."""
+        """Take this word; raises `UnsupportedFormulaError` if a different word is next."""
         if not self.accept(word):
             raise UnsupportedFormulaError(f"{self.word!r} where {word!r} is expected")
 
@@ -85,7 +85,7 @@ class WordReader:
         return int((number * (_SECONDS[self.take()] if self.word in _SECONDS else 1)).scaleb(9))
 
     def end(self) -> None:
-        """Raise `UnsupportedFormulaError` if something is left."""
+        """Raise `UnsupportedFormulaError` unless the whole text was read."""
         if self.word:
             raise UnsupportedFormulaError(f"{self.word!r} after the end")
 
@@ -111,7 +111,7 @@ MTL = (
     {**_NOT, **{word: word for word in ("previously", "once", "historically")}},
     ({"since": "since"}, *_BOOLEAN),
 )
-"""The operators of a logic: those before one operand, and those between two, from the tightest to the loosest."""
+"""The operators of a logic: first the unary operators, then the binary operators from tightest to loosest."""
 
 Grammar = tuple[Mapping[str, str], Sequence[Mapping[str, str]]]
 
@@ -158,7 +158,7 @@ def _operand(words: WordReader, events: Sequence[str], grammar: Grammar, depth: 
 
 
 def _unbounded(words: WordReader, grammar: Grammar) -> None:
-    """Take the bounds of mtl that bound nothing."""
+    """Take the bounds of an mtl operator if they have no effect."""
     if grammar is MTL and words.accept("["):
         if words.duration() != 0:
             raise UnsupportedFormulaError("a bound of time")

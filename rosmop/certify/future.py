@@ -1,9 +1,10 @@
-"""Formulas about the future, over endless traces: the remaining obligation after an event, and whether it can be met.
+"""Formulas about the future, over endless traces. The module computes the remaining obligation after an event, and
+whether it can be met.
 
 A state is the remaining obligation: a set of *clauses*, of which one must come true. A clause is a set of parts of the
-formula that begin with a temporal operator; all of them must come true. (Clauses that require more than another one are
-left out, so there are finitely many states.) The remainder of a part after an event follows from its definition: `x U
-y` is `y`, or `x` and `x U y` at the next event.
+formula, each beginning with a temporal operator; all of them must come true. A clause that requires more than another
+clause is left out, so there are finitely many states. The remainder of a part after an event follows from the
+definition: `x U y` is `y`, or else `x` now and `x U y` at the next event.
 
 A clause can come true if its paths from event to event reach a cycle on which no `until` is postponed at every step.
 """
@@ -24,7 +25,7 @@ FALSE: State = frozenset()
 class FutureFollower:
     """Follow a formula over `letters` numbered letters; exactly one happens at each position.
 
-    `work` is the largest number of clauses that may be made; beyond it `WorkLimitError` is raised.
+    `work` is the maximum number of clauses; beyond it, `WorkLimitError` is raised.
     """
 
     def __init__(self, letters: int, work: int) -> None:
@@ -53,11 +54,11 @@ class FutureFollower:
         return any(self._possible(clause) for clause in state)
 
     def _among(self, clause: Clause, letters: Sequence[int]) -> list[int]:
-        """Return the letters that no single part of the clause rules out."""
+        """Return the letters that no part of the clause rules out alone."""
         masks = [part[1] for part in clause if part[0] == "one of"]
         return [letter for letter in letters if all(mask >> letter & 1 for mask in masks)]  # type: ignore[operator]  # sets of letters
 
-    # --- what remains ---
+    # --- the remaining obligation ---
 
     def _after(self, clause: Clause, letter: int) -> State:
         left = [self._part_after(part, letter) for part in clause]
@@ -87,7 +88,7 @@ class FutureFollower:
         return self.step(self._now(formula), letter)
 
     def _now(self, formula: Node) -> State:
-        """Return a formula that is to hold from the next position on, as clauses."""
+        """Return, as clauses, a formula that must hold from the next position on."""
         operator, operands = formula[0], formula[1:]
         if operator == "and":
             return self._all([self._now(operand) for operand in operands])  # type: ignore[arg-type]  # formulas
@@ -107,7 +108,7 @@ class FutureFollower:
         return frozenset(together)
 
     def _least(self, clauses: set[Clause]) -> State:
-        """Return the clauses without those that require more than another."""
+        """Return the clauses, except each clause that requires more than another."""
         self._work -= len(clauses)
         if self._work < 0:
             raise WorkLimitError
@@ -127,7 +128,7 @@ class FutureFollower:
         return self._known[clause]
 
     def _explore(self, start: Clause) -> None:
-        """Find all clauses that this one leads to, and which of them can come true."""
+        """Find all clauses that `start` leads to, and which of them can come true."""
         ways: dict[Clause, set[Way]] = {}
         waiting = [start]
         while waiting:
@@ -154,7 +155,7 @@ class FutureFollower:
         self._known.update({clause: clause in good for clause in ways})
 
     def _ways(self, clause: Clause, letter: int) -> set[Way]:
-        """Return the possible remainders with their postponed untils, without redundant ones."""
+        """Return the possible remainders with their postponed untils, without redundant remainders."""
         left = [(part, self._part_after(part, letter)) for part in clause]
         self._work -= 1
         if any(state == FALSE for _, state in left):
@@ -218,9 +219,9 @@ def _circles(ways: dict[Clause, set[Way]]) -> list[set[Clause]]:
 
 
 def positive(formula: Node, letters: int, *, wanted: bool = True) -> Node:
-    """Return the formula (or its negation) with `one of` some letters, `and`, `or`, `next`, `until`, `release` only.
+    """Return the formula (or its negation) using only `one of`, `and`, `or`, `next`, `until` and `release`.
 
-    `letters` is the number of letters; a set of bits names those of a `one of`.
+    `letters` is the number of letters. A `one of` names its letters by a set of bits.
     """
     operator, everything = formula[0], (1 << letters) - 1
     if operator in ("one of", "true", "false"):

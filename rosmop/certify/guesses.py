@@ -1,8 +1,9 @@
-"""Formulas about the future with operators about the past in them, as formulas about the future alone.
+"""Replace the operators about the past in a formula about the future.
 
-The value of an operator about the past is guessed with every event: a letter is an event and one bit for each of these
-operators. Rules determine the correct guess from the one before and the operator's definition. On every endless trace
-exactly one sequence of guesses keeps all rules, so a formula can come true with them exactly if it could without them.
+The value of each operator about the past is guessed with every event: a letter is an event and one bit for each of
+these operators. Rules determine the correct guess from the previous guess and the operator's definition. On every
+endless trace, exactly one sequence of guesses satisfies all rules. So a formula can come true with guesses exactly if
+it could without them.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,13 +19,15 @@ _DEFINED: Mapping[str, tuple[Callable[[Node, Node, Node], Node], bool]] = {
     "since": (lambda x, y, before: ("or", y, ("and", x, before)), False),
     "dual since": (lambda x, y, before: ("and", y, ("or", x, before)), True),
 }
-"""The value from the operands and the value at the event before; and the value at the first event."""
+"""For each operator: its value from the operands and its value at the previous event, and the value before the first
+event.
+"""
 _BEFORE: Mapping[str, bool] = {"previously": False, "dual previously": True}
-"""The values at the first event; later, the operand's value at the event before."""
+"""For each operator: its value at the first event. Later it has the operand's value at the previous event."""
 
 
 class PastGuesses:
-    """The letters of each event, as numbers below `count`, and the formula over sets of them (`one of`)."""
+    """The letters of each event, as numbers below `count`, and the formula over sets of letters (`one of`)."""
 
     def __init__(self, formula: Node, events: Sequence[str]) -> None:
         self._guessed: dict[Node, int] = {}

@@ -65,9 +65,9 @@ class StateMachineFollower:
         return self._moves.get(state, {}).get(event, self._default.get(state, FAIL))
 
     def timeout(self, state: str) -> tuple[int, str] | None:
-        """Return after how many nanoseconds without an event the machine leaves a state, and the next state."""
+        """Return the nanoseconds without an event after which the machine leaves a state, and the next state."""
         return self._timeouts.get(state)
 
     def verdicts(self, state: str) -> tuple[str, ...]:
-        """Return the state, and its aliases as they are written."""
+        """Return the state, and its aliases in the order of the text."""
         return (state, *(alias for alias, members in self._aliases.items() if state in members))

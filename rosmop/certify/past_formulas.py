@@ -1,4 +1,4 @@
-"""Formulas about the past, by their definition: the value of each part at an event, from the values before."""
+"""Formulas about the past, by their definition: the value of each part at an event follows from the previous values."""
 
 from collections.abc import Callable, Mapping
 
@@ -8,20 +8,21 @@ State = tuple[bool, ...]
 
 
 class PastFollower:
-    """Follow a past formula; a state has, for each operator that looks back, its memory of the event before."""
+    """Follow a past formula; a state has, for each operator that looks back, its memory of the previous event."""
 
     def __init__(self, formula: Node) -> None:
         self._parts: dict[Node, int] = {}
         self._looking: list[tuple[Node, int]] = []
         self._file(formula)
         self._order = list(self._parts)
-        # The first event has no past: operators about all of the past are true, those about some of it false.
+        # The first event has no past. There, operators about all of the past are true, and operators about some of it
+        # are false.
         self.initial: State = tuple(
             node[0] in ("historically", "dual since", "dual previously") for node, _ in self._looking
         )
 
     def _file(self, node: Node) -> int:
-        """Return the number of a part; its operands have smaller ones."""
+        """Return the number of a part. Its operands have smaller numbers."""
         for operand in node[1:]:
             if isinstance(operand, tuple):
                 self._file(operand)
@@ -32,7 +33,7 @@ class PastFollower:
         return self._parts[node]
 
     def step(self, state: State, event: str) -> tuple[State, bool]:
-        """Return the memory after an event, and whether the formula holds at it."""
+        """Return the memory after an event, and whether the formula holds at the event."""
         before = {node: state[place] for node, place in self._looking}
         now: dict[Node, bool] = {}
         for node in self._order:

@@ -1,6 +1,7 @@
-"""Patterns without a bound of time, as formulas about the future that say the same (after Dwyer; HPL).
+"""Translate patterns without a time bound to equivalent formulas about the future (after Dwyer; HPL).
 
-`W` is "until, or for ever". Inside a scope that `q` closes (`false` where nothing does), from its first event on:
+`W` is "until, or for ever". These formulas hold inside a scope that `q` closes (`false` if no event closes it), from
+its first event on:
 
     no c            not c  W  q
     some c          not q  U  (c and not q);  open to the end: eventually c
@@ -8,7 +9,7 @@
     c requires d    not c  W  ((d and not c) or q)
     c forbids d     (c => next (not d  W  q))  W  q
 
-Strictly before and after: no event answers itself. An event that closes the scope is not in it.
+Before and after are strict: no event answers itself. An event that closes the scope is not inside the scope.
 """
 
 from collections.abc import Sequence
@@ -59,7 +60,7 @@ def _event(word: str, events: Sequence[str]) -> Node:
 
 
 def _weak(left: Node, right: Node) -> Node:
-    """`left W right`: the right one releases the disjunction of both."""
+    """Return `left W right`: the right side releases the disjunction of both sides."""
     return ("release", right, ("or", left, right))
 
 

@@ -1,6 +1,6 @@
 """Certify the compiled properties of specifications.
 
-This is the only place where certificates take results of the logics' compilers.
+This is the only module that passes results of the logics' compilers to the certifier.
 """
 
 from collections.abc import Iterable

@@ -1,11 +1,11 @@
 """Replace the functions of events and handlers in a finished module with stubs that return scripted results.
 
-The walks of topics and the data, tables included, stay the same bytes. Behind the frames, the script has: the notes of
-calls, the state to restore before each try, and the result of each function.
+The walks of topics and the data, tables included, stay byte for byte the same. The script is stored after the frames:
+the notes of calls, the state to restore before each try, and the result of each function.
 
-The encoders and decoders here are this file's own, and share none with the writer of modules (`fast/wasm.py`): an error
-in the writer's encoding of a number or section is not repeated here. Shared with the writer are only facts about the
-module, from `WasmModule`: the names of the walks, and the addresses of frames and effects. If the writer records a
+This file has its own encoders and decoders, and shares none with the writer of modules (`fast/wasm.py`). So an error in
+the writer's encoding of a number or section is not repeated here. The file shares only facts about the module
+(`WasmModule`) with the writer: the names of the walks, and the addresses of frames and effects. If the writer records a
 wrong address, the module traps or the comparison in `steps.py` fails, unless the writer uses the same wrong address
 everywhere.
 """
@@ -16,9 +16,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from rosmop.fast.batch_codegen import WasmModule
 
 RECORD, NOTE = struct.Struct("<qqqii"), struct.Struct("<3i")
-"""The result of a try: answer, first effect, state, end of the notes. A note of a call: function and two arguments."""
+"""The format of a try's result: answer, first effect, state, end of the notes.
+
+The format of a call's note: function and two arguments.
+"""
 TELL, SCRIPT = 4096, 8192
-"""Offsets behind the first frame: the end of the notes; the results of the functions."""
+"""Offsets after the first frame: of the end of the notes, and of the results of the functions."""
 
 _I32, _I64 = b"\x7f", b"\x7e"
 _ADD, _LESS = b"\x6a", b"\x48"  # i32.add, i32.lt_s
@@ -27,7 +30,10 @@ _COPY_MEMORY = b"\xfc\x0a\x00\x00"
 
 
 def scripted(module: WasmModule) -> bytes:
-    """Return the module with stubs, and with a function that tries a range of states (`try` and a walk's name)."""
+    """Return the module with stubs.
+
+    For each walk it gets a function that tries a range of states (`try` and the walk's name).
+    """
     sections = sections_of(module.code)
     types, chosen = list(_types(sections[1])), list(_chosen(sections[3]))
     exports = _exports(sections[7])
@@ -50,10 +56,10 @@ def scripted(module: WasmModule) -> bytes:
 
 
 def _stub(module: WasmModule, number: int, kind: bytes) -> bytes:
-    """Return a function that notes its number and its first two arguments, and returns its result in the script."""
+    """Return a stub: it notes its number and first two arguments, and returns its result from the script."""
     end, result = module.frames + TELL, kind[-1:]
     code = b""
-    if kind[1] >= 2 and kind[2:4] == _I32 + _I32:  # of two addresses: an event or a handler
+    if kind[1] >= 2 and kind[2:4] == _I32 + _I32:  # two addresses: an event or a handler
         note = _load_i32(end)
         for index, value in enumerate((_i32(number), _get(0), _get(1))):
             code += note + value + _store(_I32, 4 * index)
@@ -68,7 +74,8 @@ def _stub(module: WasmModule, number: int, kind: bytes) -> bytes:
 def _sweep(module: WasmModule, walk: int) -> bytes:
     """Return `try(first, behind, cell, out, end, now)`.
 
-    It runs the walk on the frames up to `end` with each of these states in `cell`, and restores all other state before.
+    This function runs the walk on the frames up to `end` with each of these states in `cell`. It restores all other
+    state before each run.
     """
     state, last, cell, out, end, now, answer = range(7)
     told, template = module.frames + TELL, module.frames + TELL + 16
@@ -94,7 +101,7 @@ def _leb(value: int) -> bytes:
 
 
 def _i32(value: int) -> bytes:
-    """Encode the constant of an address or small number; five bytes, so its sign bit is clear."""
+    """Encode the constant of an address or small number in five bytes, so that its sign bit is clear."""
     return b"\x41" + bytes(value >> shift & 0x7F | 0x80 for shift in (0, 7, 14, 21)) + bytes((value >> 28,))
 
 
@@ -126,7 +133,7 @@ def _function(code: bytes, locals_: Iterable[bytes] = ()) -> bytes:
 
 
 def _read_leb(data: bytes, at: int) -> tuple[int, int]:
-    """Return the number at `at`, and the position behind it."""
+    """Return the number at `at`, and the position after it."""
     value = shift = 0
     while True:
         byte = data[at]

@@ -1,25 +1,25 @@
-"""Run the steps of a finished module in every state, and compare them with the certified automata.
+"""Run the steps of a compiled module in every state, and compare them with the certified automata.
 
-In a module, the walk of a topic (`fast/batch_codegen.py`) calls the functions of events, looks up states in tables,
-and runs handlers. The check runs the same bytes, tables included, but with stubs in place of the functions of events
-and handlers (`scripted_module.py`). A stub notes its call and returns a scripted result, so every event can happen in
-every state of every property. The effect is compared with `expected_steps.py`: the certified automaton, and the order
-and effects of `run/execution.py`.
+In a module, the walk of a topic (`fast/batch_codegen.py`) calls the functions of events, looks up states in tables, and
+runs handlers. The check runs the same bytes, tables included, but with stubs in place of the functions of events and
+handlers (`scripted_module.py`). A stub notes its call and returns a scripted result, so the check can let every event
+happen in every state of every property. The effect is compared with `expected_steps.py`: the certified automaton, and
+the order and effects of `run/execution.py`.
 
 For each topic the check runs:
 
 - each event alone, in every state of every property; with a clock before, at and after its bound;
 - each handler with no result, a drop, `__RESET;`, both, and a message that is left to the engine;
-- each event that may drop, dropping; two events on one message in every state, the second dropping if it may, up to
-  `MOST` steps for the whole set; and several messages in one read, all with the same results;
+- each event that may drop, with a drop; two events on one message in every state, with a drop by the second if it may
+  drop, up to `MOST` steps for the whole set; and several messages in one read, all with the same results;
 - a monitor that is switched off, and a drop and a verdict that are left to the engine.
 
-Not checked: the functions themselves (`prove` compares those of events with their form), the list of effects after a
-changed message, the stored explanations, and the translation of the module to machine code.
+Not checked: the functions themselves (`prove` compares the functions of events with their form), the list of effects
+after a changed message, the stored explanations, and the translation of the module to machine code.
 
-Independence ends here: the check takes the addresses of states, clocks, frames and counters from the writer
-(`WasmModule`, `Cells`), the numbers of events and properties from `form/specification_groups.py`, and the steps of
-clocked properties from `ClockedRun`. It encodes its stubs with code of its own.
+The check depends on the writer for some data: the addresses of states, clocks, frames and counters (`WasmModule`,
+`Cells`). It also takes the numbers of events and properties from `form/specification_groups.py`, and the steps of
+clocked properties from `ClockedRun`. It encodes its stubs with its own code.
 """
 
 import struct
@@ -50,19 +50,19 @@ from rosmop.form.specification_groups import groups
 from rosmop.logics.interface import ClockedProperty, ClockedRun, FiniteProperty
 
 MOST = 100_000
-"""Steps of pairs of events that are run for one set."""
+"""The maximum number of steps with pairs of events for one set."""
 
-_FEW = 16  # states, if the state does not matter
+_FEW = 16  # the number of states to try if the state does not matter
 _FUEL = 100_000  # for each message
 _FRAME = bytes(range(7, 23))
 
 
 class StepDiffersError(Exception):
-    """The module differs from the automaton; the text says where."""
+    """The steps of the module differ from the automaton; the text says where."""
 
 
 def check_steps(compiled: Compiled, module: WasmModule) -> int:
-    """Run the steps of a module; return how many there were. Raises `StepDiffersError` for the first wrong one."""
+    """Run the steps of a module, and return their number. Raises `StepDiffersError` for the first wrong step."""
     if not module.feeds:
         return 0
     pairs = MOST
@@ -88,7 +88,10 @@ def check_steps(compiled: Compiled, module: WasmModule) -> int:
 
 
 def _cases(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
-    """Yield the cases, each with the property whose states are tried (None: none), and whether all states are."""
+    """Yield the cases.
+
+    Each has the property whose states are tried (or None), and whether all of its states are tried.
+    """
     for event, function in enumerate(topic.functions):
         happens = {function: HAPPENED}
         rows = [one for one in topic.steps[event] if one.number is not None]
@@ -123,7 +126,7 @@ def _cases(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
 
 
 def _pairs(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
-    """Yield the cases of two events on one message: both happen, and the second drops it if it may."""
+    """Yield the cases of two events on one message: both happen, and the second drops the message if it may."""
     for first, second in combinations(range(len(topic.functions)), 2):
         one, other = topic.functions[first], topic.functions[second]
         numbers = dict.fromkeys(each.number for event in (first, second) for each in topic.steps[event])
@@ -153,7 +156,7 @@ def _handling(one: PropertyStep) -> tuple[int, int] | None:
 
 
 def _answers(one: PropertyStep, bits: int) -> dict[int, int]:
-    """Return the results of a property's handlers; a handler that may not drop has no drop."""
+    """Return the results of a property's handlers. A handler that may not drop gets no drop."""
     bits |= HAPPENED | CHANGED
     return {
         each.function: bits if each.drops else bits & ~DROPPED
@@ -193,7 +196,7 @@ class _Bench:
             self._memory[at : at + 20] = struct.pack("<I", len(_FRAME)) + _FRAME
 
     def run(self, case: StepCase, number: int | None, *, everywhere: bool) -> int:
-        """Run a case and compare; return how many states were tried. Raises `StepDiffersError`."""
+        """Run a case and compare the results; return the number of tried states. Raises `StepDiffersError`."""
         one = None if number is None else self._topic.properties[number]
         states = 1 if one is None else one.states if everywhere else min(one.states, _FEW)
         for first in range(0, states, self._most):
@@ -264,7 +267,7 @@ class _Bench:
         given: tuple[int, ...],
         expected: ExpectedResult,
     ) -> int:
-        """Compare the results of one try; return where the notes of the next begin."""
+        """Compare the results of one try; return the position where the notes of the next try begin."""
         answer, who, what, cell, end, at = given
         notes = list(NOTE.iter_unpack(self._memory[at:end]))
         begins = [self._frames + 20 * frame for frame in range(4)]
@@ -289,7 +292,7 @@ class _Bench:
         return () if address is None else struct.unpack_from("<2q", self._memory, address)
 
     def _count(self, case: StepCase, one: PropertyStep | None, expected: Sequence[ExpectedResult]) -> None:
-        """Compare how often events have happened, dropped, and come to verdicts."""
+        """Compare how often events happened, dropped a message, and led to verdicts."""
         rows = [
             [0] * len(self._feed.functions),
             [0] * len(self._feed.functions),

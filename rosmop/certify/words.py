@@ -1,7 +1,7 @@
 """Extended regular expressions by their derivatives (the expression after an event).
 
-Each expression has a number. Unions and intersections are sets of numbers, so that order and repetition do not matter.
-Then there are finitely many derivatives (Brzozowski, 1964).
+Each expression has a number. Unions and intersections are sets of numbers, so order and repetition do not matter, and
+there are finitely many derivatives (Brzozowski, 1964).
 """
 
 from collections.abc import Iterable
@@ -9,13 +9,16 @@ from collections.abc import Iterable
 from rosmop.certify.formula_reader import Node, UnsupportedFormulaError, WorkLimitError
 
 LONGEST = 5_000
-"""Symbols of an expression whose powers are written out."""
+"""The maximum number of symbols of an expression after its powers are written out."""
 
 Parts = tuple[object, ...] | frozenset[int]
 
 
 class ExpressionDerivatives:
-    """The derivatives of an expression; a state is an expression's number. `work` is the most parts of all together."""
+    """The derivatives of an expression.
+
+    A state is an expression's number. `work` limits the parts of all derivatives together.
+    """
 
     def __init__(self, expression: Node, work: int) -> None:
         self._work = work
@@ -73,7 +76,7 @@ class ExpressionDerivatives:
         return self._number("not", (inner,), matches=not self._matching[inner])
 
     def _sequence(self, first: int, rest: int) -> int:
-        """Return a sequence that nests to the right: its first part is not a sequence."""
+        """Return a sequence that nests to the right, so that its first part is not a sequence."""
         if self._none in (first, rest):
             return self._none
         if first == self._nothing:
@@ -102,7 +105,7 @@ class ExpressionDerivatives:
         return self._number(kind, frozenset(flat), matches=quantor(self._matching[part] for part in flat))
 
     def _read(self, node: Node) -> tuple[int, int]:
-        """Return the number of an expression, and how many symbols it has when its powers are written out."""
+        """Return the number of an expression, and the number of its symbols after its powers are written out."""
         kind = str(node[0])
         if kind == "event":
             return self._number("event", (node[1],), matches=False), 1
