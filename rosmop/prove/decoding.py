@@ -1,6 +1,6 @@
 """Decodes a module into functions: types, local variables, and instructions in a tree.
 
-Only the instructions are known that modules of events are written with; any other is an `UnknownInstructionError`.
+It knows only the instructions that the writer of modules uses. Any other instruction raises `UnknownInstructionError`.
 """
 
 import struct
@@ -10,12 +10,12 @@ from types import MappingProxyType
 
 
 class UnknownInstructionError(Exception):
-    """The module has something unknown."""
+    """The module has an unknown instruction or element."""
 
 
 @dataclass(frozen=True, slots=True)
 class WasmInstruction:
-    """`operands` are its constants; blocks have their `body`, and `if` what is done `otherwise`."""
+    """An instruction. `operands` are its constants. A block has a `body`, and `if` also has the branch `otherwise`."""
 
     name: str
     operands: tuple[int | float, ...] = ()
@@ -25,7 +25,7 @@ class WasmInstruction:
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """A function: the types of its parameters, of its result and of its further variables ("i32", "f64", …)."""
+    """A function: the types of its parameters, its result and its local variables ("i32", "f64", …)."""
 
     parameters: tuple[str, ...]
     result: str
@@ -76,7 +76,7 @@ _TRUNCATING = MappingProxyType(dict(enumerate(_TRUNCATED.split())))
 _NUMBERED = MappingProxyType({0x0C: "br", 0x0D: "br_if", 0x10: "call", 0x20: "local.get", 0x21: "local.set"})
 _BLOCKS = MappingProxyType({0x02: "block", 0x03: "loop", 0x04: "if"})
 _ELSE, _END = 0x05, 0x0B
-_COPY, _FILL = 10, 11  # behind 0xFC
+_COPY, _FILL = 10, 11  # the byte after 0xFC
 _FLOATS = MappingProxyType(
     {0x43: ("f32.const", struct.Struct("<f")), 0x44: ("f64.const", struct.Struct("<d"))}
 )
@@ -121,7 +121,7 @@ class Reader:
         return tuple(TYPES[self.byte()] for _ in range(self.unsigned()))
 
     def block(self) -> tuple[tuple[WasmInstruction, ...], int]:
-        """Read instructions up to an `else` or `end`; return them and which of the two it is."""
+        """Read instructions up to `else` or `end`. Return the instructions, and which of the two ended them."""
         found: list[WasmInstruction] = []
         while True:
             code = self.byte()
@@ -134,12 +134,12 @@ class Reader:
         if code in PLAIN:
             return WasmInstruction(PLAIN[code])
         if code in MEMORY:
-            self.unsigned()  # what the address is a multiple of: a hint
+            self.unsigned()  # the alignment, which is only a hint
             return WasmInstruction(MEMORY[code], (self.unsigned(),))
         if code in _NUMBERED:
             return WasmInstruction(_NUMBERED[code], (self.unsigned(),))
         if code in _BLOCKS:
-            self.byte()  # the type of its value
+            self.byte()  # the type of the block's value
             body, end = self.block()
             otherwise = self.block()[0] if end == _ELSE else ()
             return WasmInstruction(_BLOCKS[code], (), body, otherwise)

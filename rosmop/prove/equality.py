@@ -1,15 +1,17 @@
-"""Asks z3 whether an event and its code in the module can differ.
+"""Asks z3 whether the form of an event and its code in the module can differ.
 
-An event and its function in the module are equal if, for every message of up to `AREA` bytes and every state, the
-function leaves the message to Python (which then processes it from the start), or
+The form of an event and its function in the module are compared for every message of up to `AREA` bytes and every
+state. They are equal if the function leaves the message to Python, which then processes it from the start, or if all of
+these hold:
 
 - the form does not fault,
-- both agree on whether the event happened, dropped the message, changed it,
+- both agree on whether the event happened, dropped the message, and changed it,
 - the bytes of the message, the variables and the rest of the budget are the same,
-- and so are the lines of output, in order. (An event that reads or keeps a string in a variable is not proved.)
+- the lines of output are the same, in order.
 
-If it leaves the message, its effects are undone: each variable that it has written must be among those that are
-restored, and each byte in the log (`module_terms.py`).
+An event that reads or keeps a string in a variable is not proved. If the function leaves the message, its effects are
+undone: each variable that it wrote must be among those that are restored, and each byte must be in the log
+(`module_terms.py`).
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -52,7 +54,7 @@ from rosmop.types.value_types import Type
 EQUAL = "equal"
 IN_PYTHON = "not compiled: Python evaluates the messages of this topic"
 PATIENCE = 5.0
-"""Default number of seconds for each event."""
+"""The default time limit for each event, in seconds."""
 
 _NOW, _REST = 16, 32  # addresses of the time and of the number of bytes that are not shown
 _HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE = 1, 2, 4, 8
@@ -63,9 +65,9 @@ _LATEST = 1 << 62
 class ProofFinding:
     """The result for an event on a topic, or part of a service.
 
-    `answer` is `EQUAL`, or says why it is not known to be, or what differs.
+    `answer` is `EQUAL`, the reason why equality is not known, or the difference.
 
-    `differs`: the two are not equal, which is a defect of what writes modules.
+    `differs`: the two are not equal, which is a defect in the writer of modules.
     """
 
     topic: str
@@ -77,7 +79,10 @@ class ProofFinding:
 def findings_of(
     compiled: Compiled, clock: Callable[[], float], patience: float = PATIENCE
 ) -> Iterator[ProofFinding]:
-    """Yield the result for each event of a set except timers, in order; `patience` is in seconds for each."""
+    """Yield the result for each event of a set except timers, in order.
+
+    `patience` is the time limit for each event, in seconds.
+    """
     found = list(groups(compiled.specifications))
     values = ValueCodec(compiled.messages)
     module = written(compiled.functions, [group.component for group in found], values)
@@ -168,7 +173,7 @@ class Validation:
         return EQUAL
 
     def _first(self, known: Sequence[Term], wrong: Mapping[str, Term]) -> str | None:
-        """Return why they are not known to be equal; None if they are. Raises `DiffersError`."""
+        """Return why the two are not known to be equal; None if they are equal. Raises `DiffersError`."""
         begun = self._clock()
         undecided = False
         for text, condition in wrong.items():
@@ -186,8 +191,9 @@ class Validation:
         return "not decided in time" if undecided else None
 
     def _asked(self, conditions: Sequence[Term], begun: float) -> tuple[Any, Any]:
-        """Return whether the conditions are satisfiable, and a model; `begun` is the time of the event's first
-        question.
+        """Return whether the conditions are satisfiable, and a model.
+
+        `begun` is the time when the event's first question was asked.
         """
         rest = int(1000 * (begun + self._patience - self._clock()))
         if rest <= 0:
@@ -199,7 +205,7 @@ class Validation:
         return answer, solver.model() if answer == z3.sat else None
 
     def _beginning(self) -> tuple[StartTerms, dict[int, Term], list[Term]]:
-        """Return the initial state of every event, the same as cells of the module, and its constraints."""
+        """Return the initial state of every event, the same state as cells of the module, and the constraints on it."""
         now, size = z3.BitVec("now", 64), z3.BitVec("size", 32)
         known = [now >= 0, now < _LATEST, z3.ULE(size, AREA)]
         cells: dict[int, Term] = {_NOW: now, _REST: integer(0, 64)}
@@ -239,7 +245,9 @@ class Validation:
 
 
 def _holds(conditions: Sequence[Term], guess: Any) -> bool:
-    """Return whether a message and a state are an example with the true results of costly operations."""
+    """Return whether the guessed message and state still satisfy the conditions with the true results of costly
+    operations.
+    """
     values = [
         (declaration(), guess[declaration]) for declaration in guess.decls() if declaration.arity() == 0
     ]
@@ -259,12 +267,12 @@ def _example(model: Any) -> str:
 
 
 def _same(held: Term, value: Term) -> Term:
-    """Return whether a cell holds a value; a boolean may be a number."""
+    """Return the condition that a cell holds a value. A boolean may be stored as a number."""
     return held == (as_bits(value) if z3.is_bool(value) and not z3.is_bool(held) else value)
 
 
 def _among(noted: LineTerm, lines: Term) -> Term:
-    """Return whether the line has one of its allowed values."""
+    """Return the condition that the line has one of its allowed values."""
     held = number_at(lines, noted.offset, noted.allowed[0].size() // 8) if noted.allowed else None
     return either(*(held == one for one in noted.allowed))
 

@@ -1,10 +1,12 @@
-"""Translates the form of an event to terms of z3: `run/interpreter.py` line by line, for all messages at once.
+"""Translates the form of an event to terms of z3. It follows `run/interpreter.py` line by line, for all messages at
+once.
 
-- Positions and counts have 64 bits here and are unbounded there: a function without loops adds a few products of a
-  count below 2**32 and a size, which never exceed 64 bits. Times also have 64 bits, and sums of two of them fit.
-- For floats of 32 bits the interpreter rounds the double result of `+ - * /`. That is the result of the operation on
-  floats: a double has more than twice as many digits, so that rounding twice is rounding once.
-- Measuring the values of a specification, once for each megabyte that it allocates, is left out.
+- Positions and counts have 64 bits here, but are unbounded in the interpreter. This is enough: a function without loops
+  adds a few products of a count below 2**32 and a size, which never exceed 64 bits. Times also have 64 bits, and the
+  sum of two times fits.
+- For 32-bit floats, the interpreter rounds the double result of `+ - * /`. That equals the result of the operation on
+  floats: a double has more than twice as many digits, so rounding twice gives the same result as rounding once.
+- The interpreter measures the values of a specification once for each megabyte that it allocates. This is left out.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -60,7 +62,7 @@ class _View:
 
 
 class UnknownError(Exception):
-    """The form has something that is not translated."""
+    """The form has a node that is not translated."""
 
 
 def is_signed(kind: Type) -> bool:
@@ -74,7 +76,7 @@ def width(kind: Type) -> int:
 
 
 def wrapped(value: Term, kind: value_types.IntegerType) -> Term:
-    """Wrap a number to the bits of its type, extended to the bit vector."""
+    """Wrap a number to the bits of its type, and extend it to the width of the bit vector."""
     if kind.bits >= 32:
         return value
     return (z3.SignExt if kind.signed else z3.ZeroExt)(32 - kind.bits, z3.Extract(kind.bits - 1, 0, value))
@@ -94,8 +96,10 @@ def _word(value: Term, kind: Type) -> Term:
 
 
 class FormTerms:
-    """Translates one event. `functions` are those of its set, `values` the types of its messages; `lines` are the
-    module's lines of output, by number.
+    """Translates one event.
+
+    `functions` are the functions of its set, `values` the types of its messages. `lines` has the module's lines of
+    output, by number.
     """
 
     def __init__(
@@ -130,7 +134,7 @@ class FormTerms:
         slots |= {("shared", name): value for name, value in begin.variables.items()}
         state = State(z3.BoolVal(True), slots)
         self._block(self._function.body, state)
-        self._left.append(state.alive)  # no message reaches the end without leaving
+        self._left.append(state.alive)  # every message leaves the function before its end
         happened, end = no, slots
         for left, value in self._exits:
             happened = choice(left.alive, value, happened)
@@ -145,7 +149,7 @@ class FormTerms:
     # Ends
 
     def _leave_to_python(self, state: State, condition: Term) -> None:
-        """Leave the message to Python: a fault, or something that is not compiled."""
+        """Leave the message to Python because of a fault, or of a node that is not compiled."""
         self._left.append(both(state.alive, condition))
         state.require(opposite(condition))
 
@@ -255,7 +259,7 @@ class FormTerms:
         state.slots[_SAID] = begin + (offset + 7 & ~7)
 
     def _pending(self, node: nodes.Pending, state: State) -> None:
-        """Do nothing: only `Whole` uses it, which is not compiled."""
+        """Do nothing: only `Whole` uses this list, and `Whole` is not compiled."""
 
     def _require(self, node: nodes.Require, state: State) -> None:
         test = self._value(node.test, state)
@@ -394,7 +398,7 @@ class FormTerms:
         return z3.Concat(z3.Extract(31, 0, rest), z3.Extract(31, 0, seconds))
 
     def _parts(self, value: Term) -> tuple[Term, Term]:
-        """Return `divmod(value, 10**9)`: the rest has the sign of the divisor."""
+        """Return `divmod(value, 10**9)`. The remainder has the sign of the divisor."""
         billion = integer(times.BILLION, 64)
         rest = z3.SRem(value, billion)
         rest = z3.If(rest < 0, rest + billion, rest)
@@ -471,7 +475,10 @@ class FormTerms:
         return wrapped(value if width(target) == value.size() else z3.Extract(31, 0, value), target)
 
     def _truncated(self, value: Term, target: value_types.IntegerType) -> Term:
-        """Truncate toward zero, within the limits; types narrower than 32 bits first within those of `int`."""
+        """Truncate toward zero, within the limits of the type.
+
+        For types narrower than 32 bits, first use the limits of `int`.
+        """
         whole = target if target.bits >= 32 else value_types.INT
         bits = whole.bits
         least, most = floating(whole.least, 64), floating(whole.most, 64)
@@ -489,7 +496,7 @@ class FormTerms:
         kind, operator = node.type, node.operator
         if isinstance(kind, value_types.FloatingType):
             return _OF_FLOATS[operator](NEAREST, left, right)
-        assert isinstance(kind, value_types.IntegerType)  # noqa: S101  numbers that are calculated with are one of the two
+        assert isinstance(kind, value_types.IntegerType)  # noqa: S101  operands have one of two types
         if operator in "/%":
             self._leave_to_python(state, right == 0)
             if operator == "/":
@@ -532,8 +539,10 @@ class FormTerms:
         return self._of_parts(node.type, seconds, rest, state)
 
     def _of_parts(self, kind: Type, seconds: Term, rest: Term, state: State) -> Term:
-        """Return the exact time. Seconds beyond 2**33 are out of range for all allowed nanoseconds. Below that, the
-        sum in 72 bits shows whether the sum in 64 overflows.
+        """Return the exact time.
+
+        Seconds beyond 2**33 are out of range for all allowed nanoseconds. Below that limit, the sum in 72 bits shows
+        whether the sum in 64 bits overflows.
         """
         far = either(seconds >= 1 << 33, seconds <= -(1 << 33), rest >= 1 << 62, rest <= -(1 << 62))
         known = state.where(far)
@@ -599,7 +608,7 @@ class FormTerms:
         return self._beginning.now
 
     def _throttle(self, node: nodes.Throttle, state: State) -> Any:
-        """Leave output that is due to Python; ignore output that is not due."""
+        """Leave the message to Python if the output is due; otherwise do nothing."""
         last = self._beginning.throttles.get((self._function.context, node.site))
         if last is None:
             raise UnknownError("output with a rate limit")
@@ -608,7 +617,7 @@ class FormTerms:
         )
         more = z3.fpMul(NEAREST, seconds, floating(1e9, 64))
         until = z3.fpAdd(NEAREST, z3.fpSignedToFP(NEAREST, last, DOUBLE), more)
-        # A whole number is below another if it is below the next whole one.
+        # A whole number is below `until` if it is below the next whole number.
         whole = z3.fpRoundToIntegral(z3.RTP(), until)
         first, limit = z3.fpToSBV(z3.RTZ(), whole, z3.BitVecSort(64)), floating(2.0**63, 64)
         now = self._beginning.now

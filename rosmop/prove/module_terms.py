@@ -1,15 +1,15 @@
 """Translates a function of a module to terms of z3, by the standard of WebAssembly.
 
-Memory has these parts, and any other address is a difference:
+Memory has these parts. Access to any other address counts as a difference:
 
 - cells, 8 bytes each at constant addresses: variables, budgets, times, and the end of the log (`UNDO`);
 - the message, from the address that the function gets: all reads and writes are within its size;
 - lines of output, in order;
-- the log, by which a message that is left is restored: each write to the message is preceded by an entry with address,
-  size and old bytes, and entries are never overwritten.
+- the log, which restores a message that is left. Each write to the message is preceded by an entry with address, size
+  and old bytes. Entries are never overwritten.
 
-For strings in variables, and for constant strings, only the addresses are known: code that reads them is not proved.
-Leaving the message (`ELSEWHERE`) and a trap are the same: the effects are undone.
+For strings in variables, and for constant strings, only the addresses are known. Code that reads such strings is not
+proved. A message that is left (`ELSEWHERE`) and a trap are treated alike: the effects are undone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -74,8 +74,9 @@ class _Note:
 
 @dataclass(frozen=True)
 class ModuleResult:
-    """The result of a function of an event. `bits` are its return value, unless it has `trapped`; `outside`: it reads
-    beyond the message.
+    """The result of the function of an event.
+
+    `bits` are its return value, unless it has `trapped`. `outside`: it reads beyond the message.
     """
 
     trapped: Term
@@ -89,12 +90,12 @@ class ModuleResult:
 
 
 class ModuleExecution:
-    """Executes the function of one event, by its number, on these cells (booleans are also numbers).
+    """Executes the function of one event, by its number, on these cells. Booleans in cells are also numbers.
 
-    `strings` are the addresses of strings, and of the cells that refer to them.
+    `strings` are the addresses of strings, and of the cells that refer to strings.
     """
 
-    def __init__(  # noqa: PLR0917  as `done` names them
+    def __init__(  # noqa: PLR0917  a function, its message and its cells
         self,
         functions: Sequence[Code],
         number: int,
@@ -140,7 +141,7 @@ class ModuleExecution:
         )  # fmt: skip
 
     def _call(self, number: int, arguments: Sequence[Any], state: State) -> Any:
-        """Return the value of a function; `state` becomes the one after the call."""
+        """Return the value of a function call. `state` becomes the state after the call."""
         code = self._functions[number]
         self._frames += 1
         outer = self._frame, self._returned
@@ -184,7 +185,7 @@ class ModuleExecution:
                 stack.append(_calculated(family, rest, instruction.operands, stack))
 
     def _divides(self, name: str, state: State, stack: Sequence[Any]) -> None:
-        """Trap for a division by zero, or if the quotient overflows."""
+        """Trap if the divisor is zero or the quotient overflows."""
         left, right = _bits(stack[-2]), _bits(stack[-1])
         traps = right == 0
         if name == "div_s":
@@ -256,7 +257,7 @@ class ModuleExecution:
             raise DiffersError(f"it reads {each_name(family, how)} at {place}, where no such value is stored")
         return value
 
-    def _store(  # noqa: PLR0917  as the instruction has them
+    def _store(  # noqa: PLR0917  the operands of the instruction
         self, family: str, how: str, offset: float, address: Any, value: Any, state: State
     ) -> None:
         size = int(how or family[1:]) // 8
@@ -361,7 +362,7 @@ def _stored(value: Any, size: int) -> Term:
 
 
 def each_name(family: str, how: str) -> str:
-    """Return a name for the bits that are read or written."""
+    """Return the number of bits that are read or written as a text, such as `32 bits`."""
     return f"{how.strip('_us') or family[1:]} bits"
 
 
@@ -412,10 +413,10 @@ def _calculated(family: str, name: str, operands: Sequence[float], stack: list[A
 
 
 def _cut(value: Term, bits: int, *, signed: bool) -> Term:
-    """Return `trunc_sat`: toward zero, saturated, 0 for NaN."""
+    """Return the result of `trunc_sat`: rounded toward zero, saturated, 0 for NaN."""
     least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
     whole = (z3.fpToSBV if signed else z3.fpToUBV)(z3.RTZ(), value, z3.BitVecSort(bits))
-    # Between a limit and the next whole number nothing is cut but to the limit.
+    # A value between a limit and the next whole number can only be cut to the limit.
     high, low = z3.fpGEQ(value, floating(most, 64)), z3.fpLEQ(value, floating(least, 64))
     fitting = z3.If(low, integer(least, bits), z3.If(high, integer(most, bits), whole))
     return z3.If(z3.fpIsNaN(value), integer(0, bits), fitting)

@@ -1,8 +1,8 @@
 """Terms of z3 for both sides, their initial state, and states that merge branches.
 
 - A message is an array of bytes, addressed in 32 bits, with a `size` that no frame exceeds.
-- A number of the language is a bit vector of 32 bits (narrower ones extended by their sign, or zeros) or of 64, a
-  truth, or an IEEE number; there is one NaN, and its bits cannot be read.
+- A number of the language is a bit vector, a boolean, or an IEEE number. Bit vectors have 64 or 32 bits; narrower
+  numbers are extended by their sign or by zeros. There is only one NaN, and its bits cannot be read.
 """
 
 import struct
@@ -24,11 +24,11 @@ FRAME = z3.BitVec("position", 32)
 
 
 class NotProvedError(Exception):
-    """Nothing is known about an event, for this reason."""
+    """Nothing is known about an event; the text has the reason."""
 
 
 class _Mixed:
-    """The content of a slot with different kinds of values in two branches; it may not be read."""
+    """The content of a slot that has different kinds of values in two branches. It must not be read."""
 
 
 MIXED = _Mixed()
@@ -44,7 +44,7 @@ def integer(value: int, bits: int) -> Term:
 
 
 def floating(value: float, bits: int) -> Term:
-    """Return a floating-point constant, to the last bit."""
+    """Return a floating-point constant, exact to the last bit."""
     number = int.from_bytes(struct.pack("<d" if bits == 64 else "<f", value), "little")
     return z3.simplify(z3.fpBVToFP(integer(number, bits), DOUBLE if bits == 64 else SINGLE))
 
@@ -74,7 +74,10 @@ def opposite(condition: Term) -> Term:
 
 
 def choice(test: Term, yes: Term, no: Term) -> Term:
-    """Return `test ? yes : no` of terms and of structures of them; a part that only one has is taken from it."""
+    """Return `test ? yes : no` for terms, or for structures of terms.
+
+    A part that only one structure has is taken from that structure.
+    """
     if z3.is_true(test) or no is None or yes is no:
         return yes
     if z3.is_false(test) or yes is None:
@@ -109,7 +112,7 @@ def number_at(message: Term, position: Term, size: int) -> Term:
 
 
 def with_number(message: Term, position: Term, value: Term) -> Term:
-    """Return the message with these bytes."""
+    """Return the message with the little-endian bytes of `value` at a position."""
     for more in range(value.size() // 8):
         place = position + integer(more, 32) if more else position
         message = z3.Store(message, place, z3.Extract(8 * more + 7, 8 * more, value))
@@ -163,7 +166,7 @@ class StartTerms:
 
 @dataclass(frozen=True)
 class LineTerm:
-    """A part of a line of output, under a condition (`alive`): one of these values, at an offset."""
+    """A part of a line of output at an offset: under the condition `alive`, it is one of these values."""
 
     alive: Term
     offset: Term
@@ -172,8 +175,10 @@ class LineTerm:
 
 @dataclass(frozen=True)
 class FormResult:
-    """The result of an event: `left` (a fault), and reasons why it is unknown (`unknown`, by name); the rest holds if
-    it is neither. Its lines of output are `noted`, in `said` bytes.
+    """The result of an event.
+
+    `left` is the condition of a fault, and `unknown` has, by name, the conditions under which the result is unknown.
+    The other fields are valid if neither holds. The lines of output are `noted`, and take `said` bytes.
     """
 
     left: Term
@@ -200,12 +205,12 @@ _COSTLY = frozenset(
 
 
 def abstracted(terms: Sequence[Term]) -> list[Term]:
-    """Replace the results of costly operations by variables, the same for equal operands.
+    """Replace the results of costly operations by variables, with the same variable for equal operands.
 
-    If a formula over these variables cannot hold, neither can the original.
+    If a formula over these variables cannot hold, the original formula cannot hold.
     """
     known: dict[int, Term] = {}
-    kept: list[Term] = []  # as long as their numbers are used
+    kept: list[Term] = []  # kept alive as long as their numbers are used
     begin = [z3.simplify(term) for term in terms]
     waiting = list(begin)
     while waiting:
@@ -233,7 +238,7 @@ def abstracted(terms: Sequence[Term]) -> list[Term]:
 
 
 def _is_cheap(kind: int, operands: Sequence[Term]) -> bool:
-    """Return whether it is an operation on constants, or a product with a small constant."""
+    """Return whether an operation is cheap: only on constants, or a product with a small constant."""
     small = any(z3.is_bv_value(operand) and operand.as_long() < _SMALL for operand in operands)
     return (kind == z3.Z3_OP_BMUL and small) or all(map(_is_number, operands))
 
