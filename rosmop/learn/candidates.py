@@ -1,8 +1,8 @@
 """Propose conditions on a topic's messages and on their order, each with a bound that the recordings support.
 
-A bound is the level that `extremes` expects all bounds of the file together to exceed once in `QUIET_HOURS`. Conditions
-without content are left out: a rate that allows any change, a standstill as long as the recording. Each topic keeps at
-most `MOST` conditions of a kind; those that most messages exercised come first.
+Bounds are levels from `extremes`: all bounds of the file together are expected to be exceeded once in `QUIET_HOURS`.
+Conditions without content are left out, such as a rate that allows any change, or a standstill as long as the
+recording. Each topic keeps at most `MOST` conditions of a kind: the conditions that the most messages exercised.
 """
 
 import math
@@ -19,12 +19,12 @@ from rosmop.learn.topics import TopicContent, TopicRhythm
 
 QUIET_HOURS = 10.0
 MOST = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
-"""The limit for one topic and kind; of the other kinds there is one for each field, or one in all."""
+"""The limit for one topic and kind. Other kinds have one condition for each field, or only one condition."""
 
-_FEWEST = 20  # least number of messages for a statement about all of them
+_FEWEST = 20  # the minimum number of messages for a statement about all messages
 _FEWEST_SET = 10
-_ALWAYS_CHANGING = 0.5  # of the messages brought another value
-_REGULAR = 8.0  # usual gaps: a topic with longer pauses is not regular
+_ALWAYS_CHANGING = 0.5  # the fraction of messages with a changed value
+_REGULAR = 8.0  # usual gaps; a topic with a longer pause is not regular
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,10 @@ class CandidateSupport:
 class Candidate:
     """One condition that held in all recordings.
 
-    `says` begins the warning, as no other's does; `condition` is that of the alarm in the language, with `{v}` for the
-    field's value, `{n}` for a name made of its path and `{t}` for a prefix of the topic's own. It needs the
-    declarations `state`, and the statements `first` before and `then` after all conditions. Or a `formula` instead.
+    `says` begins the warning; no other candidate has the same text. `condition` is the condition of the alarm in the
+    language. In it, `{v}` stands for the field's value, `{n}` for a name made of the field's path, and `{t}` for a
+    prefix of the topic's own. It needs the declarations `state`, and the statements `first` before and `then` after all
+    conditions. A candidate may have a `formula` instead.
     """
 
     topic: str
@@ -61,9 +62,9 @@ class Candidate:
     then: tuple[str, ...] = ()
     formula: str = ""
     events: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    """For an order: the topics and patterns of its events."""
+    """For an order of topics: the topics and patterns of its events."""
     alarms: int = 0
-    """On the recordings that were held out."""
+    """The number of alarms on the held-out recordings."""
     widened: str = ""
 
     @property
@@ -78,7 +79,7 @@ class Candidate:
 
     @property
     def place(self) -> str:
-        """Return the field as people write it."""
+        """Return the field in the notation for people."""
         return self.path if self.element is None else f"{self.path}[{self.element}]"
 
 
@@ -92,11 +93,11 @@ class LearntFacts:
     orders: TopicOrders
     windows: Windows
     trimmed: Counter[str] = field(default_factory=Counter)
-    """How many conditions of each topic `candidates` left out because there are more than `MOST`."""
+    """By topic: the number of conditions that `candidates` left out because there were more than `MOST`."""
 
     @property
     def short(self) -> Mapping[str, str]:
-        """Return a name for each topic: its last words, as far as they are its own."""
+        """Return a short unique name for each topic, made of its last words."""
         paths = {topic: identifier(topic).replace("_", ".") for topic in self.contents}
         names = short_names(paths.values())
         return {topic: names[path] for topic, path in paths.items()}
@@ -117,7 +118,7 @@ class LearntFacts:
         yield from proposer.of_orders()
 
 
-# Path, element and length of an array, and what is known of it
+# Path, element and length of an array, and the statistics of its values
 _Place = tuple[str, int | None, int | None, Series]
 
 
@@ -189,7 +190,7 @@ class _Proposer:
                 state=("double {t}stamped = 0.0;",), then=("{t}stamped = {v}.toSec();",),
             )  # fmt: skip
         if age is not None and lead is not None:
-            width = max(content.ages.top + content.leads.top, 1e-4)  # a tenth of a millisecond is not a delay
+            width = max(content.ages.top + content.leads.top, 1e-4)  # 0.1 ms is not a delay
             low, high = rounded_down(-lead - 1e-4, width), rounded_up(age + 1e-4, width)
             yield Candidate(
                 topic, "age", "header.stamp", "header.stamp is too old or too new",
@@ -224,7 +225,7 @@ class _Proposer:
         texts = [literal(value) for value in values.windows]
         if not values.closed or None in texts:
             return
-        if content.types[path] == "bool" and len(texts) == 2:  # there are no others
+        if content.types[path] == "bool" and len(texts) == 2:  # `bool` has no other values
             yield from self._moves(topic, content, path, values, support)
             return
         shown = "{v}.c_str()" if content.types[path] == "string" else "(long) {v}"
@@ -238,7 +239,7 @@ class _Proposer:
     def _moves(
         self, topic: str, content: TopicContent, path: str, values: ValueSeries, support: CandidateSupport
     ) -> Iterator[Candidate]:
-        """Yield the automaton of a field's values, if some value never followed another, and moves are frequent."""
+        """Yield the automaton of a field's values, if some value never followed another and changes are frequent."""
         moves = content.moves.get(path, {})
         ordered = list(values.windows)
         count = len(ordered)
@@ -344,7 +345,7 @@ class _Proposer:
         for (a, b), pair in orders.pairs.items():
             if pair.turns and orders.pairs[b, a].turns and frozenset((a, b)) not in done:
                 if not pair.requires:
-                    continue  # reported for (b, a), which begins
+                    continue  # reported for (b, a), because b begins
                 done.add(frozenset((a, b)))
                 formula = "fsm: first [ a -> second ] second [ b -> first ]"
                 found.append((0.0, self._order((a, b), "turns", formula, "one after the other, always")))

@@ -1,8 +1,8 @@
 """Measure how often recordings exercise events, branches, handlers, functions, states and transitions.
 
 The specifications are compiled with a counter before each action, branch and handler. Counters are added to the syntax
-tree, not to the text, so line numbers stay. The runs of state machines are observed from outside. Otherwise the
-monitors behave as usual, and no messages are kept.
+tree, not to the text, so line numbers stay the same. The runs of state machines are observed from outside. Otherwise
+the monitors behave as usual, and no messages are stored.
 """
 
 import re
@@ -27,7 +27,9 @@ from roswire.definitions import Definitions
 
 @dataclass(frozen=True)
 class CoverageItem:
-    """Something that a recording may exercise: its kind (`event`, `branch`, `state`, …), what it is, and where."""
+    """A part that a recording may exercise: its kind (`event`, `branch`, `state`, …), its description and its
+    position.
+    """
 
     specification: str
     kind: str
@@ -40,14 +42,14 @@ def covered(
 ) -> dict[CoverageItem, int]:
     """Return how often the recordings exercised each item, in the order of the text.
 
-    A state counts how often it was entered or stayed in by an event. Raises `SpecificationError`.
+    The number for a state is how often an event entered it or stayed in it. Raises `SpecificationError`.
     """
-    compiled_from(texts, definitions)  # errors are those of the text as it is
+    compiled_from(texts, definitions)  # reports errors for the unchanged text
     marked = _Marked([parse(text, name) for name, text in texts.items()])
     counts: Counter[CoverageItem] = Counter()
     for recording in recordings:
         monitors = MonitorSet(compile_files(marked.files, definitions), "drop", lambda: lambda: False)
-        # explaining a verdict tries runs, which are not part of the recording
+        # explaining a verdict makes test runs, which are not part of the recording
         monitors.explain_when(lambda *_: False, lambda *_: False)
         watches = _watch(monitors)
         monitors.start(recording.began, frozenset(recording.topics))
@@ -67,7 +69,7 @@ def covered(
 
 
 class _Marked:
-    """Files with a counter in front of each thing; `items` by the names of the counters."""
+    """Files with a counter before each item; `items` has the items by the names of their counters."""
 
     def __init__(self, files: Sequence[tree.SpecificationFile]) -> None:
         self.items: dict[str, CoverageItem] = {}
@@ -170,7 +172,7 @@ def _watch(monitors: MonitorSet) -> list["_Watch"]:
 
 
 class _Watch(CompiledProperty):
-    """A state machine whose runs count the transitions that they take."""
+    """A state machine whose runs count their transitions."""
 
     def __init__(self, specification: str, machine: CompiledProperty) -> None:
         super().__init__(machine.source, machine.categories)
@@ -181,7 +183,7 @@ class _Watch(CompiledProperty):
         self.timed = machine.timed
 
     def start(self, time_ns: int) -> Run:
-        """Return a run of the machine that is watched."""
+        """Return a run of the watched machine."""
         states = read_state_machine(self.source, timed=self._machine.timed).states
         return _Run(self, self._machine.start(time_ns), next(iter(states)))
 
@@ -218,7 +220,7 @@ class _Run:
 
     @property
     def as_new(self) -> bool:
-        """Never: what is watched is not tried out."""
+        """Return False, so that no watched run is stepped as a test."""
         return False
 
     def step(self, event: int, time_ns: int) -> Categories:

@@ -1,12 +1,14 @@
 """Set a bound beyond the observed values, by extreme value theory on the extremes of independent windows.
 
-The largest value of each window is a draw from an extreme value distribution. Gumbel's, that of exponential tails, is
-fitted by L-moments (Hosking 1990), and the bound is the level that it passes once in a given number of windows. A
-shape is not fitted, because some twenty windows are too few for it. If the quantity has a limit, the margin is
-therefore wider than needed, which causes no false alarm. Where windows are of different kinds (a robot that stays
-near, and one that goes far), their upper quarter has a tail of its own, longer than the fit's: the exponential through
-its mean excess (Weissman 1978) is the bound if it is higher. An extreme that several windows reach exactly is a stop
-(a joint's limit, a clamped command): it is the bound.
+The largest value of each window is a draw from an extreme value distribution. Gumbel's distribution, which suits
+exponential tails, is fitted by L-moments (Hosking 1990). The bound is the level that is passed once in a given number
+of windows. No shape parameter is fitted, because some twenty windows are too few. If the quantity has a limit, the
+margin is therefore wider than needed, which causes no false alarm.
+
+Windows may be of different kinds, for example if a robot often stays near and sometimes goes far. Then the upper
+quarter of windows has its own tail, longer than that of the fit. The exponential through its mean excess (Weissman
+1978) is the bound if it is higher. An extreme that several windows reach exactly is a stop, such as a joint's limit or
+a clamped command. The stop is then the bound.
 """
 
 import math
@@ -15,17 +17,18 @@ from collections.abc import Iterable
 FEWEST_WINDOWS = 8
 """The minimum number of windows for a statement about an extreme."""
 
-_STOP = 3  # windows that reach the same extreme
-_SAME = 1e-9  # relative difference by which calculation changes the same extreme
-_TAIL = 4  # the number of highest values in the tail
+_STOP = 3  # the minimum number of windows that reach the same extreme
+_SAME = 1e-9  # relative difference that rounding can cause between equal extremes
+_TAIL = 4  # the tail is the highest of this many equal parts of the values
 _EULER = 0.5772156649015329
 
 
 def upper(highs: Iterable[float], windows: float, *, stops: bool = False) -> float | None:
-    """Return the level that the maximum of a window exceeds once in `windows` windows; None with too little data.
+    """Return the level that the maximum of a window exceeds once in `windows` windows; None if there is too little
+    data.
 
-    `stops`: the quantity may have a stop. Calculated quantities have none: differences of rounded numbers are equal by
-    chance.
+    `stops`: the quantity may have a stop. Calculated quantities have no stops, because differences of rounded numbers
+    can be equal by chance.
     """
     values = sorted(highs)
     count = len(values)

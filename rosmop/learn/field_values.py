@@ -1,8 +1,8 @@
 """Read the values of a message's fields by path, as far as they are useful for learning.
 
-Numbers, strings and times are scalars, arrays of numbers are numpy arrays, arrays of strings are lists; of an array of
-messages only the length is read. Bytes (images, points, maps) are left out, because single bytes mean nothing. So is
-the `seq` of headers, which every publisher counts automatically.
+Numbers, strings and times are scalars, arrays of numbers are numpy arrays, and arrays of strings are lists. Only the
+length of an array of messages is read. Bytes (images, points, maps) are left out, because single bytes mean nothing.
+The `seq` of headers is left out, because every publisher increments it automatically.
 """
 
 import struct
@@ -15,13 +15,13 @@ from roswire.message_layout import ArrayPart, FixedField, FixedPart, MessageLayo
 from roswire.message_text import PRIMITIVES
 
 MOST_ELEMENTS = 20_000
-"""Longer arrays are left out: a monitor that looks at each of their elements would be too slow."""
+"""Longer arrays are left out: a monitor that reads each of their elements would be too slow."""
 
 _LENGTH = struct.Struct("<I")
 _BYTES = frozenset({"uint8", "int8", "char", "byte", "bool"})
 _NO_NUMBERS = frozenset({"time", "duration"})
 
-Value = Any  # float, int, bool, str, (seconds, nanoseconds) or an array of the first four
+Value = Any  # float, int, bool, str, (seconds, nanoseconds), or an array of one of the first four
 _Part = Callable[[bytes, int, dict[str, Value]], int]
 
 
@@ -35,7 +35,9 @@ class Fields:
     def __init__(self, layout: MessageLayout) -> None:
         self._parts = [_reader(part) for part in layout.parts]
         self.types = dict(_types(layout))
-        """The primitive types of the fields that are read; with `[]` those of arrays, `length` where only that is."""
+        """The primitive types of the fields that are read, with `[]` for arrays; `length` if only the length is
+        read.
+        """
 
     def read(self, data: bytes) -> dict[str, Value]:
         """Return the values by path. Raises `MessageError`."""

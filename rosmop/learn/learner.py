@@ -1,11 +1,11 @@
 """Learn in two passes over the training recordings, and one over the held-out part.
 
-1. Times only: the rhythm of each topic, and its order relative to the others.
-2. The fields of each message. Then the candidates are written as specifications.
+1. The first pass reads only times: the rhythm of each topic, and its order relative to other topics.
+2. The second pass reads the fields of each message. Then the candidates are written as specifications.
 3. The specifications run on the held-out recordings. A bound that was exceeded there is learnt again from all
-   recordings (and so is untested); any other candidate with an alarm is left out.
+   recordings, and so stays untested. Any other candidate with an alarm is left out.
 
-Messages are never kept, so the number of topics and fields bounds the memory.
+Messages are never stored, so the memory depends only on the number of topics and fields.
 """
 
 from collections import Counter
@@ -34,7 +34,10 @@ class LearningError(Exception):
 
 @dataclass(frozen=True)
 class LearningResult:
-    """The result. `alarms` are those of the text on the held-out recordings, as in the comments."""
+    """The result of learning.
+
+    `alarms` counts the alarms of the text on the held-out recordings, as given in its comments.
+    """
 
     text: str
     candidates: tuple[Candidate, ...]
@@ -52,7 +55,7 @@ class LearningResult:
 def learn(
     recordings: Sequence[RecordingSource], definitions: Definitions, held_out: float, progress: Progress
 ) -> LearningResult:
-    """Learn from recordings, holding out the fraction `held_out`; `progress` gets the number of messages so far.
+    """Learn from recordings, but hold out the fraction `held_out`. `progress` gets the number of messages so far.
 
     Raises `LearningError`.
     """
@@ -142,7 +145,7 @@ class _Learner:
         return known
 
     def _continue(self, known: LearntFacts) -> None:
-        """Learn from the held-out recordings also, after the test."""
+        """Also learn from the held-out recordings, after the test."""
         self._times(self._held_out, known.rhythms)
         for part in self._held_out:
             self._observe(known, part)
@@ -153,7 +156,7 @@ class _Learner:
         for content in known.contents.values():
             content.begin()
         for topic, time, data in self._messages(part):
-            if topic not in known.contents:  # it is in the held-out recordings only
+            if topic not in known.contents:  # the topic is only in the held-out recordings
                 continue
             window = known.windows.at(time)
             try:

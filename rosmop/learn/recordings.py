@@ -7,7 +7,7 @@ from typing import Protocol
 
 Received = tuple[str, int, bytes]  # topic, nanoseconds, the bytes of the fields
 
-_WINDOWS = 24  # at least this number for all recordings together
+_WINDOWS = 24  # the minimum number for all recordings together
 
 
 class RecordingSource(Protocol):
@@ -15,7 +15,7 @@ class RecordingSource(Protocol):
 
     @property
     def name(self) -> str:
-        """Return the name for messages."""
+        """Return the name of the recording for messages to the user."""
 
     @property
     def began(self) -> int:
@@ -43,12 +43,12 @@ class RecordingPart:
 
     @property
     def name(self) -> str:
-        """Return the recording's."""
+        """Return the name of the recording."""
         return self.whole.name
 
     @property
     def topics(self) -> Mapping[str, str]:
-        """Return the recording's."""
+        """Return the message types of the recording's topics."""
         return self.whole.topics
 
     @property
@@ -57,7 +57,7 @@ class RecordingPart:
         return (self.ended - self.began) / 10**9
 
     def messages(self) -> Iterator[Received]:
-        """Return the messages of these times."""
+        """Yield the messages between these times."""
         return (message for message in self.whole.messages() if self.began <= message[1] <= self.ended)
 
 
@@ -66,7 +66,7 @@ def split(
 ) -> tuple[list[RecordingPart], list[RecordingPart]]:
     """Return the training part and the held-out part: whole recordings, spread evenly, or the end of a single one.
 
-    Nothing is held out of one recording that is too short to have an end.
+    If there is only one recording and it is too short to split, nothing is held out.
     """
     parts = [RecordingPart(recording, recording.began, recording.ended) for recording in recordings]
     if held_out <= 0:
@@ -86,7 +86,10 @@ def split(
 
 
 class Windows:
-    """Number the windows that recordings are divided into: equally long, and enough of them in each recording."""
+    """Number the windows that recordings are divided into.
+
+    Windows are equally long, and each recording has enough of them.
+    """
 
     def __init__(self, recordings: int) -> None:
         self._each = math.ceil(_WINDOWS / recordings)
@@ -97,7 +100,7 @@ class Windows:
 
     @property
     def mean(self) -> float:
-        """Seconds of a window."""
+        """Return the mean length of a window in seconds."""
         return max(self.seconds / (self._first + self._each), 1e-3)
 
     def enter(self, part: RecordingPart) -> None:

@@ -13,11 +13,11 @@ CPP = {
     "float32": "float", "float64": "double", "byte": "int8_t", "char": "uint8_t", "string": "std::string",
     "bool": "bool", **{f"{sign}int{size}": f"{sign}int{size}_t" for sign in ("", "u") for size in (8, 16, 32, 64)},
 }  # fmt: skip
-"""The language's types for those of messages."""
+"""The language's type for each type of message fields."""
 
 
 def rounded_up(value: float, width: float) -> str:
-    """Return a number not below the value, with no more digits than a hundredth of the width needs."""
+    """Return a number that is not below the value, rounded to about a hundredth of the width."""
     if not width > 0:
         return number(value)
     quantum = Decimal(1).scaleb(math.floor(math.log10(width / 100)))
@@ -25,18 +25,18 @@ def rounded_up(value: float, width: float) -> str:
 
 
 def rounded_down(value: float, width: float) -> str:
-    """Return a number not above the value."""
+    """Return a number that is not above the value, rounded likewise."""
     return number(-float(rounded_up(-value, width)))
 
 
 def number(value: float) -> str:
-    """Return a number as the language reads it; an integer stays one."""
+    """Return a number as the language reads it. An integer stays an integer."""
     text = repr(value)
     return "0.0" if text == "-0.0" else text
 
 
 def literal(value: object) -> str | None:
-    """Return a bool, number or string; None where the language cannot write it."""
+    """Return the literal of a bool, number or string; None if the language cannot write the value."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -50,12 +50,12 @@ def quoted(text: str) -> str:
 
 
 def formatted(text: str) -> str:
-    """Return text for a format of printf."""
+    """Return text for use in a printf format."""
     return quoted(text).replace("%", "%%")
 
 
 def identifier(text: str) -> str:
-    """Return a name made of any text."""
+    """Return an identifier made of any text."""
     name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_") or "root"
     return f"n{name}" if name[0].isdigit() else name
 

@@ -8,7 +8,7 @@ from rosmop.learn.candidates import Candidate, CandidateSupport, LearntFacts
 from rosmop.learn.rv_text import CPP, formatted, identifier, number, short_names
 
 _TOLD_EVERY = "1.0"  # seconds
-_WIDTH = 104  # columns of a statement
+_WIDTH = 104  # the maximum number of columns of a statement
 
 
 def specifications(
@@ -27,7 +27,7 @@ def specifications(
 
 
 def _new_name(text: str, taken: set[str]) -> str:
-    """Return a name made of the text, with a number if there is such a name already."""
+    """Return a name made of the text, with a number if the name is taken."""
     name = identifier(text)
     free = name if name not in taken else next(f"{name}_{n}" for n in count(2) if f"{name}_{n}" not in taken)
     taken.add(free)
@@ -98,7 +98,7 @@ def _check(row: Candidate, names: Mapping[str, str]) -> list[str]:
     elif row.length is not None:
         condition = f"{size} == {row.length} && ({condition})"
     lines = _alarm(condition, [_warning(row, names)])
-    # A constant's condition suffices.
+    # The condition of a constant needs no comment.
     return lines if row.kind == "constant" and not row.widened else [_comment(row), *lines]
 
 
@@ -145,7 +145,10 @@ def _once(pieces: Iterable[str]) -> list[str]:
 
 
 def _filled(row: Candidate, texts: Iterable[str], names: Mapping[str, str]) -> list[str]:
-    """Return the texts with the field's expression and name; statements of an element only where it is there."""
+    """Return the texts with the field's expression and name.
+
+    Statements about an array element run only if the element exists.
+    """
     value = _short(row, names)
     name = value
     if row.element is not None:

@@ -1,13 +1,13 @@
 """Statistics of one field over all recordings: extremes by window, few values, rates of change, standstills.
 
-Memory is bounded: a number for each window, and as many values as a set may have.
+Memory is bounded: one number for each window, and a limited set of values.
 """
 
 import math
 from typing import Any
 
 MOST_VALUES = 8
-"""A field with more values is not an enumeration."""
+"""A field with more distinct values is not an enumeration."""
 
 
 class HighestValues:
@@ -23,7 +23,7 @@ class HighestValues:
 
     @property
     def top(self) -> float:
-        """Return the highest of all; minus infinity without any."""
+        """Return the highest number of all windows; minus infinity if there is none."""
         return max(self.of.values(), default=-math.inf)
 
 
@@ -47,28 +47,30 @@ class ValueSeries:
 
     @property
     def closed(self) -> bool:
-        """Whether a further value is unlikely: none was seen in one window only (Good and Turing's estimate)."""
+        """Whether a further value is unlikely, because no value was seen in only one window (Good and Turing's
+        estimate).
+        """
         return bool(self.windows) and min(self.windows.values()) > 1
 
 
 class Series:
-    """A field that is a number (or an array of them folded into one): what it was, and how it changed.
+    """A numeric field, or a numeric array folded into one value: its values, and how they changed.
 
-    `period` is the usual time between two messages in seconds. Closer messages count as this far apart, because their
-    rate would otherwise be that of the network.
+    `period` is the usual time between two messages in seconds. Closer messages count as one period apart, because
+    otherwise network delays would determine their rate.
     """
 
     def __init__(self, period: float) -> None:
         self.count = self.changed = 0
         self.nan = self.infinite = False
-        self.highs, self.lows = HighestValues(), HighestValues()  # of lows the negative
+        self.highs, self.lows = HighestValues(), HighestValues()  # `lows` has the negated values
         self.values = ValueSeries()
         self.rates, self.stays = HighestValues(), HighestValues()
         self._period = period
         self.begin()
 
     def begin(self) -> None:
-        """Begin a recording: its values are independent of earlier ones."""
+        """Begin a recording, whose values are independent of earlier values."""
         self._last: float | None = None
         self._time = self._since = 0.0
 
@@ -97,7 +99,7 @@ class Series:
             self.infinite = True
 
     def add_array(self, low: float, high: float, nan: bool, infinite: bool, window: int) -> None:
-        """Add the extremes of an array's finite elements, and whether it has others."""
+        """Add the extremes of an array's finite elements, and whether it has NaNs or infinite elements."""
         self.count += 1
         self.nan |= nan
         self.infinite |= infinite

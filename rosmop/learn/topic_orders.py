@@ -1,7 +1,8 @@
-"""Which topics follow each other: alternations, answers and preconditions with their times.
+"""Find which topics follow each other: alternations, answers and preconditions, with their times.
 
-For each two topics: the time from a message of the second back to the last one of the first (`back`), the time from the
-first unanswered one on (`forth`), and whether they take turns. `by_chance` returns whether chance would give the same.
+For each pair of topics, three things are measured: the time from a message of the second topic back to the last message
+of the first (`back`); the time from the first unanswered message to its answer (`forth`); and whether the topics take
+turns. `by_chance` returns whether chance would give the same result.
 """
 
 import math
@@ -10,10 +11,10 @@ from collections.abc import Mapping, Sequence
 from rosmop.learn.series import HighestValues
 
 MOST_TOPICS = 24
-"""The maximum number of topics that are compared with each other: those with the fewest messages."""
+"""The maximum number of topics that are compared with each other. The topics with the fewest messages are used."""
 
-_SURE = 1e-6  # probability that chance makes one of all pairs look like an order
-_FEWEST = 20  # messages that an order is based on
+_SURE = 1e-6  # the probability that any of all pairs looks like an order by chance
+_FEWEST = 20  # the minimum number of messages for an order
 
 
 class TopicPair:
@@ -28,9 +29,9 @@ class TopicPair:
 
     def begin(self) -> None:
         """Begin a recording."""
-        self._first: int | None = None  # of those that no second has followed
+        self._first: int | None = None  # the first message that no second-topic message has followed
         self._last: int | None = None
-        self._seconds = 0  # since the last first
+        self._seconds = 0  # second-topic messages since the last first-topic message
         self._started = False
 
     def add_first(self, time: int) -> None:
@@ -80,6 +81,9 @@ class TopicOrders:
             pair.add_first(time)
 
     def by_chance(self, bound: float, rate: float, count: int) -> bool:
-        """Whether as many messages would be within the bound of a topic with this rate (1/s) by chance."""
+        """Whether chance alone would place `count` messages within `bound` seconds of another topic's messages.
+
+        `rate` is the other topic's rate (1/s).
+        """
         share = bound * rate
         return share >= 0.5 or count * math.log(max(share, 1e-12)) > math.log(_SURE / max(len(self.pairs), 1))

@@ -9,10 +9,10 @@ from rosmop.learn.field_values import MOST_ELEMENTS, Fields
 from rosmop.learn.series import HighestValues, Series, ValueSeries
 
 MOST_SINGLE = 6
-"""Arrays that are always of one length and no longer have a series for each element."""
+"""Arrays that always have the same length, up to this maximum, have a series for each element."""
 
 _MOST_GAPS = 5000
-_IN_STEP = 60.0  # seconds from a stamp to its reception; beyond it, the clocks are not of one robot
+_IN_STEP = 60.0  # seconds from a stamp to its reception; longer times mean clocks of different robots
 
 
 class TopicRhythm:
@@ -42,12 +42,12 @@ class TopicRhythm:
 
     @property
     def period(self) -> float:
-        """Return the usual interval in seconds; a nanosecond if it is unknown."""
+        """Return the usual interval in seconds; a nanosecond if the interval is unknown."""
         return max(statistics.median(self._some) if self._some else 0.0, 1.0) / 10**9
 
     @property
     def interval(self) -> float:
-        """Return the intervals in seconds in which messages are counted."""
+        """Return the length in seconds of the intervals in which messages are counted."""
         return float(max(1, round(5 * self.period)))
 
 
@@ -64,10 +64,12 @@ class TopicContent:
         self.sets: dict[str, ValueSeries] = {}
         self.lengths: dict[str, ValueSeries] = {}
         self.moves: dict[str, dict[tuple[Any, Any], tuple[int, int]]] = {}
-        """For fields with few values: how often each was followed by another (number of windows, the last window)."""
+        """For fields with few values: how often a value was followed by another value (number of windows, the last
+        window).
+        """
         self.ages, self.leads, self.counts = HighestValues(), HighestValues(), HighestValues()
         self.backward = False
-        """Whether some message had an earlier stamp than the one before it."""
+        """Whether some message had an earlier stamp than the previous message."""
         self.begin()
 
     def begin(self) -> None:
