@@ -24,7 +24,7 @@ from roswire.errors import DefinitionError
 from roswire.message_text import MessageDefinition
 
 _OWN = "/rosrv"  # caller id of messages that monitors publish; monitors do not receive them
-# The exceptions of `rosbags` and of its decompressors for a damaged bag.
+# The exceptions that `rosbags` and its decompressors raise for a damaged bag.
 _DAMAGE = (
     ReaderError, ValueError, LookupError, AssertionError, struct.error, MemoryError, OverflowError, OSError,
     EOFError, RuntimeError,
@@ -62,7 +62,10 @@ def open_bag(program: CommandContext, path: Path) -> BoundedReader:
 
 
 def messages_of(reader: BoundedReader) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield connection, nanoseconds and bytes of every message, in order. Raises a usage error for a damaged bag."""
+    """Yield connection, time in nanoseconds and bytes of every message, in order.
+
+    Raises a usage error for a damaged bag.
+    """
     try:
         yield from reader.in_order()
     except _DAMAGE as error:
@@ -89,8 +92,8 @@ def definitions_of(reader: BoundedReader) -> Definitions:
 class RecordedBag:
     """The messages of a bag on topics that match a pattern, read again for each pass.
 
-    `definitions` are those in the bag. Raises a usage error for a bag that cannot be read, has no messages, or has two
-    types on one topic.
+    `definitions` has the message definitions of the bag. Raises a usage error for a bag that cannot be read, has no
+    messages, or has two types on one topic.
     """
 
     def __init__(self, program: CommandContext, path: Path, patterns: Sequence[str]) -> None:
@@ -113,7 +116,7 @@ class RecordedBag:
                     raise program.usage_error(f"{path}: {connection.topic} carries both {other} and {kind}")
 
     def messages(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield topic, nanoseconds and bytes of every message, in order."""
+        """Yield topic, time in nanoseconds and bytes of every message, in order."""
         with closing(open_bag(self._program, self._path)) as reader:
             for connection, time_ns, data in messages_of(reader):
                 if connection.topic in self.topics:
@@ -216,7 +219,7 @@ def replay(
 
 
 class _ExplainOnce:
-    """Select for explanation the first verdict each second of each category and binding of a property."""
+    """Select verdicts for explanation: in each second, the first of each category and binding of a property."""
 
     def __init__(self) -> None:
         self.now = 0

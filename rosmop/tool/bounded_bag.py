@@ -2,10 +2,10 @@
 
 `rosbags` trusts the headers of a bag. This reader adds limits:
 
-1. it reads at most `LARGEST_CHUNK` bytes at once, and unpacks a chunk to at most that size;
-2. it unpacks and reads at most `PER_BYTE` bytes for each byte of the bag, plus one chunk: index entries can name one
-   message many times, or unpack two chunks in turn;
-3. the index has at most as many entries as fit into the bag: chunks cannot share an index.
+1. It reads at most `LARGEST_CHUNK` bytes at once, and unpacks a chunk to at most that size.
+2. It unpacks and reads at most `PER_BYTE` bytes for each byte of the bag, plus one chunk. Without this limit, index
+   entries could name one message many times, or unpack two chunks in turn.
+3. The index has at most as many entries as fit in the bag, so chunks cannot share an index.
 """
 
 import bz2
@@ -24,7 +24,7 @@ from rosmop.tool.command_context import CommandContext, open_regular
 LARGEST_CHUNK = 256 << 20
 PER_BYTE = 256
 _LONGEST_LINE = 64
-_HEADER, _ENTRY = 55, 12  # bytes of an index of one connection in one chunk, and of a message in it
+_HEADER, _ENTRY = 55, 12  # bytes of a chunk's index of one connection, and of each entry
 _UNPACKERS: dict[Callable[[bytes], bytes], Callable[[], Any]] = {
     decompressors["bz2"]: bz2.BZ2Decompressor,
     decompressors["lz4"]: lz4.frame.LZ4FrameDecompressor,

@@ -70,7 +70,7 @@ def check(
 
 
 def _say_slow(compiled: Compiled, *, as_json: bool) -> None:
-    """Write which messages the interpreter processes, and why."""
+    """Write the messages that the interpreter processes, with the reasons."""
     found = slow_paths(compiled)
     for path in found:
         if as_json:

@@ -1,4 +1,4 @@
-"""The commands `check`, `run`, `learn` and `coverage`: of `rosmop`, and of `rosrv monitor`."""
+"""The commands `check`, `run`, `learn` and `coverage`, for `rosmop` and for `rosrv monitor`."""
 
 import inspect
 from collections.abc import Callable
@@ -28,7 +28,7 @@ from rosmop.tool.options import (
 
 
 def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
-    """Return the commands of a program by name; the help of each goes on after its summary."""
+    """Return the commands of a program by name. The docstring of each command is its help after the summary."""
 
     def check(
         files: Files,

@@ -27,7 +27,11 @@ _KINDS = {
 
 @dataclass(frozen=True)
 class CommandContext:
-    """`name` begins each message, and pip installs `package`. `write` replaces a file, or raises `OSError`."""
+    """The context of a command.
+
+    `name` begins each message, and `package` is the name that pip installs. `write` replaces a file, or raises
+    `OSError`.
+    """
 
     name: str
     package: str
@@ -51,7 +55,7 @@ class CommandContext:
         typer.echo(f"{self.name}: {printable(text)}", err=True)
 
     def usage_error(self, text: str) -> typer.Exit:
-        """Report an error of the command line; the caller raises the result (exit status 2)."""
+        """Report an error in the command line. The caller raises the result (exit status 2)."""
         self.warn(text)
         return typer.Exit(2)
 
@@ -59,7 +63,7 @@ class CommandContext:
 def open_regular(path: Path) -> io.BufferedReader:
     """Open a regular file, or the pipe that a shell made for `<(command)` or `command |`. Raises `OSError`.
 
-    A named pipe may block its reader for ever, and a device may be endless.
+    Other files are rejected: a named pipe may block its reader for ever, and a device may be endless.
     """
     descriptor = os.open(os.fspath(path), os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     try:

@@ -97,7 +97,7 @@ def _write(program: CommandContext, out: Path, learnt: LearningResult, recorded:
 
 
 def _needed(learnt: LearningResult, recorded: Definitions) -> list[str]:
-    """Return the types of the specifications, and of their fields, that `check` would not know."""
+    """Return the message types of the specifications, and of their fields, that `check` would not know."""
     own = standard_definitions()
     waiting = [learnt.types[topic] for candidate in learnt.candidates for topic in candidate.topics]
     found: set[str] = set()
@@ -109,7 +109,7 @@ def _needed(learnt: LearningResult, recorded: Definitions) -> list[str]:
             if own.md5sum(name) == recorded.md5sum(name):
                 continue
         except DefinitionError:
-            pass  # not one of ROS's own
+            pass  # not a type of ROS itself
         found.add(name)
         waiting += [field.type for field in recorded.message(name).fields]
     return sorted(found)

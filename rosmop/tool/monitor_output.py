@@ -75,7 +75,7 @@ def _fault(fault: Fault) -> dict[str, object]:
 
 
 def lines(outcome: Outcome, index: int | None = None, topic: str | None = None) -> Iterator[str]:
-    """Yield the lines for a person; none for a message without an outcome to report."""
+    """Yield the lines for a person. A message without an outcome to report has no lines."""
     seconds = f"{outcome.time / BILLION:.3f}"
     head = f"{seconds} {outcome.timer}" if topic is None else f"{seconds} #{index} {topic}"
     if topic is not None and outcome.result != "passed":

@@ -19,9 +19,9 @@ from rich.progress import (
 def progress(
     what: str, total: Callable[[], int], *, shares_screen: bool = False
 ) -> Iterator[Callable[[int], None]]:
-    """Yield a function that takes the finished part of `total()`.
+    """Yield a function that takes the finished amount of `total()`.
 
-    `shares_screen`: the work writes to standard output; without a bar if that is a terminal.
+    `shares_screen`: the work writes to standard output. If standard output is a terminal, there is no bar.
     """
     console = Console(stderr=True)
     if not console.is_terminal or (shares_screen and sys.stdout.isatty()):

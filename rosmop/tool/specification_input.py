@@ -23,7 +23,7 @@ def load(
 ) -> Compiled:
     """Compile specifications. Raises `SpecificationError`.
 
-    `recorded` definitions apply to the types that no file defines.
+    The definitions in `recorded` apply to types that no file defines.
     """
     definitions = read_definitions(program, files, folders)
     if recorded is not None:
@@ -61,7 +61,7 @@ def topics_of(texts: Mapping[str, str], chosen: str | None) -> dict[str, str]:
 def read_definitions(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> Definitions:
     """Return the definitions of ROS, of `msg/` beside the specifications, and of the folders.
 
-    Later ones win. Raises `SpecificationError` for a definition that cannot be read.
+    Later definitions replace earlier ones. Raises `SpecificationError` for a definition that cannot be read.
     """
     definitions = standard_definitions()
     for folder in definition_folders(program, files, folders):
@@ -75,7 +75,7 @@ def read_definitions(program: CommandContext, files: Sequence[Path], folders: Se
 
 
 def definition_folders(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
-    """Return the folders of definitions beside the files, and the given ones."""
+    """Return the folders of definitions beside the files, followed by the given folders."""
     for folder in folders:
         if not folder.is_dir():
             raise program.usage_error(f"--msg: {folder} is not a folder")
@@ -84,7 +84,7 @@ def definition_folders(program: CommandContext, files: Sequence[Path], folders: 
 
 
 def definition_texts(program: CommandContext, folder: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the definitions below a folder by `package/File`, and their paths by that name and by type."""
+    """Return the definitions below a folder by name (`package/File`), and their paths by this name and by type."""
     texts: dict[str, str] = {}
     places: dict[str, str] = {}
     for path in sorted(path for path in folder.rglob("*") if path.suffix in (".msg", ".srv")):

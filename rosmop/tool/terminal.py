@@ -25,7 +25,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def refused(findings: Iterable[object]) -> typer.Exit:
-    """Write errors, one on each line; the caller raises the result (exit status 1)."""
+    """Write errors, one on each line. The caller raises the result (exit status 1)."""
     for finding in findings:
         typer.echo(printable(str(finding)), err=True)
     return typer.Exit(1)
