@@ -3,8 +3,8 @@
 Definitions come as text: from ROS (`standard.py`), from `.msg` and `.srv` files, or from the `message_definition` of a
 publisher's connection header. Results are cached for each type.
 
-A type that contains itself, or nests deeper than `MAX_DEPTH`, is rejected. The size of the text and the limits of
-`message_text` and `message_layout` bound work and memory.
+A type that contains itself, or nests deeper than `MAX_DEPTH`, is rejected. Work and memory are bounded by the size of
+the text, and by the limits of `message_text` and `message_layout`.
 """
 
 import difflib
@@ -27,7 +27,7 @@ from roswire.message_text import (
 )
 
 MAX_DEPTH = 64
-"""Most levels of nested messages."""
+"""The maximum number of levels of nested messages."""
 
 _FILE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:(msg|srv)/)?([A-Za-z][A-Za-z0-9_]*)\.(msg|srv)\Z")
 _TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*\Z")
@@ -54,7 +54,7 @@ class Definitions:
 
     @classmethod
     def from_files(cls, files: Mapping[str, str]) -> Self:
-        """Parse files by name: `pkg/T.msg`, `pkg/msg/T.msg`, `pkg/T.srv` or `pkg/srv/T.srv`, to their text.
+        """Parse files; `files` maps names (`pkg/T.msg`, `pkg/msg/T.msg`, `pkg/T.srv` or `pkg/srv/T.srv`) to texts.
 
         Raises `DefinitionError` with the file and line.
         """
@@ -75,9 +75,9 @@ class Definitions:
 
     @classmethod
     def from_full_text(cls, name: str, text: str) -> Self:
-        """Parse the full text of the message type `name`, as a connection header has it.
+        """Parse the full text of the message type `name`, in the form used by connection headers.
 
-        The text must also have the types in it. Raises `DefinitionError`.
+        The text must also define all nested types. Raises `DefinitionError`.
         """
         messages: dict[str, MessageDefinition] = {}
         for section, body, line in split_full_text(name, text):
@@ -91,12 +91,15 @@ class Definitions:
         return cls(messages)
 
     def extended(self, other: "Definitions") -> "Definitions":
-        """Return these types and those of `other`; if both have a type, that of `other` wins."""
+        """Return these types together with the types of `other`.
+
+        If both define a type, the definition of `other` is used.
+        """
         return Definitions(self._messages | other._messages, self._services | other._services)
 
     @property
     def message_types(self) -> list[str]:
-        """Return the names of all message types, requests and responses included."""
+        """Return the names of all message types, including requests and responses."""
         return sorted(self._messages)
 
     @property
@@ -122,7 +125,7 @@ class Definitions:
         return _fingerprint(self._md5_text(service.request, ()) + self._md5_text(service.response, ()))
 
     def full_text(self, name: str) -> str:
-        """Return the text of a message type and of all types in it, as connection headers have it."""
+        """Return the text of a message type and of all its nested types, in the form used by connection headers."""
         self.md5sum(name)  # raises if a type is missing or contains itself
         order: dict[str, MessageDefinition] = {}
         waiting = [name]
@@ -139,7 +142,7 @@ class Definitions:
         """Return the layout of messages of the type `name`; raises `DefinitionError`."""
         return self._layout(name, ())
 
-    # `outer` is always the types that contain this one, outermost first.
+    # `outer` always lists the types that contain this type, outermost first.
 
     def _md5sum(self, name: str, outer: tuple[str, ...]) -> str:
         if name not in self._md5sums:

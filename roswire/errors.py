@@ -1,6 +1,6 @@
 """Errors in ROS traffic, by the side that is at fault.
 
-A `PeerError` is the sender's fault: its text says what was wrong, where, and what to do, and may be sent back to the
+A `PeerError` is the sender's fault. Its text names the fault, its position and the remedy, and may be sent back to the
 sender. An `EncodingError` is a fault of this side: ROS has no notation for the value.
 """
 
@@ -10,7 +10,7 @@ class RosError(Exception):
 
 
 class EncodingError(RosError):
-    """A value that ROS cannot encode (a control character, an integer of 64 bits)."""
+    """A value that ROS cannot encode, such as a control character or a 64-bit integer."""
 
 
 class PeerError(RosError):
@@ -30,7 +30,7 @@ class ProtocolError(PeerError):
 
 
 class LimitExceededError(ProtocolError):
-    """Data that is larger, deeper or longer than the limits allow; the part that was read is well-formed."""
+    """Data that exceeds a limit of size, depth or length. The part that was read is well-formed."""
 
 
 class DefinitionError(PeerError):
@@ -47,5 +47,5 @@ class DefinitionError(PeerError):
 
 
 def quoted(text: str) -> str:
-    """Return the part of a rejected name or URI that its error repeats."""
+    """Return the part of a rejected name or URI that the error message repeats."""
     return ascii(text if len(text) <= 80 else text[:80] + "...")

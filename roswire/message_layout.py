@@ -1,9 +1,9 @@
 """The layout of a message in its bytes, for reading a few fields without decoding the rest.
 
 A serialised ROS 1 message is its fields one after another, little-endian, without padding. A layout flattens the nested
-messages: consecutive fields of fixed size form one `FixedPart`, in which each has an offset; strings and arrays of
-variable size separate these parts. Two fixed parts are never adjacent, so everything before the first string or array
-has the same offset in every message.
+messages. Consecutive fields of fixed size form one `FixedPart`, in which each field has an offset. Strings and arrays
+of variable size separate these parts. Two fixed parts are never adjacent, so everything before the first string or
+array has the same offset in every message.
 """
 
 from collections.abc import Mapping
@@ -12,18 +12,18 @@ from dataclasses import dataclass, field, replace
 from roswire.message_text import PRIMITIVES
 
 MAX_ITEMS = 20_000
-"""Most leaves, strings and arrays in one layout; nested definitions can need exponentially many."""
+"""The maximum number of leaves, strings and arrays in one layout; nested definitions can need exponentially many."""
 
 MAX_SIZE = 1 << 32
-"""Most bytes of one fixed part or array of fixed length; a TCPROS message is never longer."""
+"""The maximum number of bytes of one fixed part or array of fixed length; a TCPROS message is never longer."""
 
 
 @dataclass(frozen=True, slots=True)
 class FixedField:
     """A value of fixed size in a `FixedPart`.
 
-    `type` is a primitive, or, for arrays only, a message type of fixed size with its `layout`. `count` is the number of
-    elements of a fixed array, None for a scalar. `offset` and `size` are in bytes.
+    `type` is a primitive type. For arrays it may also be a message type of fixed size, with its `layout`. `count` is
+    the number of elements of a fixed array, or None for a scalar. `offset` and `size` are in bytes.
     """
 
     path: str
@@ -36,7 +36,7 @@ class FixedField:
 
 @dataclass(frozen=True, slots=True)
 class FixedPart:
-    """Consecutive leaves; `size` is the number of their bytes."""
+    """Consecutive leaves; `size` is their total number of bytes."""
 
     size: int
     leaves: tuple[FixedField, ...]
@@ -53,8 +53,8 @@ class StringPart:
 class ArrayPart:
     """An array of variable length, or of elements of variable size.
 
-    `count` is the number of elements of a fixed array; if it is None, the number (4 bytes) comes first. `element_size`
-    is in bytes, None if it varies; `layout` is that of elements that are messages.
+    `count` is the number of elements of a fixed array. If it is None, the number (4 bytes) precedes the elements.
+    `element_size` is in bytes, or None if the size varies. `layout` is the layout of the elements if they are messages.
     """
 
     path: str
@@ -79,8 +79,9 @@ class FieldLocation:
 class MessageLayout:
     """The parts of a message in order.
 
-    `size` is the bytes of every such message, None if they vary; `minimum` the bytes of the shortest.
-    `places` finds the items by path (`pose.position.x`); the elements of an array are in the array's layout.
+    `size` is the number of bytes of every such message, or None if it varies. `minimum` is the number of bytes of the
+    shortest message. `places` finds the items by path (`pose.position.x`); the elements of an array are in the array's
+    layout.
     """
 
     parts: tuple[Part, ...]
@@ -98,12 +99,12 @@ class LayoutBuilder:
 
     def __init__(self) -> None:
         self._parts: list[Part] = []
-        self._leaves: list[FixedField] = []  # of the open fixed part
+        self._leaves: list[FixedField] = []  # the leaves of the open fixed part
         self._offset = 0
         self._items = 0
 
     def add_primitive(self, path: str, type_name: str, count: int | None) -> None:
-        """Add a value of a primitive type, or a fixed array of `count` of them."""
+        """Add a value of a primitive type, or a fixed array of `count` such values."""
         size = PRIMITIVES[type_name][1] * (1 if count is None else count)
         self._add_leaf(FixedField(path, type_name, self._offset, size, count))
 
@@ -112,7 +113,7 @@ class LayoutBuilder:
         self._add_part(StringPart(path))
 
     def add_array(self, path: str, type_name: str, count: int | None, layout: MessageLayout | None) -> None:
-        """Add an array; `layout` is that of its elements if they are messages."""
+        """Add an array; `layout` is the layout of its elements if they are messages."""
         size = PRIMITIVES[type_name][1] if type_name in PRIMITIVES else None
         if layout is not None:
             size = layout.size
@@ -122,7 +123,7 @@ class LayoutBuilder:
             self._add_part(ArrayPart(path, type_name, count, size, layout))
 
     def add_message(self, path: str, layout: MessageLayout) -> None:
-        """Add the items of a nested message; their paths get `path` in front."""
+        """Add the items of a nested message, with `path` as a prefix of their paths."""
         for part in layout.parts:
             if isinstance(part, FixedPart):
                 for leaf in part.leaves:
@@ -131,7 +132,7 @@ class LayoutBuilder:
                 self._add_part(replace(part, path=f"{path}.{part.path}"))
 
     def finish(self) -> MessageLayout:
-        """Return the layout of what was added."""
+        """Return the layout of all added fields."""
         self._close()
         places: dict[str, FieldLocation] = {}
         for index, part in enumerate(self._parts):

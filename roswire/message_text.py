@@ -27,7 +27,7 @@ PRIMITIVES = {
     "time": ("II", 8),
     "duration": ("ii", 8),
 }
-"""Types of fixed size: the `struct` code (little-endian, unpadded) and the bytes of one value."""
+"""Types of fixed size: the `struct` code (little-endian, unpadded) and the number of bytes of one value."""
 
 BUILTINS = frozenset({*PRIMITIVES, "string"})
 """Types that have no definition of their own."""
@@ -45,13 +45,13 @@ _INTEGERS = {
 _CONSTANT_TYPES = frozenset({*_INTEGERS, "bool", "float32", "float64", "string"})
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)?)(\[([0-9]{0,10})\])?\Z")
 _FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
-_MAX_NUMBER_LENGTH = 400  # characters of a numeric constant
+_MAX_NUMBER_LENGTH = 400  # the maximum number of characters of a numeric constant
 _SEPARATOR = re.compile(r"={40,}[ \t\r]*\Z")
 
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """A constant: its value, and the text of the value as it was written (md5sums are made from that)."""
+    """A constant: its value, and the text of the value as written, from which md5sums are made."""
 
     type: str
     name: str
@@ -63,7 +63,7 @@ class Constant:
 class Field:
     """A field: its element type (`float64`, `geometry_msgs/Point`), and whether it is an array.
 
-    `length` is the number of elements of a fixed array, None for a scalar and for an array of any length.
+    `length` is the number of elements of a fixed array; None for a scalar, and for an array of variable length.
     """
 
     type: str
@@ -81,7 +81,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class MessageDefinition:
-    """A message type: `package/Type`, its fields and constants in order, and the text it was read from."""
+    """A message type: `package/Type`, its fields and constants in order, and its source text."""
 
     name: str
     fields: tuple[Field, ...]
@@ -102,7 +102,7 @@ class ServiceDefinition:
 def parse_message(name: str, text: str, source: str, first_line: int = 1) -> MessageDefinition:
     """Parse the text of a `.msg` file for the type `name`.
 
-    `source` and `first_line` are the position of the text for errors. Raises `DefinitionError`.
+    `source` and `first_line` give the position of the text for error messages. Raises `DefinitionError`.
     """
     fields: dict[str, Field] = {}
     constants: dict[str, Constant] = {}
@@ -138,10 +138,10 @@ def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
 
 
 def split_full_text(name: str, text: str) -> list[tuple[str, str, int]]:
-    """Split the full text of a type, as a connection header has it, into types.
+    """Split the full text of a type, in the form used by connection headers, into types.
 
-    Returns (type, text, number of its first line) for `name`, then for each type in it; in the text these follow after
-    `===…` and `MSG: package/Type`. Raises `DefinitionError`.
+    Returns (type, text, number of its first line) for `name`, then for each nested type. In the text, each nested type
+    follows a line `===…` and a line `MSG: package/Type`. Raises `DefinitionError`.
     """
     lines = text.split("\n")
     starts = [index for index, line in enumerate(lines) if _SEPARATOR.match(line)]

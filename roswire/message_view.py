@@ -1,7 +1,7 @@
-"""Show a message as fields and values for a person, within limits and as far as its bytes go.
+"""Show a message as fields and values for a person, within limits, as far as its bytes can be read.
 
 A value that cannot be read is shown as `…`: the bytes may be cut off, or malicious. Long strings, arrays and messages
-are shortened, with the omitted number (`… 344 more`). The result is plain values that a log can hold.
+are shortened, with a note on the omitted part (`… 344 more`). The result is plain values that a log can hold.
 """
 
 import hashlib
@@ -35,8 +35,8 @@ class _Reader:
         self._definitions = definitions
         self._data = data
         self._position = 0
-        self._left = MOST_FIELDS  # values that are shown
-        self._steps = _MOST_STEPS  # values that are read, whether shown or not
+        self._left = MOST_FIELDS  # the number of values that may still be shown
+        self._steps = _MOST_STEPS  # the number of values that may still be read, whether shown or not
         self._sizes: dict[str, int | None] = {}
 
     def message(self, name: str) -> dict[str, Any]:
@@ -75,7 +75,7 @@ class _Reader:
         return values
 
     def _pass_over(self, kind: str, count: int) -> None:
-        """Skip this many values of a type, to reach what comes after them."""
+        """Skip this many values of a type, to reach the next field."""
         size = self._size(kind)
         if size is not None:
             self._take(size * count)
@@ -86,7 +86,7 @@ class _Reader:
         self._left = left
 
     def _size(self, kind: str) -> int | None:
-        """Return the bytes of each value of a type; None if they differ."""
+        """Return the number of bytes of each value of a type; None if values differ in size."""
         if kind in PRIMITIVES:
             return PRIMITIVES[kind][1]
         if kind == "string":
@@ -138,7 +138,7 @@ class _CutError(Exception):
 
 
 def read_bytes(data: bytes) -> str:
-    """Return the first bytes as hexadecimal digits, and how many more there are."""
+    """Return the first bytes as hexadecimal digits, with the number of omitted bytes."""
     return data[:MOST_BYTES].hex() + _more(len(data) - MOST_BYTES)
 
 
@@ -148,7 +148,7 @@ def _more(count: int) -> str:
 
 
 def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, Any] | None:
-    """Return the fields of a message of the type `name` as far as `data` goes; None if the type is not known."""
+    """Return the fields of a message of the type `name`, as far as `data` can be read; None if the type is unknown."""
     try:
         return _Reader(definitions, data).message(name)
     except _CutError as cut:
@@ -171,7 +171,10 @@ class PublisherReader:
             self._why = f": {str(error)[:300]}"
 
     def read(self, data: bytes) -> tuple[dict[str, Any], str]:
-        """Return the fields of a message, and why there are only the first bytes (else empty)."""
+        """Return the fields of a message and an empty text.
+
+        If the definition cannot be used, return the first bytes of the message and the reason.
+        """
         fields = read_fields(self._definitions, self.type, data) if self._definitions is not None else None
         if fields is not None:
             return fields, ""

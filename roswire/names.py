@@ -1,7 +1,7 @@
 """ROS graph names: the spelling that `rosmaster` acts on, or an error.
 
 `rosmaster` resolves the names of topics, services, nodes and parameters against the `caller_id`, folds `//` and drops a
-trailing slash, but checks almost no characters. A decision must be about the name that `rosmaster` acts on.
+trailing slash, but checks almost no characters. A decision of this side must be about the same name.
 
 Invariants:
 
@@ -17,7 +17,10 @@ import re
 from roswire.errors import InvalidNameError, quoted
 
 MAX_NAME_LENGTH = 1024
-"""Most characters in one name; the longest names on robots have far less than a quarter of it."""
+"""The maximum number of characters in one name.
+
+The longest names on robots have far less than a quarter of this number.
+"""
 
 _NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*\Z")
 _CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]+)+\Z")
@@ -31,11 +34,11 @@ _SLASHES = re.compile("/{2,}")
 
 
 def resolve(name: str, caller_id: str) -> str:
-    """Return the canonical global name of the topic, service or node that `name` is for `caller_id`.
+    """Return the canonical global name of the topic, service or node that `caller_id` calls `name`.
 
     `/a` is global, `~a` private to the caller, `a` relative to the caller's namespace. An empty `caller_id` is the
     global namespace, as for `rosmaster`. Raises `InvalidNameError` for a name outside the ROS grammar, for the global
-    namespace itself, and for a relative name of a caller that has no valid name.
+    namespace, and for a relative name if the caller's own name is invalid.
     """
     resolved = _resolve(name, caller_id, _NAME)
     if resolved == "/":
@@ -44,14 +47,16 @@ def resolve(name: str, caller_id: str) -> str:
 
 
 def resolve_namespace(name: str, caller_id: str) -> str:
-    """Resolve an argument that may be a whole namespace (`subgraph`): like `resolve`, but `/` is allowed."""
+    """Resolve an argument that may be a whole namespace (`subgraph`). This is like `resolve`, but `/` is allowed."""
     return _resolve(name, caller_id, _NAME)
 
 
 def resolve_parameter(name: str, caller_id: str) -> str:
-    """Resolve a parameter key: like `resolve_namespace`, but segments may hold printable ASCII as YAML keys do.
+    """Resolve a parameter key. This is like `resolve_namespace`, but segments may have any printable ASCII, as in YAML
+    keys.
 
-    Not allowed are `~` (except in front), `*`, `?`, quotes, backslash, and spaces at the ends of a segment.
+    These are still rejected: `~` (except as the first character), `*`, `?`, quotes, backslash, and spaces at the ends
+    of a segment.
     """
     return _resolve(name, caller_id, _PARAMETER)
 
@@ -79,7 +84,9 @@ def is_global_name(name: str) -> bool:
 
 
 def is_relative_member(name: str) -> bool:
-    """Whether a member `name` of a namespace of parameters is below it: no `/a`, no `~a`, no empty segment."""
+    """Whether a member `name` of a parameter namespace is below this namespace: not `/a`, not `~a`, and without empty
+    segments.
+    """
     return not name.startswith("~") and all(name.split("/"))
 
 
@@ -94,7 +101,7 @@ def namespace(name: str) -> str:
 
 
 def join(namespace: str, name: str) -> str:
-    """Return `name` in `namespace`; a global or private name stays as it is."""
+    """Return `name` in `namespace`. A global or private name stays unchanged."""
     if name.startswith(("/", "~")) or not namespace:
         return name
     return f"{namespace}{name}" if namespace.endswith("/") else f"{namespace}/{name}"

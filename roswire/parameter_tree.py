@@ -15,14 +15,14 @@ def parts_of(key: str) -> tuple[str, ...]:
 
 
 def holds_others(value: Value) -> bool:
-    """Whether a value is a namespace with keys, for which rights are also needed."""
+    """Whether a value is a namespace with keys. Its keys also need rights."""
     return isinstance(value, dict) and bool(value)
 
 
 def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
-    """Return the value at a canonical `key` (or None), and the name of a parent that is a value (or None).
+    """Return the value at a canonical `key` (or None), and the name of a parent that is not a namespace (or None).
 
-    `rosmaster` replaces such a parent by a namespace when a key below it is set.
+    If a key below such a parent is set, `rosmaster` replaces the parent by a namespace.
     """
     node: Value = tree
     passed = ""

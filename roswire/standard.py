@@ -1,7 +1,7 @@
 """The definitions that ROS Noetic ships: messages from the type store of `rosbags`, and the common services.
 
-The store lacks services, the messages of actions, and the message of `/tf`; the common ones are written here. The
-definitions of mavros_msgs are in `mavros`.
+The store lacks services, the messages of actions, and the message of `/tf`. This module defines the common services and
+messages among these. The definitions of mavros_msgs are in `mavros`.
 """
 
 from rosbags.typesys import Stores, get_typestore
@@ -71,9 +71,9 @@ _ACTIONS = {
     ),
     "control_msgs/GripperCommand": ("GripperCommand command\n", _GRIPPER, _GRIPPER),
 }
-"""Goal, result and feedback of actions; the messages that `actionlib` sends are made from these."""
+"""Goal, result and feedback of each action. The messages that `actionlib` sends are made from these."""
 
-_NOT_ROS_1 = "builtin_interfaces"  # where the store has `time` and `duration`, as messages of ROS 2
+_NOT_ROS_1 = "builtin_interfaces"  # has `time` and `duration` as ROS 2 messages
 
 
 def standard_definitions() -> Definitions:
@@ -88,7 +88,7 @@ def standard_definitions() -> Definitions:
 
 
 def _messages_of_actions() -> dict[str, str]:
-    """Return the messages that genaction makes of each action."""
+    """Return the messages that genaction makes from each action."""
     files = {}
     for name, parts in _ACTIONS.items():
         short = name.partition("/")[2]

@@ -1,15 +1,16 @@
 """TCPROS without I/O: connection headers, message frames and service replies.
 
-A connection starts with one header each way: a length, then fields `name=value`, each with its own length.
-Then come frames: a length and a body. A service reply has one byte in front of its frame: 1 for success, 0
-for an error, whose text is the body. All lengths are little-endian and of 32 bits.
+A connection starts with one header in each direction: a length, then fields `name=value`, each with its own length.
+Then frames follow: a length and a body. A service reply has one byte before its frame: 1 for success, or 0 for an
+error, whose text is the body. All lengths are little-endian and have 32 bits.
 
 Invariants:
 
-1. A length is checked against its limit, and a field's also against its header, before any byte of the data is kept.
+1. Before any byte of data is stored, its length is checked against the limit. The length of a field is also checked
+   against the length of its header.
 2. A header that is accepted has each field once, and every field has a name.
-3. Header text is UTF-8. Only `message_definition` may hold other bytes (roscpp copies comments
-   unchanged); they survive decoding and encoding as surrogate escapes.
+3. Header text is UTF-8. Only `message_definition` may have other bytes, because roscpp copies comments unchanged. These
+   bytes survive decoding and encoding as surrogate escapes.
 """
 
 import struct
@@ -19,34 +20,37 @@ from dataclasses import dataclass
 from roswire.errors import LimitExceededError, ProtocolError
 
 HEADER_LIMIT = 65536
-"""Most bytes in one connection header; the largest message definitions of MoveIt fill about half of it."""
+"""The maximum number of bytes in one connection header.
+
+The largest message definitions of MoveIt need about half of this.
+"""
 
 MESSAGE_LIMIT = 256 << 20
-"""Most bytes in one message, request or response."""
+"""The maximum number of bytes in one message, request or response."""
 
 _LENGTH = struct.Struct("<I")
 _ANY_BYTES = frozenset({"message_definition"})
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
-    """Write a connection header, length included, with the fields in the order given."""
+    """Encode a connection header, including its length, with the fields in the given order."""
     lines = [f"{name}={value}".encode("utf-8", "surrogateescape") for name, value in fields.items()]
     body = b"".join([_LENGTH.pack(len(line)) + line for line in lines])
     return _LENGTH.pack(len(body)) + body
 
 
 def encode_frame(body: bytes | bytearray | memoryview) -> bytes:
-    """Write one message, service request or response: its length, then its bytes."""
+    """Encode one message, service request or response: its length, then its bytes."""
     return _LENGTH.pack(len(body)) + body
 
 
 def encode_service_reply(body: bytes | bytearray | memoryview) -> bytes:
-    """Write the reply of a service call that succeeded; `body` is the serialised response."""
+    """Encode the reply to a service call that succeeded; `body` is the serialised response."""
     return b"\x01" + encode_frame(body)
 
 
 def encode_service_error(text: str) -> bytes:
-    """Write the reply of a service call that failed; the caller shows `text`."""
+    """Encode the reply to a service call that failed; the calling node shows `text`."""
     return b"\x00" + encode_frame(text.encode("utf-8", "replace"))
 
 
@@ -75,9 +79,9 @@ def decode_header(body: bytes) -> dict[str, str]:
 
 
 class HeaderParser:
-    """A parser of one connection header, from bytes as they arrive; the bytes after it are in `rest`.
+    """A parser of one connection header, from bytes as they arrive. Bytes after the header are in `rest`.
 
-    `limit` is the most bytes of a header that is accepted.
+    `limit` is the maximum number of bytes of an accepted header.
     """
 
     def __init__(self, limit: int = HEADER_LIMIT) -> None:
@@ -87,10 +91,10 @@ class HeaderParser:
         self._done = False
 
     def feed(self, data: bytes) -> dict[str, str] | None:
-        """Take `data`; return the fields once the header is whole, None before.
+        """Take `data`. Return the fields once the header is complete; before that, return None.
 
-        Raises `LimitExceededError` as soon as the announced length is beyond the limit, `ProtocolError` for a
-        malformed header, and RuntimeError when the header has been returned already.
+        Raises `LimitExceededError` as soon as the announced length exceeds the limit, `ProtocolError` for a malformed
+        header, and RuntimeError if the header was already returned.
         """
         if self._done:
             raise RuntimeError("the header is complete; what followed it is in .rest")
@@ -122,7 +126,7 @@ class FrameParser:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take `data`; return the bodies that are complete now. Raises `LimitExceededError`."""
+        """Take `data`, and return the bodies that are now complete. Raises `LimitExceededError`."""
         buffer = self._buffer
         buffer += data
         frames = []
@@ -141,7 +145,7 @@ class FrameParser:
 
 @dataclass(frozen=True, slots=True)
 class ServiceReply:
-    """The reply of a service: the serialised response, or, when not `ok`, the text of the error."""
+    """The reply of a service: the serialised response, or the text of the error if not `ok`."""
 
     ok: bool
     body: bytes
@@ -155,9 +159,10 @@ class ServiceReplyParser:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[ServiceReply]:
-        """Take `data`; return the replies that are complete now.
+        """Take `data`, and return the replies that are now complete.
 
-        Raises `ProtocolError` if the first byte is neither 0 nor 1, and `LimitExceededError` for the length.
+        Raises `ProtocolError` if the first byte is neither 0 nor 1, and `LimitExceededError` if the length exceeds the
+        limit.
         """
         buffer = self._buffer
         buffer += data

@@ -1,8 +1,8 @@
 """Node API URIs (`http://host:port/`) and service URIs (`rosrpc://host:port`), as nodes announce them.
 
-Invariants: the host is a host name, an IPv4 address or an IPv6 address; the port is given and between 1 and 65535;
-there is no user info, query or fragment. A URI that two parsers could read differently is rejected. rospy writes an
-IPv6 address without brackets (`http://::1:4000/`): the port follows the last colon.
+Invariants: the host is a host name, an IPv4 address or an IPv6 address. The port is given, and is between 1 and 65535.
+There is no user info, query or fragment. A URI that two parsers could read differently is rejected. rospy writes an
+IPv6 address without brackets (`http://::1:4000/`); there, the port follows the last colon.
 """
 
 import ipaddress
@@ -13,7 +13,7 @@ from functools import lru_cache
 from roswire.errors import InvalidUriError, quoted
 
 MAX_URI_LENGTH = 1024
-"""Most characters in one URI."""
+"""The maximum number of characters in one URI."""
 
 _URI = re.compile(
     r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*)://"
@@ -48,12 +48,12 @@ def parse_service_uri(text: str) -> NodeUri:
 
 
 def node_uri(host: str, port: int, path: str = "/") -> str:
-    """Write the URI of a node's XML-RPC API; an IPv6 `host` is put in brackets."""
+    """Return the URI of a node's XML-RPC API. An IPv6 `host` gets brackets."""
     return f"http://{_bracketed(host)}:{port}{path}"
 
 
 def service_uri(host: str, port: int) -> str:
-    """Write the URI of a service; an IPv6 `host` is put in brackets."""
+    """Return the URI of a service. An IPv6 `host` gets brackets."""
     return f"rosrpc://{_bracketed(host)}:{port}"
 
 

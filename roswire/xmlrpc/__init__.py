@@ -1,7 +1,7 @@
 """XML-RPC as ROS 1 uses it, without I/O: parse requests and answers under limits, and build them.
 
-Received bytes are never forwarded: they are parsed into values (`xmlrpc_reader`, or `common_documents` for simple
-documents), decided on, and encoded again (`xmlrpc_writer`).
+Received bytes are never forwarded. They are parsed into values (`xmlrpc_reader`, or `common_documents` for simple
+documents). After a decision, the values are encoded again (`xmlrpc_writer`).
 """
 
 from dataclasses import dataclass

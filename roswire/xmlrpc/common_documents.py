@@ -1,9 +1,9 @@
-"""Read common documents fast: names, numbers and lists of them, as ROS clients write them.
+"""Read common documents fast: names, numbers, and lists of names and numbers, as ROS clients write them.
 
-One pattern matches the whole document, or each part of a multicall, while `xmlrpc_reader` visits its elements. It
-accepts a subset of what `xmlrpc_reader` accepts, with the same values. Other documents, and all errors, are left to
-`xmlrpc_reader`. So is a single complex part of a multicall, which therefore does not slow the others. Strings are
-printable ASCII without characters that XML escapes.
+One pattern matches the whole document, or each part of a multicall, whereas `xmlrpc_reader` visits each element. This
+module accepts a subset of the documents that `xmlrpc_reader` accepts, with the same values. All other documents, and
+all errors, are left to `xmlrpc_reader`. A single complex part of a multicall is also left to `xmlrpc_reader`, so that
+it does not slow the other parts. Strings are printable ASCII without characters that XML escapes.
 """
 
 import re
@@ -14,8 +14,8 @@ from roswire.errors import PeerError, ProtocolError
 from roswire.xmlrpc.xmlrpc_reader import XmlRpcDocument
 from roswire.xmlrpc.xmlrpc_values import Value, XmlRpcLimits
 
-_LONGEST = 32 << 10  # bytes for one pattern
-_MOST_ALONE = 256  # parts that are read one by one: if all are, that takes twice as long as one pass
+_LONGEST = 32 << 10  # the maximum number of bytes for one pattern
+_MOST_ALONE = 256  # the maximum number of parts left to `xmlrpc_reader`, which take twice as long
 _SMALLEST = len("<value></value>")
 # If two stars can match the same byte, one is possessive (`*+`), so time is linear in the document.
 _SPACE = rb"[ \t\r\n]*+"
@@ -25,7 +25,7 @@ _DOUBLE = rb"-?[0-9]++(?:\.[0-9]++)?(?:e[-+]?[0-9]++)?"
 
 
 def _scalar(group: bytes = b"(?:") -> bytes:
-    """Return the pattern of a scalar; `group` begins the name of the group for each kind of content."""
+    """Return the pattern of a scalar. The group for each kind of content has a name that begins with `group`."""
     kinds = (
         (b"string", _TEXT), (b"int", _INTEGER), (b"i4", _INTEGER), (b"boolean", b"[01]"), (b"double", _DOUBLE)
     )  # fmt: skip
@@ -44,7 +44,10 @@ def _spaced(*parts: bytes) -> re.Pattern[bytes]:
 
 
 def _list_in(group: bytes) -> bytes:
-    """Return the pattern of a list of scalars whose last may be such a list; `group` begins the name of each group."""
+    """Return the pattern of a list of scalars.
+
+    The last item may itself be a list of scalars. The name of each group begins with `group`.
+    """
     each = group + _EACH + b")"
     return _ARRAY + each + b"(?:" + _ARRAY + each + _END + b")?" + _END
 
@@ -80,8 +83,9 @@ _STRUCT_END = re.compile(b"</struct>" + _SPACE + b"</value>" + _SPACE)
 
 
 def read_common_call(body: bytes, limits: XmlRpcLimits) -> tuple[str, list[Value]] | None:
-    """Return the method and the parameters of a call if they are scalars, or those of all parts of a multicall; else
-    None.
+    """Return the method and the parameters of a call if all parameters are scalars; otherwise None.
+
+    For a multicall, return the parameters of all parts.
     """
     if not _fits(body, limits):
         return None
@@ -93,7 +97,9 @@ def read_common_call(body: bytes, limits: XmlRpcLimits) -> tuple[str, list[Value
 
 
 def read_common_answer(body: bytes, limits: XmlRpcLimits) -> list[Value] | None:
-    """Return the answer, if it is a list of scalars whose last may be such a list, or several of a multicall's."""
+    """Return the answer, or the answers of a multicall, if each is a list of scalars whose last item may be such a
+    list.
+    """
     if not _fits(body, limits):
         return None
     found = _ANSWER.match(body) if len(body) <= _LONGEST else None
@@ -108,7 +114,7 @@ def _several(
     patterns: tuple[re.Pattern[bytes], re.Pattern[bytes], re.Pattern[bytes]],
     read: Callable[[re.Match[bytes]], Value],
 ) -> list[Value] | None:
-    """Return the parts of a document, if it has at least one and nothing else between head and end."""
+    """Return the parts of a document, if it has at least one part and nothing else between its head and end."""
     head, part, end = patterns
     found = head.match(body)
     if found is None:
@@ -126,9 +132,10 @@ def _several(
 
 
 def _struct(body: bytes, begin: int, limits: XmlRpcLimits) -> tuple[Value, int]:
-    """Return the struct that begins here, as `reader` returns it, and its end. Raises `PeerError` if there is none.
+    """Return the struct that begins here, as `reader` returns it, and its end. Raises `PeerError` if there is not a
+    struct here.
 
-    A value that is valid alone in a document is also valid in any other position, one level deeper.
+    A value that is valid alone in a document is also valid in any other position one level deeper.
     """
     depth, end = 0, None
     for tag in _STRUCT_TAG.finditer(body, begin) if body.startswith(_STRUCT, begin) else ():

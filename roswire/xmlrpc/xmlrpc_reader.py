@@ -1,16 +1,17 @@
 """Parse an XML-RPC document into values, under limits.
 
 The parser follows one table, `_GRAMMAR`: the elements that each element may contain, in order. Unknown elements and
-attributes, text between elements, and invalid values are rejected. Beyond the specification it accepts what ROS
-clients send: values without a type (strings; XmlRpc++), `<nil/>`, `inf` and `nan`, space around numbers, CDATA
-sections (rosnodejs), the extensions of Apache XML-RPC (rosjava).
+attributes, text between elements, and invalid values are rejected. The parser also accepts some forms outside the
+specification, because ROS clients send them: values without a type (strings; XmlRpc++), `<nil/>`, `inf` and `nan`,
+space around numbers, CDATA sections (rosnodejs), and the extensions of Apache XML-RPC (rosjava).
 
 Invariants:
 
-1. The document starts with an optional XML declaration and the root element. There is no document type, so only the
-   five entities of XML exist and no external reference. Processing instructions are rejected.
-2. One pass takes time linear in the body, and keeps only values; their number, depth and size are bounded.
-3. Every error is a `PeerError` with its byte offset.
+1. The document starts with an optional XML declaration and the root element. A document type is rejected, so only the
+   five entities of XML exist, and there are no external references. Processing instructions are rejected.
+2. The parser takes one pass, in time linear in the body, and stores only values. The number, depth and size of the
+   values are bounded.
+3. Every error is a `PeerError` with a byte offset.
 """
 
 import binascii
@@ -39,8 +40,8 @@ _SCALARS = ("i4", "int", "boolean", "double", "string", "dateTime.iso8601", "bas
             "ex:i1", "ex:i2", "ex:i8", "ex:float", "ex:nil")  # fmt: skip
 _TYPES = (*_SCALARS, "array", "struct")
 
-# For each state of an element: which child may start, and the element's state after it. An element starts in the state
-# of its own name.
+# For each state of an element: the children that may start, and the element's state after each child. An element starts
+# in the state with its own name.
 _GRAMMAR: Mapping[str, Mapping[str, str]] = {
     "document": {"methodCall": "full", "methodResponse": "full"},
     "methodCall": {"methodName": "methodCall, named"},
@@ -66,7 +67,7 @@ _INCOMPLETE = frozenset(
 
 _INTEGER = re.compile(r"[ \t\r\n]*([+-]?[0-9]{1,20})[ \t\r\n]*\Z")
 _DOUBLE = re.compile(
-    # Only one part can match a digit: two such parts would try every split, quadratic in the digits.
+    # Only one part can match a digit. With two such parts, every split of the digits would be tried, in quadratic time.
     r"[ \t\r\n]*([+-]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|inf|infinity|nan))[ \t\r\n]*\Z",
     re.IGNORECASE | re.ASCII,
 )
@@ -74,12 +75,12 @@ _DATE_TIME = re.compile(
     r"[ \t\r\n]*([0-9]{4})([0-9]{2})([0-9]{2})T([0-9]{2}):([0-9]{2}):([0-9]{2})[ \t\r\n]*\Z"
 )
 _BASE64 = re.compile(r"[A-Za-z0-9+/]*={0,2}\Z")
-_PIECE = 64 << 10  # bytes given to expat at once
+_PIECE = 64 << 10  # the number of bytes given to expat at once
 _NO_SPACE = str.maketrans("", "", _SPACE)
 
 
 class XmlRpcDocument:
-    """One document while it is read; afterwards `method`, `values` and `is_fault` have its contents."""
+    """One document. After it is read, `method`, `values` and `is_fault` have its contents."""
 
     __slots__ = ("_depth", "_elements", "_expat", "_follow", "_keys", "_limits", "_stack", "_state", "_text",
                  "_value", "is_fault", "method", "values")  # fmt: skip
@@ -91,7 +92,7 @@ class XmlRpcDocument:
         self.is_fault = False
         self._limits = limits
         self._state = "document"
-        self._follow: list[str] = []  # the next state of each open element's parent
+        self._follow: list[str] = []  # for each open element: the next state of its parent
         self._text: list[str] = []
         self._value: Value = None  # the value that ended last
         self._stack: list[list[Value] | dict[str, Value]] = [self.values]  # open arrays and structs
@@ -112,14 +113,14 @@ class XmlRpcDocument:
             what = expat.ErrorString(error.code)
             raise ProtocolError(f"not well-formed XML at byte {parser.ErrorByteIndex}: {what}") from None
         finally:
-            del self._expat  # the parser refers to this object: no cycle is left behind
+            del self._expat  # the parser refers to this object; this breaks the cycle
 
     def _parse(self, body: bytes) -> None:
         """Feed the parser in pieces, and reject a tag that is longer than a piece.
 
-        When a handler raises, expat still goes through the rest of its piece and keeps a stack of the elements there.
-        An unfinished tag is scanned again with the next piece, and its attributes are collected. Small pieces and short
-        tags bound all three.
+        When a handler raises, expat still reads the rest of its piece and keeps a stack of the elements there. An
+        unfinished tag is scanned again with the next piece, and its attributes are collected. Small pieces and short
+        tags keep all three costs low.
         """
         parser = self._expat
         if len(body) <= _PIECE:
@@ -135,7 +136,7 @@ class XmlRpcDocument:
 
     def _start(self, tag: str, attributes: list[str]) -> None:
         follow = _GRAMMAR[self._state].get(tag)
-        if follow is None or (attributes and self._state != "document"):  # the root's: see _HEAD
+        if follow is None or (attributes and self._state != "document"):  # _HEAD has the root's attributes
             raise self._error(f"<{tag[:40]}> {'with attributes' if follow else f'inside {self._place()}'}")
         if self._text:
             self._pass_space()
@@ -152,7 +153,7 @@ class XmlRpcDocument:
 
     def _end(self, tag: str) -> None:
         if tag == "value":
-            if self._state == "value":  # without a type
+            if self._state == "value":  # a value without a type
                 self._value = self._string()
             elif self._text:
                 self._pass_space()
@@ -160,7 +161,7 @@ class XmlRpcDocument:
             if type(container) is list:
                 container.append(self._value)
             else:
-                container[self._keys.pop()] = self._value  # type: ignore[call-overload]  # it is the dict
+                container[self._keys.pop()] = self._value  # type: ignore[call-overload]  # the container is the dict
         elif (read := _READ.get(tag)) is not None:
             self._value = read(self)
         else:
@@ -253,7 +254,7 @@ class XmlRpcDocument:
         return self._state if self._state != "full" else "an element that is complete"
 
     def _pass_space(self) -> None:
-        """Skip whitespace, which alone may be between elements; ROS clients write a line feed."""
+        """Skip whitespace. Only whitespace may be between elements, and ROS clients write a line feed there."""
         if self._text != _LINE_FEED:
             text = "".join(self._text).strip(_SPACE)
             if text:

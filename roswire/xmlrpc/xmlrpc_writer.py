@@ -1,7 +1,7 @@
 """Build XML-RPC documents in the notation of Python's `xmlrpc.client`, which every ROS client reads.
 
-A parsed value has one notation. This module's output is read back as the same value here, by `rosmaster` and rospy and,
-except for `\\r`, by roscpp (XmlRpc++ knows no character references). Values without a notation raise `EncodingError`.
+A parsed value has one notation. This module, `rosmaster` and rospy read the output back as the same value. roscpp also
+does, except for `\\r`, because XmlRpc++ knows no character references. Values without a notation raise `EncodingError`.
 """
 
 import binascii
@@ -14,11 +14,11 @@ from roswire.errors import EncodingError
 from roswire.xmlrpc.xmlrpc_values import Value
 
 _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
-_MAX_WRITE_DEPTH = 200  # well below Python's own limit, far above what is read
+_MAX_WRITE_DEPTH = 200  # well below Python's own limit, far above the reader's limit
 
 
 def build_call(method: str, params: Sequence[Value]) -> bytes:
-    """Write a request; raises `EncodingError` for what XML-RPC has no notation for."""
+    """Write a request; raises `EncodingError` for a value that XML-RPC has no notation for."""
     out = ["<?xml version='1.0'?>\n<methodCall>\n<methodName>", _text(method), "</methodName>\n<params>\n"]
     for value in params:
         if type(value) is str:
@@ -32,7 +32,7 @@ def build_call(method: str, params: Sequence[Value]) -> bytes:
 
 
 def build_response(value: Value) -> bytes:
-    """Write an answer; raises `EncodingError` for what XML-RPC has no notation for."""
+    """Write an answer; raises `EncodingError` for a value that XML-RPC has no notation for."""
     out = ["<?xml version='1.0'?>\n<methodResponse>\n<params>\n<param>\n"]
     _write(value, out, 0)
     out.append("</param>\n</params>\n</methodResponse>\n")
@@ -61,7 +61,7 @@ def _text(string: str) -> str:
     if ">" in string:
         string = string.replace(">", "&gt;")
     if "\r" in string:
-        string = string.replace("\r", "&#13;")  # a bare one is read back as a line feed
+        string = string.replace("\r", "&#13;")  # a bare carriage return is read back as a line feed
     return string
 
 
@@ -107,7 +107,7 @@ def _write_base64(value: bytes, out: list[str], _depth: int) -> None:
 def _write_array(value: Sequence[Value], out: list[str], depth: int) -> None:
     out.append("<value><array><data>\n")
     for item in value:
-        if type(item) is str:  # as most are
+        if type(item) is str:  # the most common case
             out.append(f"<value><string>{_text(item)}</string></value>\n")
         else:
             _write(item, out, depth + 1)
