@@ -1,1 +1,3 @@
-"""Build what is released: Debian packages (`deb`), the image (`image`), an archive (`site`), signed (`release`)."""
+"""Build and sign (`release`) the released files: Debian packages (`deb`), the image (`image`) and an archive
+(`site`).
+"""

@@ -1,8 +1,8 @@
 """Write the page of audit events from the registry and from the calls that record events.
 
-`python -m distribution.audit_events_page` prints docs/reference/audit-events.md; a test compares the page with it.
-Severities that the registry does not have, and the fields of `detail`, are read from the calls that record an event.
-Events whose names are computed (the log's own records, the actions of monitors) are in `ELSEWHERE`.
+`python -m distribution.audit_events_page` prints docs/reference/audit-events.md. A test compares the file with the
+output. The fields of `detail`, and severities that are missing in the registry, are read from the calls that record an
+event. Events whose names are computed (the log's own records, the actions of monitors) are in `ELSEWHERE`.
 """
 
 import ast
@@ -103,7 +103,7 @@ def _use(node: ast.Call, place: str) -> Iterator[EventUse]:
 
 
 def _texts(node: ast.AST) -> Iterator[str]:
-    """Yield the possible texts of an expression: a literal, or one of two."""
+    """Yield the possible texts of an expression: a literal, or both literals of a conditional expression."""
     match node:
         case ast.Constant(value=str(text)):
             yield text

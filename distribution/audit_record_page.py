@@ -1,6 +1,6 @@
 """Write the generated part of the page about audit records.
 
-`python -m distribution.audit_record_page` prints it; a test compares it with the page.
+`python -m distribution.audit_record_page` prints this part. A test compares it with the page.
 """
 
 import json

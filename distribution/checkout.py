@@ -11,12 +11,12 @@ ROOT = Path(__file__).parents[1]
 
 
 def time_of_commit() -> int:
-    """Return the time of the newest commit in seconds since the epoch; all files of a build get it."""
+    """Return the time of the newest commit in seconds since the epoch. All files of a build get this time."""
     return int(_git("log", "-1", "--format=%ct"))
 
 
 def revision() -> str:
-    """Return the newest commit, with `-changed` if files differ from it."""
+    """Return the newest commit, with the suffix `-changed` if files differ from the commit."""
     changed = _git("status", "--porcelain", "--untracked-files=no")
     return _git("rev-parse", "HEAD") + ("-changed" if changed else "")
 
@@ -29,6 +29,6 @@ def facts(kind: str, architecture: str, commit: str, moment: int, **more: str) -
 
 
 def _git(*arguments: str) -> str:
-    # Root may build a checkout of another user.
+    # Root may build a checkout that belongs to another user.
     command = ["git", "-c", f"safe.directory={ROOT}", *arguments]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()

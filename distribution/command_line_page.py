@@ -20,7 +20,7 @@ command line, unless the command's text says otherwise.
 ## Options of many commands
 
 """
-_SHARED_BY = 8  # commands
+_SHARED_BY = 8  # the minimum number of commands that share an option
 
 
 class _Command(NamedTuple):

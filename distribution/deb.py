@@ -2,8 +2,8 @@
 
     python -m distribution.deb amd64 arm64
 
-The tree of the package is made under build/package/ARCH, then debhelper packs it. All times in it are that of the
-newest commit, so two builds of one commit are equal, byte by byte.
+The tree of the package is made under build/package/ARCH, then debhelper packs it. All its times are that of the newest
+commit, so two builds of one commit are equal, byte by byte.
 """
 
 import os
@@ -45,7 +45,7 @@ def build(architecture: Architecture, *, moment: int) -> Path:
     source.mkdir(parents=True)
     _gather(source, architecture, work, moment)
     _debian_folder(source / "debian", moment)
-    for path in source.rglob("*"):  # dpkg lowers later times, but keeps earlier ones
+    for path in source.rglob("*"):  # dpkg lowers later times, but keeps earlier times
         os.utime(path, (moment, moment), follow_symlinks=False)
     environment = {"SOURCE_DATE_EPOCH": str(moment), "DEB_BUILD_OPTIONS": "nocheck", "LC_ALL": "C.UTF-8"}
     subprocess.run(
@@ -81,7 +81,7 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     (shipped / "build.json").write_text(facts("package", architecture.debian, revision(), moment))
     (shipped / "scripts").mkdir()
     shutil.copy(ROOT / "scripts/build-roscpp", shipped / "scripts")
-    # The program's data path, as with the wheel.
+    # The program finds its data here, as with the wheel.
     (library / "share").symlink_to("../../share")
     (root / "usr/bin").mkdir(parents=True)
     launcher = root / "usr/bin/rosrv"
@@ -132,7 +132,7 @@ def _debian_folder(target: Path, moment: int) -> None:
         f" -- The ROSRV maintainers <maintainers@localhost>  {formatdate(moment)}\n"
     )
     lines = [f'u {name} - "ROSRV appliance" - -' for name in NUMERIC_IDS]
-    # root reads the audit log as a member of its group, where it has no CAP_DAC_OVERRIDE.
+    # root reads the audit log as a member of its group if it has no CAP_DAC_OVERRIDE.
     (target / "rosrv.sysusers").write_text("\n".join([*lines, "m root rosrv-api"]) + "\n")
     (target / "rosrv.install").write_text("root/* /\n")
     for name in ("postinst", "prerm"):

@@ -1,11 +1,11 @@
-"""Make the locked Python environment of the package, for an architecture and all interpreters.
+"""Make the locked Python environment of the package, for one architecture and all interpreters.
 
     lib/python3.11/site-packages   files for this interpreter only
     lib/python3.12/site-packages
     common                         files for all: each `site-packages` has a `common.pth` with its path
 
-The wheels are those of requirements.lock, by hash, for the given architecture; none of their code runs here.
-python-iptables comes as source; its one C file needs only libc and is compiled here.
+The wheels are those of requirements.lock, by hash, for the given architecture. None of their code runs here.
+python-iptables comes as source. Its one C file needs only libc, and is compiled here.
 """
 
 import filecmp
@@ -54,7 +54,7 @@ def make_environment(target: Path, architecture: Architecture, work: Path) -> No
         _strip(tree, architecture)
     _share(trees, target / "common")
     for tree in trees:
-        # Relative to the folder that the .pth file is in.
+        # The path is relative to the folder of the .pth file.
         (tree / "common.pth").write_text("../../../common\n")
 
 
@@ -82,7 +82,7 @@ def _install_wheels(tree: Path, version: str, architecture: Architecture, lock: 
 def _install_iptables(tree: Path, version: str, architecture: Architecture, lock: Path, work: Path) -> None:
     folder = work / "iptables"
     if not folder.exists():
-        # pip asks the source for its name, which needs Debian's setuptools; nothing is installed.
+        # pip asks the source package for its name, which needs Debian's setuptools. Nothing is installed.
         _run(
             *(
                 str(PIP),
@@ -125,7 +125,7 @@ def _leave_out(tree: Path) -> None:
     shutil.rmtree(tree / "apsw/sqlite_extra_binaries", ignore_errors=True)
     for name in (".lock", ".gitignore"):
         (tree / name).unlink(missing_ok=True)
-    # The installer's notes about this machine, and outdated lists of files.
+    # These are the installer's notes about this machine, and outdated lists of files.
     for record in [*tree.glob("*.dist-info/RECORD"), *tree.glob("*.dist-info/direct_url.json")]:
         record.unlink()
 

@@ -2,9 +2,9 @@
 
     python -m distribution.image [OPTIONS OF docker build …]
 
-The engine builds the target `appliance` of the Dockerfile with the Debian packages of image-packages.lock. The result
-is rewritten: no time in it is later than the newest commit, so that two builds of one commit can be equal. One layer is
-added, with the list of parts (`sbom`) and the origin of the build.
+The engine builds the target `appliance` of the Dockerfile with the Debian packages of image-packages.lock. Then the
+result is rewritten: no time in it is later than the newest commit, so that two builds of one commit can be equal. One
+layer is added, with the list of parts (`sbom`) and the origin of the build.
 
     python -m distribution.image lock BASE [OPTIONS …]     new image-packages.lock from Debian's present packages
 """
@@ -53,7 +53,7 @@ def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
 
     Raises `subprocess.CalledProcessError`.
     """
-    # No cache: older parts would keep their own times.
+    # Without a cache, because older parts would keep their own times.
     pins = " ".join(line for line in LOCK.read_text().splitlines() if not line.startswith("#"))
     _docker(
         "build", "--no-cache", "--target", "appliance", "--tag", NAME, "--build-arg", f"PINS={pins}",
@@ -69,7 +69,7 @@ def build(options: list[str], *, moment: int) -> tuple[Path, Path]:
 
 
 def lock(base: str, build_options: list[str]) -> None:
-    """Write image-packages.lock: the packages of the image that are not in its base."""
+    """Write image-packages.lock: the packages of the image that are not in its base image."""
     options = ["--quiet", "--target", "appliance", str(ROOT)]
     listed = "dpkg-query --show --showformat '${Package}=${Version}\\n'"
     before, after = (
@@ -106,7 +106,7 @@ def _rewrite(saved: Path, work: Path, moment: int) -> tuple[Path, Path]:
 def _kept(
     members: tarfile.TarFile, tree: ImageFiles, moment: int
 ) -> Iterator[tuple[tarfile.TarInfo, IO[bytes] | None]]:
-    """Yield the entries of a layer without values that differ between builds; add each to `tree`."""
+    """Yield the entries of a layer, without values that differ between builds. Add each entry to `tree`."""
     for member in members:
         member.mtime = min(int(member.mtime), moment)
         member.pax_headers = {
@@ -148,7 +148,7 @@ def _blob(path: Path) -> Blob:
 
 
 def _settled(config: dict[str, Any], layers: list[Blob], moment: int) -> dict[str, Any]:
-    """Return the configuration for these layers, without values of the building engine."""
+    """Return the configuration for these layers, without values that the building engine set."""
     created = datetime.fromtimestamp(moment, UTC).isoformat().replace("+00:00", "Z")
     history = [{**step, "created": created} for step in config["history"]]
     history.append(
@@ -228,7 +228,7 @@ def _docker(*arguments: str) -> str:
 
 
 def attempt(options: list[str]) -> tuple[Path, ...]:
-    """Build the image and print the result; return no paths if the engine fails."""
+    """Build the image and print the result. Return an empty tuple if the engine fails."""
     try:
         made = build(options, moment=time_of_commit())
     except FileNotFoundError:
@@ -243,7 +243,7 @@ def attempt(options: list[str]) -> tuple[Path, ...]:
 
 
 def main(arguments: list[str]) -> int:
-    """Build the image, or with `lock` a new list of its packages; return the exit status."""
+    """Build the image, or, with `lock`, write a new list of its packages. Return the exit status."""
     if arguments[:1] == ["lock"]:
         lock(arguments[1], arguments[2:])
         return 0

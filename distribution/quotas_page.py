@@ -55,7 +55,7 @@ def _table(title: str, columns: tuple[str, ...], cells: Callable[[QuotaRow], tup
 
 
 def _setting(row: QuotaRow) -> str:
-    """Return the key as code, then its note."""
+    """Return the key of a setting as code, followed by its note."""
     key, space, note = row.setting.partition(" ")
     return f"`{key}`{space}{note}" if key else "none"
 

@@ -4,7 +4,7 @@
     SHA256SUMS        of every file, as `sha256sum --check` reads them
     SHA256SUMS.sig    ECDSA P-256 over SHA256SUMS, as `cosign verify-blob` and `openssl dgst` check it
 
-The key is that of the person who releases (`openssl ecparam -name prime256v1 -genkey -noout`); sites get the public
+The key belongs to the person who releases (`openssl ecparam -name prime256v1 -genkey -noout`). Sites get the public
 half separately. The target builds everything again before it signs, so that all files are of one commit.
 """
 

@@ -56,7 +56,7 @@ class ImageFiles:
             self._links[name] = posixpath.normpath(posixpath.join(folder, link))
 
     def copyright(self, package: str) -> str:
-        """Return the text about a Debian package's licences, or an empty string."""
+        """Return the copyright file of a Debian package, or an empty string."""
         folder = f"usr/share/doc/{package}"
         return self.texts.get(f"{self._links.get(folder, folder)}/copyright", "")
 
@@ -66,7 +66,7 @@ class ImageFiles:
 
 
 def make_sbom(tree: ImageFiles, *, architecture: str, moment: int) -> str:
-    """Return the list as JSON, equal for equal trees; `moment` in seconds since the epoch."""
+    """Return the list as JSON, equal for equal trees. `moment` is in seconds since the epoch."""
     itself = Component(
         name="rosrv/appliance", version=__version__, type=ComponentType.CONTAINER, bom_ref="rosrv/appliance",
         licenses=_licences(["Apache-2.0"]),
@@ -92,7 +92,7 @@ def _part(
 
 
 def _licences(names: Iterable[str]) -> list[License]:
-    """Return licences for CycloneDX: one expression, or a list of single ones."""
+    """Return licences for CycloneDX: one expression, or a list of single licences."""
     factory = LicenseFactory()
     made = [factory.make_from_string(name) for name in sorted(set(names))]
     return made if len(made) == 1 else [factory.make_with_name(name) for name in sorted(set(names))]

@@ -1,8 +1,9 @@
-"""`make site`: dist/rosrv-site_VERSION_ARCH.tar, all that a site without a network needs: docs/install.md.
+"""`make site`: dist/rosrv-site_VERSION_ARCH.tar, with everything that a site without a network needs (docs/install.md).
 
     python -m distribution.site [OPTIONS OF docker build …]
 
-It has the image with its list of parts, compose files, policies, monitors, pages, and the checksums of all files.
+The archive has the image with its list of parts, compose files, policies, monitors, pages, and the checksums of all
+files.
 """
 
 import hashlib
@@ -42,7 +43,7 @@ def pack(parts: tuple[Path, ...], *, moment: int) -> Path:
 
 
 def main(arguments: list[str]) -> int:
-    """Build the image, then the archive; return exit status 1 if the engine fails."""
+    """Build the image, then the archive. Return exit status 1 if the engine fails."""
     made = image.attempt(arguments)
     if made:
         sys.stdout.write(f"{pack(made, moment=time_of_commit()).relative_to(ROOT)}\n")
