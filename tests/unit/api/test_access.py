@@ -19,7 +19,7 @@ def kept(row: TokenRow) -> TokenKept:
 
 
 def recognise(door: TokenAuthenticator, header: str | None, host: str = "10.0.0.1") -> Any:
-    """Return the bearer, or the status of the refusal."""
+    """Return the bearer of a token, or the HTTP status of the refusal."""
     try:
         return asyncio.run(door.recognise(header, host))
     except ProblemError as problem:

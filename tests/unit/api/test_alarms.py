@@ -26,7 +26,7 @@ def changed(path: str, value: object, **more: object) -> Status:
 
 
 def test_a_healthy_appliance_has_none() -> None:
-    """A healthy appliance has no alarms, nor has one before the first probe."""
+    """A healthy appliance has no alarms, and neither has an appliance before its first probe."""
     assert open_alarms(example(Status, **GOOD)) == []
     assert open_alarms(changed("probe", "")) == []
 

@@ -11,7 +11,7 @@ __all__ = ["key", "make_log", "notary", "path"]
 
 
 def test_a_viewers_page_reveals_nothing_that_is_withheld(make_log: MakeLog) -> None:
-    """Neither records nor the cursor reveal whether a message contains a text."""
+    """Neither the records nor the cursor reveal whether a withheld message contains a text."""
     log = make_log()
     said = {"monitor": "m", "before_fields": {"data": "password"}}
     for number in range(40):
@@ -39,7 +39,10 @@ def test_a_viewers_page_reveals_nothing_that_is_withheld(make_log: MakeLog) -> N
 
 
 def test_a_search_for_messages_says_that_they_are_never_recorded(make_log: MakeLog) -> None:
-    """The note comes with the records, which an older version may have written. Other searches have no note."""
+    """The note comes with the records, because an older version may have recorded messages.
+
+    Other searches have no note.
+    """
     log = make_log()
     settle(log)
     slips = Filter(event="message droped", category="publsh")
@@ -53,7 +56,7 @@ def test_a_search_for_messages_says_that_they_are_never_recorded(make_log: MakeL
 
 
 def test_a_viewer_learns_nothing_of_monitor_names_inside_messages(make_log: MakeLog) -> None:
-    """A name that occurs only in a message is answered like the name of an unknown monitor."""
+    """A search for a name that occurs only in a message gets the same answer as an unknown monitor's name."""
     log = make_log()
     for number in range(600):
         detail = {"monitor": "m" if number % 300 else "gun", "before_fields": {"data": "gun password"}}

@@ -16,7 +16,7 @@ NOW = datetime.datetime.now(datetime.UTC)
 
 
 def shake_hands(context: ssl.SSLContext, certificate: Path, name: str) -> str | None:
-    """Return the TLS version agreed with a client that trusts only this certificate, or the reason of the failure."""
+    """Return the TLS version agreed with a client that trusts only this certificate, or the reason for the failure."""
     here, there = socket.socketpair()
 
     def serve() -> None:
@@ -76,7 +76,7 @@ def test_it_is_renewed_for_a_new_name_or_before_it_expires(
 
 @pytest.mark.parametrize("wrong", [datetime.timedelta(days=-20_000), datetime.timedelta(days=3650)])
 def test_it_follows_a_corrected_clock(tmp_path: Path, wrong: datetime.timedelta) -> None:
-    """A certificate made in 1970 or in ten years is replaced once the clock is right; the key stays."""
+    """A certificate made in 1970 or dated ten years ahead is replaced once the clock is correct; the key stays."""
     context = tls_context(tmp_path, ["10.1.2.3"], NOW + wrong)
     pin = pin_of(tmp_path)
     assert shake_hands(context, tmp_path / CERTIFICATE, "10.1.2.3") not in ("TLSv1.2", "TLSv1.3")

@@ -135,7 +135,7 @@ def test_the_manifest_lists_all_vendored_files() -> None:
 
 
 def test_vendored_versions_match_the_lock_file() -> None:
-    """The vendored packages are those of `console/package-lock.json`; none was added by hand."""
+    """The vendored packages are those of `console/package-lock.json`; none was added manually."""
     lock = json.loads((FILES.parents[2] / "console" / "package-lock.json").read_text())["packages"]
     manifest = json.loads((VENDOR / "manifest.json").read_text())["files"]
     for entry in manifest.values():
@@ -228,6 +228,6 @@ def _luminance(colour: str) -> float:
 
 
 def test_the_console_explains_every_category_of_decision() -> None:
-    """Each category can be explained and has its button at a record."""
+    """Every category can be explained, and its records have the button for the explanation."""
     text = (FILES / "js" / "categories.js").read_text()
     assert set(re.findall(r'\["(\w+)", "', text)) == {*Category}

@@ -42,7 +42,7 @@ def _words(schema: dict[str, Any]) -> str:
 
 
 def test_a_wrong_method_lists_the_valid_ones(app: FastAPI, contract: dict[str, Any]) -> None:
-    """Every path of the contract lists its methods, also a path with a name in it."""
+    """A wrong method gets 405 with the valid methods, for every path of the contract."""
     paths = [*(path for path in contract["paths"] if "{" not in path), "/v1/tokens/{name}"]
     answers = [requested(app, "TRACE", path.format(name="mallory")) for path in paths]
     told = [", ".join(sorted(method.upper() for method in contract["paths"][path])) for path in paths]
@@ -51,7 +51,7 @@ def test_a_wrong_method_lists_the_valid_ones(app: FastAPI, contract: dict[str, A
 
 
 def test_times_have_units(contract: dict[str, Any]) -> None:
-    """Every time that is not a whole number has its unit in its name or its description."""
+    """Every field that holds a time has its unit in its name or its description, unless it is a whole number."""
     without, seen = [], 0
     for kind, schema in contract["components"]["schemas"].items():
         for name, of in schema.get("properties", {}).items():
@@ -66,7 +66,7 @@ def test_times_have_units(contract: dict[str, Any]) -> None:
 
 
 def test_every_field_is_described(contract: dict[str, Any]) -> None:
-    """Each field has a description, its own or its type's; no description is unused."""
+    """Each field or its type has a description; no description is unused."""
     fields = {
         (kind, name): field
         for kind, schema in contract["components"]["schemas"].items()
@@ -83,7 +83,7 @@ def test_every_field_is_described(contract: dict[str, Any]) -> None:
 
 
 def test_every_json_answer_has_an_etag(contract: dict[str, Any]) -> None:
-    """Each GET that answers with JSON has an ETag; one whose ETag guards changes is always sent whole."""
+    """Each GET that answers with JSON has an ETag; if its ETag guards changes, the answer is always sent whole."""
     for path, operations in contract["paths"].items():
         if "get" not in operations:
             continue

@@ -41,7 +41,7 @@ class Control:
         self.heard = self._ear.messages
 
     async def until(self, count: int) -> list[Any]:
-        """Return what was received, once it has this length."""
+        """Wait until this number of messages was received, and return all of them."""
         return await self._ear.until(count)
 
 
@@ -59,7 +59,7 @@ def link(tokens: list[TokenKept]) -> ControlLink:
 
 @pytest.fixture
 def control(link: ControlLink) -> Iterator[Callable[[], Control]]:
-    """Return a function that starts a control, of which there may be several."""
+    """Return a function that connects a control; each call replaces the previous control."""
     ends: list[Channel] = []
     yield lambda: Control(link, ends)
     for end in ends:
@@ -95,7 +95,7 @@ async def test_each_question_gets_its_own_answer(link: ControlLink, there: Contr
 async def test_a_question_ends_with_the_link_or_the_timeout(
     link: ControlLink, control: Callable[[], Control]
 ) -> None:
-    """Without a control, or with one that dies, is replaced or is silent, the question ends with an error."""
+    """Without a control, or with a control that dies, is replaced or stays silent, the question ends with an error."""
     with pytest.raises(ControlAwayError, match="restarted"):
         await link.ask(StatusWanted(), bearer("w"))
     there = control()

@@ -41,13 +41,13 @@ def why(record: AuditRecord, text: str = CLOSED) -> Why:
 
 
 def allowing(found: Why) -> list[str]:
-    """Return the lines of the policy that would allow it."""
+    """Return the lines of the policy that would allow the denied request."""
     start = "would be allowed by: "
     return [line.removeprefix(start) for line in found.lines if line.startswith(start)]
 
 
 def test_every_event_of_a_denial_has_its_row() -> None:
-    """Covers events recorded with a denial, and events that refuse without one."""
+    """The table covers events recorded with a denial, and events that refuse without a denial."""
     refusing = {use.event for use in uses() if use.denies} | {*get_args(Violation)} - {""}
     refusing |= {"decision", "denials folded"}  # their decision is computed
     refusing |= {"specifications refused", "policy refused", "rate limited", "message dropped"}
@@ -97,7 +97,7 @@ def test_the_change_lets_a_revoked_grant_be_kept(call: str, category: str, *, na
 
 
 def test_denials_without_a_policy_are_not_blamed_on_it() -> None:
-    """Covers an expelled host and the appliance's own calls; `call` is not asked."""
+    """Covers an expelled host and the appliance's own calls."""
     live = LiveRight(ipaddress.ip_address(HOST), "/it", "registerPublisher", "/x")
     decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
     assert not revocation(decision, HOST, "/it", "publication", "/x", call="").more
@@ -125,7 +125,7 @@ def test_a_connection_without_a_grant() -> None:
 
 
 def test_a_name_that_another_host_has() -> None:
-    """The answer is the option that allows it at once, whether or not its section or another value exists."""
+    """The change is the option that allows a takeover at once, whether or not its section or another value exists."""
     held = f"/it is held by a running node on 10.0.0.1 (or at once with {AT_ONCE})"
     all_may = "[Nodes]\ndefault = *\n[Publishers]\n/x = *\n"
     for options, line in {
@@ -141,7 +141,10 @@ def test_a_name_that_another_host_has() -> None:
 
 
 def test_repetitions_and_limits() -> None:
-    """A record of repetitions is explained like one denial; several kinds by the first; a limit by its line."""
+    """A record of repetitions is explained like one denial, of several kinds like the first kind.
+
+    A limit names its line.
+    """
     one = {"scope": "kind", "of": "decision", "recorded_id": "7"}
     assert allowing(why(denied("denials folded", detail=one))) == [
         "/x = 10.0.0.1 10.0.0.9",

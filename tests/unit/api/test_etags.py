@@ -46,7 +46,7 @@ def _app() -> ConditionalGet:
 
 
 def asked(app: ConditionalGet, path: str, method: str = "GET", **headers: str) -> httpx.Response:
-    """Return an answer."""
+    """Return the answer to a request."""
     given = {name.replace("_", "-"): value for name, value in headers.items()}
     return requested(app, method, path, headers=given)
 
@@ -87,7 +87,7 @@ def test_a_changed_body_is_sent(app: ConditionalGet) -> None:
 def test_these_answers_get_no_etag_of_the_body(
     app: ConditionalGet, path: str, status: int, tag: str | None
 ) -> None:
-    """A revision keeps its own ETag; errors, texts and streams get none, and streams are not buffered."""
+    """A revision keeps its own ETag. Errors, text and streams get no ETag, and streams are not buffered."""
     answer = asked(app, path, if_none_match=f"{tag or '*'}")
     assert (answer.status_code, answer.headers.get("etag")) == (status, tag)
     assert answer.content

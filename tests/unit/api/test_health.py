@@ -22,7 +22,7 @@ SERVING: dict[str, Any] = {"probe": "passed", "relay": "connected", "rosmaster":
 
 
 class Probed:
-    """REST before a control in a given state; `looks` counts the probes of control."""
+    """REST before a control in a given state; `looks` counts the queries to control."""
 
     def __init__(self, *statuses: dict[str, Any] | None) -> None:
         self._statuses = list(statuses)
@@ -54,7 +54,7 @@ class Probed:
 
 @contextlib.asynccontextmanager
 async def sampled(probed: Probed) -> AsyncIterator[None]:
-    """Sample health meanwhile, from before the first sample."""
+    """Take samples of health during the block; the first sample exists when it begins."""
     async with asyncio.timeout(30):
         task = asyncio.create_task(probed.history.run())
         await probed.history.after(0)
@@ -70,7 +70,7 @@ async def sampled(probed: Probed) -> AsyncIterator[None]:
     ],
 )  # fmt: skip
 async def test_it_is_not_ready_while_nodes_are_not_served(wrong: dict[str, Any] | None) -> None:
-    """Each reason answers 503, and 200 as soon as it is gone."""
+    """Each reason answers 503; as soon as the reason is gone, the answer is 200."""
     unready = None if wrong is None else SERVING | wrong
     probed = Probed(unready, unready, SERVING)
     async with sampled(probed):
@@ -87,7 +87,7 @@ async def test_a_log_that_may_fail_does_not_make_it_unready() -> None:
 
 
 async def test_many_probes_ask_control_once() -> None:
-    """Many probes of an appliance that is not ready cause one question to control."""
+    """Many probes of an appliance that is not ready cause one query to control."""
     probed = Probed(SERVING | {"relay": "away"})
     async with sampled(probed):
         assert set(await asyncio.gather(*(probed.ready() for _ in range(200)))) == {"not-served"}

@@ -38,7 +38,7 @@ def test_a_sample_adds_up() -> None:
 
 @contextlib.asynccontextmanager
 async def sampling(measures: Callable[[], Awaitable[Measures]]) -> AsyncIterator[SampleHistory]:
-    """Take samples meanwhile, with a time limit."""
+    """Take samples during the block, with a time limit."""
     samples = SampleHistory(measures)
     task = asyncio.create_task(samples.run())
     async with asyncio.timeout(20):
@@ -79,7 +79,7 @@ async def test_followers_get_each_sample_and_an_hour_is_stored(monkeypatch: Any)
 
 
 async def test_samples_stay_in_order_when_the_clock_is_set_back(monkeypatch: Any) -> None:
-    """Samples later than the new time are removed, so that rates and curves do not run backwards."""
+    """Samples later than the new time are removed, so that rates and curves never run backwards."""
     monkeypatch.setattr(history, "BUSY_SECONDS", 0.001)
     times = [1000.0, 1010.0, 8200.0, 1005.0, 1015.0]
     clock = iter(times)

@@ -9,7 +9,7 @@ from appliance.channel.messages.api import RestCalled
 
 
 def answered(journal: Journal, **changes: Any) -> None:
-    """Return one answer."""
+    """Report one answer to the journal."""
     fields: dict[str, Any] = {
         "host": "h",
         "who": "w",
@@ -23,7 +23,7 @@ def answered(journal: Journal, **changes: Any) -> None:
 
 
 def test_equal_reads_are_reported_once_and_counted() -> None:
-    """The first read is reported at once, the others as a number; a flush starts over."""
+    """The first read is reported at once, later equal reads as a number; a flush starts over."""
     told: list[RestCalled] = []
     journal = Journal(told.append)
     for _ in range(4):
@@ -37,7 +37,7 @@ def test_equal_reads_are_reported_once_and_counted() -> None:
 
 
 def test_changes_are_never_folded() -> None:
-    """Calls with a valid token that change something are reported each time; attempts without one are folded."""
+    """Calls with a valid token that change something are each reported; attempts without a valid token are folded."""
     told: list[RestCalled] = []
     journal = Journal(told.append)
     for _ in range(3):
@@ -49,7 +49,7 @@ def test_changes_are_never_folded() -> None:
 
 
 def test_a_flood_of_kinds_is_bounded() -> None:
-    """Beyond the limit of kinds, the rest is counted by status; the sum is complete."""
+    """Beyond the limit of kinds, further calls are counted by status; the total is complete."""
     told: list[RestCalled] = []
     journal = Journal(told.append, kinds=10)
     for number in range(1000):
@@ -70,7 +70,7 @@ def test_unknown_methods_share_one_label() -> None:
 
 
 def test_invalid_text_is_escaped() -> None:
-    """Text from a client that no message can hold is reported by its code points."""
+    """Characters that no message can hold are reported by their code points."""
     told: list[RestCalled] = []
     journal = Journal(told.append)
     answered(journal, reason="names: \ud800 é", path="/\udcff", method="POST")

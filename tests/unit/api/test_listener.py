@@ -79,7 +79,7 @@ async def cut_off(reader: asyncio.StreamReader) -> bool:
 
 
 async def test_connections_of_one_host_are_limited() -> None:
-    """One more is closed at once; when one ends, the next is accepted."""
+    """One connection more is closed at once; when a connection ends, the next is accepted."""
     async with listening(ApiLimits(connections_per_host=3)) as connect:
         first = [await connect() for _ in range(3)]
         assert all([await served(*one) for one in first])
@@ -97,7 +97,7 @@ async def test_connections_of_all_hosts_are_limited() -> None:
 
 
 async def test_unfinished_headers_are_cut_off() -> None:
-    """This holds for the first and for later requests of a connection; new connections are served."""
+    """The first and later requests of a connection are cut off; new connections are still served."""
     async with listening(ApiLimits(header_seconds=0.3)) as connect:
         slow, later = await connect(), await connect()
         slow[1].write(REQUEST[:20])
@@ -154,7 +154,7 @@ async def answered(connect: Connect, request: bytes) -> tuple[asyncio.StreamRead
 
 
 async def test_data_after_an_answer_keeps_no_connection_open() -> None:
-    """Neither an empty line nor a slow body keeps a connection; a whole request is served."""
+    """Neither an empty line nor a slow body keeps a connection open; a complete request is served."""
     async with listening(ApiLimits(header_seconds=1.0)) as connect:
         empty = await answered(connect, REQUEST)
         body = await answered(connect, REQUEST[:-2] + b"Content-Length: 1000000\r\n\r\n")

@@ -29,7 +29,7 @@ def test_findings_without_a_position_stay_in_the_detail() -> None:
 
 
 def test_a_monitor_is_described() -> None:
-    """Covers events of topics, services and clocks, properties with their handlers, and a picture if finite."""
+    """The description has events of topics, services and clocks, properties with handlers, and a picture if finite."""
     compiler = Compiler()
     a = compiler.monitor(example(Monitors, revision=1, files={"a.rv": A, "b.rv": TICK}, definitions={}), "a")
     b = compiler.monitor(

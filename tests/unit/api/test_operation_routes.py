@@ -1,4 +1,4 @@
-"""Each operation over REST, from the gate to control's link: its order, its roles, its dry run, its ETag."""
+"""Each operation over REST, from the gate to control's link: its order, roles, dry run and ETag."""
 
 import asyncio
 import functools
@@ -186,7 +186,7 @@ def application(control: ControlLink, door: TokenAuthenticator, journal: Journal
 
 
 def asked(method: str, target: str, body: Any, role: str, tag: str | None) -> httpx.Response:
-    """Return the api's answer to a request of a role; the orders that it gave are noted."""
+    """Return the api's answer to a request by a role; `Listening.orders` has the orders of this request."""
     _gate, control, tokens = api()
     control.orders.clear()
     headers = {"Authorization": f"Bearer {tokens[role]}"} | ({} if tag is None else {"If-Match": tag})
@@ -198,7 +198,7 @@ def asked(method: str, target: str, body: Any, role: str, tag: str | None) -> ht
 
 
 def sample(operation: Operation) -> tuple[str, str, Any]:
-    """Return the first request above for an operation, or else the request of the command line."""
+    """Return the first request in `REQUESTS` for an operation, or the command line's request if there is none."""
     parts = operation.path.split("/")
     for method, target, body in REQUESTS:
         given = target.partition("?")[0].split("/")
@@ -220,7 +220,7 @@ def fields_of(operation: Operation) -> set[str]:
 
 
 def ordered(method: str, target: str, body: Any, tag: str = "*") -> list[RequestMade]:
-    """Return what an honest api asks of control for a request by a role that may make it."""
+    """Return the orders that an honest api sends to control for a request by a role that may make it."""
     role = "investigator" if target == "/v1/recordings/memory" else "admin"
     assert "noted" in asked(method, target, body, role, tag).text
     return list(api()[1].orders)
@@ -245,7 +245,10 @@ MATRIX = [
     ("operation", "dry"), MATRIX, ids=[f"{one.name}{' dry' * dry}" for one, dry in MATRIX]
 )
 def test_role_then_etag_decide_whether_an_operation_reaches_control(operation: Operation, dry: bool) -> None:
-    """Another role is 403, whatever the tag; then no tag is 428, and an invalid one 412; a dry run needs none."""
+    """A wrong role gets 403 whatever its ETag.
+
+    Then a missing ETag gets 428, and an invalid ETag 412; a dry run needs no ETag.
+    """
     method, target, body = sample(operation)
     target += ("&" if "?" in target else "?") + "dry_run=1" if dry else ""
     allowed = BY_ROLE[LEAST[operation.name]] if not dry else BY_ROLE["operator"]
@@ -277,7 +280,7 @@ def test_role_then_etag_decide_whether_an_operation_reaches_control(operation: O
 
 
 def test_the_matrix_has_every_operation() -> None:
-    """The roles above are those of all operations, and nothing else."""
+    """`LEAST` has every operation and nothing else."""
     assert LEAST.keys() == {operation.name for operation in NAMED}
     assert {operation.name for operation in NAMED if operation.dry_run} == {
         "load_policy", "load_monitors", "replace_monitor",
@@ -285,7 +288,7 @@ def test_the_matrix_has_every_operation() -> None:
 
 
 def test_pruning_is_for_admins() -> None:
-    """Operators take what the folder has; only admins remove what it does not have."""
+    """Operators load the folder's files; only admins remove monitors whose files the folder does not have."""
     for role, status in (("operator", 403), ("admin", 503)):
         assert asked("POST", "/v1/monitors/reload?prune=1", None, role, "*").status_code == status
     assert "removing files that the folder does not have is for admins" in asked(
@@ -317,7 +320,7 @@ BY_HAND = {
 
 
 def routes() -> dict[str, set[str]]:
-    """Return the least roles of each method and path, but those of the console."""
+    """Return the least roles of each method and path, without the console's."""
     app = application(Listening(), TokenAuthenticator(10), Journal(lambda _call: None))
     return {
         f"{method} {re.sub(r':[a-z]+}', '}', str(route.path))}": {
@@ -330,7 +333,7 @@ def routes() -> dict[str, set[str]]:
 
 
 def test_routes_written_by_hand_are_for_these_roles() -> None:
-    """Every route is above, and none asks for another role than its row, where it has one."""
+    """Every route has a row in the tables and requires exactly the role of its row."""
     named = {f"{one.method} {one.path}": one.name for one in NAMED}
     of_table = {
         path: {"operator" if any(one.dry_run and one.name == name for one in NAMED) else LEAST[name]}
@@ -344,7 +347,7 @@ def test_routes_written_by_hand_are_for_these_roles() -> None:
 
 
 def roles_of(dependant: Any) -> Iterator[str | None]:
-    """Yield the least roles that a route asks for."""
+    """Yield the least roles that a route requires."""
     if dependant is not None:
         yield getattr(dependant.call, "least", None)
         for one in dependant.dependencies:
@@ -352,7 +355,7 @@ def roles_of(dependant: Any) -> Iterator[str | None]:
 
 
 def test_every_order_has_its_way() -> None:
-    """No order that the api may give is missing above."""
+    """`REQUESTS` has a request for every kind of order that the api may send."""
     found = {
         type(ordered(method, target, body)[0].request) for method, target, body in REQUESTS
     }  # fmt: skip
@@ -374,7 +377,7 @@ def test_no_field_of_an_order_can_be_another(method: str, target: str, body: Any
 
 
 def _other(value: Any) -> Any:
-    """Return another value of the same kind, or of one that the field may have."""
+    """Return a different value of the same type; for None, a number."""
     match value:
         case bool():
             return not value
@@ -391,7 +394,7 @@ def _other(value: Any) -> Any:
 
 
 def test_control_hears_of_a_client_that_disconnects() -> None:
-    """The bearer of an order ends with its client: a client that is killed withdraws what it ordered."""
+    """When the client of an order disconnects, its bearer ends, and control withdraws the order."""
     gate, control, tokens = api()
     seen: list[Any] = []
 

@@ -36,7 +36,7 @@ def test_every_route_but_the_public_ones_needs_a_token() -> None:
 
 
 def test_an_invalid_token_is_refused() -> None:
-    """Another scheme, an empty, malformed or unknown token, and the id of a token with another secret are 401."""
+    """Wrong schemes, empty, malformed and unknown tokens, and a valid id with another secret get 401."""
     right = f"Bearer {api()[2]['viewer']}"
     secret = right[:-4] + ("AAAA" if not right.endswith("AAAA") else "BBBB")
     unknown = "bearer rosrv_0123456789ab_" + "A" * 43
@@ -56,7 +56,7 @@ def test_an_invalid_token_is_refused() -> None:
     ],
 )
 def test_only_its_own_names_are_accepted(name: str, status: int) -> None:
-    """A page whose own host name resolves to the appliance (DNS rebinding) cannot read; each address is accepted."""
+    """A page whose own host name resolves to the appliance (DNS rebinding) is refused; each address is accepted."""
     for path in ("/v1/status", "/healthz"):
         assert get(path, Host=name).status_code == status
 
@@ -66,7 +66,7 @@ def test_only_its_own_names_are_accepted(name: str, status: int) -> None:
     [("https://evil.example", 403), ("null", 403), ("https://api", 403), ("http://api", 200)],
 )
 def test_other_origins_are_refused(origin: str, status: int) -> None:
-    """Every request of a page of another origin is 403, and no answer has a CORS header."""
+    """Every request from a page of another origin gets 403, and no answer has a CORS header."""
     for method in ("GET", "OPTIONS", "POST"):
         answer = sent(
             method, "/v1/policy", {"Origin": origin, "Authorization": f"Bearer {api()[2]['viewer']}"}

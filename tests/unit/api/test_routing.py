@@ -1,4 +1,4 @@
-"""Bodies of REST: an invalid body gets all its errors in one answer, each with its field."""
+"""Request bodies of REST: one answer lists all errors of an invalid body, each with its field."""
 
 import json
 from typing import Annotated, Any
@@ -76,6 +76,6 @@ def test_every_wrong_field_is_named(app: FastAPI, sent: Any, places: list[str]) 
     "rest", ["", "[" * 100_000, "1e" + "9" * 1000, '"\\ud800"', '{"a":' * 50_000, "9" * 300_000]
 )
 def test_invalid_json_after_a_wrong_field_is_reported(app: FastAPI, rest: str) -> None:
-    """The parser stops at the first wrong field; invalid JSON after it is still an error."""
+    """The parser stops at the first wrong field, but invalid JSON after that field is still reported."""
     answer = posted(app, f'{{"name": 1, "count": {rest}')
     assert (answer.status_code, answer.json()["type"]) == (422, "urn:rosrv:problem:not-json")

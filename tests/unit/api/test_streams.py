@@ -48,7 +48,7 @@ def test_one_token_and_one_host_have_a_quota() -> None:
 
 @pytest.mark.parametrize(("whole", "first"), [(1, 1), (2, 1), (64, 24)])
 def test_quotas_scale_with_the_total(whole: int, first: int) -> None:
-    """For any configured total a token gets its fraction, and an operator gets one if there are two."""
+    """For any configured total a token gets its fraction; an operator gets a stream if the total is at least two."""
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, whole)
     assert len(taken(streams, bearer("a"), "10.0.0.1")) == first
     assert bool(taken(streams, bearer("op", "admin"), "10.0.0.2", 1)) is (whole > 1)
@@ -56,7 +56,7 @@ def test_quotas_scale_with_the_total(whole: int, first: int) -> None:
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_slot_is_released_when_the_response_ends(*, fails: bool) -> None:
-    """Completed or aborted, the token may follow again, and nothing is stored about it."""
+    """After a completed or aborted response the token may follow again, and nothing is stored about the response."""
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 1)
 
     async def send(_message: Any) -> None:

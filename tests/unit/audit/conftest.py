@@ -17,7 +17,7 @@ MakeLog = Callable[..., AuditLog]
 
 
 class Notary:
-    """The signer's memory, settings and clock, which runs `ago` nanoseconds behind."""
+    """The signer's memory, settings and clock; the clock is `ago` nanoseconds behind."""
 
     def __init__(self, directory: Path) -> None:
         directory.mkdir()
@@ -31,7 +31,7 @@ class Notary:
         return time.time_ns() - self.ago
 
     def sign(self, text: bytes) -> None:
-        """Remember a checkpoint, unless it is from another history: some tests make these."""
+        """Remember a checkpoint, unless it is from another history: some tests make such checkpoints."""
         with contextlib.suppress(CheckpointRefusedError):
             self._signed.approve(text)
 

@@ -43,7 +43,7 @@ def test_a_host_in_debt_waits_until_it_is_paid() -> None:
 
 
 def test_a_folded_record_costs_nothing() -> None:
-    """The cost of a record that was only counted is returned."""
+    """If the log only counted a record, the host gets back its cost."""
     desk = Desk()
     record = desk.spend(GUEST)
     desk.budget.folded(record)
@@ -51,7 +51,7 @@ def test_a_folded_record_costs_nothing() -> None:
 
 
 def test_two_hundred_hosts_leave_the_robot_its_quota() -> None:
-    """Two hundred hosts with the largest debt, and more, are slowed down; the robot is not."""
+    """Two hundred hosts, each with the largest debt, are slowed down; the robot is not."""
     desk = Desk()
     guests = [f"10.1.{number // 100}.{number % 100}" for number in range(200)]
     for guest in guests:

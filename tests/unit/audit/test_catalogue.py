@@ -14,7 +14,7 @@ def test_the_page_matches_the_program() -> None:
 
 
 def test_severities_and_fields_come_from_the_code() -> None:
-    """They are read from the calls that record an event, also where a call records one of two events."""
+    """Severities and fields are read from the calls that record an event, even if a call records one of two events."""
     found = {use.event: use for use in uses()}
     assert {"who", "method", "status", "count"} <= set(found["rest call"].fields)
     assert found["forwarding gap"].severities == {"alarm"}
@@ -23,5 +23,5 @@ def test_severities_and_fields_come_from_the_code() -> None:
 
 
 def test_handwritten_fields_belong_to_registered_events() -> None:
-    """Fields written by hand are of events in the registry."""
+    """Every event that has handwritten fields is in the registry."""
     assert set(ELSEWHERE) <= set(EVENTS)

@@ -1,4 +1,4 @@
-"""An export proves itself on another machine with only the public key, whatever its filter was."""
+"""An export can be verified on another machine with only the public key, whatever its filter was."""
 
 import json
 import lzma
@@ -75,7 +75,7 @@ def test_it_verifies_elsewhere(log: Path, public: bytes, tmp_path: Path, wanted:
 
 
 def test_a_line_is_a_record_with_its_position(log: Path) -> None:
-    """A line of an export is the record of a search with one more field."""
+    """Each line of an export is the record as a search returns it, with its position as an added field."""
     for (entry, _chain), line in zip(evidence(log, Filter()), exported(log, Filter()), strict=True):
         chain = line.pop("chain")
         assert line == json.loads(as_json(entry))
@@ -134,7 +134,7 @@ def test_tampering_is_found(
 
 
 def test_a_rehashed_record_leads_to_no_checkpoint(log: Path, public: bytes, tmp_path: Path) -> None:
-    """A forger who recomputes the hashes of the whole export lacks the signature."""
+    """A forger who recomputes the hashes of the whole export cannot sign a checkpoint."""
     forged_log = AuditLog(tmp_path / "forged.db", checkpoint_every=5)
     for number in range(20):
         forged_log.record(decision(forged_log, number))
@@ -151,7 +151,7 @@ def test_a_rehashed_record_leads_to_no_checkpoint(log: Path, public: bytes, tmp_
 
 @pytest.mark.parametrize("text", ["", "{}\n", "no json\n", '{"chain": {}}\n', "[]\n"])
 def test_other_files_are_not_valid_exports(tmp_path: Path, public: bytes, text: str) -> None:
-    """A file without records and their positions is not an export, and is never valid."""
+    """A file without records, or whose records have no positions, is never a valid export."""
     file = tmp_path / "x.ndjson"
     file.write_text(text)
     if text:
@@ -166,7 +166,7 @@ def test_other_files_are_not_valid_exports(tmp_path: Path, public: bytes, text: 
 def test_an_export_after_retention_is_proved(
     make_log: MakeLog, path: Path, public: bytes, notary: Notary, tmp_path: Path
 ) -> None:
-    """The remaining records prove themselves, from the first one on."""
+    """The records that retention left can be proved, from the first to the last."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log))
@@ -184,7 +184,7 @@ def test_an_export_after_retention_is_proved(
 
 
 def test_a_log_of_version_0_1_0(path: Path, tmp_path: Path) -> None:
-    """A whole export of such a log is proved; for a filtered one the result says that it cannot be proved."""
+    """A whole export of such a log is proved; for a filtered export the result says that it cannot be proved."""
     path.write_bytes(lzma.decompress(OLD_LOG.read_bytes()))
     old_key = read_public_key(OLD_LOG.with_name("log-0.1.0.pub"))
     whole = checked(exported(path, Filter()), tmp_path / "x.ndjson", old_key)

@@ -60,7 +60,7 @@ def test_texts_are_bounded_and_storable(field: str) -> None:
     ids=str,
 )  # fmt: skip
 def test_fields_of_a_wrong_type(fields: dict[str, Any]) -> None:
-    """A record with fields of a wrong type (our defect) is stored as well as possible."""
+    """A record with fields of a wrong type, which only our own defect can cause, is stored as well as possible."""
     columns = to_columns(make(**fields), 1)
     assert all(type(one) in (str, int, bytes, type(None)) for one in columns)
     assert abs(columns.time) < 1 << 63
@@ -68,7 +68,10 @@ def test_fields_of_a_wrong_type(fields: dict[str, Any]) -> None:
 
 
 def test_small_details_survive_large_ones() -> None:
-    """A load of many files keeps revision and hash though its names do not fit, and names the omitted fields."""
+    """A load of many files keeps its revision and hash.
+
+    Names that do not fit are omitted, and the record names the field.
+    """
     names = [f"monitor_{number}" * 20 for number in range(1000)]
     detail = {
         "sha256": "a" * 64,

@@ -66,7 +66,7 @@ def test_an_unchanged_log_agrees(log: Path) -> None:
 def test_history_signed_by_root_is_found(
     log: Path, key: Ed25519PrivateKey, tmp_path: Path, change: str
 ) -> None:
-    """A history rewritten and signed with the real key passes every local check, but not the copy."""
+    """A history rewritten and signed with the real key passes every local check, but disagrees with the copy."""
     copies = signed_checkpoints(log)
     write_anew(log, key, tmp_path / "signer", change)
     public = key.public_key().public_bytes_raw()
@@ -76,7 +76,7 @@ def test_history_signed_by_root_is_found(
 
 
 def test_the_range_is_between_two_checkpoints(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
-    """The reported range begins after the last checkpoint that agrees and ends at the first that does not."""
+    """The reported range begins after the last checkpoint that agrees and ends at the first that disagrees."""
     copies = signed_checkpoints(log)
     write_anew(log, key, tmp_path / "signer", "UPDATE record SET reason = 'x' WHERE sequence = 110")
     result = verify(log, copies=copies)
@@ -87,7 +87,7 @@ def test_the_range_is_between_two_checkpoints(log: Path, key: Ed25519PrivateKey,
 
 
 def test_an_end_removed_by_root_is_found(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
-    """The copy shows removed last records, even without their checkpoints and the signer's memory."""
+    """The copy reveals that the last records were removed, even with their checkpoints and the signer's memory gone."""
     copies = signed_checkpoints(log)
     with closing(sqlite3.connect(log)) as connection:
         connection.execute("DELETE FROM record WHERE sequence > 90")
@@ -133,7 +133,7 @@ def test_a_replaced_key_is_found(log: Path, tmp_path: Path) -> None:
 def test_checkpoints_of_removed_records_contradict_nothing(
     make_log: MakeLog, path: Path, notary: Notary
 ) -> None:
-    """Without their records, checkpoints prove nothing, and the result says so."""
+    """Checkpoints whose records were removed prove nothing, and the result says so."""
     notary.ago = 2 * 86_400_000_000_000
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     for number in range(60):

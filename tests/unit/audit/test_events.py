@@ -12,5 +12,5 @@ def test_every_recorded_event_is_registered() -> None:
 
 
 def test_severities_belong_to_registered_events() -> None:
-    """Each severity of the registry is that of an event in it."""
+    """Each event that has a severity is in the registry."""
     assert SEVERITIES.keys() <= EVENTS.keys()

@@ -33,7 +33,7 @@ def denial(resource: str = "/a", host: str = "10.0.0.1", **fields: Any) -> Audit
 
 
 def offer(folder: RecordFolder, *records: AuditRecord, now: float = 0) -> list[AuditRecord]:
-    """Return the records written for these."""
+    """Return the records that the folder writes for these records."""
     return [written for record in records for written in folder.offer(record, now)]
 
 
@@ -66,7 +66,7 @@ def test_summaries_continue_with_the_repetitions() -> None:
 
 
 def test_different_records_are_not_folded() -> None:
-    """Another host, caller, resource, reason, rule or policy revision is another kind, recorded in full."""
+    """A record that differs in host, caller, resource, reason, rule, revision, category or decision is not folded."""
     folder = make_folder()
     kinds = [
         denial(), denial(reason="other"), denial(host="10.0.0.2"), denial(caller_id="/other"), denial("/b"),
@@ -77,7 +77,7 @@ def test_different_records_are_not_folded() -> None:
 
 
 def test_an_allow_ends_the_folding_it_contradicts() -> None:
-    """The summary of denials precedes the allow of the same request, and the next denial is in full."""
+    """The summary of earlier denials precedes the allow, and the next denial is recorded in full."""
     folder = make_folder()
     offer(folder, denial(), denial())
     allowed = denial(decision="allow")
@@ -89,14 +89,14 @@ def test_an_allow_ends_the_folding_it_contradicts() -> None:
 
 
 def test_allows_that_change_something_are_never_folded() -> None:
-    """Each such allow is recorded in full."""
+    """Each allow of a call that changes something is recorded in full."""
     folder = make_folder()
     allows = [denial(decision="allow") for _ in range(50)]
     assert offer(folder, *allows) == allows
 
 
 def test_varied_names_are_folded_per_host() -> None:
-    """Varied names of one host use bounded memory and records; every denial is counted, other hosts are unaffected."""
+    """Varied names of one host use bounded memory and records. Every denial is counted; other hosts are unaffected."""
     folder = make_folder(keys_per_host=16, keys=64)
     flood = offer(folder, *(denial(f"/{number}") for number in range(10_000)))
     assert len(flood) == 17
@@ -128,7 +128,7 @@ def test_varied_addresses_are_folded_together() -> None:
 
 
 def test_a_summary_names_host_and_call() -> None:
-    """A summary names the call, the node and the resource, not only the first record."""
+    """The summary has the caller, call, key and node, and omits other details."""
     folder = make_folder()
     detail = {"call": "getParam", "key": "/secret", "node": "/arm", "unrelated": 1}
     offer(folder, *(denial(resource="getParam", detail=detail) for _ in range(5)))
@@ -180,7 +180,7 @@ def test_would_deny_is_never_folded() -> None:
 
 
 def test_denials_of_different_parameters_are_separate() -> None:
-    """The same call on another key, or another call, is recorded in full; a repetition is counted."""
+    """A denial of another key or another call is recorded in full; a repetition is counted."""
     folder = RecordFolder(FoldSettings(), lambda: "0" * 20, lambda: 0)
     kinds = [
         denial(resource="getParam", detail={"call": "getParam", "key": "/a"}),
@@ -227,7 +227,7 @@ def test_invalid_text_can_be_stored() -> None:
 
 
 def test_unknown_hosts_leave_named_hosts_their_kinds() -> None:
-    """Unknown hosts with a new number in each field use a few kinds; a named host keeps its own."""
+    """Unknown hosts that vary each field use few kinds; a named host keeps its own kinds."""
     folder = make_folder(keys=64, unknown=8)
     flood = [
         denial(
@@ -251,7 +251,7 @@ def test_unknown_hosts_leave_named_hosts_their_kinds() -> None:
 
 
 def test_a_reason_with_peer_text_is_one_kind() -> None:
-    """Numbers, names and quotations in the reason of a refused request share a kind, counted in its summary."""
+    """Refusals whose reasons differ only in numbers, names or quotations share one kind and one summary."""
     folder = make_folder(seconds=10)
     flood = [
         denial(reason=f"number {number} of '/x{number}' at /n{number} is too large", event="malformed")
@@ -303,7 +303,7 @@ def test_reads_of_other_topics_are_not_folded() -> None:
 
 
 def test_reads_beyond_the_quota_are_recorded_in_full() -> None:
-    """No read loses its key: beyond the quota of kinds each is a record, and takes no kind of a denial."""
+    """Beyond the quota of kinds, each read is a record with its key, and takes no kind from denials."""
     folder = make_folder(keys=64, keys_per_host=16)
     varied = [read(f"/{number}") for number in range(1000)]
     assert offer(folder, *varied) == varied
@@ -323,7 +323,7 @@ def test_a_denial_ends_the_folding_of_reads() -> None:
 
 
 def test_another_key_ends_no_folding() -> None:
-    """Denials of one parameter stay folded while the same call on another parameter is allowed."""
+    """Denials of one parameter stay folded while the same call for another parameter is allowed."""
     folder = make_folder()
     flood = [one for n in range(100) for one in (read(f"/a/{n}"), read("/b", decision="deny", folds=False))]
     written = offer(folder, *flood)
@@ -345,7 +345,7 @@ def test_events_beyond_the_budget_are_counted() -> None:
 
 
 def test_a_denied_caller_gets_a_recorded_id_or_none() -> None:
-    """This holds beyond every limit, for unknown hosts, and for single and batched records."""
+    """The id is of a recorded denial, beyond every limit, for unknown hosts, and for single and batched records."""
     for gathered in (1, 7, 400):
         folder = make_folder(keys_per_host=4, unknown=3)
         denials = [

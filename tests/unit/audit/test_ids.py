@@ -37,7 +37,7 @@ def test_sources_in_the_same_nanosecond_differ() -> None:
 
 
 def test_ids_report_how_far_the_clock_was_set_back() -> None:
-    """They report it, also after a restart, until the clock has caught up."""
+    """Ids report how far the clock was set back, also after a restart, until the clock has caught up."""
     now = 10_000_000_000
     before = IdSource(clock=lambda: now)
     last = before.next()

@@ -1,4 +1,4 @@
-"""Tests of finding the process that blocks the log: a real process holds SQLite's locks as a reader may."""
+"""Find the process that blocks the log: a real process holds SQLite's locks, as a reader may."""
 
 import fcntl
 import queue

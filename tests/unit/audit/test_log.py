@@ -199,7 +199,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_full_disk(small_disk: Path) -> None:
-    """With a full disk the log reports it, keeps its queue, and writes it once there is space."""
+    """With a full disk the log reports the failure, keeps its queue, and writes the queue once there is space."""
     path = small_disk / "audit.db"
     filler = small_disk / "filler"
     log = AuditLog(path)
@@ -349,7 +349,7 @@ def test_a_missing_directory_is_a_failure(tmp_path: Path) -> None:
 
 
 def test_missing_earlier_log_is_an_alarm(make_log: MakeLog, path: Path) -> None:
-    """If a signed log existed here before and is gone, the first record of the new one says so."""
+    """If a signed log existed at this path and is gone, the first record of the new log says so."""
     log = make_log(checkpoint_every=1)
     log.record(decision(log))
     assert settle(log) is None
@@ -397,7 +397,7 @@ def signed_now(log: AuditLog) -> str | None:
 
 
 def test_a_signature_can_be_requested_at_once(make_log: MakeLog, path: Path) -> None:
-    """Checkpoints are an hour apart; a caller gets one at once over all records, and no second one."""
+    """Regular checkpoints are an hour apart; a caller gets one over all records at once, and no second one is made."""
     log = make_log(checkpoint_seconds=3600)
     for number in range(5):
         log.record(decision(log, number))

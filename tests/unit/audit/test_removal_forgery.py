@@ -32,7 +32,7 @@ def kinds(result: Verification) -> set[FindingKind]:
 
 
 def forge(path: Path, proof: dict[str, object] | None = None) -> RemovedRange:
-    """Remove as many records as possible, as the program does, with age as the recorded reason."""
+    """Remove as many records as possible in the program's way, with age as the recorded reason."""
     writer = ChainWriter(path, 0)
     gone = writer.removable(1 << 30, signed=True)
     assert gone is not None
@@ -61,7 +61,7 @@ def fresh(make_log: MakeLog, path: Path) -> Path:
 
 
 def test_a_forged_removal_is_found(fresh: Path) -> None:
-    """The log alone shows it: its checkpoints record no removal, and there is no signature for one."""
+    """The log alone reveals the removal: its checkpoints do not record it, and it has no signature."""
     forge(fresh)
     result = verify(fresh)
     assert kinds(result) == {FindingKind.REMOVAL_UNFOUNDED}
@@ -69,7 +69,7 @@ def test_a_forged_removal_is_found(fresh: Path) -> None:
 
 
 def test_the_signer_and_copies_find_it_too(fresh: Path, notary: Notary) -> None:
-    """A forged removal silences neither the signer's memory nor copied checkpoints."""
+    """A forged removal is also found with the signer's memory and with copied checkpoints."""
     copies = signed_checkpoints(fresh)
     forge(fresh)
     with closing(sqlite3.connect(fresh)) as attacker:
@@ -159,7 +159,7 @@ def test_an_old_log_is_valid_with_a_note(old: Path) -> None:
 
 
 def test_an_old_log_is_continued(old: Path) -> None:
-    """This version continues the log; after its first checkpoint, a further removal must be signed."""
+    """This version continues the log; after its first checkpoint, every further removal must be signed."""
     log = AuditLog(old, checkpoint_every=10)
     for number in range(50):
         log.record(decision(log, number))

@@ -1,4 +1,4 @@
-"""Tests of removing old records: only records within the rules, always recorded, and provable afterwards."""
+"""Retention removes only records that its rules allow, records each removal, and leaves a log that can be verified."""
 
 import itertools
 import sqlite3
@@ -30,7 +30,7 @@ def await_removal(path: Path, through: int = 1) -> None:
 
 
 def make_old(make_log: MakeLog, notary: Notary) -> None:
-    """Return a log of 2000 records that were made and signed a week ago."""
+    """Make a log of 2000 records that were made and signed a week ago."""
     notary.ago = 7 * _DAY
     clock = itertools.count(time.time_ns() - 7 * _DAY, 1000)
     log = make_log(checkpoint_every=100, clock=lambda: next(clock))
@@ -78,7 +78,7 @@ def test_young_records_stay(make_log: MakeLog, path: Path) -> None:
 
 
 def test_records_with_future_times_delay_no_removal(make_log: MakeLog, path: Path, notary: Notary) -> None:
-    """The clock was a year ahead for a while: records from then delay no removal and are not removed early."""
+    """After a year of a fast clock, its records delay no removal and are not removed early."""
     now = itertools.count(time.time_ns() - 7 * _DAY, 1000)
     notary.ago, ahead = 7 * _DAY, 0
     log = make_log(checkpoint_every=10, clock=lambda: next(now) + ahead)
@@ -138,7 +138,7 @@ def test_a_log_past_its_size_loses_its_oldest_records(make_log: MakeLog, path: P
 
 
 def test_denials_and_alarms_are_removed_last(make_log: MakeLog, path: Path) -> None:
-    """A flood of allows removes no denial: it is copied with its id, time and original position."""
+    """A flood of allows removes no denial: each denial is copied with its id, time and original position."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))
     early = decision(log, decision="deny", host="10.0.0.66", resource="/cmd_vel", reason="no")
     log.record(early)
@@ -169,7 +169,10 @@ def denial(number: int, host: str, **fields: Any) -> AuditRecord:
 
 
 def test_a_flood_of_denials_leaves_those_of_other_hosts() -> None:
-    """At most half of the removed records are copied: hosts in turn, unknown hosts as one, alarms first."""
+    """At most half of the removed records are copied: alarms first, then hosts in turn.
+
+    Unknown hosts count as one host.
+    """
     flood = [denial(number, "10.0.0.66") for number in range(400)]
     unknown = [denial(1000 + n, f"10.9.0.{n}", detail={"stranger": True}) for n in range(90)]
     few = [denial(2000 + number, "10.0.0.5") for number in range(10)]

@@ -32,7 +32,7 @@ def test_every_field_is_documented() -> None:
 
 
 def test_a_line_of_an_export_is_a_record_and_its_position() -> None:
-    """The documented position in the chain has the written fields."""
+    """The schema of an exported line has the fields that an export writes, including the position in the chain."""
     assert list(CHAIN["properties"]) == list(ChainProof.__struct_fields__)
 
 

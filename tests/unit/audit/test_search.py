@@ -199,7 +199,7 @@ def test_reading_leaves_no_trace(log: AuditLog, path: Path) -> None:
 
 
 def test_reads_over_rest_can_be_left_out(log: AuditLog, path: Path) -> None:
-    """Allowed GETs of REST are left out; orders, refused reads, and methods made up by a client stay."""
+    """The filter omits allowed GETs of REST; orders, refused reads, and unknown methods of clients stay."""
     calls = [
         ("GET", "allow", "rest call", "rest"), ("HEAD", "allow", "rest call", "rest"),
         ("POST", "allow", "rest call", "rest"),
@@ -219,7 +219,7 @@ def test_reads_over_rest_can_be_left_out(log: AuditLog, path: Path) -> None:
 
 
 def test_records_are_found_by_token_name(log: AuditLog, path: Path) -> None:
-    """The name of a token finds its requests, a glob those of several; texts of a node match no name."""
+    """A token's name finds its requests, and a glob those of several tokens; text from a node never matches."""
     details: list[dict[str, Any]] = [{"who": "alice"}, {"who": "bob"}, {"text": '"who":"alice"'}, {}]
     for detail in details:
         log.record(decision(log, resource="/v1/x", detail=detail))

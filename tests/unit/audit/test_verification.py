@@ -64,7 +64,7 @@ def found(path: Path, **arguments: Any) -> list[tuple[FindingKind, int, int]]:
 
 
 def test_an_unchanged_log_is_complete(log: Path, key: Ed25519PrivateKey) -> None:
-    """An unchanged log is complete, and the result says how far signatures prove it."""
+    """An unchanged log is complete, and the result names the last record that a signature covers."""
     result = verify(log, key.public_key().public_bytes_raw())
     assert result.ok
     assert result.first == 1
@@ -103,7 +103,7 @@ ATTACKS = transcripts(Path(__file__).with_name("attacks.txt"))
 
 @pytest.mark.parametrize("title", ATTACKS, ids=ATTACKS)
 def test_attack(log: Path, title: str) -> None:
-    """An attack (SQL on the file) has the findings below it, no others: kind, first and last record or checkpoint."""
+    """Each attack (SQL on the file) has exactly its listed findings: kind, first and last record or checkpoint."""
     statements = [line for line in ATTACKS[title] if not line.startswith(" ")]
     columns = COLUMNS.split(", ", 1)[1]
     attack(log, *(statement.replace("OTHER_COLUMNS", columns) for statement in statements))
@@ -199,7 +199,7 @@ def test_signatures_without_a_key_are_a_finding(log: Path) -> None:
 
 
 def signer_memory(log: Path, directory: Path) -> None:
-    """Return the memory of this log's signer: all of its checkpoints."""
+    """Write the memory of this log's signer, with all of its checkpoints."""
     with closing(sqlite3.connect(log)) as connection:
         (log_id,) = connection.execute("SELECT id FROM log").fetchone()
         texts = connection.execute("SELECT text FROM checkpoint WHERE signature IS NOT NULL ORDER BY number")
@@ -220,7 +220,7 @@ def signer_memory(log: Path, directory: Path) -> None:
 def test_the_signers_memory_finds_a_removed_end(
     log: Path, tmp_path: Path, statements: tuple[str, ...], kind: FindingKind
 ) -> None:
-    """A log without its end and checkpoints looks complete alone, but not beside the signer's memory."""
+    """A log without its last records and checkpoints passes alone, but disagrees with the signer's memory."""
     signer_memory(log, tmp_path / "signer")
     assert found(log, signer=tmp_path / "signer") == []
     attack(log, *statements)
@@ -387,7 +387,7 @@ def unsign(path: Path, first: int) -> None:
 
 
 def test_pending_signatures_are_not_tampering(log: Path, tmp_path: Path) -> None:
-    """Signatures at the end that the signer has made and the log has not stored yet are not a finding."""
+    """Signatures at the end that are made but not yet stored in the log are not a finding."""
     signer_memory(log, tmp_path / "signer")
     unsign(log, 2)
     result = verify(log, signer=tmp_path / "signer")
@@ -397,7 +397,7 @@ def test_pending_signatures_are_not_tampering(log: Path, tmp_path: Path) -> None
 
 
 def test_too_many_missing_signatures_are_found(make_log: MakeLog, path: Path, tmp_path: Path) -> None:
-    """More missing signatures at the end than can be pending were removed."""
+    """More missing signatures at the end than can be pending mean that signatures were removed."""
     log = make_log(checkpoint_every=1, checkpoint_seconds=3600)
     for number in range(70):
         log.record(decision(log, number))
@@ -445,7 +445,7 @@ def test_findings_are_limited(log: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_forged_log_does_not_keep_verification_busy(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the limit of findings, misplaced records are not searched for: that would take hours for a large log."""
+    """At the limit of findings the search for misplaced records ends: it could take hours in a large log."""
     monkeypatch.setattr("appliance.audit.verification._MOST_FINDINGS", 3)
     searched: list[int] = []
 

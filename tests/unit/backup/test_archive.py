@@ -1,4 +1,4 @@
-"""Tests of validating an archive: everything is checked before anything is written."""
+"""Tests of validating an archive: every check runs before the first file is written."""
 
 import gzip
 import io
@@ -51,7 +51,7 @@ def test_only_files_are_accepted(tmp_path: Path, kind: bytes) -> None:
 
 
 def test_sparse_files_are_rejected(tmp_path: Path) -> None:
-    """A header of a hundred bytes cannot unpack to a file of gigabytes."""
+    """Reject a header of a hundred bytes that would unpack to a file of gigabytes."""
     sparse = bytearray(header("api/hole", kind=tarfile.GNUTYPE_SPARSE))
     sparse[483:495] = b"%011o\0" % (4 << 30)
     sparse[148:156] = b" " * 8
@@ -63,7 +63,7 @@ def test_sparse_files_are_rejected(tmp_path: Path) -> None:
     "kind", [tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK]
 )
 def test_extended_headers_are_rejected(tmp_path: Path, kind: bytes) -> None:
-    """A backup has none; they could hold gigabytes, or name a file twice."""
+    """A backup has no extended headers; a header could hold gigabytes, or name a file twice."""
     text = b"20 path=api/x\0yyyyy\n".ljust(512, b"\0")
     refused(
         archive(tmp_path / "evil", header("x", 20, kind), text, header("api/x")), tmp_path / "state", NOTHING
@@ -72,7 +72,7 @@ def test_extended_headers_are_rejected(tmp_path: Path, kind: bytes) -> None:
 
 @pytest.mark.parametrize("size", [-1, 1 << 40])
 def test_impossible_sizes_are_rejected(tmp_path: Path, size: int) -> None:
-    """A size is not negative and not larger than any file except a database."""
+    """Negative sizes are rejected, and sizes above the limit for files that are not databases."""
     refused(archive(tmp_path / "evil", header("api/x", size)), tmp_path / "state", NOTHING)
 
 
@@ -103,7 +103,7 @@ def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
 
 
 def test_an_unreadable_archive_is_an_error(tmp_path: Path) -> None:
-    """Another file, a missing file, or an archive without an audit log: the error names it."""
+    """If the file is missing, is not an archive, or has no audit log, the error names it."""
     (tmp_path / "rubbish").write_bytes(b"\x1f\x8b rubbish")
     refused(tmp_path / "rubbish", tmp_path / "state", "rubbish cannot be restored")
     refused(tmp_path / "nowhere", tmp_path / "state", "nowhere cannot be restored")

@@ -62,7 +62,7 @@ def state(tmp_path: Path) -> Path:
 
 
 def test_a_backup_is_restored(state: Path, tmp_path: Path) -> None:
-    """Permanent state is restored unchanged; that of a running appliance is not; the log proves itself."""
+    """Permanent state is restored unchanged; run-time state is left out; the restored log verifies."""
     file, other = tmp_path / "backup.tar.gz", tmp_path / "other"
     assert not verify(state / "control" / "audit.db", signer=state / "signer").ok
     names = back_up(state, file)
@@ -85,7 +85,7 @@ def test_a_backup_is_restored(state: Path, tmp_path: Path) -> None:
 def test_a_key_pinned_during_the_backup_is_included(
     state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first checkpoint may be signed, and its key pinned, while a backup begins: its log proves itself."""
+    """The first checkpoint may be signed, and its key pinned, while a backup begins: the restored log verifies."""
     pin, file = state / "control" / "audit.pub", tmp_path / "backup.tar.gz"
     key = pin.read_bytes()
     pin.unlink()
@@ -101,7 +101,7 @@ def test_a_key_pinned_during_the_backup_is_included(
 
 
 def test_a_backup_needs_no_ros(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without rosmaster a backup is made and restored; no backup contains recordings of messages."""
+    """Backup and restore work without rosmaster; no backup contains recordings of messages."""
     monkeypatch.setattr(shutil, "which", lambda _program: None)
     (state / "recordings").mkdir()
     (state / "recordings" / "recording.bag").write_text("what messages said")
@@ -175,7 +175,7 @@ def test_an_unreadable_part_is_an_error(state: Path, tmp_path: Path) -> None:
 
 
 def test_planted_links_and_pipes_are_refused(state: Path, tmp_path: Path) -> None:
-    """Links, pipes and linked folders that a part's user plants lead a backup by root nowhere."""
+    """If the user of a part plants links, pipes or linked folders, a backup by root does not follow them."""
     secret = tmp_path / "shadow"
     secret.write_text("root's")
     (tmp_path / "outside").mkdir()
@@ -222,7 +222,7 @@ def test_a_file_of_another_user_is_refused(state: Path, tmp_path: Path) -> None:
 
 
 def test_a_sparse_file_is_refused(state: Path, tmp_path: Path) -> None:
-    """A process cannot fill the disk or the memory of a backup with a file full of holes."""
+    """A file full of holes cannot fill the disk or the backup's memory."""
     with (state / "api" / "hole").open("wb") as file:
         file.truncate(1 << 40)
     with pytest.raises(BackupError, match="api/hole has 1099511627776 bytes"):
@@ -270,7 +270,7 @@ def test_too_many_files_are_refused(state: Path, tmp_path: Path, monkeypatch: py
 def test_an_interrupted_backup_leaves_no_file(
     state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After Ctrl-C in the middle, the target is a whole backup or does not exist."""
+    """After Ctrl-C in the middle, the target is either a whole backup or missing."""
 
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt

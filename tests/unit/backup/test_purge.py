@@ -31,7 +31,7 @@ def state(tmp_path: Path) -> Path:
 
 
 def test_all_of_it_is_removed_and_nothing_else(state: Path, tmp_path: Path) -> None:
-    """An open key reads as random bytes; the target of a link stays unchanged."""
+    """A key file that is still open reads as random bytes; the target of a link stays unchanged."""
     with (state / "signer" / "audit.key").open("rb") as still:
         files, written = purge(state)
         kept = still.read()
@@ -69,7 +69,7 @@ def test_only_a_state_directory_is_removed(tmp_path: Path) -> None:
 
 
 def test_the_command_asks_for_the_path_again(state: Path) -> None:
-    """A script gives it by --confirm, a person is asked; another path removes nothing."""
+    """A script confirms the path with --confirm, a person types it; a different path removes nothing."""
     run = CliRunner().invoke
     refused = run(app, ["purge", "--state", str(state), "--confirm", "/var/lib/rosrv"])
     assert (refused.exit_code, "nothing was removed" in refused.output) == (1, True)

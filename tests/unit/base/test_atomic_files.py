@@ -45,7 +45,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
 
 
 def test_concurrent_writers_do_not_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each writer completes its own temporary file before the rename; none uses that of another."""
+    """Each writer completes its own temporary file before the rename; no writer uses another's file."""
     path = tmp_path / "policy.ini"
     rename = Path.rename
 
@@ -134,7 +134,7 @@ def test_only_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_error_names_the_file(tmp_path: Path) -> None:
-    """The system's error names no file; this one says where to free space."""
+    """The system's error names no file; our error names the place where space is needed."""
     need_root()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4k", "rosrv-files-test", tmp_path], check=True)
     try:
@@ -180,7 +180,7 @@ def test_writing_to_standard_output_keeps_the_order(tmp_path: Path) -> None:
 
 
 def test_a_file_gets_its_owner_before_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A writer that is killed or may not change the owner leaves no file that its owner cannot read."""
+    """If a writer is killed or may not change the owner, it leaves no file that the owner cannot read."""
     need_root()
     file = tmp_path / "policy.ini"
     file.write_text("before")

@@ -1,4 +1,4 @@
-"""Tests of files named by a person: only regular files of bounded size are read, others are clear errors."""
+"""Tests of files named by a person: regular files of bounded size are read; any other file is a clear error."""
 
 import logging
 import os
@@ -113,7 +113,7 @@ def test_no_file_makes_a_verb_hang_or_crash(
 def test_a_bad_certificate_file_is_an_error(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`--api-ca` follows the same rules; an empty file does not mean the system's authorities."""
+    """`--api-ca` follows the same rules; an empty file does not select the system's authorities."""
     monkeypatch.chdir(tmp_path)
     KINDS[kind](Path("given"))
     with pytest.raises(ValueError, match="--api-ca given: "):

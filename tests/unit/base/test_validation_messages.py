@@ -1,4 +1,4 @@
-"""Users get our own messages for invalid values, never a library's: command line, REST and configuration."""
+"""Invalid values get our own messages, never a library's: on the command line, in REST and in the configuration."""
 
 import asyncio
 import dataclasses
@@ -105,7 +105,7 @@ def _dependants(of: FastAPI) -> Iterator[Any]:
 
 
 def _said_of(reads: Any, value: Any) -> set[str]:
-    """Return the messages about a body."""
+    """Return the validation messages for a request body."""
 
     async def sent() -> dict[str, Any]:
         return {"type": "http.request", "body": json.dumps(value).encode()}

@@ -8,7 +8,7 @@ from appliance.base.withdrawal import WithdrawnError, awaited, require_awaited, 
 
 
 def test_an_order_of_a_disconnected_client_does_not_take_effect() -> None:
-    """It is withdrawn until it takes effect, and not afterwards."""
+    """An order can be withdrawn until it takes effect, and not afterwards."""
     gone = False
     with awaited(lambda: gone):
         require_awaited()
@@ -23,7 +23,7 @@ def test_an_order_of_a_disconnected_client_does_not_take_effect() -> None:
 
 
 def test_only_orders_are_withdrawn() -> None:
-    """A start, a signal and an automatic rollback have no client, nor has a task that an order left behind."""
+    """Starts, signals, automatic rollbacks, and tasks that an order left behind have no client."""
     take_effect()
 
     async def order() -> asyncio.Task[None]:

@@ -1,13 +1,13 @@
-"""Tests of `appliance.channel.admin`: every request that REST can make has its way and its role."""
+"""Tests of `appliance.channel.admin`: every request that REST can make has a route and a role."""
 
 from appliance.channel import admin
 from appliance.channel.admin import CHANGES, OPERATIONS, operation_of
 
 
 def test_changes_are_for_operators_and_admins() -> None:
-    """Each change is for one of them, or makes messages that only investigators may fetch.
+    """Each change requires one of these roles, or makes messages that only investigators may fetch.
 
-    Requests for both that change nothing: the list of tokens, a kit, a query, a check of specifications.
+    Some requests for these roles change nothing: the list of tokens, a kit, a query, a check of specifications.
     """
     listed = {one.request for one in OPERATIONS if one.role in ("operator", "admin")}
     assert listed - CHANGES == {admin.TokenList, admin.HostKit, admin.TopicLook, admin.MonitorTry}

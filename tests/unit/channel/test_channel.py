@@ -59,7 +59,7 @@ def test_messages_arrive_in_order_with_their_descriptors(pair: Pair) -> None:
 
 
 async def test_delayed_messages_are_sent_together(pair: Pair) -> None:
-    """A delayed message waits some milliseconds or for the next immediate one; order and descriptors stay."""
+    """A delayed message waits for the next immediate one, at most some milliseconds; order and descriptors stay."""
     here, there = pair
     here.attach(asyncio.get_running_loop(), lambda _message, _descriptors: None, lambda: None)
 
@@ -95,7 +95,7 @@ def test_a_message_must_come_with_its_descriptors(pair: Pair) -> None:
 
 
 def test_foreign_data_is_rejected(pair: Pair) -> None:
-    """A message of another link, garbage, and a message that is too long (before it is complete) are errors."""
+    """A message of another link, garbage, and an overlong message (even before it is complete) are errors."""
     for frame, reason in (
         (_frame(msgspec.msgpack.encode(StateBegan(1))), "Invalid value"),
         (_frame(b"\xc1"), "malformed"),

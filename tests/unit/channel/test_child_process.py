@@ -1,4 +1,4 @@
-"""Tests of the base of the supervisor's children; the test holds the ends of supervisor and control."""
+"""Tests of the base class of the supervisor's children; the test holds the ends of supervisor and control."""
 
 import asyncio
 import socket
@@ -97,7 +97,7 @@ def test_it_ends_with_its_supervisor() -> None:
 
 
 def test_a_new_link_replaces_the_old_one() -> None:
-    """A restarted control is served; the old link is closed; messages in between are dropped."""
+    """A restarted control is served and the old link is closed; messages sent between the two are dropped."""
 
     async def work(bench: Bench) -> None:
         bench.child.tell(AuthorityStated(0, b""))

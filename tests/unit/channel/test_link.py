@@ -29,7 +29,7 @@ class World:
             self.link.answered(message.number, message)
 
     def life(self) -> Channel:
-        """Connect another process at the other end."""
+        """Connect a new process at the other end."""
         here, there = socket.socketpair()
         self.link.attach(Channel(here, Ping | Pong))
         self.ends.append(Channel(there, Ping | Pong))
@@ -47,7 +47,7 @@ def world() -> Iterator[World]:
 
 
 async def test_an_answer_has_the_number_of_its_question(world: World) -> None:
-    """Other messages and the order of the answers do not matter."""
+    """Other messages, and answers in another order, do not matter."""
     ear = Heard(other := world.life())
     asked = [asyncio.ensure_future(world.link.ask(Ping, 10)) for _turn in range(2)]
     pings = await ear.until(2)
@@ -59,7 +59,7 @@ async def test_an_answer_has_the_number_of_its_question(world: World) -> None:
 
 
 async def test_a_replaced_peer_is_ignored_and_owes_no_answer(world: World) -> None:
-    """Its unread messages are dropped, and its end is not reported as a loss."""
+    """The unread messages of a replaced peer are dropped, and its end is not reported as a loss."""
     before = world.life()
     asked = asyncio.ensure_future(world.link.ask(Ping, 10))
     await asyncio.sleep(0)

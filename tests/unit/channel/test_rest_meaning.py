@@ -39,7 +39,7 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
 
 @st.composite
 def orders(draw: st.DrawFn, operation: Operation) -> Any:
-    """Draw an order that can be asked in the way of a row."""
+    """Draw an order that can be requested in the way of a row."""
     fields = dict(operation.fixed)
     for name, field in operation.fields().items():
         if field.name == "expected" or field.name in fields:
@@ -52,7 +52,7 @@ def orders(draw: st.DrawFn, operation: Operation) -> Any:
 
 
 def request_of(call: RestCall, if_match: str) -> ClientRequest:
-    """Return a call as the api gets it."""
+    """Return a call as the api receives it."""
     body = b"" if call.body is None else json.dumps(call.body).encode()
     return ClientRequest("10.0.0.1", call.method, call.target, if_match, "application/json", "", body)
 
@@ -62,7 +62,7 @@ def request_of(call: RestCall, if_match: str) -> ClientRequest:
 )
 @given(data=st.data())
 def test_an_order_means_itself(operation: Operation, data: st.DataObject) -> None:
-    """The request that asks for an order means this order, for the revision that If-Match names."""
+    """The request for an order is read as this order, for the revision that If-Match names."""
     order = data.draw(orders(operation))
     call = call_of(order, operation)
     if not operation.is_change or "expected" not in operation.fields():
@@ -91,7 +91,7 @@ def test_an_order_means_itself(operation: Operation, data: st.DataObject) -> Non
     ],
 )  # fmt: skip
 def test_requests_that_are_not_orders(change: dict[str, Any]) -> None:
-    """A dry run, another route or another type of body gives no order, and no error."""
+    """A dry run, another route, or a body of another type is neither an order nor an error."""
     good = ClientRequest("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", b"[Nodes]\n")
     assert meant(good) == admin.PolicyLoad("[Nodes]\n")
     with pytest.raises(NoOrderError):
@@ -100,7 +100,7 @@ def test_requests_that_are_not_orders(change: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("text", ["1h", "yesterday", "2026-13-01"])
 def test_an_order_has_no_relative_date(text: str) -> None:
-    """`1h` ago would differ between control and the api."""
+    """A relative date such as `1h` would give control and the api different times."""
     body = json.dumps({"since": text}).encode()
     asked = ClientRequest("10.0.0.1", "POST", "/v1/recordings/memory", "", "application/json", "", body)
     with pytest.raises(NoOrderError, match=rf"body.since: '{text}' is not a date"):

@@ -18,7 +18,7 @@ def test_a_duration_is_a_number_and_a_unit(text: str, seconds: float) -> None:
     "text", ["", "5", "m", "-1m", "0s", "0.0h", "1y", "1e9d", "1 h", "٣m", "1m\n", "9999999999s"]
 )
 def test_an_invalid_duration_is_none(text: str) -> None:
-    """Other text, and a duration of zero, have no seconds."""
+    """Any other text, and a duration of zero, return None."""
     assert seconds_of(text, "smhdw") is None
 
 

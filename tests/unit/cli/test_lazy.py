@@ -19,14 +19,14 @@ ROSRV = str(Path(sys.executable).parent / "rosrv")
 
 
 def test_the_table_matches_the_verbs() -> None:
-    """The help in the table is the first sentence of the verb's own."""
+    """The help in the table is the first sentence of the verb's own help."""
     for name, verb in table():
         own = str(loaded(verb, name.split()[-1]).help)
         assert " ".join(own.split("\n\n", maxsplit=1)[0].split()) == verb.help, name
 
 
 def test_a_verb_imports_only_what_it_needs() -> None:
-    """The command, and a query to a running appliance, import no network library, REST server, bags or compiler."""
+    """`rosrv` alone, and a query to a running appliance, import no network library, REST server, bags or compiler."""
     program = (
         "import sys, appliance.cli.main, appliance.cli.status_verb, appliance.cli.monitor.in_force\n"
         "heavy = ('pyroute2', 'fastapi', 'uvicorn', 'rosbags', 'lark', 'numpy', 'httpx', 'cryptography', 'pydantic')\n"

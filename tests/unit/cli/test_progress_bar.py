@@ -15,7 +15,7 @@ print("end")
 
 
 def said(shares: bool, *, screen: bool) -> tuple[str, str]:
-    """Return standard output, and the output on the terminal or pipe of standard error."""
+    """Return the text on standard output, and the text on standard error, which is a terminal or a pipe."""
     near, far = pty.openpty()
     command = [sys.executable, "-c", PROGRAM.format(shares=shares)]
     process = subprocess.Popen(
@@ -41,7 +41,7 @@ def said(shares: bool, *, screen: bool) -> tuple[str, str]:
 
 
 def test_a_terminal_has_a_bar() -> None:
-    """The bar shows the part that is done."""
+    """The bar shows the finished fraction."""
     output, shown = said(shares=False, screen=False)
     assert output == "end\n"
     assert "working" in shown
@@ -49,7 +49,7 @@ def test_a_terminal_has_a_bar() -> None:
 
 
 def test_output_on_the_same_terminal_has_no_bar() -> None:
-    """A bar would break the lines; with output to a file there is one."""
+    """A bar would break the lines of the output; if the output goes to a file, the bar is shown."""
     assert "working" not in said(shares=True, screen=True)[1]
     assert "working" in said(shares=True, screen=False)[1]
 

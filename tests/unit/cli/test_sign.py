@@ -38,7 +38,7 @@ def sign(*arguments: object) -> tuple[int, str]:
 
 @pytest.mark.parametrize("form", [PrivateFormat.OpenSSH, PrivateFormat.PKCS8])
 def test_each_file_gets_a_signature_beside_it(tmp_path: Path, form: PrivateFormat) -> None:
-    """Keys of ssh-keygen and of openssl work; the output has the key's line for appliance.yaml."""
+    """Keys from ssh-keygen and from openssl work; the output has the key's line for appliance.yaml."""
     files = [tmp_path / "p.ini", tmp_path / "a.rv"]
     for file in files:
         file.write_text(f"{file.name} ä\n", encoding="utf-8")
@@ -57,7 +57,7 @@ def test_each_file_gets_a_signature_beside_it(tmp_path: Path, form: PrivateForma
     [(b"a\r\n", "CR LF"), (b"\xef\xbb\xbfa\n", "byte order mark"), (b"\xff\n", "not UTF-8")],
 )
 def test_ambiguous_text_is_not_signed(tmp_path: Path, content: bytes, why: str) -> None:
-    """Nothing is written then, not for the other files either."""
+    """No signature is written then, not even for the other files."""
     good, bad = tmp_path / "a.rv", tmp_path / "b.rv"
     good.write_text("a\n")
     bad.write_bytes(content)

@@ -36,7 +36,7 @@ def write_bag(name: str, md5sum: str | None = None, *, below: list[str]) -> None
 
 
 def write_log(signed: str | None = None, *, below: list[str]) -> None:
-    """`log [signed]`: an audit log of decisions, each `NUMBER {FIELD: VALUE}`; signed, each tenth is a checkpoint."""
+    """`log [signed]`: an audit log of decisions, each `NUMBER {FIELD: VALUE}`; `signed`: each tenth is a checkpoint."""
     file, key = Path("state/control/audit.db"), Ed25519PrivateKey.generate()
     file.parent.mkdir(exist_ok=True)
     public, logs = key.public_key().public_bytes_raw(), list[AuditLog]()
@@ -57,10 +57,10 @@ def write_log(signed: str | None = None, *, below: list[str]) -> None:
 
 
 def keep_recordings(fake: FakeAppliance, before: str, how: str = "", *, below: list[str]) -> None:
-    """`recordings SECONDS [fleeting]`: recordings, each `LETTER BEGAN ENDED {FIELD: VALUE}`, and what is in memory.
+    """`recordings SECONDS [fleeting]`: recordings, each `LETTER BEGAN ENDED {FIELD: VALUE}`, and the memory's contents.
 
-    The letter, 20 times, is the id; `m` is the memory, of that many seconds. Each recording has a number a second,
-    with the second's last digit. A fleeting one is removed when the next one is fetched.
+    The id is the letter 20 times; `m` is the memory, with SECONDS of messages. A recording has one number a second, the
+    last digit of that second. A fleeting recording is removed when the next one is fetched.
     """
     known, fetched = dict[str, Recording](), list[str]()
     for line in below:
@@ -89,7 +89,7 @@ def keep_recordings(fake: FakeAppliance, before: str, how: str = "", *, below: l
 
 
 def set_scan(monkeypatch: pytest.MonkeyPatch, *, below: list[str]) -> None:
-    """`scan`: what a scan of ports from outside finds, as the fields of a `ScanResult`."""
+    """`scan`: the result of a port scan from outside, as the fields of a `ScanResult`."""
     found = yaml.safe_load("\n".join(below))
     result = ScanResult(**found | {"open": tuple(found.get("open", ()))})
     monkeypatch.setattr("appliance.cli.protect_verb.scan", lambda *_: result)
@@ -111,5 +111,5 @@ def transcript(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Tran
 
 @pytest.mark.parametrize("section", sections(*sorted(Path(__file__).parent.rglob("*.txt"))))
 def test_transcript(transcript: Transcript, section: Section) -> None:
-    """Each command makes the requests, and has the output and exit status, that are written below it."""
+    """Each command makes the requests listed below it, and has the output and the exit status listed there."""
     assert section.played(transcript) == section.text

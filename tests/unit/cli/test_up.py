@@ -30,7 +30,7 @@ class Full(io.StringIO):
 def test_the_first_token_is_in_its_file_before_the_line_is_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A program that waits for the line finds the file, readable for its owner only."""
+    """When the ready line appears, the token's file exists and only its owner can read it."""
     _announce(READY, Settings(state=tmp_path, api="off"), as_json=False)
     kept = tmp_path / "first-token"
     assert (kept.read_text(), stat.S_IMODE(kept.stat().st_mode)) == ("secret\n", 0o600)
@@ -42,7 +42,7 @@ def test_the_first_token_is_in_its_file_before_the_line_is_printed(
 def test_the_policys_warnings_are_printed_at_start(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A person gets at most ten on standard error; the object of `--json`, one line, has all."""
+    """Standard error has at most ten warnings; the object of `--json`, on one line, has all."""
     said = msgspec.structs.replace(
         READY, token=None, warnings=tuple(f"p.ini:{n}:1: warning" for n in range(12))
     )

@@ -64,7 +64,7 @@ async def conversation(*wanted: messages.Message) -> list[Any]:
 
 
 async def test_it_answers_each_question_and_ends_with_its_link(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Findings and errors are those of `check`."""
+    """The compiler's findings and errors equal those of `check`."""
     monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)  # the test's own process continues
     bad = GOOD.replace("shared + 1", "shred + 1")
@@ -102,7 +102,7 @@ async def test_it_builds_what_relays_run(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 async def test_large_specifications_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """This holds for the whole set and for a relay's part, so that no link breaks."""
+    """The limit holds for the whole set and for each relay's part, so that no link breaks."""
     monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
     compiled = check(Sources({"a.rv": GOOD}, DEFINITIONS), ()).compiled
@@ -118,7 +118,7 @@ async def test_large_specifications_are_rejected(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize(("memory", "seconds"), [(8 << 20, 4), (1 << 30, 1)], ids=["memory", "time"])
 def test_expensive_texts_stay_within_bounds(memory: int, seconds: int) -> None:
-    """They are rejected, or the kernel ends the process, within the limits."""
+    """Within the limits, expensive specifications are rejected, or the kernel ends the process."""
     program = f"""
 import resource, sys
 from pathlib import Path
@@ -185,7 +185,7 @@ process.main(int(sys.argv[1]))
 
 
 async def test_a_dry_run_ends_with_its_budget() -> None:
-    """A dry run of 24 kB that would take minutes is rejected with its seconds, and the process ends normally."""
+    """A dry run of 24 kB that would take minutes is rejected with its limit in seconds; the process ends normally."""
     with started(_COMPILER.format(1)) as (running, _supervisor, control):
         answers: asyncio.Queue[Any] = asyncio.Queue()
         control.attach(
@@ -204,7 +204,7 @@ async def test_a_dry_run_ends_with_its_budget() -> None:
 
 
 async def test_abandoned_work_ends() -> None:
-    """When control closes the link during a dry run, the process ends at once."""
+    """If control closes the link during a dry run, the process ends at once."""
     with started(_COMPILER.format(1000)) as (running, _supervisor, control):
         control.send(messages.ContentsWanted(4, {"a.rv": nested_repetitions(118)}, {}, dry_run=True))
         await asyncio.to_thread(_until_working, running.pid)
@@ -213,7 +213,7 @@ async def test_abandoned_work_ends() -> None:
 
 
 def _until_working(pid: int) -> None:
-    """Return when the process has used more processor time than a start takes."""
+    """Wait until the process has used more processor time than a start takes."""
 
     def used() -> float:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

@@ -39,7 +39,7 @@ def test_later_sources_override_earlier_ones(file: Path) -> None:
 
 
 def test_all_mistakes_are_reported_with_their_positions(file: Path) -> None:
-    """Each has its file and line, variable or flag, and an unknown key suggests the nearest."""
+    """Each mistake has its file and line, variable or flag; for an unknown key the nearest key is suggested."""
     file.write_text(
         "listn: 0.0.0.0:1\nlimits:\n  nesting: deep\n  bodybytes: 1\naudit:\n  durability: sometimes\n"
     )
@@ -56,7 +56,7 @@ def test_all_mistakes_are_reported_with_their_positions(file: Path) -> None:
 
 
 def test_a_key_in_the_wrong_section_names_the_right_one(file: Path) -> None:
-    """The mistake suggests the section where the key exists."""
+    """The message suggests the section that has this key."""
     file.write_text("queue_messages: 10\n")
     assert mistakes(file) == [f"{file}:1: unknown key queue_messages: did you mean relay.queue_messages?"]
 
@@ -76,7 +76,7 @@ def test_a_wrong_entry_of_a_list_has_its_line(file: Path) -> None:
     "value", ["perhaps", 5.5, -1, None, [1], {"a": 1}, ["x"], "", 10**30, float("nan"), "5 parsecs"]
 )
 def test_messages_about_values_are_our_own(value: Any) -> None:
-    """No wrong value of a key is described in the words of a library or of Python."""
+    """No message about a wrong value uses the words of a library or of Python."""
     settings = asdict(Settings())
     given = [{key: value} for key in settings]
     given += [
@@ -99,7 +99,7 @@ def test_messages_about_values_are_our_own(value: Any) -> None:
 
 
 def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
-    """YAML would silently use the last one."""
+    """YAML would silently use the last value."""
     file.write_text("relays: 1\nlisten: 127.0.0.1:1\nrelays: 1\n")
     assert mistakes(file) == [f"{file}:3: relays is given twice"]
 
@@ -142,7 +142,7 @@ def test_a_file_in_the_working_directory_is_found(tmp_path: Path, monkeypatch: p
 
 
 def test_relative_paths_depend_on_their_source(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the file they are relative to it, in a flag to the working directory; the result is absolute."""
+    """A path in the file is relative to the file, a path in a flag to the working directory; the result is absolute."""
     monkeypatch.chdir("/")
     file.write_text("policy: policies/a.ini\nstate: /srv/state\n")
     settings = resolve(file, {}, {})
@@ -158,7 +158,7 @@ def test_an_unknown_variable_is_a_mistake() -> None:
 
 
 def test_variables_of_other_programs_are_ignored() -> None:
-    """Kubernetes' links to a service named rosrv, and the token of other verbs, are not configuration."""
+    """Variables that Kubernetes sets for a service named rosrv, and the token of other verbs, are not configuration."""
     environment = {
         "ROSRV_SERVICE_HOST": "10.0.0.1",
         "ROSRV_SERVICE_PORT_MASTER": "11311",
@@ -177,14 +177,14 @@ def test_a_list_in_the_environment_is_yaml() -> None:
 
 
 def test_a_mistake_about_two_keys_names_one_that_was_set() -> None:
-    """`--mediation monitored` without `--relay monitored` is a mistake of that flag, with any other settings."""
+    """`--mediation monitored` without `--relay monitored` is a mistake of that flag, whatever else is set."""
     with pytest.raises(ConfigError) as caught:
         resolve(None, {}, {"policy": Path("/a.ini"), "mediation": "monitored"})
     assert str(caught.value) == "--mediation: monitored needs relaying: monitored (--relay monitored)"
 
 
 def test_the_variable_of_a_flag_with_another_key() -> None:
-    """`ROSRV_RELAY` is `--relay`; a table, and the keys of the section of that name, go to the section."""
+    """`ROSRV_RELAY` is the variable of `--relay`; as a table, or with a key's name, it sets the section `relay`."""
     assert (
         resolve(None, {"ROSRV_RELAY": "monitored", "ROSRV_MEDIATION": "monitored"}, {}).relaying
         == "monitored"

@@ -34,7 +34,7 @@ def anew() -> Iterator[None]:
 
 
 def test_on_debian_it_lists_needed_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Installed packages that the appliance needs are listed, not others or removed ones."""
+    """The list has the installed packages that the appliance needs; other packages and removed ones are left out."""
     (tmp_path / "status").write_text(STATUS)
     monkeypatch.setattr(inventory, "DPKG", tmp_path)
     found = [(part.name, part.version) for part in inventory.inventory().parts if part.kind == "debian"]
@@ -42,7 +42,7 @@ def test_on_debian_it_lists_needed_packages(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_elsewhere_it_lists_python_packages_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without dpkg's list nothing is invented."""
+    """Without dpkg's list, the inventory has no Debian packages."""
     monkeypatch.setattr(inventory, "DPKG", tmp_path)
     found = inventory.inventory()
     assert {part.kind for part in found.parts} == {"python"}
@@ -53,7 +53,7 @@ def test_elsewhere_it_lists_python_packages_only(tmp_path: Path, monkeypatch: py
 def test_a_build_has_its_commit_and_the_hash_of_its_list(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An image has both, a checkout neither."""
+    """The inventory of an image has the commit and the hash of its list; the inventory of a checkout has neither."""
     assert (inventory.inventory().build, inventory.inventory().parts_list) == (None, None)
     inventory.inventory.cache_clear()
     monkeypatch.setattr(inventory, "SHIPPED", tmp_path)
@@ -73,5 +73,5 @@ def test_a_build_has_its_commit_and_the_hash_of_its_list(
     ],
 )
 def test_licences_of_debian_packages(text: str, licences: list[str]) -> None:
-    """The licence is read from Debian's format or from common names; otherwise it is missing."""
+    """A package's licence is read from Debian's format or recognised by its common name; otherwise it is missing."""
     assert inventory.debian_licences(text) == licences

@@ -76,7 +76,7 @@ def test_an_invalid_address_is_rejected(text: str) -> None:
 
 @pytest.mark.parametrize("value", [0, -1, float("inf"), float("nan"), "soon"])
 def test_a_time_is_a_positive_number(value: object) -> None:
-    """No number disables a limit."""
+    """No number, such as zero, disables a limit."""
     with pytest.raises(ValidationError):
         read({"limits": {"header_seconds": value}})
 
@@ -140,7 +140,7 @@ def test_an_invalid_syslog_receiver_is_rejected(syslog: dict[str, object], why: 
     ],
 )
 def test_an_invalid_pool_of_virtual_addresses_is_rejected(pool: str, said: str) -> None:
-    """The error for an IPv6 pool, or one of a wrong size, says what is valid."""
+    """The error for an IPv6 pool, or for a pool of a wrong size, describes valid pools."""
     with pytest.raises(ValidationError, match=said):
         read({"ipsec": {"pool": pool}})
 
@@ -172,12 +172,12 @@ def test_an_unreachable_endpoint_is_rejected(endpoint: str, said: str) -> None:
 
 
 def test_an_empty_endpoint_is_unset() -> None:
-    """compose.yaml passes an empty variable on: the address is then found automatically."""
+    """compose.yaml may pass an empty variable; the endpoint's address is then found automatically."""
     assert read({"ipsec": {"endpoint": ""}}).ipsec.endpoint is None
 
 
 def test_rules_of_annotated_keys_are_enforced() -> None:
-    """A rule must be inside the annotation of an annotated type: pydantic ignores one beside it."""
+    """A rule must be inside the annotation of an annotated type: pydantic ignores a rule beside the annotation."""
 
     def sections(section: Any) -> Iterator[Any]:
         yield section

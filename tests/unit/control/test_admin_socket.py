@@ -95,7 +95,7 @@ async def test_a_tool_without_an_answer_says_how_to_check(
 
 
 async def test_the_order_of_a_killed_tool_is_withdrawn(tmp_path: Path) -> None:
-    """A killed tool has changed nothing; the next one is served."""
+    """The order of a killed tool changes nothing; the next tool is served."""
     async with served(tmp_path) as slow:
         _reader, writer = await asyncio.open_unix_connection(tmp_path / ADMIN_SOCKET)
         writer.write(encode(PolicyConfirm()) + b"\n")
@@ -113,7 +113,7 @@ async def test_the_order_of_a_killed_tool_is_withdrawn(tmp_path: Path) -> None:
 
 
 def _once(event: asyncio.Event, method: Any) -> Any:
-    """Wrap the method for other threads: it waits for the event first."""
+    """Wrap a method so that other threads can call it: the call waits for the event first."""
     loop = asyncio.get_running_loop()
 
     def later(*arguments: Any) -> Any:

@@ -16,7 +16,7 @@ MARKED = [marked for part in (Queries, *get_args(Orders)) for marked in methods_
 REQUESTS: tuple[type[Any], ...] = tuple(
     dict.fromkeys([*get_args(admin.AnyRequest), *get_args(admin.RestRequest)])
 )
-# Exceptions: fields of a record, which depend on its event, and of a child's readiness, which depend on its role.
+# Exceptions: a record's fields depend on its event, and a child's readiness on its role.
 OPEN = {
     (messages.MonitorEvent, "detail"),
     (messages.Ready, "detail"),
@@ -26,7 +26,7 @@ OPEN = {
 
 
 def kinds(base: type[Any]) -> set[type[Any]]:
-    """Yield every request: a struct with its own tag and no subclass."""
+    """Return every request: a struct with its own tag and no subclass."""
     below = [kinds(one) for one in base.__subclasses__()]
     return set().union(*below) if below else {base}
 
@@ -55,7 +55,7 @@ ANSWERED = [one for one in REQUESTS if one is not admin.ChallengeWanted]
 
 
 def test_one_method_answers_each_request() -> None:
-    """Each request has exactly one method, which takes it as argument; mypy compares the answers."""
+    """Each request has exactly one method, which takes the request as its argument; mypy compares the answers."""
     assert Counter(mark.request for mark, _method in MARKED) == Counter(ANSWERED)
     for mark, method in MARKED:
         hints = typing.get_type_hints(method)

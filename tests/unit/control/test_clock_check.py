@@ -31,7 +31,7 @@ def trail() -> Trail:
 
 
 def test_an_unsynchronised_clock_is_recorded_once(trail: Trail) -> None:
-    """A record marks its beginning and its end; an unknown state has none."""
+    """The period without synchronisation has a record at its beginning and its end; an unknown state has no record."""
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
     for synchronised in (None, False, False, True, True, None, False):
         clock.synchronisation_reported(synchronised)
@@ -40,7 +40,7 @@ def test_an_unsynchronised_clock_is_recorded_once(trail: Trail) -> None:
 
 
 def test_a_right_clock_is_not_recorded(trail: Trail) -> None:
-    """A start with a right clock makes no record."""
+    """A start with a correct clock makes no record."""
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
     clock.synchronisation_reported(True)
     clock.look()
@@ -48,7 +48,7 @@ def test_a_right_clock_is_not_recorded(trail: Trail) -> None:
 
 
 def test_a_clock_that_was_set_back_is_recorded_once(trail: Trail) -> None:
-    """Each step back has one record however often the clock is checked; a second does not count."""
+    """Each step back has one record however often the clock is checked; a step of one second is ignored."""
     behind = [1.5]
     clock = ClockCheck(cast(AuditTrail, trail), lambda: behind[0])
     clock.look()
@@ -60,7 +60,7 @@ def test_a_clock_that_was_set_back_is_recorded_once(trail: Trail) -> None:
 
 
 def test_each_step_forward_is_recorded(trail: Trail) -> None:
-    """The record tells readers that less time has passed than the times suggest; a second does not count."""
+    """The record says that less time passed than the timestamps suggest; a step of one second is ignored."""
     started = [1000.0]
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0, lambda: started[0])
     for started[0] in (1000.0, 1001.0, 4600.0, 4600.0, 1000.0, 1003.0):
@@ -74,7 +74,7 @@ def test_each_step_forward_is_recorded(trail: Trail) -> None:
 def test_a_clock_before_the_build_date_is_reported(
     trail: Trail, monkeypatch: pytest.MonkeyPatch, days: float, said: str | None
 ) -> None:
-    """The machine has no time yet, and no earlier record shows the error."""
+    """The machine does not know the time yet, and no earlier record reveals the error."""
     made = Path(shipped.__file__).stat().st_mtime
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
     clock.synchronisation_reported(True)

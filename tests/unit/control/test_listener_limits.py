@@ -26,7 +26,7 @@ CALL = b"POST / HTTP/1.1\r\nHost: here\r\nContent-Length: 1\r\n\r\n?"
 
 @pytest.mark.parametrize("guarded", [True, False])
 async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *, guarded: bool) -> None:
-    """This includes the ROS master, which keeps a connection to each node that ever existed."""
+    """Idle connections are closed even by the ROS master, which keeps a connection to each node that ever existed."""
     given = Settings()
     settings = dataclasses.replace(given, limits=dataclasses.replace(given.limits, idle_seconds=0.1))
     policy = compile_policy("[Nodes]\ndefault = *\n", file="a.ini")
@@ -51,7 +51,10 @@ async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *,
 
 
 def test_hosts_of_a_wildcard_share_processor_time() -> None:
-    """Hosts that only `*` names count as one; a named or registered host, or a named network, counts as one each."""
+    """All hosts that only `*` names count as one host.
+
+    Named hosts, registered hosts and named networks count as one each.
+    """
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1 10.1.0.0/16\n/guest/** = *\n", file="a.ini")
     registered = address_of("10.9.0.7")
     quota_class = {registered: QuotaClass.REGISTERED}
@@ -68,7 +71,7 @@ def test_hosts_of_a_wildcard_share_processor_time() -> None:
 
 @pytest.fixture
 def everybodys(tmp_path: Path) -> Iterator[ListenerLimits]:
-    """Return limits under a policy that names `ROBOT` and all others by `*`; one of these has a registration."""
+    """Return limits under a policy that names `ROBOT` and admits all others by `*`; one of the others is registered."""
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
     log = AuditLog(tmp_path / "audit.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
@@ -82,7 +85,7 @@ def everybodys(tmp_path: Path) -> Iterator[ListenerLimits]:
 
 
 def test_hosts_of_a_wildcard_leave_a_named_host_its_slot(everybodys: ListenerLimits) -> None:
-    """Two hundred hosts of `*` keep connecting: a named host may still connect, and so may a registered host of `*`."""
+    """While two hundred hosts of `*` keep connecting, a named host and a registered host of `*` can still connect."""
     arriving = everybodys.connection_table.arriving
     for number in range(200):
         for _ in range(20):
@@ -94,7 +97,7 @@ def test_hosts_of_a_wildcard_leave_a_named_host_its_slot(everybodys: ListenerLim
 
 
 def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots(tmp_path: Path) -> None:
-    """Two hundred hosts of `*` register a node each and keep connecting: the robot finds the kept part free."""
+    """Two hundred hosts of `*` register a node each and keep connecting: the slots reserved for the robot stay free."""
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
     log = AuditLog(tmp_path / "audit.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
@@ -124,7 +127,7 @@ class Opened:
         connection_table.file(self, stage)
 
     def expire(self) -> None:
-        """Not used by this test."""
+        """Do nothing: no connection expires in this test."""
 
     def abort(self) -> None:
         """Free the slot."""

@@ -22,13 +22,13 @@ def test_sums_by_name() -> None:
 
 
 def test_counters_begin_at_zero() -> None:
-    """A counter exists with 0 before its first event, so that the first is an increase."""
+    """A counter exists with value 0 before its first event, so that Prometheus sees the first event as an increase."""
     counts = from_zero({("fault", "safe"): 2}, [("fault", "safe"), ("drop", "safe")])
     assert counts == {("fault", "safe"): 2, ("drop", "safe"): 0}
 
 
 def test_names_are_bounded() -> None:
-    """Past the limit names share one series, and the sum is complete."""
+    """Past the limit, further names share one series; the total stays complete."""
     sums = by_resource((f"/topic{number}", (1,)) for number in range(MOST_RESOURCES + 500))
     assert len(sums) == MOST_RESOURCES + 1
     assert sums[OTHERS] == [500]
@@ -42,7 +42,7 @@ def test_few_topics_have_their_own_histogram() -> None:
 
 
 def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A restarted node is another incarnation: its topic counts on, with bounded names."""
+    """A restarted node is a new incarnation: the counters of its topic continue, and the number of names is bounded."""
     monkeypatch.setattr(traffic, "MOST_RESOURCES", 2)
     registry, host = Registry(), ipaddress.ip_address("10.0.0.5")
     for number in range(4):
@@ -67,7 +67,7 @@ def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_publishers_md5sum_is_known_once_a_relay_has_seen_its_header() -> None:
-    """A registration has the type and a header the md5sum; a later report without one changes nothing."""
+    """The registration gives the type and a header the md5sum; a later report without an md5sum changes nothing."""
     registry, uri = Registry(), "http://10.0.0.5:4000/"
     host = ipaddress.ip_address("10.0.0.5")
     node = Incarnation("k", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)

@@ -41,7 +41,7 @@ async def at_once() -> None:
 
 
 class Appliance:
-    """The policy file and the store; `started()` is one run of control."""
+    """The policy file and the store; each `started()` is one run of control."""
 
     def __init__(self, directory: Path) -> None:
         self.state = directory / "state"
@@ -58,7 +58,7 @@ class Appliance:
         changed: Callable[[Policy, Policy], int] = lambda _before, _policy: 0,
         site_keys: Sequence[str] = (),
     ) -> Iterator[Policies]:
-        """Run control until the block ends, and return its policies."""
+        """Run control until the block ends; yield its policies."""
         store = StateStore(self.state, failed=fail)
         records = cast(Any, Records())
         policies = Policies(
@@ -121,7 +121,7 @@ async def test_a_clock_set_back_does_not_extend_the_timeout(
 
 
 async def test_an_edited_file_ends_the_timeout(tmp_path: Path) -> None:
-    """Another file at the start is another policy: no old timeout fires, at that start or after a crash."""
+    """If the file was changed, the start loads a new policy, and the old timeout never fires, even after a crash."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
@@ -134,7 +134,7 @@ async def test_an_edited_file_ends_the_timeout(tmp_path: Path) -> None:
 
 
 async def test_a_change_stays_confirmed_over_a_crash(tmp_path: Path) -> None:
-    """Confirmed stays confirmed; an unconfirmed change is still unconfirmed after a crash of control."""
+    """After a crash of control a confirmed change stays confirmed, and an unconfirmed change stays unconfirmed."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
@@ -148,7 +148,7 @@ async def test_a_change_stays_confirmed_over_a_crash(tmp_path: Path) -> None:
 
 
 class Slow:
-    """Tests of the policy that finish when the loop says so."""
+    """Tests of the policy that finish when the test allows it."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, appliance: Appliance) -> None:
         self.rounds = 0
@@ -225,7 +225,7 @@ class DiedError(Exception):
 
 
 async def test_a_crash_during_an_unconfirmed_change_rolls_it_back(tmp_path: Path) -> None:
-    """The timeout protects from the time at which the new revision comes into force."""
+    """The timeout counts from the time at which the new revision comes into force, so a crash cannot avoid it."""
     appliance = Appliance(tmp_path)
 
     def die(_before: object, _policy: object) -> int:
@@ -315,7 +315,7 @@ async def test_a_rollback_restores_a_signed_revision(tmp_path: Path) -> None:
 
 
 async def test_keys_are_replaced_while_both_are_valid(tmp_path: Path) -> None:
-    """The same text with a new signature is a new revision, so no later crash asks for the old key."""
+    """The same text with a new signature is a new revision, so that no later crash requires the old key."""
     appliance = Appliance(tmp_path)
     beside = tmp_path / "policy.ini.sig"
     beside.write_text(signed(OPEN))
@@ -331,7 +331,7 @@ async def test_keys_are_replaced_while_both_are_valid(tmp_path: Path) -> None:
 
 
 async def test_the_same_text_posted_twice_is_one_revision(tmp_path: Path) -> None:
-    """A repeated order changes nothing, and a running timeout continues; another text is another revision."""
+    """Posting the same text again changes nothing, and a running timeout continues; another text is a new revision."""
     with Appliance(tmp_path).started() as policies:
         first = await policies.load(PolicyLoad(OTHER, confirm_within=100.0), "adam")
         again = await policies.load(PolicyLoad(OTHER, "once more"), "eve")

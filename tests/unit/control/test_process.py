@@ -28,15 +28,15 @@ def fail(reason: str) -> None:
 
 
 class Ports(idle_class(ProxyEndpoints)):  # type: ignore[misc]  # it is made
-    """Ports that can all be bound again."""
+    """Ports that can all be bound again after a restart."""
 
     async def reopen(self, _incarnation: Incarnation) -> list[Durable]:
-        """Reopen, as `ProxyEndpoints` does."""
+        """Reopen the ports, as `ProxyEndpoints` does."""
         return []
 
 
 async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None:
-    """The policy may have changed during a stop: it is applied when all nodes are restored."""
+    """The policy may have changed while control was stopped: the new one applies once all nodes are restored."""
     store = StateStore(tmp_path, failed=fail)
     before = Registry()
     host = ipaddress.ip_address("10.0.0.5")

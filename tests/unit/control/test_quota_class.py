@@ -11,7 +11,7 @@ NAMED, OTHER = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2"
 
 
 def test_the_class_follows_reloads_and_registrations() -> None:
-    """A rule with the address, then a registration, raise a host; without them it is unknown again."""
+    """A rule that names the host, and then a registration, raise its class; without both it is unknown again."""
     policies = [
         compile_policy("[Nodes]\n/a = 10.0.0.1\n", file="a.ini"),
         compile_policy("[Nodes]\n/a = 10.0.0.2\n", file="b.ini"),
@@ -28,7 +28,7 @@ def test_the_class_follows_reloads_and_registrations() -> None:
 
 
 def test_recordings_are_charged_by_the_policys_names() -> None:
-    """The robot's host counts as the robot; hosts of one network, and all unknown hosts, count as one."""
+    """Named hosts are charged separately, the hosts of a named network as one, and all unknown hosts as one."""
     policy = compile_policy(
         "[Nodes]\n/a = robot 10.0.0.9 10.1.0.0/16\n", file="p.ini", robot=[ipaddress.ip_address("172.17.0.1")]
     )

@@ -1,4 +1,4 @@
-"""Orders of operators to the flight recorder, which the test plays."""
+"""Orders of operators to the flight recorder; the test plays the recorder."""
 
 import asyncio
 import socket
@@ -76,7 +76,7 @@ def scene() -> Scene:
 
 
 async def told(scene: Scene, done: Callable[[], bool]) -> None:
-    """Wait until control has received it."""
+    """Wait until control has received this message."""
     async with asyncio.timeout(10):
         while not done():
             await asyncio.sleep(0)
@@ -97,7 +97,7 @@ async def test_a_missing_recorder_is_reported() -> None:
 
 
 async def test_a_call_of_the_service_is_an_order() -> None:
-    """The order has the name and host of the node; the node gets the recording's id, or the reason of the refusal."""
+    """The order has the node's name and host; the node gets the recording's id, or the reason for the refusal."""
     heard: list[Any] = []
     call = messages.OwnServiceCalled(7, "/rosrv/record_now", "10.0.0.5", "/arm")
 
@@ -125,7 +125,7 @@ async def test_a_call_of_the_service_is_an_order() -> None:
 
 
 async def test_a_closed_recording_is_recorded_and_listed() -> None:
-    """A removed recording leaves the list, whatever removed it; reading an unknown one is an error."""
+    """A removed recording leaves the list for any cause of the removal; reading an unknown recording is an error."""
     heard: list[Any] = []
     scene = Scene()
 
@@ -161,7 +161,7 @@ async def test_a_closed_recording_is_recorded_and_listed() -> None:
 
 
 async def test_orders_have_the_name_of_their_operator() -> None:
-    """The trigger has the id of the record with the name; an invalid order is rejected before it is recorded."""
+    """The trigger has the id of the audit record with the operator's name; an invalid order is never recorded."""
 
     def answer(message: Any) -> list[messages.Message]:
         match message:
@@ -217,7 +217,7 @@ async def test_an_order_to_a_dying_recorder_fails_at_once(scene: Scene) -> None:
 
 
 async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
-    """Order and fetch are recorded; later orders keep it for a while."""
+    """Both the order and the fetch are recorded; the fetched memory stays available for later orders for a while."""
     lent = iter([msgspec.structs.replace(KEPT, id=letter * 20) for letter in "bcdef"])
 
     def answer(message: Any) -> list[messages.Message]:
@@ -245,7 +245,7 @@ async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
 
 
 async def test_more_topics_than_a_record_can_name_are_rejected(scene: Scene) -> None:
-    """The record names every topic that is read, none left out or cut."""
+    """The record of a fetch must name every topic that is read; if the names do not fit, the fetch is rejected."""
     recorder = scene.attach(lambda _message: [])
     recorder.send(messages.RecordingsStated([KEPT]))
     await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))

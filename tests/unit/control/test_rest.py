@@ -43,7 +43,7 @@ def kept(row: TokenRow) -> TokenKept:
 
 
 def loading(number: int, text: str, shown: str = TOKEN) -> RequestMade:
-    """Return a policy to load, as an honest api passes it on."""
+    """Return an order to load a policy, as an honest api passes it on."""
     asked = ClientRequest("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", text.encode())
     return RequestMade(number, PolicyLoad(text), shown, asked)
 
@@ -102,13 +102,13 @@ class Api:
         self.heard = self._ear.messages
 
     async def until(self, count: int) -> list[Any]:
-        """Return what was received, once it has this length."""
+        """Wait until this number of messages was received, and return all of them."""
         return await self._ear.until(count)
 
 
 @pytest.fixture
 def pins() -> list[str]:
-    """Return what the api reports of its key."""
+    """Return the list of pins that control received from the api."""
     return []
 
 
@@ -134,7 +134,7 @@ async def api(world: Everything, link: RestLink) -> Api:
 
 
 def answer_of(message: RequestAnswered) -> AdminAnswer[Status]:
-    """Return the answer; a status, if any."""
+    """Return the decoded answer to a status request."""
     return decode(message.answer, StatusWanted())
 
 
@@ -146,7 +146,7 @@ async def test_tokens_are_sent_at_once_and_after_every_change(link: RestLink, ap
 
 
 async def test_enrolments_block_no_other_requests(world: Everything, api: Api) -> None:
-    """Those that wait for charon run beside other requests, up to a limit, and are then answered."""
+    """Enrolments that wait for charon run beside other requests, up to a limit, and are then answered."""
     world.only_slow = True
     world.go.clear()
     for number in range(20):
@@ -160,7 +160,7 @@ async def test_enrolments_block_no_other_requests(world: Everything, api: Api) -
 
 
 async def test_the_pin_of_the_api_is_passed_on(link: RestLink, api: Api, pins: list[str]) -> None:
-    """The api sends the pin of its key; an invalid one ends the link."""
+    """The api sends the pin of its key; an invalid pin ends the link."""
     pin = "sha256//" + "A" * 43 + "="
     api.channel.send(RestServed(pin))
     api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
@@ -173,7 +173,7 @@ async def test_the_pin_of_the_api_is_passed_on(link: RestLink, api: Api, pins: l
 
 
 async def test_answers_are_in_order_with_their_numbers(world: Everything, api: Api) -> None:
-    """Requests run one after the other, each on behalf of its token."""
+    """Requests run one after the other, each in the name of its token."""
     for number in (7, 3, 9):
         api.channel.send(RequestMade(number, StatusWanted(), VIEWER_TOKEN if number == 3 else TOKEN))
     heard = await api.until(4)
@@ -236,7 +236,7 @@ async def test_nothing_is_changed_while_the_log_cannot_be_written(world: Everyth
 
 
 async def test_a_change_with_a_wrong_name_is_refused(world: Everything, api: Api) -> None:
-    """An api that invents a name, or a role for a token, changes nothing; reading continues."""
+    """If an api invents a name or a role for a token, nothing is changed; reading continues."""
     for number, shown in enumerate(("operator", "disk", "", VIEWER_TOKEN)):
         api.channel.send(loading(number, "[Nodes]", shown))
     api.channel.send(RequestMade(8, StatusWanted(), VIEWER_TOKEN))
@@ -247,7 +247,7 @@ async def test_a_change_with_a_wrong_name_is_refused(world: Everything, api: Api
 
 
 async def test_invalid_messages_end_the_link(world: Everything, link: RestLink) -> None:
-    """A request for a token's creation, a message of another link, and garbage close it; another api is served."""
+    """A request to create a token, a message of another link, and garbage end the link; another api is served."""
     token = {"message": "RequestMade", "number": 1, "shown": TOKEN, "request": {"verb": "token add"}}
     for body in (
         msgspec.msgpack.encode(token),
@@ -267,7 +267,7 @@ async def test_invalid_messages_end_the_link(world: Everything, link: RestLink) 
 
 
 async def test_a_new_api_does_not_wait_for_the_old_ones_request(world: Everything, link: RestLink) -> None:
-    """An api that dies during a request leaves none behind, and its successor is served at once."""
+    """The request of an api that died does not delay its successor."""
     world.go.clear()
     first = Api(world, link)
     for number in range(3):
@@ -283,7 +283,7 @@ async def test_a_new_api_does_not_wait_for_the_old_ones_request(world: Everythin
 
 
 async def test_an_api_that_does_not_read_loses_its_link(world: Everything, link: RestLink) -> None:
-    """Unread answers are bounded."""
+    """If the api does not read its answers, control closes the link before memory grows."""
     here, there = socket.socketpair()
     control = Channel(here, ApiLink, limit=100_000)
     link.attach(control)

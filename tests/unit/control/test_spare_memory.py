@@ -1,4 +1,4 @@
-"""Free memory that the allocator keeps goes back to the system, if it is much."""
+"""Large amounts of free memory that the allocator keeps are returned to the system."""
 
 import subprocess
 import sys
@@ -25,20 +25,20 @@ print(kept > MUCH, resident() - before < MUCH, kept >> 20, (resident() - before)
 
 
 class Process:
-    """A process of some size, with only `live` in use."""
+    """A process of `size` bytes, of which only `live` are in use."""
 
     def __init__(self, size: int) -> None:
         self.size = self.live = size
         self.times = 0
 
     def give_back(self) -> None:
-        """Return the memory that is not in use."""
+        """Give the unused memory back to the system."""
         self.size = self.live
         self.times += 1
 
 
 async def test_freed_memory_is_returned() -> None:
-    """glibc keeps much of the freed memory; after one check it does not."""
+    """glibc keeps much of the freed memory; one check returns it to the system."""
     done = subprocess.run([sys.executable, "-c", _FREED], capture_output=True, text=True, check=True)
     assert done.stdout.split()[:2] == ["True", "True"], done.stdout
 
@@ -55,7 +55,7 @@ async def test_memory_freed_later_is_returned() -> None:
 
 
 async def test_a_little_memory_is_kept() -> None:
-    """Slightly above the lowest use of the process nothing is returned."""
+    """Slightly above the lowest use of the process, no memory is returned."""
     process = Process(200 << 20)
     spare = SpareMemory(size=lambda: process.size, give_back=process.give_back)
     process.size = process.live = 50 << 20

@@ -27,7 +27,7 @@ _LIMIT_SECONDS = 30
 
 
 class Supervisor:
-    """The supervisor's end; `asked` are the hosts whose routes control requested."""
+    """The supervisor's end; `asked` lists the hosts whose routes control requested."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.asked: list[str] = []
@@ -62,7 +62,7 @@ class Supervisor:
 
 @pytest.fixture
 def answers() -> list[TunnelsEnclosed]:
-    """Return what the supervisor answered about tunnels."""
+    """Return the supervisor's answers about tunnels."""
     return []
 
 
@@ -93,12 +93,12 @@ async def test_a_route_is_requested_once(ends: tuple[ControlLifeline, Supervisor
 
 
 async def test_routes_of_many_hosts_are_requested_in_turns(ends: tuple[ControlLifeline, Supervisor]) -> None:
-    """The supervisor has few open questions, abandoned ones included; all callers get answers."""
+    """The supervisor gets few questions at a time, abandoned ones included; all callers get answers."""
     lifeline, supervisor = ends
     hosts = [f"host {number}" for number in range(ROUTES_AT_ONCE * 4)]
     tasks = {host: asyncio.create_task(lifeline.route_to(host)) for host in hosts}
     await supervisor.until_asked(ROUTES_AT_ONCE)
-    given_up = [tasks.pop(host) for host in (hosts[0], hosts[-1])]  # one with a question, one in the queue
+    given_up = [tasks.pop(host) for host in (hosts[0], hosts[-1])]  # one asked, one in the queue
     for one in given_up:
         one.cancel()
     await asyncio.gather(*given_up, return_exceptions=True)
@@ -113,7 +113,7 @@ async def test_routes_of_many_hosts_are_requested_in_turns(ends: tuple[ControlLi
 async def test_early_messages_are_not_lost(
     ends: tuple[ControlLifeline, Supervisor], answers: list[TunnelsEnclosed]
 ) -> None:
-    """Messages wait for their receiver in order; an awaited answer does not."""
+    """Messages wait in order for their receiver; an answer that a caller awaits is delivered at once."""
     lifeline, supervisor = ends
     lifeline, supervisor = ends
     for message in (Announced(), PolicyReloadRequested(), TunnelsEnclosed("kernel"), SocketsRestored(0)):

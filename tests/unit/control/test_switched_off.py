@@ -1,4 +1,4 @@
-"""Alarms about what was disabled and forgotten."""
+"""Alarms about disabled parts that were forgotten."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -46,7 +46,7 @@ def scene(tmp_path: Path) -> Iterator[Scene]:
 
 @pytest.mark.anyio
 async def test_a_disabled_monitor_is_an_alarm_once(scene: Scene) -> None:
-    """After `forgotten_after` of running it is recorded and marked, over restarts, until it is enabled."""
+    """After `forgotten_after` of running, the monitor is recorded and marked until it is enabled, over restarts."""
     scene.off = {"a": False, "b": "shadow"}
     watch = scene.watch()
     watch.look(3000.0)
@@ -71,7 +71,7 @@ async def test_a_disabled_monitor_is_an_alarm_once(scene: Scene) -> None:
 
 
 def test_a_timed_change_is_not_forgotten(scene: Scene) -> None:
-    """It has an age only if it is still disabled after its time."""
+    """A timed change has an age only if the monitor is still disabled after that time."""
     scene.off, scene.until = {"a": False}, {"a": 1e12}
     watch = scene.watch()
     watch.look(9000.0)

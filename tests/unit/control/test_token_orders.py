@@ -52,7 +52,7 @@ def opens(tokens: TokenOrders, text: str | None) -> bool:
 
 
 async def test_an_unannounced_token_is_replaced(lives: Lives) -> None:
-    """Control dies before it could announce the first token: the next one makes another and revokes the lost one."""
+    """Control dies before it could announce the first token: the next control replaces and revokes the lost token."""
     lost = await lives.next().first()
     tokens = lives.next()
     assert opens(tokens, lost)
@@ -63,7 +63,7 @@ async def test_an_unannounced_token_is_replaced(lives: Lives) -> None:
 
 
 async def test_an_announced_token_stays(lives: Lives) -> None:
-    """No later control makes another, whether or not it knows of the announcement."""
+    """No later control makes a new token, whether or not it knows of the announcement."""
     tokens = lives.next()
     text = await tokens.first()
     tokens.first_token_shown()
@@ -75,7 +75,7 @@ async def test_an_announced_token_stays(lives: Lives) -> None:
 
 
 async def test_a_late_notice_of_the_announcement_counts(lives: Lives) -> None:
-    """Control died before the supervisor's notice: the next one gets it first, and makes no other token."""
+    """Control died before the supervisor's notice: the next control gets the notice first and makes no new token."""
     text = await lives.next().first()
     tokens = lives.next()
     tokens.first_token_shown()
@@ -91,7 +91,7 @@ async def test_an_old_state_gets_no_first_token(lives: Lives) -> None:
 
 
 async def test_a_token_that_cannot_be_stored_is_void(lives: Lives, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its text is never announced, and it does not block the next one of its name."""
+    """The text of such a token is never announced, and a later token may use its name."""
     tokens = lives.next()
     assert lives.store is not None
 

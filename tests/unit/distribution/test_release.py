@@ -28,7 +28,7 @@ def released(tmp_path: Path) -> Path:
 
 
 def checks(folder: Path) -> bool:
-    """Whether the two commands of docs/install.md, with openssl and coreutils, accept it."""
+    """Whether the two commands of docs/install.md (openssl and coreutils) accept the release."""
     signature = folder.parent / "signature"
     decoded = subprocess.run(
         ["base64", "--decode", "SHA256SUMS.sig"], cwd=folder, capture_output=True, check=False
@@ -53,7 +53,7 @@ def checks(folder: Path) -> bool:
 
 
 def test_standard_tools_check_it(released: Path) -> None:
-    """An unchanged release is accepted; a second one of the same files has the same sums."""
+    """An unchanged release is accepted; a second release of the same files has the same sums."""
     assert checks(released)
 
 

@@ -55,7 +55,7 @@ NUMBERS = (
 
 
 class Control:
-    """A running appliance, as an export sees it."""
+    """A running appliance, as an export finds it."""
 
     def __init__(self, log: AuditLog) -> None:
         self.log = log
@@ -135,7 +135,7 @@ class Control:
         return None
 
     def exported(self, place: Path, since: int | None = None, until: int | None = None) -> Path:
-        """Return a bundle in a file."""
+        """Write a bundle to a file and return its path."""
         span = TimeSpan(self.begun if since is None else since, time.time_ns() if until is None else until)
         place.write_bytes(b"".join(export(self.log.path, span, self.ask)))
         return place

@@ -1,4 +1,4 @@
-"""A bundle has the events and the rules in force, and proves itself with only Python and openssl."""
+"""A bundle has the events and the rules in force, and is verified with only Python and openssl."""
 
 import ast
 import hashlib
@@ -72,7 +72,7 @@ def pem(key: Ed25519PrivateKey, tmp_path: Path) -> Path:
 
 
 class Reviewer:
-    """Runs the verifier in this process; `said` is its output."""
+    """Runs the verifier in this process; `said` has its output."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str], key: Path) -> None:
         self._capsys = capsys
@@ -118,7 +118,7 @@ def test_an_old_python_runs_the_verifier(tmp_path: Path) -> None:
 
 
 def test_it_has_the_events_and_the_rules_in_force(bundle: Path, control: Control) -> None:
-    """It has all records of the time, earlier loads, and signed texts, but no other revisions."""
+    """A bundle has all records of its time span, earlier loads, and signed texts, but no other revisions."""
     found = members_of(bundle)
     specifications = ["%2E%2E/b%0A.rv", "a.rv", "msg/p/T.msg"]
     assert list(found) == [
@@ -150,7 +150,7 @@ def test_the_same_time_is_the_same_bundle(control: Control, tmp_path: Path) -> N
 
 
 def test_every_change_of_a_member_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """Every byte of small members and a sample of the others are changed: each time the member is named."""
+    """Every byte of small members, and a sample of the others, is changed; each change names its member."""
     members, chance = members_of(bundle), random.Random(5)  # noqa: S311  the same each time
     for name, data in members.items():
         places = range(len(data)) if len(data) <= 40 else chance.sample(range(len(data)), examples(12))
@@ -166,7 +166,7 @@ def test_every_change_of_a_member_is_named(bundle: Path, tmp_path: Path, reviewe
 def test_removed_added_or_exchanged_members_are_named(
     bundle: Path, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """Covers each member removed, cut or replaced by another, and extra files."""
+    """Covers each member removed, cut, or replaced by another member, and extra files."""
     members = members_of(bundle)
     for name, data in members.items():
         without = {other: data for other, data in members.items() if other != name}
@@ -219,14 +219,14 @@ def test_a_bundle_cannot_control_the_terminal(bundle: Path, tmp_path: Path, revi
 
 
 def test_a_missing_bundle_is_named(tmp_path: Path, reviewer: Reviewer) -> None:
-    """The error has words and no number."""
+    """The error explains the cause without an errno."""
     assert reviewer.status(tmp_path / "gone.zip") == 2
     assert reviewer.said == f"nothing can be verified: {tmp_path}/gone.zip: No such file or directory\n"
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "proof.json", "records.ndjson"])
 def test_large_members_use_little_memory(bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str) -> None:
-    """A text of 100 MB that is small in the ZIP file is read in pieces."""
+    """A text of 100 MB that is small in the ZIP file is read piece by piece."""
     place = tmp_path / "x.zip"
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
         for member, data in members_of(bundle).items():
@@ -240,7 +240,7 @@ def test_large_members_use_little_memory(bundle: Path, tmp_path: Path, reviewer:
 
 
 def test_a_duplicate_name_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """Tools differ in which of the two they unpack."""
+    """Tools differ in which of two members with the same name they unpack."""
     with zipfile.ZipFile(bundle, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
         archive.writestr("policies/7.ini", members_of(bundle)["policies/7.ini"])
     assert reviewer.status(bundle) == 1
@@ -248,7 +248,7 @@ def test_a_duplicate_name_is_named(bundle: Path, tmp_path: Path, reviewer: Revie
 
 
 def test_a_cut_or_damaged_file_is_never_valid(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """After any cut or changed byte it is invalid, or a header differs and each text is unchanged."""
+    """After a cut or a changed byte the bundle is invalid, or only a header differs and each text is unchanged."""
     whole, members, chance = bundle.read_bytes(), members_of(bundle), random.Random(6)  # noqa: S311  the same each time
     place = tmp_path / "damaged.zip"
     for length in [0, 1, len(whole) - 1, *chance.sample(range(len(whole)), 5)]:
@@ -266,7 +266,7 @@ def test_a_cut_or_damaged_file_is_never_valid(bundle: Path, tmp_path: Path, revi
 
 
 def _longer(place: Path) -> bytes:
-    """Return a bundle whose last member counts four bytes more, which no tool unpacks."""
+    """Return a bundle whose last member's size is four bytes too large, which no tool unpacks."""
     with zipfile.ZipFile(place) as archive:
         last, end, whole = archive.infolist()[-1], archive.start_dir, place.read_bytes()
     whole = whole[:end] + b"evil" + whole[end:]
@@ -280,7 +280,7 @@ def _longer(place: Path) -> bytes:
 
 
 def test_data_outside_members_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """ZIP tools do not show data before, between and after members, in comments and in extra fields."""
+    """ZIP tools hide data before, between and after members, in comments, and in extra fields; here it is named."""
     members, place = members_of(bundle), tmp_path / "x.zip"
     whole = bundle.read_bytes()
 
@@ -378,7 +378,7 @@ def test_an_empty_file_is_not_a_bundle(bundle: Path, tmp_path: Path, reviewer: R
 def test_a_zip_bomb_is_not_unpacked(
     bundle: Path, tmp_path: Path, reviewer: Reviewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A ZIP file with overlapping members, or that unpacks to too much, is not read."""
+    """A ZIP file whose members overlap, or that unpacks to too much, is not read."""
     monkeypatch.setattr(bundle_verifier, "UNPACKED", 1 << 20)
     place, many = tmp_path / "x.zip", bytes(1 << 25)
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -407,7 +407,7 @@ def test_runs_are_in_order(bundle: Path, tmp_path: Path, reviewer: Reviewer, run
 
 
 def test_many_runs_take_few_steps() -> None:
-    """The lookup of a record takes as many steps as the number of runs has bits."""
+    """A lookup takes about as many comparisons as the number of runs has bits."""
     asked = 0
 
     class Counted(int):
@@ -441,7 +441,7 @@ def resealed(members: Members) -> Members:
 
 
 def lines(members: Members, change: Callable[[list[dict[str, Any]]], None]) -> Members:
-    """Return the bundle with other records."""
+    """Return a bundle whose lines the forger replaced."""
     records = [json.loads(line) for line in members["records.ndjson"].splitlines()]
     change(records)
     text = "".join(json.dumps(record, separators=(",", ":")) + "\n" for record in records)
@@ -499,7 +499,7 @@ def test_another_policy_with_a_matching_manifest_is_named(
 def test_a_bundle_of_another_key_is_invalid(
     bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A forger's own key does not convince a reviewer with the right one."""
+    """The signature of a forger's own key is rejected if the reviewer has the right key."""
     other = Ed25519PrivateKey.generate().public_key()
     place = tmp_path / "other.pub"
     place.write_bytes(other.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
@@ -511,7 +511,7 @@ def test_a_bundle_of_another_key_is_invalid(
 def test_copied_checkpoints_show_a_rewritten_history(
     bundle: Path, control: Control, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """They agree, or the first that differs is named; an unsigned copy proves nothing."""
+    """The copied checkpoints agree, or the first that differs is named; an unsigned copy proves nothing."""
     assert reviewer.status(bundle, "--json") == 0
     said = json.loads(reviewer.said)
     assert (said["ok"], said["findings"], said["kept_elsewhere"]) == (True, [], 0)
@@ -529,7 +529,7 @@ def test_copied_checkpoints_show_a_rewritten_history(
 
 
 def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
-    """The bag matches the hash in the log, with the time and the reason of the recording; another bag is named."""
+    """The bag matches the hash in the log and has the recording's time and reason; a different bag is named."""
     bag = random.Random(7).randbytes(3 << 20)  # noqa: S311  the same each time
     trigger = Trigger(control.begun, "drop", "r", "<b>\x1b")
     kept = control.record(tmp_path, bag, triggers=[trigger], topics=[example(RecordedTopic, topic="/scan")])
@@ -554,7 +554,7 @@ def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Rev
 
 
 def test_unproven_facts_are_listed(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
-    """Covers a load without a hash, a text that the appliance lost, and a time before the first load."""
+    """Covers a load without a hash, a text that the appliance lost, and time before the first load."""
     control.load_policy(8, "[Nodes]\n", sha256=None)
     control.work(3)
     control.load_policy(9, "[Nodes]\n# nine\n")
@@ -574,7 +574,7 @@ def _as_before(previous: bytes, columns: tuple[object, ...]) -> bytes:
 def test_a_load_before_the_upgrade_is_listed_as_unproven(
     make_log: MakeLog, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """A bundle of version 0.1.0 is valid; it lists that no checkpoint covers its load."""
+    """A bundle of version 0.1.0 is valid; the result says that no checkpoint covers its load."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("appliance.audit.log_writer.record_hash", _as_before)
         before = Control(make_log(checkpoint_seconds=3600))
@@ -600,7 +600,7 @@ def test_a_load_before_the_upgrade_is_listed_as_unproven(
 def test_records_removed_by_retention_are_listed(
     make_log: MakeLog, path: Path, notary: Notary, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """Removed loads are named, and that the state before them is unknown."""
+    """The result names the removed loads and says that the state before them is unknown."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log))
@@ -654,7 +654,7 @@ def test_an_export_needs_the_signer(path: Path, monkeypatch: pytest.MonkeyPatch,
 
 
 def test_a_text_changed_during_the_export_ends_it(control: Control) -> None:
-    """The written text matches the manifest, or the export fails."""
+    """If a text changes during the export, the bundle matches its manifest or the export fails."""
     pieces = export(control.log.path, TimeSpan(control.begun, time.time_ns()), control.ask)
     control.policies[7] = "[Nodes]\n"
     with pytest.raises(BundleError, match=r"policies/7\.ini changed during the export"):

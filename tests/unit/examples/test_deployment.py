@@ -37,7 +37,7 @@ def test_the_role_checks_before_it_writes() -> None:
 
 
 def test_cloud_init_writes_valid_files(tmp_path: Path) -> None:
-    """Its policy compiles, and its configuration names it without a mistake."""
+    """The policy that cloud-init writes compiles, and its configuration names that policy without a mistake."""
     files = written()
     policy = compile_policy(files["/etc/rosrv/policies/robot.ini"], file="robot.ini")
     assert list(policy.warnings) == []

@@ -1,4 +1,4 @@
-"""The simulated drive is deterministic, and its recording has what was published."""
+"""The simulated drive is deterministic, and its recording has every published message."""
 
 from pathlib import Path
 
@@ -17,14 +17,14 @@ def test_two_drives_are_equal() -> None:
 
 
 def test_the_base_stops_without_commands() -> None:
-    """Each part follows its commands; the last one counts for half a second."""
+    """Each part follows its commands; the last command counts for half a second."""
     drive = Simulation().run(SHORT)
     assert drive.poses[-1].x == pytest.approx(1.0, abs=0.11)
     assert [shot.fired for shot in drive.shots] == [True]
 
 
 def test_the_recording_has_every_message_in_order(tmp_path: Path) -> None:
-    """It has the time, the topic, the bytes and the definition of each type."""
+    """Each message has its time, topic and bytes, and each type its definition."""
     drive = Simulation().run(SHORT)
     record(drive, tmp_path / "drive.bag")
     with Reader(tmp_path / "drive.bag") as reader:
@@ -37,7 +37,7 @@ def test_the_recording_has_every_message_in_order(tmp_path: Path) -> None:
 
 
 def test_missing_fields_are_zero() -> None:
-    """Given fields are read back."""
+    """Fields that were not given are read back as zero, given fields unchanged."""
     messages = Messages()
     data = messages.encode("nav_msgs/Odometry", pose__pose__position={"x": 2.0}, child_frame_id="base_link")
     odometry = messages.decode("nav_msgs/Odometry", data)

@@ -20,7 +20,7 @@ KNOWN = {metric.name: metric for metric in METRICS}
 
 
 def expressions() -> Iterator[tuple[str, str, str]]:
-    """Yield panel, query and legend of each series, also of annotations."""
+    """Yield panel, query and legend of each series, including annotations."""
     for panel in PANELS:
         yield from ((panel["title"], target["expr"], target["legendFormat"]) for target in panel["targets"])
     yield from ((one["name"], one["expr"], "") for one in DASHBOARD["annotations"]["list"])
@@ -98,6 +98,6 @@ def test_options_are_complete(panel: dict[str, Any]) -> None:
 
 
 def test_the_data_source_is_a_variable() -> None:
-    """Prometheus and the appliance are chosen in its header, so that it can be imported unchanged."""
+    """The data source and the appliance are chosen in the dashboard's header, so it can be imported unchanged."""
     assert [one["name"] for one in DASHBOARD["templating"]["list"]] == ["source", "instance"]
     assert {panel["datasource"]["uid"] for panel in PANELS} == {"${source}"}

@@ -1,4 +1,4 @@
-"""The simulated LandShark moves and measures by its geometry."""
+"""The simulated LandShark moves and measures according to its geometry."""
 
 import importlib.util
 import math
@@ -14,7 +14,7 @@ FILE = Path(__file__).parents[3] / "examples" / "landshark" / "nodes" / "physics
 
 
 def load() -> ModuleType:
-    """Load the module by its file, as the nodes do: it is not in a package."""
+    """Load the module from its file, as the nodes do: the module is not in a package."""
     spec = importlib.util.spec_from_file_location("landshark_physics", FILE)
     assert spec is not None
     assert spec.loader is not None
@@ -100,6 +100,6 @@ def test_position_on_earth() -> None:
 
 
 def test_battery_is_never_negative() -> None:
-    """Driving uses more charge than quota class still."""
+    """Driving uses more charge than standing still; the charge never falls below zero."""
     assert physics.drained(1.0, 1.0, 10) < physics.drained(1.0, 0.0, 10) < 1.0
     assert physics.drained(0.001, 2.0, 1000) == 0.0

@@ -33,7 +33,7 @@ def test_metrics_of_alerts_exist() -> None:
 
 
 def test_every_alert_has_an_explanation_and_advice() -> None:
-    """The person on duty reads what happened and the next step; events of records exist."""
+    """The person on duty reads the cause and the next step; events that an alert names exist."""
     for rule in rules():
         notes = rule["annotations"]
         assert set(notes) == {"summary", "what_to_do"}, rule["alert"]

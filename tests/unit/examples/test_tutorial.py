@@ -30,7 +30,7 @@ def said(*arguments: str) -> list[str]:
 
 
 def shown(command: str) -> list[str]:
-    """Return the outputs that the page shows below a command."""
+    """Return the outputs that the page prints below a command."""
     return [
         line.strip()
         for block in re.findall(rf"    \$ {re.escape(command)}\n((?:    [^$\n].*\n)*)", PAGE)
@@ -39,7 +39,7 @@ def shown(command: str) -> list[str]:
 
 
 def test_the_page_quotes_check(folder: Path) -> None:
-    """First the errors, then the success."""
+    """The page has the errors first, then the success."""
     (folder / "gun.rv").write_text(FIRST)
     wrong = said("check", "my-monitors/gun.rv")
     (folder / "gun.rv").write_text(RIGHT)
@@ -47,7 +47,7 @@ def test_the_page_quotes_check(folder: Path) -> None:
 
 
 def test_the_page_quotes_run(folder: Path) -> None:
-    """The output of the simulated mission is the same, to the millisecond."""
+    """The output of the simulated mission equals the page's, to the millisecond."""
     (folder / "gun.rv").write_text(RIGHT)
     record(Simulation().run(), Path("mission.bag"))
     found = said("run", "my-monitors/gun.rv", "--bag", "mission.bag")
@@ -55,7 +55,7 @@ def test_the_page_quotes_run(folder: Path) -> None:
 
 
 def test_the_second_one_locks_after_two_in_a_row(folder: Path) -> None:
-    """A single shot at the robot does not lock; the joint states always pass."""
+    """A single shot at the robot does not lock the gun; the joint states always pass."""
     (folder / "gun.rv").write_text(SECOND)
     guarded = Simulation([folder / "gun.rv"]).run()
     assert [one.result for one in guarded.messages if one.topic == TRIGGERED] == [

@@ -39,7 +39,7 @@ class Kept:
         self.torn = False
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Store the messages; with `torn`, only the first half before a failure."""
+        """Store the messages; with `torn`, store only the first half and fail."""
         if self.torn:
             self.lines += messages[: len(messages) // 2]
             raise ConnectionResetError("cut in the middle")
@@ -74,7 +74,7 @@ def forwarder(path: Path, kept: Kept, chosen: Chosen = "all") -> LogForwarder:
 
 
 def run(one: LogForwarder, steps: int = 100) -> None:
-    """Step until the forwarder has to wait."""
+    """Step the forwarder until it has to wait."""
     for _ in range(steps):
         if one.step() > 0:
             return
@@ -100,7 +100,7 @@ def everything(path: Path) -> list[int]:
 
 
 def test_the_whole_log_is_sent_in_order(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """Every record, also an old one, is sent once and in order; then the forwarder waits."""
+    """Every record, old ones included, is sent once and in order; then the forwarder waits."""
     log = make_log()
     record(log, 700)
     one = forwarder(path, kept)
@@ -151,7 +151,7 @@ def test_it_continues_after_a_restart(make_log: MakeLog, path: Path, kept: Kept)
 
 
 def test_a_killed_forwarder_repeats_its_batch(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """No record is missing, some arrive twice."""
+    """No record is missing, but some arrive twice."""
     log = make_log()
     record(log, 300)
     first = forwarder(path, kept)
@@ -253,7 +253,7 @@ def test_an_old_log_has_no_missed_records(make_log: MakeLog, path: Path, kept: K
 
 
 def test_another_log_is_sent_from_its_start(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """A new log at the same path is forwarded from its beginning."""
+    """If a new log appears at the same path, the forwarder sends it from its beginning."""
     log = make_log()
     record(log, 20)
     one = forwarder(path, kept)
@@ -269,14 +269,14 @@ def test_another_log_is_sent_from_its_start(make_log: MakeLog, path: Path, kept:
 
 
 def test_a_missing_log_is_waited_for(path: Path, kept: Kept) -> None:
-    """The forwarder reports it and tries again."""
+    """The forwarder reports the missing log and tries again."""
     one = forwarder(path, kept)
     assert one.step() > 0
     assert "no audit log yet" in one.progress.trouble
 
 
 def test_an_unreadable_position_stops_it(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """The reason is reported; no record is silently repeated or skipped."""
+    """The forwarder reports the reason and stops; it never silently repeats or skips a record."""
     record(make_log(), 3)
     path.with_name("position.json").write_text("rubbish")
     one = forwarder(path, kept)
@@ -296,7 +296,7 @@ def put_back(path: Path, copy: Path) -> None:
 def test_a_restored_log_is_continued(
     make_log: MakeLog, path: Path, kept: Kept, tmp_path: Path, later: int
 ) -> None:
-    """New records after a restore are sent, even with sequences that were sent before."""
+    """New records after a restore are sent, even if their sequences were sent before."""
     log = make_log(checkpoint_every=5)
     record(log, 20)
     log.close()
@@ -326,7 +326,7 @@ def test_a_restored_log_is_continued(
 
 
 def test_an_old_position_beyond_the_end_is_corrected(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """A position from an earlier version, ahead of the log, moves back to the log's end."""
+    """If the position of an earlier version is ahead of the log, it moves back to the log's end."""
     log = make_log()
     record(log, 5)
     (last,) = everything(path)[-1:]
@@ -343,7 +343,7 @@ def test_an_old_position_beyond_the_end_is_corrected(make_log: MakeLog, path: Pa
 def test_records_removed_while_reading_are_counted(
     make_log: MakeLog, path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Records removed between the query of the log's range and the reading count as missed."""
+    """Records removed after the log's range was queried and before they were read count as missed."""
     log = make_log()
     record(log, 30)
     one = forwarder(path, kept)

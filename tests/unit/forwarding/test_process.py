@@ -37,13 +37,13 @@ class Control:
 
 
 def missed(count: int) -> messages.ForwardingReported:
-    """Return the report of this number of missed records."""
+    """Return the report that this number of records was missed."""
     return messages.ForwardingReported(missed=count)
 
 
 @pytest.fixture
 def controls() -> list[Control]:
-    """Return the list of controls, the current one last; none at first."""
+    """Return the list of controls, the current one last; the list is empty at first."""
     return []
 
 
@@ -87,7 +87,7 @@ async def test_records_missed_before_the_first_link_are_reported(
 async def test_records_missed_between_two_controls_are_reported(
     controls: list[Control], reports: ProgressReports
 ) -> None:
-    """The second control records only what the first did not."""
+    """The second control records only the gaps that the first did not record."""
     begin(controls, reports, missed(0))
     reports.tell(missed(5))
     gone = controls.pop()

@@ -41,7 +41,7 @@ def test_udp_sends_datagrams() -> None:
 
 
 def test_tcp_counts_octets() -> None:
-    """Each message has its length before it, on one connection that stays open."""
+    """Each message is sent with its length before it, on one connection that stays open."""
     with StreamCollector() as collector:
         receiver = StreamReceiver(HOST, collector.port)
         receiver.send([message(1), message(2)])
@@ -53,7 +53,7 @@ def test_tcp_counts_octets() -> None:
 
 
 def test_a_closed_connection_is_an_error() -> None:
-    """The error comes before more messages count as sent; the next connection works."""
+    """The error is raised before further messages count as sent; the next connection works."""
     with StreamCollector() as collector:
         receiver = StreamReceiver(HOST, collector.port)
         receiver.send([message(1)])
@@ -72,7 +72,7 @@ def test_a_closed_connection_is_an_error() -> None:
 
 
 def test_a_receiver_that_reads_nothing_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unacknowledged data does not count as sent: an error comes within the timeout."""
+    """Unacknowledged data does not count as sent: the error is raised within the timeout."""
     monkeypatch.setattr("appliance.forwarding.receiver._SEND_SECONDS", 0.3)
     with socket.socket() as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -86,7 +86,7 @@ def test_a_receiver_that_reads_nothing_is_an_error(monkeypatch: pytest.MonkeyPat
 
 
 def test_tls_checks_the_receiver(certificates: Certificates) -> None:
-    """The receiver shows a certificate of the given authority, for its address or the given name."""
+    """The certificate must be from the given authority, for the receiver's address or the given name."""
     with StreamCollector(context=server_context(certificates)) as collector:
         for name in (None, "logs.example"):
             receiver = StreamReceiver(
@@ -110,7 +110,7 @@ def test_a_wrong_certificate_gets_nothing(certificates: Certificates, tmp_path: 
 
 
 def test_tls_with_client_certificates(certificates: Certificates) -> None:
-    """The receiver accepts ours; without it, the refusal is an error although TLS 1.3 reports it late."""
+    """The receiver accepts our certificate; without one, its refusal is an error although TLS 1.3 reports it late."""
     with StreamCollector(context=server_context(certificates, clients=True)) as collector:
         receiver = StreamReceiver(
             HOST,
@@ -136,7 +136,7 @@ def test_unreadable_files_are_errors(tmp_path: Path, certificates: Certificates)
 
 
 def test_a_receiver_without_tls_gets_nothing(certificates: Certificates) -> None:
-    """If TLS is configured, such a receiver is an error and gets no record."""
+    """If TLS is configured, a receiver without TLS is an error and gets no record."""
     with socket.socket() as listener:
         listener.bind((HOST, 0))
         listener.listen(1)

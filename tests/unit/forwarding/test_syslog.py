@@ -1,4 +1,4 @@
-"""Tests of records as messages of RFC 5424, parsed by its grammar."""
+"""Tests of records as RFC 5424 messages, parsed by the grammar of the RFC."""
 
 import json
 from typing import Any
@@ -63,12 +63,12 @@ def test_a_denial_has_all_its_parameters() -> None:
     ],
 )
 def test_severities_are_mapped(severity: Severity, number: int) -> None:
-    """Each severity has its own in syslog: an alarm is an alert."""
+    """Each severity has its own syslog severity: an alarm is an alert."""
     assert parse(formatter().record(entry(severity=severity))).severity == number
 
 
 def test_the_event_is_the_message_id() -> None:
-    """Spaces of the event are replaced."""
+    """Spaces in the event's name are replaced."""
     assert parse(formatter().record(entry(event="denials folded"))).event == "denials-folded"
 
 
@@ -90,7 +90,7 @@ def test_names_of_unknown_hosts_are_escaped(
 
 
 def test_a_name_cannot_inject_fields() -> None:
-    """A name that looks like the end of an element, or a second message, is the value of its parameter."""
+    """A name that looks like the end of an element, or like a second message, stays inside its parameter."""
     evil = '/x"] [rosrv@32473 decision="allow"]\n<0>1 - - - - - -'
     message = parse(formatter().record(entry(caller_id=evil, decision="deny")))
     assert message.fields["decision"] == "deny"
@@ -128,7 +128,7 @@ def test_a_message_fits_a_datagram() -> None:
 
 @pytest.mark.parametrize("time", [-1, 0, 2**62, -(2**62)])
 def test_any_time_is_valid(time: int) -> None:
-    """A wrong clock makes no message that a receiver rejects."""
+    """Even with a wrong clock, the receiver accepts the message."""
     parse(formatter().record(entry(time=time)))
 
 

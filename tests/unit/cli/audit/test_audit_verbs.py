@@ -1,4 +1,4 @@
-"""`rosrv audit` on terminals and full disks, and while it follows; `audit.txt` and `signed.txt` have the rest."""
+"""`rosrv audit` on terminals and full disks, and in follow mode; `audit.txt` and `signed.txt` have the rest."""
 
 import contextlib
 import json
@@ -50,7 +50,7 @@ def test_every_recorded_category_is_known() -> None:
 
 
 def test_search_on_a_terminal_is_a_table(state: Path) -> None:
-    """On a terminal there is a table, and no escape code of an unknown host has an effect."""
+    """A terminal gets a table, in which escape codes from unknown hosts have no effect."""
     ours, theirs = pty.openpty()
     command = [sys.executable, "-m", "appliance.cli.main", "audit", "search", "--deny", "--state", str(state)]
     environment = os.environ | {"COLUMNS": "200", "TERM": "xterm"}

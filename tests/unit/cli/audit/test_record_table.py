@@ -33,7 +33,7 @@ def test_a_log_is_complete_only_once_something_is_signed(
 def test_a_table_of_records_has_their_numbers(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`rosrv audit why` and `rosrv policy grant` take them."""
+    """The table has the record numbers that `rosrv audit why` and `rosrv policy grant` take as arguments."""
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "dumb")
     print_entries([LogEntry(4711, AuditRecord(id="0" * 20, time=0, event="decision", decision="deny"))])

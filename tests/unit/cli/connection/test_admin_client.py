@@ -12,7 +12,7 @@ NO_TEXT = "alice\udcff"
 
 
 def test_it_waits_for_the_slowest_answer() -> None:
-    """It waits longer than REST does for the slowest order: a new host."""
+    """The client waits longer than the slowest order of REST takes: adding a host."""
     assert max(operation.seconds for operation in OPERATIONS) < admin_client.SECONDS
 
 

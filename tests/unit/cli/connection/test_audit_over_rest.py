@@ -19,7 +19,7 @@ END = 'data: {"reason": "the token has expired"}'
 
 
 class Answer:
-    """An answer with these lines, after which the connection breaks unless it ends."""
+    """An answer with these lines; unless `ends` is set, the connection breaks after the last line."""
 
     def __init__(self, lines: list[str], *, breaks: bool) -> None:
         self._lines = lines
@@ -33,7 +33,7 @@ class Answer:
 
 
 class Rest:
-    """REST that gives these answers to streams in turn, and an empty log otherwise."""
+    """REST that gives these answers to streams in turn, and an empty log to other requests."""
 
     url = "https://robot"
 
@@ -77,7 +77,7 @@ def line(sequence: int) -> str:
 def test_refused_streams_raise_the_errors_of_a_file(
     refusal: RestProblemError, told: type[Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An export and a stream that REST refuses raise the same errors as the log's file."""
+    """If REST refuses an export or a stream, the caller gets the same errors as from the log's file."""
     monkeypatch.setattr(audit_rest, "_AGAIN_SECONDS", 0.0)
     with pytest.raises(told, match=refusal.lines[0]):
         list(log_of(refusal).export(Filter()))

@@ -63,7 +63,7 @@ CERTIFICATES = {"right": {}, "other": {}, "elsewhere": {"address": "10.9.9.9"}, 
 def test_an_untrusted_certificate_gets_nothing(
     tmp_path: Path, served: str, trusted: str | None, said: str
 ) -> None:
-    """Unknown, for another name, expired, or missing: nothing is sent, and each has its own message."""
+    """An unknown, expired or missing certificate, or one for another name, has its own message, and nothing is sent."""
     contexts = {name: certificate(tmp_path / name, **given) for name, given in CERTIFICATES.items()}  # type: ignore[arg-type]  # a table
     (tmp_path / "text").write_text("nothing")
     with FakeAppliance(contexts[served]) as fake:
@@ -74,7 +74,7 @@ def test_an_untrusted_certificate_gets_nothing(
 
 
 def test_a_trusted_certificate_gets_the_request(tmp_path: Path) -> None:
-    """The option and the environment name the certificate; https to a server without TLS is an error."""
+    """The option or the environment names the certificate; https to a server without TLS is an error."""
     right = str(tmp_path / "right.pem")
     with FakeAppliance(certificate(Path(right))) as fake:
         fake.problem(403, "refused", "reached")
@@ -87,7 +87,7 @@ def test_a_trusted_certificate_gets_the_request(tmp_path: Path) -> None:
 
 
 def test_deeply_nested_json_is_an_error_of_the_server() -> None:
-    """The answer of another server does not exhaust the stack."""
+    """A deeply nested answer of another server does not exhaust the stack."""
     with FakeAppliance() as fake:
         fake.body = b"[" * 100_000
         done = rosrv("status", "--api", fake.url, ROSRV_TOKEN=TOKEN)

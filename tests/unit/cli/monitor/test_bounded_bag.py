@@ -37,7 +37,7 @@ def record(fields: dict[str, bytes], data: bytes) -> bytes:
 
 
 def bag(place: Path, chunks: list[tuple[str, bytes, list[tuple[int, int]]]]) -> Path:
-    """Write a bag with these chunks: compression, packed bytes, seconds and offset of each message."""
+    """Write a bag with these chunks, each given by compression, packed bytes, and its messages' seconds and offsets."""
     out = bytearray(b"#ROSBAG V2.0\n" + bytes(4096))
     infos = b""
     for compression, packed, entries in chunks:
@@ -92,7 +92,7 @@ def test_a_chunk_is_unpacked_up_to_a_limit(
 def test_a_damaged_chunk_is_reported(
     name: str, pack: Callable[[bytes], bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A cut chunk, an invalid one, and an empty one end with the reason."""
+    """A cut, invalid or empty chunk ends the command with the reason."""
     packed = pack(message(1, b"x" * 1000))
     for wrong in (packed[:-4], b"?" * 50, b"", packed[:20] + b"?" * 20 + packed[40:]):
         assert "is damaged" in refusal(bag(tmp_path / "x.bag", [(name, wrong, [(1, 0)])]), capsys)
@@ -101,7 +101,7 @@ def test_a_damaged_chunk_is_reported(
 def test_repeated_reading_is_bounded(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Alternating chunks, entries for one message, and repeated connections share one limit."""
+    """Alternating chunks, several entries for one message, and repeated connections share one limit."""
     monkeypatch.setattr(bounded_bag, "LARGEST_CHUNK", 1 << 20)
     monkeypatch.setattr(bounded_bag, "PER_BYTE", 4)
     large = bz2.compress(message(0, b"") * 1 + bytes(1 << 17))
@@ -121,7 +121,7 @@ def test_repeated_reading_is_bounded(
 
 
 def test_chunks_cannot_share_an_index(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A hundred index entries for one chunk do not count its messages a hundred times."""
+    """A hundred index entries for one chunk count its messages only once."""
     place = bag(tmp_path / "x.bag", [("none", message(1, b""), [(1, 0)] * 1000)])
     data = place.read_bytes()
     info = data[data.index(record(*CONNECTION)) + len(record(*CONNECTION)) :]

@@ -20,7 +20,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def test_a_learned_specification_accepts_its_recording(drive: str, tmp_path: Path) -> None:
-    """The file passes `check` without a warning, beside the robot's own definitions, and drops no message."""
+    """The file passes `check` without warnings beside the robot's own definitions, and drops no message."""
     out = str(tmp_path / "learnt.rv")
     assert rosrv("monitor", "learn", "--bag", drive, "--out", out).returncode == 0
     checked = rosrv("monitor", "check", out)
@@ -35,7 +35,7 @@ def test_a_learned_specification_accepts_its_recording(drive: str, tmp_path: Pat
 
 
 def test_json_lists_the_evidence(drive: str) -> None:
-    """One object for each condition, of the chosen topics only."""
+    """The output is one object for each condition of the chosen topics."""
     learnt = rosrv("monitor", "learn", "--bag", drive, "--topic", "*/odom", "--json").stdout
     rows = [json.loads(line) for line in learnt.splitlines()]
     assert {row["topic"] for row in rows} == {"/landshark/odom"}
@@ -44,7 +44,7 @@ def test_json_lists_the_evidence(drive: str) -> None:
 
 
 def test_coverage_lists_what_never_happened(drive: str) -> None:
-    """Output is a table with missing events, one object each with `--json`, and an exit status for pipelines."""
+    """The missing events are a table, or with `--json` one object each; the exit status tells a pipeline."""
     file = str(MONITORS / "logging.rv")
     result = rosrv("monitor", "coverage", file, "--bag", drive, "--fail-under", "80")
     assert result.returncode == 0

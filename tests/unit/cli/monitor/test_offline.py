@@ -1,4 +1,4 @@
-"""Return to the folder's specifications while the appliance does not run."""
+"""Resetting to the folder's specifications while the appliance is stopped."""
 
 import json
 from pathlib import Path

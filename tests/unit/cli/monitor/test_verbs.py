@@ -12,7 +12,7 @@ from tests.support.command import rosrv
 
 
 def test_proving_needs_the_prover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exit status 2 and the package to install, before anything is checked."""
+    """Without the prover, the exit status is 2 and the error names the package to install; nothing is checked."""
     (tmp_path / "a.rv").write_text("a() { event e() /t std_msgs/Empty '{}' { } }")
     monkeypatch.setattr("rosmop.tool.check_command.find_spec", lambda name: None)
     result = rosrv("monitor", "check", str(tmp_path / "a.rv"), "--prove")

@@ -55,7 +55,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
 
 
 def test_a_valid_setup_passes(place: Place) -> None:
-    """Exit status 0; every line has a result; as root the kernel was tried and left unchanged."""
+    """The exit status is 0 and every check has a result; as root the kernel test ran and left nothing changed."""
     need_root()
     status, found = place.run()
     assert status == 0, found
@@ -67,7 +67,7 @@ def test_a_valid_setup_passes(place: Place) -> None:
 
 
 def test_a_used_port_names_its_program(place: Place) -> None:
-    """The failure has the address, the program that uses it, and advice."""
+    """The failure names the address, the program that uses it, and the remedy."""
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         place.lines[2] = f"listen: 127.0.0.1:{port}"
@@ -98,7 +98,7 @@ def test_a_certificate_near_its_end_is_a_warning(place: Place) -> None:
 
 
 def test_a_crashing_check_is_a_finding() -> None:
-    """The other checks continue."""
+    """If one check crashes, the other checks continue."""
 
     def broken() -> Iterator[Any]:
         yield ok("one", "fine")
