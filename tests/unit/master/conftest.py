@@ -1,4 +1,4 @@
-"""Fixtures that the tests of control share."""
+"""Fixtures shared by the tests of control."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Small calls are sent one after the other. Calls that arrive in the meantime are sent together."""
+"""The first call is sent at once; small calls that arrive before its answer are sent together."""
 
 import asyncio
 from typing import Any
@@ -13,14 +13,14 @@ pytestmark = pytest.mark.anyio
 
 
 class Server:
-    """A connection that answers as the ROS master does, and remembers its requests."""
+    """A connection that answers as the ROS master does, and records its requests."""
 
     def __init__(self) -> None:
         self.travelled: list[tuple[str, tuple[Any, ...]]] = []
         self.broken = False
 
     async def call(self, method: str, *params: Any) -> Any:
-        """Echo, after a turn of the loop; the method `searchParam` is a fault."""
+        """Echo the call after a turn of the loop; the method `searchParam` gives a fault."""
         await asyncio.sleep(0)
         self.travelled.append((method, params))
         if self.broken:
@@ -68,7 +68,7 @@ def test_waiting_calls_are_sent_as_one_in_order() -> None:
 
 
 async def test_one_request_is_under_way_at_a_time() -> None:
-    """Calls wait for the answer to the request under way, also if its caller was cancelled."""
+    """Calls wait for the answer to the current request, even if its caller was cancelled."""
     server, go = Server(), asyncio.Event()
     answer = server.call
 
@@ -123,7 +123,7 @@ def test_many_calls_are_split(count: int) -> None:
 
 
 def test_values_are_sent_alone() -> None:
-    """A value, which may be large or unserializable, cannot fail another caller's call."""
+    """A value may be large or unserializable, so it is sent alone and cannot fail another caller's call."""
     server = Server()
     run(server, ("lookupNode", 0), ("setParam", 1), ("hasParam", 2), ("getParam", 3), ("lookupNode", 4))
     assert sorted(method for method, _ in server.travelled) == [
@@ -137,7 +137,7 @@ def test_values_are_sent_alone() -> None:
 
 
 def test_an_unserializable_call_is_its_callers_error() -> None:
-    """Each failure of a call reaches its caller; no caller waits for ever."""
+    """Each failure reaches the caller of that call; no caller waits forever."""
 
     async def call(_method: str, *_params: Any) -> Any:
         raise EncodingError("no notation")

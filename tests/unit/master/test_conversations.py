@@ -1,4 +1,4 @@
-"""Conversations of nodes with RVMaster, and the effects of each line, as text; no socket is opened.
+"""Conversations of nodes with RVMaster as text, with the effects of each line; no socket is opened.
 
 `conversations.txt` has them: a line at the margin is an action, the indented lines below it are its effects
 (`tests/support/conversation.py` describes the form).
@@ -41,7 +41,7 @@ _CONVERSATIONS = dict(text.strip().split("\n", 1) for text in _TEXTS)
 
 @pytest.mark.parametrize("title", _CONVERSATIONS)
 async def test_conversation(title: str) -> None:
-    """Each line has the effects below it, all of them and in that order."""
+    """Each action has exactly the effects below it, in that order."""
     written = _CONVERSATIONS[title].splitlines()
     conversation = Conversation(await ControlParts.begun(), **_POLICIES)
     took_place: list[str] = []

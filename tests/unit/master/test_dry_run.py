@@ -68,7 +68,7 @@ TREES = st.sampled_from([{}, {"x": 1}, {"x": {"y": 1}}, {"x": {"y": {"z": 1}}}])
 
 
 def text_of(written: dict[str, dict[str, str]]) -> str:
-    """Return the policy's file."""
+    """Return the text of the policy."""
     return "".join(
         f"[{name}]\n" + "".join(f"{key} = {who}\n" for key, who in lines.items())
         for name, lines in written.items()
@@ -90,7 +90,7 @@ def held(world: ControlParts) -> set[Row]:
 async def taken(
     policy: str, registrations: frozenset[Any], grants: frozenset[Any], tree: dict[str, Any]
 ) -> tuple[set[Row], set[Row], int]:
-    """Return the list of a dry run, the losses by the reload after it, and the number that the reload reports."""
+    """Return the dry run's list, the losses by the reload that follows, and the number that the reload reports."""
     world = await ControlParts.begun()
     world.parameters = mirror(tree)
     nodes: dict[tuple[str, str], Incarnation] = {}

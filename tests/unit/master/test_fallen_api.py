@@ -1,6 +1,6 @@
-"""A compromised api, played over its link, and control's answers to its messages.
+"""A compromised api, simulated at its end of the link, and control's answers to its messages.
 
-Control's own parts are real: the link, the tokens, their keys, the proofs. Orders are only noted.
+The link, the tokens, their keys and the proofs are control's own code. Orders are only recorded.
 """
 
 import socket
@@ -41,7 +41,7 @@ class World:
         self.begin(require_proof=False)
 
     def begin(self, *, require_proof: bool) -> None:
-        """Start control again with its saved tokens."""
+        """Start control again with the saved tokens."""
         self.tokens = TokenOrders(self.store, self, self.token_changed)  # type: ignore[arg-type]  # as above
         self.link = RestLink(self, self.tokens, self, served=print, require_proof=require_proof)  # type: ignore[arg-type]  # as above
 
@@ -49,12 +49,12 @@ class World:
         """Send no notification."""
 
     async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer[Any]:
-        """Note an order."""
+        """Record an order."""
         self.done.append((request, who))
         return AdminAnswer(True)
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
-        """Note a record."""
+        """Record an event."""
         self.recorded.append({"event": event, "reason": reason, **fields})
         return "id"
 
@@ -78,7 +78,7 @@ class Api:
     async def ask(
         self, request: AdminRequest[A], shown: str = "", asked: ClientRequest | None = None
     ) -> AdminAnswer[A]:
-        """Return control's answer."""
+        """Send a message and return control's answer."""
         self._answers += 1
         self.channel.send(RequestMade(self._answers, request, shown, asked))
         while True:
@@ -102,7 +102,7 @@ class Api:
         return msgspec.structs.replace(asked, proof=proof_of(token, challenge, stated))
 
     def close(self) -> None:
-        """End both ends."""
+        """Close both ends."""
         self.channel.close()
         self.control.close()
 
@@ -119,18 +119,18 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 @pytest.fixture
 async def token(world: World) -> str:
-    """Return the token of alice, an administrator."""
+    """Return the token of alice, an admin."""
     return (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
 
 
 @pytest.fixture
 async def api(world: World, token: str) -> Api:
-    """Return the api's end of a link that is made after the token."""
+    """Return the api's end of a link that is opened after the token was made."""
     return Api(world)
 
 
 async def test_public_data_of_a_token_opens_nothing(world: World) -> None:
-    """Names, ids, hashes and salts of unseen tokens neither order nor read anything."""
+    """Names, ids, hashes and salts of tokens do not allow any order or read."""
     row = await world.tokens.add(TokenAdd("alice", "admin", 600))
     api = Api(world)
     [kept] = world.tokens.usable()
@@ -160,7 +160,7 @@ async def test_a_signed_order_is_carried_out_unchanged(world: World, token: str,
 
 
 async def test_a_signed_order_is_valid_once(world: World, token: str) -> None:
-    """A repetition at once, over a new link or after a restart of control is refused and recorded."""
+    """A repetition, at once, over a new link or after a restart of control, is refused and recorded."""
     shown = reading_key(token)
     api = Api(world)
     kept_back = await api.signed(token, REVOKE)
@@ -192,7 +192,7 @@ async def test_a_signed_order_is_valid_once(world: World, token: str) -> None:
 async def test_no_byte_of_an_order_can_change(
     change: dict[str, Any], world: World, token: str, api: Api
 ) -> None:
-    """A request that is not byte for byte the signed one is refused, whatever order is passed on with it."""
+    """A request that differs in one byte from the signed one is refused, whatever order the api passes on with it."""
     forged = msgspec.structs.replace(await api.signed(token, REVOKE), **change)
     for order in (admin.HostRevoke("laptop", 3), admin.HostRevoke("laptoq", 3), admin.HostRevoke("laptop")):
         assert (await api.ask(order, reading_key(token), forged)).trouble == "forbidden"
@@ -210,7 +210,7 @@ async def test_no_byte_of_an_order_can_change(
 async def test_another_order_under_a_valid_proof_is_an_alarm(
     order: AdminRequest[Any], world: World, token: str, api: Api
 ) -> None:
-    """The proof is valid for the request, not for another order; only a compromised api sends one."""
+    """The proof is valid for the request but not for another order; only a compromised api sends such a pair."""
     signed = await api.signed(token, REVOKE)
     assert (await api.ask(order, reading_key(token), signed)).trouble == "forbidden"
     bare = msgspec.structs.replace(REVOKE, proof="")
@@ -222,7 +222,7 @@ async def test_another_order_under_a_valid_proof_is_an_alarm(
 
 
 async def test_a_proof_is_valid_for_its_signer_only(world: World) -> None:
-    """Bob's signed order with alice's reading key is not hers, and counts for bob's role only."""
+    """Bob's signed order with alice's reading key counts for bob's role only."""
     alice = (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
     bob = (await world.tokens.add(TokenAdd("bob", "operator", 600))).token
     api = Api(world)
@@ -235,7 +235,7 @@ async def test_a_proof_is_valid_for_its_signer_only(world: World) -> None:
 
 
 async def test_orders_of_a_revoked_token_are_refused(world: World, token: str, api: Api) -> None:
-    """An order that was signed before the revocation, and delayed by the api, is refused."""
+    """An order signed before the revocation and delayed by the api is refused."""
     kept_back = await api.signed(token, REVOKE)
     await world.tokens.revoke(TokenRevoke("alice"))
     for shown in (reading_key(token), token):
@@ -247,7 +247,7 @@ async def test_orders_of_a_revoked_token_are_refused(world: World, token: str, a
 
 
 async def test_a_reading_key_changes_nothing(world: World, token: str, api: Api) -> None:
-    """The reading key of a signing client opens the views, but no order without a proof."""
+    """The reading key of a signing client allows reading, but no order without a proof."""
     assert (await api.ask(admin.PolicyWanted(), reading_key(token))).ok
     refused = await api.ask(admin.PolicyLoad("[Nodes]\n", expected=3), reading_key(token), LOAD)
     assert "needs its proof" in refused.error
@@ -273,7 +273,7 @@ async def test_bare_tokens_are_accepted_by_configuration_only(
 
 
 async def test_a_token_of_an_earlier_version_stays_valid(world: World) -> None:
-    """A token without saved keys is sent itself and recognised by its hash; it cannot sign."""
+    """A token without saved keys is sent itself and recognised by its hash; its holder cannot sign."""
     row = await world.tokens.add(TokenAdd("alice", "admin", 600))
     token = row.token
     world.store.database.submit("DELETE FROM token_keys WHERE id = ?", (row.id,))

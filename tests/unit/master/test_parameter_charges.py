@@ -1,4 +1,4 @@
-"""The host that sets a parameter is charged for it, compared with a naive count of single parameters."""
+"""The host that sets a parameter is charged for it; a naive count of single parameters must agree."""
 
 import contextlib
 import copy
@@ -53,13 +53,13 @@ def charged(there: ParameterMirror) -> dict[Address, int]:
 
 
 class Ledger:
-    """Every namespace and value with its owner, as a dictionary: slow and simple."""
+    """Every namespace and value with its owner, in a simple and slow dictionary."""
 
     def __init__(self) -> None:
         self.owners: dict[tuple[str, ...], Address] = {(): APPLIANCE}
 
     def set(self, tree: Value, key: str, owner: Address) -> None:
-        """Note `tree` after this host has set the key."""
+        """Record that this host set the key to `tree`."""
         parts = tuple(parts_of(key))
         new = next(
             parts[:depth] for depth in range(len(parts) + 1) if self._is_new(tree, parts[:depth], parts)
@@ -98,7 +98,7 @@ def _places(value: Value, place: tuple[str, ...] = ()) -> dict[tuple[str, ...], 
 @settings(max_examples=examples(400))
 @given(st.lists(STEP, max_size=14))
 def test_the_host_that_set_a_parameter_is_charged(steps: list[tuple[str, str, Any, Address]]) -> None:
-    """After any sequence, restarts included: each host is charged for the names and values that it set last."""
+    """After any sequence, restarts included, each host is charged for the names and values that it set last."""
     owners, ledger = Owners(), Ledger()
     there = mirror(owners=owners)
     for do, key, value, host in steps:
@@ -121,7 +121,7 @@ def test_the_host_that_set_a_parameter_is_charged(steps: list[tuple[str, str, An
 @settings(max_examples=examples(400))
 @given(st.lists(STEP, max_size=20))
 def test_no_sequence_exceeds_a_quota(steps: list[tuple[str, str, Any, Address]]) -> None:
-    """No combination of hosts that set, replace, take over and delete exceeds a quota or the sum."""
+    """However hosts set, replace, take over and delete parameters, no quota and no total is exceeded."""
     there = mirror(bounds=BOUNDS, quota_class=quota_class)
     for do, key, value, host in steps:
         if do == "delete":
@@ -157,7 +157,7 @@ def test_a_value_can_always_be_replaced_by_one_of_its_size(
 
 
 def test_a_guest_fills_only_its_own_quota() -> None:
-    """The robot can set and overwrite any parameter after a guest has filled its quota; the guest gets the reason."""
+    """When a guest has filled its quota, the robot can still set any parameter; the guest gets the reason."""
     there = mirror(bounds=BOUNDS, quota_class=quota_class)
     for number in range(20):
         with contextlib.suppress(LimitReachedError):
@@ -173,7 +173,7 @@ def test_a_guest_fills_only_its_own_quota() -> None:
 
 
 def test_quota_is_reserved_during_a_call_of_rosmaster() -> None:
-    """Several concurrent values get no more room than one after the other."""
+    """Values that are set concurrently get no more room than values set one after the other."""
     there = mirror(whole=1000)
     kept = there.reserve("/a", measure("x" * 400)[0], GUEST)
     second = there.reserve("/b", measure("x" * 300)[0], GUEST)
@@ -186,13 +186,13 @@ def test_quota_is_reserved_during_a_call_of_rosmaster() -> None:
 
 
 def test_charges_survive_restarts_of_rosmaster_and_control() -> None:
-    """Control restarts with its state, or adopts the tree of the ROS master: the host that set it is charged."""
+    """After control restarts with its state, or adopts the ROS master's tree, the host that set a value is charged."""
     owners = Owners()
     there = mirror(owners=owners)
     put(there, "/guest/map", "x" * 1000, GUEST)
     put(there, "/robot/name", "r", ROBOT)
     before, tree = charged(there), copy.deepcopy(there.tree)
-    again = mirror({"robot": {"name": "r"}}, owners=owners)  # the large value was not saved before the end
+    again = mirror({"robot": {"name": "r"}}, owners=owners)  # the large value was not saved in time
     again.replace(copy.deepcopy(tree))
     assert charged(again) == before
     again.replace({"robot": {"name": "r"}})

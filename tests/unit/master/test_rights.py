@@ -1,7 +1,6 @@
-"""The gate, `explain`, the cases, `diff`, `grant`, learning and revocation decide alike on each call.
+"""The gate, `explain`, the cases, `diff`, `grant`, learning and revocation agree on each call.
 
-Each rule includes or excludes a host. The rights that each call needs are written here again,
-by hand, section by section, as docs/policy.md says it.
+Each rule includes or excludes a host. `NEEDS` lists the rights for each call again, by section, as docs/policy.md does.
 """
 
 import ipaddress
@@ -55,7 +54,7 @@ NAME, THING, KEY_GIVEN = "/me", "/thing", "/arm/speed"
 URI = "http://10.0.0.5:4000/"
 ROWS = [*MASTER_CALLS.values(), *NODE_CALLS.values()]
 SECTIONS = ("Nodes", "Publishers", "Subscribers", "Services", "Clients", "read", "write", "Commands")
-# Calls that need other sections than [Commands] under their own name, which all others need.
+# The sections that decide on a call; every call that is not listed needs [Commands] under its own name.
 NEEDS = {
     "registerPublisher": ("Publishers", "Nodes"),
     "unregisterPublisher": ("Publishers", "Nodes"),
@@ -72,7 +71,7 @@ NEEDS = {
     "subscribeParam": ("Commands", "read", "Nodes"),
     "unsubscribeParam": ("Commands", "read", "Nodes"),
 }
-EXTENSIONS = {"Services", "Clients", "read", "write"}  # free when the policy does not have them
+EXTENSIONS = {"Services", "Clients", "read", "write"}  # a policy without these sections allows such calls
 GRANTS = {
     Kind.PUBLICATION: "registerPublisher",
     Kind.SUBSCRIPTION: "registerSubscriber",
@@ -131,13 +130,13 @@ def gate_says(policy: Policy, call: RosCall[Any], tree: Tree) -> Decision:
 
 
 def needed(call: RosCall[Any], missing: frozenset[str]) -> list[str]:
-    """Return the sections that must grant it, by the table above."""
+    """Return the sections that must grant the call, according to `NEEDS`."""
     free = EXTENSIONS & (missing | ({"read", "write"} if {"read", "write"} & missing else set()))
     return [section for section in NEEDS.get(call.name, ("Commands",)) if section not in free]
 
 
 def deeds(call: RosCall[Any]) -> list[Request]:
-    """Return the action of the call and its parameter, as a person would ask about it."""
+    """Return the requests by which a person would ask about the call: its action, and its parameter if any."""
     found = [
         Request(
             HOST, NAME, call.category, THING if call.category is not Category.COMMAND else call.policy_name
@@ -149,7 +148,7 @@ def deeds(call: RosCall[Any]) -> list[Request]:
 
 
 def case_passes(policy: Policy, request: Request, allowed: bool) -> bool:
-    """Return whether a case that expects this answer passes."""
+    """Whether a case that expects this answer passes."""
     word = "allow" if allowed else "deny"
     deed = f"{SAID[request.category]} {request.resource}"
     text = f"cases:\n- host: {request.host}\n  node: {NAME}\n  {word}: ['{deed}']\n"
@@ -209,7 +208,7 @@ POLICIES = st.fixed_dictionaries(
 
 
 def granted_by(decision: Decision) -> bool:
-    """Return whether the rules grant it; audit-only mode allows denied requests."""
+    """Whether the rules grant the request; audit-only mode allows denied requests."""
     return decision.allowed and not decision.would_deny
 
 
@@ -287,13 +286,13 @@ def test_a_policy_learned_from_a_call_grants_it(call: RosCall[Any], tree: dict[s
 
 
 def test_every_command_can_be_granted() -> None:
-    """`[Commands]` knows the name of each call that it decides, and no others."""
+    """`[Commands]` accepts the name of each call that it decides, and no other name."""
     named = {call.policy_name for call in ROWS if call.category is Category.COMMAND}
     assert named | {"lookupService"} == COMMANDS
 
 
 def test_a_call_that_makes_a_node_binds_its_name() -> None:
-    """The gate binds a node's name to a host for exactly the calls that [Nodes] decides."""
+    """The gate binds a node's name to a host for exactly the calls that [Nodes] decides on."""
     for call in ROWS:
         assert needs_node(deeds(call)[0]) == (call.identity is Identity.NODE), call.name
 
@@ -306,7 +305,7 @@ def test_each_registering_call_has_an_unregistering_one() -> None:
 
 
 def test_a_command_records_its_topic() -> None:
-    """A call without a kind is decided by its name alone; its record has the topic of its parameter."""
+    """A call without a category of its own is decided by its name alone; its record has the topic of its parameter."""
     row = RosCall("countPublishers", method(LookupCalls.lookup_node, TOPIC), CallVerb.READ)
     attempt = Attempt(Caller(Peer(HOST, str(HOST), "10.0.0.1"), NAME, 0), row, (THING,))
     assert (attempt.request.category, attempt.request.resource) == (Category.COMMAND, "countPublishers")
@@ -314,7 +313,7 @@ def test_a_command_records_its_topic() -> None:
 
 
 def test_a_service_that_cannot_be_looked_up_cannot_be_called() -> None:
-    """A host that may call a service but not look it up is denied, by the gate and in every explanation."""
+    """A host that may call a service but not look it up is denied by the gate and by every explanation."""
     policy = compile_policy(
         "[Groups]\nocu = 10.0.0.5\nrobot1 = 10.0.0.9\n[Nodes]\ndefault = ocu\n[Clients]\ndefault = ocu\n"
         "[Commands]\ndefault = robot1\n",

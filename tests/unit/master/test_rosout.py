@@ -27,7 +27,7 @@ class Desk:
 
 
 def test_a_line_is_a_log_message() -> None:
-    """With the appliance as node, the monitor as function, its file, its level and its time."""
+    """The message has the appliance as node, the monitor as function, and the monitor's file, level and time."""
     desk = Desk()
     desk.rosout.reported(LINE)
     (said,) = desk.said()
@@ -52,14 +52,14 @@ def test_a_line_is_a_log_message() -> None:
     ],
 )
 def test_reports_have_the_level_of_their_kind(kind: str, detail: dict[str, str], level: int | None) -> None:
-    """Output, verdicts and faults are sent; interventions of a monitor are for the audit log only."""
+    """Output, verdicts and faults are sent to /rosout; interventions of a monitor only go to the audit log."""
     desk = Desk()
     desk.rosout.reported(msgspec.structs.replace(LINE, kind=kind, detail=detail))
     assert [one["level"] for one in desk.said()] == ([] if level is None else [level])
 
 
 def test_a_flood_is_cut_and_reported() -> None:
-    """Fifty messages a second are sent; the next one has the number of dropped ones."""
+    """Fifty messages a second are sent; the next message states how many were dropped."""
     desk = Desk()
     for _ in range(60):
         desk.rosout.reported(LINE)
@@ -75,5 +75,5 @@ def test_a_flood_is_cut_and_reported() -> None:
 
 
 def test_the_header_is_that_of_ros() -> None:
-    """The sum equals the output of `rosmsg md5 rosgraph_msgs/Log`."""
+    """The header's md5sum equals the output of `rosmsg md5 rosgraph_msgs/Log`."""
     assert header(DEFINITIONS).md5sum == "acffd30cd6b6de30f120938c17c593fb"

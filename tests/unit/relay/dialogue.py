@@ -1,6 +1,6 @@
-"""Dialogues of control and peers with a relay as text: each line is a step, and fails if it does not happen.
+"""Dialogues of control and peers with a relay as text; each line is a step that fails if it does not happen.
 
-Steps (`Dialogue.say`); a word with `=` is a field that is equal, one with `~` a field that contains the text:
+Steps (`Dialogue.say`): a word with `=` is an equal field, a word with `~` a field that contains the text:
 
     listener asks callerid=/x | client calls            a peer connects with a header
     talker publishes latching=1 | server serves         a peer accepts the relay's connection and answers with a header
@@ -202,7 +202,7 @@ def _value(word: str) -> Any:
 
 
 def agrees(found: Any, words: tuple[str, ...], string: Callable[[str], bytes] = str.encode) -> bool:
-    """Whether a struct or a dictionary has the fields that the words name."""
+    """Whether a struct or a dictionary has the fields in these words."""
     for word in words:
         same = "=" in word and ("~" not in word or word.index("=") < word.index("~"))
         name, text = word.split("=" if same else "~", 1)

@@ -1,6 +1,6 @@
-"""The relay as a whole, told as transcripts: control's messages, peers' bytes, and what comes back.
+"""The whole relay as transcripts: control's messages, the peers' bytes, and the answers.
 
-The engine runs in the test's own thread; every step lets the loop turn until what is awaited has happened.
+The engine runs in the test's own thread; every step lets the loop turn until the expected event has happened.
 """
 
 import contextlib
@@ -76,7 +76,7 @@ def test_dialogue(title: str) -> None:
 
 @pytest.fixture
 def world(request: pytest.FixtureRequest) -> Iterator[World]:
-    """A relay with one node, and other limits for tests that are `impatient`."""
+    """Yield a relay with one node; tests marked `impatient` get short limits."""
     world = World(getattr(request, "param", LIMITS))
     yield world
     world.close()
@@ -92,7 +92,7 @@ def test_a_subscriber_gets_the_publishers_header_and_messages(world: World) -> N
     reports = (world.hears(TrafficReported).rows for _ in range(100))
     rows = next(
         rows for rows in reports if any(row.messages for row in rows)
-    )  # not one from before the messages
+    )  # a report that is not older than the messages
     assert [(row.resource, row.messages, row.bytes, row.subscribers) for row in rows] == [
         ("/chatter", 2, 14, 1)
     ]
@@ -101,7 +101,7 @@ def test_a_subscriber_gets_the_publishers_header_and_messages(world: World) -> N
 
 
 def test_control_gets_confirmations_of_its_orders(world: World) -> None:
-    """When it hears so, the connection whose grant it took is closed, and what came for it goes nowhere."""
+    """At the confirmation, the revoked grant's connection is closed, and its pending data is dropped."""
     publisher, subscriber = world.subscribed()
     publisher.send(encode_frame(b"one"))
     world.gets(subscriber, encode_frame(b"one"))
@@ -144,7 +144,7 @@ def test_a_grant_costs_the_same_among_thousands() -> None:
 
 
 def test_messages_that_come_with_the_publishers_header_are_not_lost(world: World) -> None:
-    """A latching publisher sends them in one piece."""
+    """A latching publisher sends header and messages in one piece."""
     subscriber = world.connect(encode_header(ASK))
     world.hears(UpstreamWanted)
     world.state(UpstreamFound("k", "/chatter", LOOPBACK, world.publisher.getsockname()[1]))
@@ -172,7 +172,7 @@ def test_messages_that_come_with_the_publishers_header_are_not_lost(world: World
 )
 @impatient
 def test_a_denied_peer_gets_the_reason(world: World, fields: dict[str, str], reason: str) -> None:
-    """An error header, the end of the connection, and a report."""
+    """The peer gets an error header and the end of the connection; control gets a report."""
     peer = world.connect(encode_header(fields))
     assert reason in world.gets_header(peer)["error"]
     world.ends(peer)
@@ -183,7 +183,7 @@ def test_a_denied_peer_gets_the_reason(world: World, fields: dict[str, str], rea
 
 @impatient
 def test_equal_refusals_are_folded(world: World) -> None:
-    """The first at once, the others with a count."""
+    """The first refusal is reported at once, equal ones with a count."""
     for peer in [world.connect(encode_header(ASK | {"callerid": "/x"})) for _ in range(5)]:
         world.ends(peer)
     counts = [world.hears(ConnectionRefused).count]
@@ -204,7 +204,7 @@ def test_an_invalid_header_ends_the_connection(world: World, data: bytes) -> Non
 
 @impatient
 def test_a_header_that_never_comes_whole_is_not_waited_for(world: World) -> None:
-    """Silence and a slow drip end alike."""
+    """A silent peer and a slowly dripping peer are both cut off."""
     silent, slow = world.connect(), world.connect(encode_header(ASK)[:7])
     world.ends(silent)
     world.ends(slow)
@@ -212,7 +212,7 @@ def test_a_header_that_never_comes_whole_is_not_waited_for(world: World) -> None
 
 
 def test_connections_have_a_bound_and_places_are_given_back(world: World) -> None:
-    """A flood from one host is turned away at its bound; when it ends, the host is served again."""
+    """A flood from one host is refused at its limit; when it ends, the host is served again."""
     flood = [world.connect() for _ in range(LIMITS.connections_per_host + 3)]
     assert "the quota of one host is 15" in world.hears(ConnectionRefused).reason
     for peer in flood:
@@ -222,7 +222,7 @@ def test_connections_have_a_bound_and_places_are_given_back(world: World) -> Non
 
 
 def test_a_peer_that_resets_at_any_point_does_no_harm(world: World) -> None:
-    """Before, in and after its header, and while it is served."""
+    """The peer resets before, in and after its header, and while it is served."""
     publisher, subscriber = world.subscribed()
     for length in (0, 1, 5, len(encode_header(ASK))):
         world.connect(encode_header(ASK)[:length]).reset()
@@ -233,7 +233,7 @@ def test_a_peer_that_resets_at_any_point_does_no_harm(world: World) -> None:
 
 @impatient
 def test_a_publisher_that_cannot_be_reached_is_asked_for_again(world: World) -> None:
-    """Refused by control, refused by the kernel, silent, or answering with an error."""
+    """The publisher is refused by control or the kernel, stays silent, or answers with an error."""
     subscriber = world.connect(encode_header(ASK))
     world.hears(UpstreamWanted)
     world.state(UpstreamRefused("k", "/chatter", "not yet"))
@@ -264,7 +264,7 @@ def test_a_publisher_that_cannot_be_reached_is_asked_for_again(world: World) -> 
 
 
 def test_a_publisher_that_always_closes_is_waited_for_ever_longer_until_it_stays(world: World) -> None:
-    """An answered header is not a success: else each attempt costs a call and a record, ten times a second."""
+    """An answered header does not reset the delay: otherwise the relay would retry ten times a second."""
     world.connect(encode_header(ASK))
     waits = []
     for _ in range(6):
@@ -293,7 +293,7 @@ def test_a_publisher_that_always_closes_is_waited_for_ever_longer_until_it_stays
 
 @pytest.mark.parametrize("host", ["robot.local", "", "10.0.0", "127.0.0.1\0"])
 def test_a_publisher_is_only_looked_for_at_an_address(world: World, host: str) -> None:
-    """The lookup of a name would block all peers."""
+    """The relay never looks up a name, which would block all peers."""
     world.connect(encode_header(ASK))
     world.hears(UpstreamWanted)
     world.state(UpstreamFound("k", "/chatter", host, 1))
@@ -301,7 +301,7 @@ def test_a_publisher_is_only_looked_for_at_an_address(world: World, host: str) -
 
 
 def test_a_message_beyond_the_limit_cuts_the_publisher_not_the_subscriber(world: World) -> None:
-    """Its connection is given up with a report; the subscriber stays for the next."""
+    """The publisher's connection is closed with a report; the subscriber waits for the next publisher."""
     publisher, subscriber = world.subscribed()
     publisher.send(encode_frame(b"one") + struct.pack("<I", LIMITS.message_bytes + 1))
     world.ends(publisher)
@@ -313,7 +313,7 @@ def test_a_message_beyond_the_limit_cuts_the_publisher_not_the_subscriber(world:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_whatever_peers_send_the_relay_serves_on(world: World, seed: int) -> None:
-    """Random bytes and broken headers from publisher, service, subscribers and clients; then a normal life."""
+    """All kinds of peers send random bytes and broken headers; then normal peers are served."""
     chance = random.Random(seed)  # noqa: S311 - a test that can be repeated
     pieces = [encode_header(HEADER), encode_header(ASK), encode_header(CALL), encode_frame(b"x" * 300)]
     world.connect(encode_header(ASK))
@@ -381,7 +381,7 @@ def test_a_withdrawn_nodes_port_is_closed(world: World) -> None:
 
 
 def test_a_new_control_learns_what_is_open_and_open_questions_are_put_to_it(world: World) -> None:
-    """Everything goes on; what it does not restate is cut at the end of its restatement."""
+    """Everything continues; entries that the new control does not restate are removed at the end of its restatement."""
     publisher, subscriber = world.subscribed()
     first = world.hears(ConnectionOpened)
     world.state(PublicationPlaced("k", "/other", "*"))
@@ -407,7 +407,7 @@ def test_a_new_control_learns_what_is_open_and_open_questions_are_put_to_it(worl
 
 
 def test_a_slow_subscriber_drops_the_oldest_and_delays_no_other(world: World) -> None:
-    """The quick one gets everything in order; the slow one whole messages in order, the rest is counted."""
+    """The fast subscriber gets everything in order; the slow one gets whole messages in order, the rest is counted."""
     publisher, slow = world.subscribed()
     quick = world.connect(encode_header(ASK))
     assert world.gets_header(quick) == HEADER
@@ -441,7 +441,7 @@ def test_a_slow_subscriber_drops_the_oldest_and_delays_no_other(world: World) ->
 
 
 def test_memory_is_given_back(world: World) -> None:
-    """After slow subscribers, large messages and broken publishers nothing is counted as used."""
+    """After slow subscribers, large messages and broken publishers, no memory is counted as used."""
     publisher, slow = world.subscribed()
     rest = encode_frame(bytes(3 * MIB)) * 6 + encode_frame(bytes(3 * MIB))[:MIB]
     world.push(publisher, rest)
@@ -452,7 +452,7 @@ def test_memory_is_given_back(world: World) -> None:
 
 
 def test_a_publisher_that_stalls_in_a_large_message_is_cut() -> None:
-    """Its memory is released; a slow publisher that makes progress is waited for."""
+    """The stalled message's memory is released; a slow publisher that makes progress is not cut."""
     patient = World(replace(LIMITS, stall_seconds=0.5))
     subscriber = patient.connect(encode_header(ASK))
     publisher = patient.upstream()
@@ -481,7 +481,7 @@ def test_a_publisher_that_stalls_in_a_large_message_is_cut() -> None:
 
 
 def test_a_long_header_that_is_never_finished_gives_back_what_it_held() -> None:
-    """Its bytes beyond the first ones count for its host until it is gone."""
+    """Its bytes beyond the first ones count for its host until the connection ends."""
     world = World(replace(LIMITS, header_seconds=30.0))
     unfinished = struct.pack("<I", 60_000) + bytes(20_000)
     first = world.connect(unfinished)
@@ -493,7 +493,7 @@ def test_a_long_header_that_is_never_finished_gives_back_what_it_held() -> None:
 
 
 def test_unknown_hosts_make_room_for_each_other_and_never_fill_the_relay() -> None:
-    """Hosts without a grant have a few places together; a newcomer replaces the one that has waited longest."""
+    """Hosts without a grant share a few places; a newcomer replaces the one that has waited longest."""
     world = World(replace(LIMITS, connections=40, connections_per_host=15, header_seconds=30.0))
     unknown = [world.connect(host=f"127.0.1.{number}") for number in range(1, 31)]
     for peer in unknown[:25]:
@@ -505,7 +505,7 @@ def test_unknown_hosts_make_room_for_each_other_and_never_fill_the_relay() -> No
 
 
 def test_the_host_with_most_makes_room_for_one_with_less() -> None:
-    """Served connections of one host take every place: another host with a grant gets in, until both have as much."""
+    """If one host's connections take every place, another host with a grant gets in until both have equally many."""
     world = World(replace(LIMITS, connections=10, connections_per_host=10))
     greedy, other = "127.0.0.2", "127.0.0.3"
     for host in (greedy, other):
@@ -528,7 +528,7 @@ def test_the_host_with_most_makes_room_for_one_with_less() -> None:
 def test_limits_are_kept_for_publishers_and_for_each_subscriber_and_change_while_they_run(
     world: World,
 ) -> None:
-    """Each gets its own part of the stream; drops are reported once a second, with the limit."""
+    """Each subscriber has its own limit on the stream; drops are reported once a second with the limit."""
     world.state(GrantInstalled("k", "/chatter", LOOPBACK, "/slow", FlowLimit(messages=2)))
     publisher, quick = world.subscribed()
     slow = world.connect(encode_header(ASK | {"callerid": "/slow"}))
@@ -557,7 +557,7 @@ def test_limits_are_kept_for_publishers_and_for_each_subscriber_and_change_while
 
 
 def test_a_limit_counts_hosts_and_not_node_names(world: World) -> None:
-    """Nodes of one host share its limit; of a topic's limit a host has its part, whatever another has sent."""
+    """Nodes of one host share its limit; each host has its part of a topic's limit, whatever other hosts send."""
     publishers = []
     for key, host, topic in (
         ("g", "10.9.9.9", "/own"),
@@ -585,7 +585,7 @@ def test_a_limit_counts_hosts_and_not_node_names(world: World) -> None:
 
 
 def test_a_flood_beyond_its_limit_delays_no_other_topic(world: World) -> None:
-    """A publisher that sends what it can: another one's messages pass within the time of one turn each."""
+    """While a publisher floods, the messages of another pass within the time of one turn for each publisher."""
     publisher, subscriber = world.subscribed()
     listening = world.listen()
     world.state(NodePlaced("g", "/guest", "10.9.9.9"), listening)
@@ -621,7 +621,7 @@ def test_a_flood_beyond_its_limit_delays_no_other_topic(world: World) -> None:
 
 @pytest.mark.parametrize("world", [replace(LIMITS, connect_seconds=0.3)], indirect=True)
 def test_a_service_that_is_busy_lets_its_client_wait_as_in_plain_ros(world: World) -> None:
-    """Longer than for a connection: the call reaches the server when that has time to answer."""
+    """The client waits longer than for a connection: the call reaches the server when the server has time."""
     client = world.connect(encode_header(CALL))
     service = world.accept(world.service)
     later = world.loop.clock() + 1.5 * IMPATIENT.connect_seconds
@@ -635,7 +635,7 @@ def test_a_service_that_is_busy_lets_its_client_wait_as_in_plain_ros(world: Worl
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_call_reaches_its_server_whatever_overtakes_what(seed: int) -> None:
-    """Service, grant and a restatement come before, between and after the client's connection, header and request."""
+    """Service, grant and a restatement arrive before, between and after the client's connection, header and request."""
     world, order = World(), random.Random(seed)  # noqa: S311 - an order, no secret
     peer = Peer(socket.create_connection(world.port.getsockname()))
     world.open.append(peer.sock)
@@ -679,7 +679,7 @@ def test_a_call_reaches_its_server_whatever_overtakes_what(seed: int) -> None:
 
 @pytest.mark.parametrize("reply", [b"\x05abcd", encode_service_reply(b"1") * 2, b"\x01\xff\xff\xff\xff"])
 def test_a_service_that_breaks_the_protocol_loses_its_client(world: World, reply: bytes) -> None:
-    """Both connections are closed and nothing stays behind."""
+    """Both connections are closed, and nothing of them remains."""
     client = world.connect(encode_header(CALL | {"persistent": "1"}))
     service = world.accept(world.service)
     world.gets_header(service)
@@ -695,7 +695,7 @@ def test_a_service_that_breaks_the_protocol_loses_its_client(world: World, reply
 
 
 def test_a_client_that_never_reads_gets_no_second_request_through(world: World) -> None:
-    """Replies it does not take hold only itself."""
+    """Replies that the client does not read delay only that client."""
     client = world.connect(encode_header(CALL | {"persistent": "1"}))
     service = world.accept(world.service)
     world.gets_header(service)
@@ -717,7 +717,7 @@ def test_a_client_that_never_reads_gets_no_second_request_through(world: World) 
 def test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Some subscribers get a message in the publisher's next turns; each gets all messages in order, and none twice."""
+    """Some subscribers get a message in later turns of the publisher; each gets all messages in order and once."""
     world = World(replace(LIMITS, connections=400, connections_per_host=100))
     publisher, first = world.subscribed()
     others = [world.connect(encode_header(ASK)) for _ in range(39)]
@@ -742,7 +742,7 @@ def test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time(
         world.gets(subscriber, b"".join(messages))
     world.gets_header(late)
     late.read()
-    late.data.clear()  # what was read after it came
+    late.data.clear()  # read after the message arrived
     assert (topic.undelivered, world.held) == (0, held)
     publisher.send(messages[0])
     for subscriber in (first, *others, late):
@@ -753,7 +753,7 @@ def test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time(
 def test_subscribers_of_a_topic_that_is_gone_are_cut_a_quantum_at_a_time(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that takes all the time is followed by others' messages; in the end all connections are closed."""
+    """Between the subscribers that are cut, messages of others pass; in the end all connections are closed."""
     _publisher, first = world.subscribed()
     others = [world.connect(encode_header(ASK)) for _ in range(5)]
     for subscriber in others:
@@ -770,7 +770,7 @@ def test_subscribers_of_a_topic_that_is_gone_are_cut_a_quantum_at_a_time(
 def test_a_second_is_reported_although_tidying_up_takes_many_turns(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Thousands of topics are tidied up a quantum at a time."""
+    """Thousands of topics are tidied a quantum at a time, and the report of the second still appears."""
     for number in range(50):
         world.state(PublicationPlaced("k", f"/topic{number}", "*"))
     world.subscribed()
@@ -783,7 +783,7 @@ def test_a_second_is_reported_although_tidying_up_takes_many_turns(
 def test_a_grant_is_compared_with_the_waiting_peers_of_its_host(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Hosts that wait for a grant that never comes do not make the grants of others dear."""
+    """Hosts that wait for a grant that never arrives do not make other hosts' grants expensive."""
     hosts = ["127.0.0.2", "127.0.0.3"]
     for host in hosts:
         world.connect(encode_header({**ASK, "callerid": "/stranger"}), host=host)

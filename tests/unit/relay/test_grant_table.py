@@ -24,7 +24,7 @@ EVERYTHING = (NODE, TOPIC, GRANT, SERVICE, CLIENT)
 
 
 def stated() -> GrantTable:
-    """A table with one of each."""
+    """Return a table with one statement of each kind."""
     table = GrantTable()
     for message in EVERYTHING:
         table.state(message)
@@ -44,7 +44,7 @@ def test_a_grant_is_for_one_host_one_caller_one_topic_and_one_incarnation() -> N
 
 
 def test_withdrawn_statements_are_gone() -> None:
-    """Each kind of statement can be taken back."""
+    """Each kind of statement can be withdrawn."""
     table = stated()
     table.withdraw(GrantRevoked("k", "/chatter", "10.0.0.2", "/listener"))
     table.withdraw(ClientRevoked("k", "/add", "10.0.0.2", "/c"))
@@ -58,7 +58,7 @@ def test_withdrawn_statements_are_gone() -> None:
 
 
 def test_a_node_takes_everything_of_its_incarnation_with_it() -> None:
-    """A withdrawn node leaves nothing behind; others stay."""
+    """When a node is withdrawn, all its statements go; those of other nodes stay."""
     table = stated()
     table.state(GrantInstalled("other", "/chatter", "10.0.0.2", "/listener"))
     table.withdraw(NodeWithdrawn("k"))
@@ -69,7 +69,10 @@ def test_a_node_takes_everything_of_its_incarnation_with_it() -> None:
 
 
 def test_hosts_that_only_a_star_names_pay_as_one() -> None:
-    """A host pays for itself while the policy names it; all others with a registration are one, all without one too."""
+    """Each host that the policy names counts alone.
+
+    All other hosts with a registration count as one, and all hosts without a registration as another.
+    """
     table = stated()
     for number in range(200):
         host = f"10.9.0.{number}"
@@ -89,14 +92,14 @@ def test_hosts_that_only_a_star_names_pay_as_one() -> None:
 
 
 def test_the_latest_place_of_a_service_counts() -> None:
-    """A service that is placed again is where it was placed last."""
+    """A service that is placed again is only at its last place."""
     table = stated()
     table.state(ServicePlaced("k", "/add", "10.0.0.1", 5000))
     assert table.service("k", "/add") == ServiceEndpoint("k", "/add", "10.0.0.1", 5000, "/talker")
 
 
 def test_the_end_of_a_restatement_withdraws_the_rest() -> None:
-    """Existing grants hold until the new control has said everything."""
+    """Existing grants stay until the new control has restated everything."""
     table = stated()
     table.begin(2)
     for message in (NODE, TOPIC):
@@ -109,7 +112,7 @@ def test_the_end_of_a_restatement_withdraws_the_rest() -> None:
 
 
 def test_a_restatement_that_another_control_begins_again_withdraws_nothing() -> None:
-    """A control that died in the middle of its restatement has not withdrawn what it had not come to."""
+    """If a control dies during its restatement, statements that it had not reached stay."""
     table = stated()
     table.begin(2)
     table.state(NODE)
@@ -122,7 +125,7 @@ def test_a_restatement_that_another_control_begins_again_withdraws_nothing() -> 
 
 
 def test_a_withdrawal_during_a_restatement_stays() -> None:
-    """A withdrawal after the statement wins, whether or not a restatement is going on."""
+    """A withdrawal after the statement wins, also during a restatement."""
     table = stated()
     table.begin(2)
     for message in EVERYTHING:

@@ -11,14 +11,14 @@ from appliance.relay.loop import ACCEPTING, QUANTUM, READ, SYSTEM, UNKNOWN, Even
 
 @pytest.fixture
 def loop() -> Iterator[EventLoop]:
-    """A loop that is closed."""
+    """Yield a loop, and close it."""
     loop = EventLoop()
     yield loop
     loop.close()
 
 
 def test_a_handler_is_not_called_for_what_was_discarded_in_the_same_turn(loop: EventLoop) -> None:
-    """Whichever of two ready sockets comes first closes the other, and the other's handler never runs."""
+    """The handler of the first of two ready sockets closes the other; the other's handler never runs."""
     pairs = [socket.socketpair() for _ in range(2)]
     called = []
     for index in range(2):
@@ -38,7 +38,7 @@ def test_a_handler_is_not_called_for_what_was_discarded_in_the_same_turn(loop: E
 
 
 def test_timers_run_in_order_and_cancelled_ones_never(loop: EventLoop) -> None:
-    """By their time, and in the order they were set for the same time."""
+    """Timers run by their time; timers for the same time run in the order they were set."""
     now = 0.0
     loop.clock = lambda: now
     ran: list[str] = []
@@ -55,13 +55,13 @@ def test_timers_run_in_order_and_cancelled_ones_never(loop: EventLoop) -> None:
 
 
 def test_stop_ends_run_after_the_turn(loop: EventLoop) -> None:
-    """From a timer as from a handler."""
+    """Both a timer and a handler can stop the loop."""
     loop.after(0, loop.stop)
     loop.run()
 
 
 class Costs:
-    """A loop whose handlers cost what a test says; `order` names the payers that were served."""
+    """A loop with handlers of known cost; `order` lists the payers in the order they were served."""
 
     def __init__(self) -> None:
         self.used = 0
@@ -70,7 +70,7 @@ class Costs:
         self._open: list[socket.socket] = []
 
     def ready(self, payer: str, cost: int, times: float = float("inf")) -> socket.socket:
-        """Watch a socket that is ready this number of times, each at this cost."""
+        """Watch a socket that is ready this number of times, at this cost each time."""
         ours, theirs = socket.socketpair()
         self._open += (ours, theirs)
         theirs.send(b"x")
@@ -88,7 +88,7 @@ class Costs:
         return ours
 
     def turns_until(self, condition: Callable[[], object]) -> int:
-        """Turn until the condition holds, a thousand times at most; the number of turns."""
+        """Turn until the condition holds, at most a thousand times; return the number of turns."""
         for turns in range(1000):
             if condition():
                 return turns
@@ -111,7 +111,7 @@ def costs() -> Iterator[Costs]:
 
 
 def test_a_host_with_little_to_do_waits_for_one_quantum_of_others(costs: Costs) -> None:
-    """While two hundred hosts always have costly messages, the robot's message is served after one of them."""
+    """While two hundred hosts always have costly messages, the robot's message waits for only one of them."""
     costs.ready("robot", QUANTUM // 50, 1)
     costs.turns_until(lambda: costs.order)
     for number in range(200):
@@ -126,7 +126,7 @@ def test_a_host_with_little_to_do_waits_for_one_quantum_of_others(costs: Costs) 
 
 
 def test_many_new_hosts_do_not_come_before_one_that_used_little(costs: Costs) -> None:
-    """Two hundred hosts that come at once, each with a costly message, delay the robot by one of them."""
+    """Two hundred hosts that arrive at once with a costly message each delay the robot by only one of them."""
     costs.ready("robot", QUANTUM // 50, 1)
     costs.turns_until(lambda: costs.order)
     costs.ready("guest", QUANTUM)
@@ -142,7 +142,7 @@ def test_many_new_hosts_do_not_come_before_one_that_used_little(costs: Costs) ->
 
 
 def test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one(costs: Costs) -> None:
-    """Both are served in turn, whatever the number of descriptors that are ready."""
+    """Both hosts are served in turn, however many descriptors are ready."""
     for _ in range(400):
         costs.ready("guest", QUANTUM // 10)
     costs.ready("robot", QUANTUM // 10)
@@ -157,11 +157,11 @@ def test_each_descriptor_of_a_host_has_its_turn(costs: Costs) -> None:
     costs.ready("robot", QUANTUM)
     costs.turns_until(lambda: costs.order.count("guest") > 4)
     with pytest.raises(KeyError):
-        costs.loop.change(later.fileno(), READ)  # it was served, and unwatched itself
+        costs.loop.change(later.fileno(), READ)  # the handler was served, and unwatched itself
 
 
 def test_all_unknown_hosts_together_are_one_payer(costs: Costs) -> None:
-    """They get together what the robot gets alone, and so do new connections."""
+    """All unknown hosts together get as much time as the robot alone; the same holds for new connections."""
     for _ in range(200):
         costs.ready(UNKNOWN, QUANTUM)
     costs.ready(ACCEPTING, QUANTUM)
@@ -174,7 +174,7 @@ def test_all_unknown_hosts_together_are_one_payer(costs: Costs) -> None:
 
 
 def test_a_host_that_overdraws_waits_for_the_others(costs: Costs) -> None:
-    """A handler that takes twenty quanta is followed by twenty of the other host."""
+    """A handler that takes twenty quanta is followed by twenty handlers of the other host."""
     costs.ready("guest", 20 * QUANTUM)
     costs.ready("robot", QUANTUM)
     costs.turns_until(lambda: costs.order.count("guest") == 3)
@@ -182,7 +182,7 @@ def test_a_host_that_overdraws_waits_for_the_others(costs: Costs) -> None:
 
 
 def test_costly_messages_of_many_hosts_never_come_in_a_row(costs: Costs) -> None:
-    """A host that keeps to its quantum is served between any two of them, even one that has used more than each."""
+    """Between any two of them, a host within its quantum is served, even if it has used more than each of them."""
     for number in range(200):
         costs.ready(f"10.9.0.{number}", 10 * QUANTUM)
     costs.turns_until(lambda: len(costs.order) >= 200)
@@ -195,7 +195,7 @@ def test_costly_messages_of_many_hosts_never_come_in_a_row(costs: Costs) -> None
 
 
 def test_hosts_within_their_quantum_do_not_starve_a_costly_one(costs: Costs) -> None:
-    """It has as much processor time as each of them."""
+    """The costly host gets as much processor time as each of the others."""
     costs.ready("camera", 10 * QUANTUM)
     for number in range(9):
         costs.ready(f"10.9.0.{number}", QUANTUM)
@@ -204,12 +204,12 @@ def test_hosts_within_their_quantum_do_not_starve_a_costly_one(costs: Costs) -> 
 
 
 def test_control_and_lifeline_are_served_in_every_turn(costs: Costs) -> None:
-    """Whatever hosts have ready, the relay's own descriptors come first."""
+    """However many hosts are ready, the relay's own descriptors come first."""
     for number in range(100):
         costs.ready(f"10.9.0.{number}", 2 * QUANTUM)
     costs.ready(SYSTEM, 1)
     for _ in range(3):
-        costs.loop.turn(0)  # more are ready than are asked for at first
+        costs.loop.turn(0)  # more are ready than the first query returns
     costs.order.clear()
     costs.turns_until(lambda: len(costs.order) >= 40)
     served = [place for place, payer in enumerate(costs.order) if payer == SYSTEM]
@@ -217,7 +217,7 @@ def test_control_and_lifeline_are_served_in_every_turn(costs: Costs) -> None:
 
 
 def test_a_host_alone_is_served_without_waiting_and_owes_nothing(costs: Costs) -> None:
-    """Its time while no other host was ready does not count later."""
+    """Time that a host used while no other host was ready does not count later."""
     costs.ready("guest", 5 * QUANTUM)
     costs.turns_until(lambda: len(costs.order) >= 50)
     costs.ready("robot", QUANTUM)
@@ -226,7 +226,7 @@ def test_a_host_alone_is_served_without_waiting_and_owes_nothing(costs: Costs) -
 
 
 def test_postponed_work_takes_turns_with_events_and_other_hosts(costs: Costs) -> None:
-    """Work that a handler postpones is charged to its payer, and starves neither its events nor another host."""
+    """Postponed work is charged to its payer, and starves neither the payer's events nor another host."""
 
     def work() -> None:
         costs.used += QUANTUM
@@ -243,7 +243,7 @@ def test_postponed_work_takes_turns_with_events_and_other_hosts(costs: Costs) ->
 
 
 def test_a_charge_for_a_new_connection_delays_its_host(costs: Costs) -> None:
-    """Work for a host in the handler of another payer counts for the host."""
+    """Work done for a host in another payer's handler counts for that host."""
     costs.ready("guest", QUANTUM)
     costs.ready("robot", QUANTUM)
     costs.loop.turn(0)
@@ -254,7 +254,7 @@ def test_a_charge_for_a_new_connection_delays_its_host(costs: Costs) -> None:
 
 
 def test_connections_made_while_alone_leave_no_debt(costs: Costs) -> None:
-    """The robot connected for hours while no other host did anything; a new guest does not come before it."""
+    """The robot connected for hours while no other host was active; a new guest still does not come first."""
 
     def accept(_events: int) -> None:
         costs.used += 50_000

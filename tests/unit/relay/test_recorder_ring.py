@@ -20,13 +20,13 @@ EVER = 0, 1 << 63
 def given(
     descriptor: int, *, never: tuple[str, ...] = (), now: Callable[[], int] = time.time_ns
 ) -> RecorderRing:
-    """The recorder of a relay."""
+    """Return the recorder of a relay."""
     return RecorderRing(RingGiven(0, 1, 60, ["/chat*"], list(never)), os.dup(descriptor), now)
 
 
 @pytest.fixture
 def memory() -> Iterator[int]:
-    """A ring."""
+    """Return the memory of a ring."""
     descriptor = os.memfd_create("ring")
     os.ftruncate(descriptor, SMALLEST)
     yield descriptor
@@ -45,7 +45,7 @@ def kept(descriptor: int) -> list[tuple[str, bytes]]:
 
 
 def test_messages_dropped_by_monitors_are_recorded(memory: int) -> None:
-    """Each is recorded as it came, with the publisher's true name and host, for the life of the connection."""
+    """Each message is recorded as received, with the publisher's true name and host, for the whole connection."""
     story = Story(recorded=given(memory))
     story.topic.monitor(lambda _batch: None, wanted=True)
     member = story.join()
@@ -61,7 +61,7 @@ def test_messages_dropped_by_monitors_are_recorded(memory: int) -> None:
 
 @pytest.mark.parametrize("never", [("/chatter",), ("/ch?tter",), ("std_msgs/*",), ("std_msgs/String",)])
 def test_excluded_topics_are_not_recorded(memory: int, never: tuple[str, ...]) -> None:
-    """By the name of the topic or of its type; nor is what no glob of `topics` fits."""
+    """A topic is excluded by its name, by its type, or because no glob of `topics` matches."""
     header = {"type": "std_msgs/String", "md5sum": "*", "callerid": "/talker"}
     stream = given(memory, never=never).open("/chatter", "10.0.0.1", header)
     assert stream is not None
@@ -75,7 +75,7 @@ def test_excluded_topics_are_not_recorded(memory: int, never: tuple[str, ...]) -
 
 
 def test_a_topic_with_the_sum_of_another_type_is_recorded(memory: int) -> None:
-    """A guest's string under the name of a camera's type stays in the recording."""
+    """A guest's string that claims a camera's type is still recorded."""
     sums = known_sums(["sensor_msgs/Image"])
     recorded = RecorderRing(
         RingGiven(0, 1, 60, ["/*"], ["sensor_msgs/Image"], sums), os.dup(memory), time.time_ns
@@ -88,7 +88,7 @@ def test_a_topic_with_the_sum_of_another_type_is_recorded(memory: int) -> None:
 
 
 def test_a_judged_message_has_the_time_of_its_judgement(memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An unjudged message has the time of its recording; a change of the clock is followed."""
+    """An unjudged message has the time of its recording; both follow a change of the clock."""
     second, wall = 10**9, 5000 * 10**9
     monkeypatch.setattr(time, "time_ns", lambda: wall)
     stream = given(memory, now=lambda: 5000 * second + 7).open("/chatter", "10.0.0.1", HEADER)
@@ -104,7 +104,7 @@ def test_a_judged_message_has_the_time_of_its_judgement(memory: int, monkeypatch
 
 @pytest.mark.parametrize("size", [10, 100_000])
 def test_each_message_is_recorded_once(memory: int, size: int) -> None:
-    """Whatever its length, and what monitors publish on their own topic after it."""
+    """This holds for any length, and for messages that monitors publish later on their own topic."""
     story = Story(recorded=given(memory))
     member = story.join()
     story.topic.upstream_opened(HEADER)
@@ -115,7 +115,7 @@ def test_each_message_is_recorded_once(memory: int, size: int) -> None:
 
 
 def test_a_connection_that_ends_within_a_message_is_no_longer_recorded(memory: int) -> None:
-    """Delivering it may end the topic: what is left belongs to no connection."""
+    """Delivering a message may end the topic; the remaining bytes then belong to no connection."""
     story = Story(recorded=given(memory))
     story.join()
     story.topic.upstream_opened(HEADER)

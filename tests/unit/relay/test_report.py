@@ -39,7 +39,7 @@ class Control:
         return [message for message, _fds in self._channel.receive()]
 
     def close(self) -> None:
-        """End both."""
+        """Close both ends."""
         self.link.close()
         self._channel.close()
         self.loop.close()
@@ -62,7 +62,7 @@ def reporter(control: Control) -> Reporter:
 
 
 def test_equal_refusals_are_one_message_and_a_count(control: Control, reporter: Reporter) -> None:
-    """The first at once, the rest with the next tick."""
+    """The first is sent at once, the rest as a count with the next tick."""
     for _ in range(5):
         reporter.refused("k", ("topic", "/chatter"), "10.0.0.2", "/x", "no grant")
     assert control.heard() == [ConnectionRefused("k", "topic", "/chatter", "10.0.0.2", "/x", "no grant", 1)]
@@ -73,7 +73,7 @@ def test_equal_refusals_are_one_message_and_a_count(control: Control, reporter: 
 
 
 def test_many_different_refusals_are_bounded(control: Control, reporter: Reporter) -> None:
-    """Beyond the bound they are counted together, and none is lost from the count."""
+    """Beyond the limit, refusals are counted together, and the count is complete."""
     for number in range(1000):
         reporter.refused("k", ("topic", "/chatter"), "10.0.0.2", f"/x{number}", "no grant")
     reporter.tick(list, {})
@@ -90,7 +90,7 @@ def test_long_claims_are_cut(control: Control, reporter: Reporter) -> None:
 
 
 def test_a_new_control_hears_of_what_is_open_only(control: Control, reporter: Reporter) -> None:
-    """With the numbers it was opened with."""
+    """Open connections are reported again, under the numbers they were opened with."""
     first = reporter.opened("k", "/chatter", "topic", "10.0.0.2", "/a")
     second = reporter.opened("k", "/chatter", "topic", "10.0.0.2", "/b")
     reporter.closed(first, "")
@@ -110,14 +110,14 @@ def test_a_new_control_hears_of_what_is_open_only(control: Control, reporter: Re
 
 
 def test_traffic_is_one_message_per_tick(control: Control, reporter: Reporter) -> None:
-    """And none when nothing has moved."""
+    """If there was no traffic, there is no message."""
     reporter.tick(lambda: [ROW, ROW], {})
     reporter.tick(list, {})
     assert control.heard() == [TrafficReported([ROW, ROW])]
 
 
 def test_refusals_without_a_control_reach_the_next_one(control: Control, reporter: Reporter) -> None:
-    """With all that there were, however many seconds it took; so is the traffic, with the seconds that it is of."""
+    """The next control gets the full count of refusals, and the traffic with its number of seconds."""
     reporter.attach(None)
     taken: list[int] = []
     for _ in range(3):
@@ -137,7 +137,7 @@ def test_refusals_without_a_control_reach_the_next_one(control: Control, reporte
 def test_connections_that_ended_without_a_control_are_reported_or_counted(
     control: Control, reporter: Reporter
 ) -> None:
-    """One by one as far as the relay keeps them."""
+    """The relay keeps a limited number of ended connections to report one by one, and counts the others."""
     before = reporter.opened("k", "/chatter", "topic", "10.0.0.2", "/a")
     control.heard()
     reporter.attach(None)

@@ -1,4 +1,4 @@
-"""Guests that use the relay's memory stop no other host, and nothing stays stopped."""
+"""Guests that use up the relay's memory stop no other host, and no stop is permanent."""
 
 import socket
 from collections.abc import Iterator
@@ -39,14 +39,14 @@ LATCHED = HEADER | {"latching": "1"}
 
 @pytest.fixture
 def world() -> Iterator[World]:
-    """A relay of 64 MiB, 16 of them for latched messages; `/talker` and `/listener` are the robot's."""
+    """A relay with 64 MiB, 16 of them for latched messages; `/talker` and `/listener` belong to the robot."""
     world = World(SMALL_RELAY)
     yield world
     world.close()
 
 
 def publish(world: World, number: int, host: str, header: dict[str, str] = HEADER) -> tuple[Peer, Peer]:
-    """A node on a host of its own publishes /chatter, and a subscriber hears it; publisher and subscriber."""
+    """Publish /chatter from a node on its own host to a subscriber; return publisher and subscriber."""
     key, listening = f"guest{number}", world.listen()
     world.state(NodePlaced(key, f"/guest{number}", host), listening)
     world.state(PublicationPlaced(key, "/chatter", "*"))
@@ -64,14 +64,14 @@ def publish(world: World, number: int, host: str, header: dict[str, str] = HEADE
 
 
 def carries_images(world: World, publisher: Peer, subscriber: Peer) -> None:
-    """The robot's images go through, ten of them."""
+    """Check that ten of the robot's images are relayed."""
     for _ in range(10):
         world.push(publisher, IMAGE)
         world.gets(subscriber, IMAGE)
 
 
 def test_latched_messages_of_a_guest_stop_no_other_host(world: World) -> None:
-    """Messages beyond its quota are refused with a report; the robot's images and latch go on; freed memory counts."""
+    """Messages beyond the guest's quota are refused with a report; the robot's images pass, and freed memory counts."""
     robot = world.subscribed()
     message = encode_frame(bytes(MIB))
     refused = 0
@@ -95,7 +95,7 @@ def test_latched_messages_of_a_guest_stop_no_other_host(world: World) -> None:
 
 
 def test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots(world: World) -> None:
-    """Each takes what it can get, the first of them by halves; the next host's latch is kept all the same."""
+    """Each host takes all that it can get, half of the rest each time; the next host's latch is still kept."""
     for number in range(200):
         size = 6 * MIB if number < 6 else 60_000
         message = encode_frame(bytes(size))
@@ -110,7 +110,7 @@ def test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots(world: 
 
 
 def test_unfinished_messages_of_a_guest_stop_no_other_host(world: World) -> None:
-    """Forty publishers of one host begin messages and never end them: it is cut, images go through at all times."""
+    """Forty publishers of one host begin messages and never end them: the host is cut, and images always pass."""
     robot = world.subscribed()
     begun = encode_frame(bytes(8 * MIB))[: 2 * MIB]
     for number in range(40):
@@ -125,7 +125,7 @@ def test_unfinished_messages_of_a_guest_stop_no_other_host(world: World) -> None
 
 
 def test_subscribers_of_a_guest_that_never_read_stop_no_other_host(world: World) -> None:
-    """They lose messages, and those in the middle of a message are cut; the quick one of another host gets all."""
+    """Subscribers lose messages, and are cut if they are in the middle of one; another host's fast one gets all."""
     publisher, quick = world.subscribed()
     world.state(GrantInstalled("k", "/chatter", "127.0.0.2", "/stuck"))
     stuck = []
@@ -154,7 +154,7 @@ def test_subscribers_of_a_guest_that_never_read_stop_no_other_host(world: World)
 
 
 def test_headers_of_unknown_hosts_leave_room_for_the_robots(world: World) -> None:
-    """A hundred unknown hosts begin headers: together they have a quarter."""
+    """A hundred unknown hosts begin headers: together they get a quarter of the memory."""
     unfinished = encode_header({"callerid": "/" + "x" * 30_000})[:-1]
     for number in range(100):
         source = (f"127.0.1.{number + 1}", 0)
@@ -170,7 +170,7 @@ def test_headers_of_unknown_hosts_leave_room_for_the_robots(world: World) -> Non
 
 
 def test_headers_of_publishers_and_servers_count_while_they_are_connected(world: World) -> None:
-    """They choose how long theirs are, and the relay remembers them: nothing of a host is there for nothing."""
+    """Peers choose the length of their headers and the relay stores them, so their memory counts for the host."""
     share = world.engine.memory.frames.of("10.9.9.9")
     publisher, _subscriber = publish(world, 1, "10.9.9.9", HEADER | {"message_definition": "x" * 60_000})
     assert 60_000 < share.used < 61_000
@@ -190,7 +190,7 @@ def test_headers_of_publishers_and_servers_count_while_they_are_connected(world:
 
 @pytest.mark.parametrize("asked", [ASK, CALL])
 def test_little_of_a_peers_header_is_kept(world: World, asked: dict[str, str]) -> None:
-    """Only ROS fields are kept, none longer than a name: eight thousand connections of a host take little memory."""
+    """Only ROS fields are kept, none longer than a name: a host's eight thousand connections use little memory."""
     long = world.connect(encode_header(asked | {"type": "x" * 2000}))
     assert world.gets_header(long)["error"] == "its header has a type of 2000 characters"
     world.connect(encode_header(asked | {"message_definition": "x" * 30_000, "own": "x" * 30_000}))

@@ -1,4 +1,4 @@
-"""Taps of topics show the messages of subscribers, a few at a time, for any bytes."""
+"""Taps show the messages that subscribers of a topic get, a few at a time, for any bytes."""
 
 import struct
 from collections.abc import Iterator
@@ -14,12 +14,12 @@ TOLD = HEADER | {"message_definition": "string data\n"}
 
 
 def text(word: str) -> bytes:
-    """A std_msgs/String."""
+    """Return a std_msgs/String."""
     return struct.pack("<I", len(word)) + word.encode()
 
 
 def seen(world: World, word: str) -> MessageSeen:
-    """The report of this message."""
+    """Return the report of this message."""
     found: MessageSeen = world.until(
         lambda: next(
             (one for one in world.told if isinstance(one, MessageSeen) and one.fields == {"data": word}), None
@@ -30,14 +30,14 @@ def seen(world: World, word: str) -> MessageSeen:
 
 @pytest.fixture
 def world() -> Iterator[World]:
-    """A publisher of /chatter, and a subscriber with a grant."""
+    """Yield a publisher of /chatter, and a subscriber with a grant."""
     world = World()
     yield world
     world.close()
 
 
 def subscribed(world: World) -> tuple[Peer, Peer]:
-    """As `World.subscribed`, with a publisher that tells its definition."""
+    """Act as `World.subscribed`, with a publisher whose header has its definition."""
     subscriber = world.connect(encode_header(ASK))
     publisher = world.upstream(TOLD)
     world.gets_header(subscriber)
@@ -45,7 +45,7 @@ def subscribed(world: World) -> tuple[Peer, Peer]:
 
 
 def test_the_next_messages_are_shown_and_no_more(world: World) -> None:
-    """As many as were asked for, with their type, size and fields; subscribers notice nothing."""
+    """The tap has the requested number of messages, with type, size and fields; subscribers are not affected."""
     publisher, subscriber = subscribed(world)
     world.state(LookWanted(1, "/chatter", 2, latched=True))
     frames = [encode_frame(text(word)) for word in ("one", "two", "three")]
@@ -60,7 +60,7 @@ def test_the_next_messages_are_shown_and_no_more(world: World) -> None:
 
 
 def test_a_topic_without_subscribers_is_tapped(world: World) -> None:
-    """The publisher is connected to for the look, and let go behind it."""
+    """The publisher is connected for the tap, and disconnected after it."""
     world.state(LookWanted(1, "/chatter", MOST_MESSAGES, latched=True))
     publisher = world.upstream(TOLD)
     publisher.send(encode_frame(text("alone")))
@@ -86,7 +86,7 @@ def test_the_latched_message_comes_first(world: World) -> None:
 
 
 def test_another_publisher_is_read_by_its_own_definition(world: World) -> None:
-    """During a tap the publisher returns with another definition."""
+    """During a tap the publisher reconnects with another definition."""
     publisher, _subscriber = subscribed(world)
     world.state(LookWanted(1, "/chatter", 5, latched=True))
     publisher.send(encode_frame(text("one")))
@@ -101,7 +101,7 @@ def test_another_publisher_is_read_by_its_own_definition(world: World) -> None:
 
 @pytest.mark.parametrize("definition", ["", "no/such field", "string data\n" * 3, "std_msgs/String data\n"])
 def test_an_unreadable_definition_is_reported(world: World, definition: str) -> None:
-    """The first bytes are shown instead, and why."""
+    """The report has the first bytes and the reason instead."""
     subscriber = world.connect(encode_header(ASK))
     publisher = world.upstream(HEADER | {"message_definition": definition})
     world.gets_header(subscriber)
@@ -113,7 +113,7 @@ def test_an_unreadable_definition_is_reported(world: World, definition: str) -> 
 
 
 def test_lengths_that_lie_are_shown_as_far_as_the_bytes_go(world: World) -> None:
-    """A string that says it is longer than the message."""
+    """A string claims to be longer than the message."""
     publisher, _subscriber = subscribed(world)
     world.state(LookWanted(1, "/chatter", 1, latched=True))
     publisher.send(encode_frame(struct.pack("<I", 1 << 31) + b"x"))
@@ -121,7 +121,7 @@ def test_lengths_that_lie_are_shown_as_far_as_the_bytes_go(world: World) -> None
 
 
 def test_taps_are_few_and_end_with_control(world: World) -> None:
-    """Beyond `MOST_LOOKS` nothing is seen; a control that is gone leaves none behind."""
+    """Beyond `MOST_LOOKS` there is no further tap; when control ends, its taps end."""
     publisher, subscriber = subscribed(world)
     for number in range(MOST_LOOKS + 1):
         world.state(LookWanted(number, "/chatter", 1, latched=True))

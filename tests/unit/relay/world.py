@@ -1,6 +1,6 @@
-"""An engine that plays with peers on loopback: control's messages, peers' bytes, and what comes back.
+"""An engine that talks to peers on loopback: control's messages, the peers' bytes, and the answers.
 
-The engine runs in the test's own thread; every step lets the loop turn until what is awaited has happened.
+The engine runs in the test's own thread; every step lets the loop turn until the expected event has happened.
 """
 
 import socket
@@ -56,7 +56,7 @@ CALL = {"callerid": "/client", "service": "/mode", "md5sum": "*"}
 
 
 class Peer:
-    """A socket of a test that never blocks; collects what it is sent."""
+    """A test's socket that never blocks and collects received bytes."""
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
@@ -65,11 +65,11 @@ class Peer:
         self.ended = False
 
     def send(self, data: bytes) -> None:
-        """Write without waiting for all of it."""
+        """Send without waiting until all bytes are sent."""
         self.sock.send(data)
 
     def read(self) -> None:
-        """Take what is there."""
+        """Read the bytes that have arrived."""
         while not self.ended:
             try:
                 data = self.sock.recv(1 << 20)
@@ -81,7 +81,7 @@ class Peer:
             self.ended = not data
 
     def header(self) -> dict[str, str] | None:
-        """The header in what has come, taken off when it is whole."""
+        """Return the header at the start of the received bytes, and remove it once it is complete."""
         parser = HeaderParser()
         fields = parser.feed(bytes(self.data))
         if fields is not None:
@@ -89,7 +89,7 @@ class Peer:
         return fields
 
     def reset(self) -> None:
-        """Close with a reset, as a crashed machine's kernel does."""
+        """Close the connection with a reset, as the kernel does after a crash."""
         self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.sock.close()
 
@@ -113,14 +113,14 @@ class World:
         self.state(ClientGranted("k", "/mode", LOOPBACK, "/client"))
 
     def connect_control(self) -> None:
-        """A (new) control."""
+        """Connect a (new) control."""
         ours, theirs = socket.socketpair()
         self.control = Channel(ours, RelayLink)
         self.link = LoopLink(self.loop, Channel(theirs, RelayLink), self.engine.take, lambda _reason: None)
         self.engine.attach(self.link)
 
     def listen(self) -> socket.socket:
-        """A listening socket of the test."""
+        """Return a listening socket of the test."""
         sock = socket.create_server((LOOPBACK, 0))
         sock.setblocking(False)
         self.open.append(sock)
@@ -128,16 +128,16 @@ class World:
 
     @property
     def held(self) -> int:
-        """The bytes of messages that the relay holds for all hosts."""
+        """Return the bytes of messages that the relay holds for all hosts."""
         return sum(size for what, size in self.engine.memory.held().items() if what != "headers")
 
     def state(self, message: Message, *sockets: socket.socket) -> None:
-        """Send a message of control, and wait until it is carried out."""
+        """Send a message from control, and wait until it is carried out."""
         self.control.send(message, tuple(sock.fileno() for sock in sockets))
         self.link.catch_up()
 
     def until(self, condition: Callable[[], Any], seconds: float = LIMIT) -> Any:
-        """Let the loop turn until the condition gives something; fails loudly."""
+        """Let the loop turn until the condition returns a value; fail after a time limit."""
         deadline = time.monotonic() + seconds
         while True:
             self.loop.turn(0.01)
@@ -161,7 +161,7 @@ class World:
         return found
 
     def connect(self, *parts: bytes, host: str = LOOPBACK) -> Peer:
-        """A peer at the relay's port, from this address."""
+        """Return a peer that connects to the relay's port from this address."""
         where = (LOOPBACK, self.port.getsockname()[1])
         peer = Peer(socket.create_connection(where, source_address=(host, 0)))
         self.open.append(peer.sock)
@@ -170,7 +170,7 @@ class World:
         return peer
 
     def push(self, peer: Peer, data: bytes) -> None:
-        """The peer sends all of this, as fast as the relay takes it."""
+        """Send all bytes from the peer, as fast as the relay reads them."""
         rest = memoryview(data)
         while rest:
             try:
@@ -182,7 +182,7 @@ class World:
             self.loop.turn(0)
 
     def accept(self, listening: socket.socket) -> Peer:
-        """The relay's connection to the publisher or the service."""
+        """Return the relay's connection to the publisher or the service."""
 
         def take() -> Peer | None:
             try:
@@ -195,7 +195,7 @@ class World:
         return peer
 
     def gets_header(self, peer: Peer) -> dict[str, str]:
-        """The peer has been sent a header."""
+        """Wait until the peer has received a header, and return it."""
 
         def find() -> dict[str, str] | None:
             peer.read()
@@ -205,7 +205,7 @@ class World:
         return fields
 
     def gets(self, peer: Peer, data: bytes) -> None:
-        """The peer has been sent exactly this."""
+        """Wait until the peer has received exactly these bytes."""
 
         def whole() -> bool:
             peer.read()
@@ -216,7 +216,7 @@ class World:
         peer.data.clear()
 
     def ends(self, peer: Peer) -> bytes:
-        """The peer's connection is closed by the relay; what came before."""
+        """Wait until the relay closes the peer's connection; return the bytes before the end."""
 
         def ended() -> bool:
             peer.read()
@@ -226,7 +226,7 @@ class World:
         return bytes(peer.data)
 
     def upstream(self, header: dict[str, str] = HEADER) -> Peer:
-        """Answer the relay's question for the publisher, and its header."""
+        """Answer the relay's request for the publisher with this header; return the connection."""
         self.hears(UpstreamWanted, key="k", topic="/chatter")
         self.state(UpstreamFound("k", "/chatter", LOOPBACK, self.publisher.getsockname()[1]))
         peer = self.accept(self.publisher)
@@ -236,14 +236,14 @@ class World:
         return peer
 
     def subscribed(self) -> tuple[Peer, Peer]:
-        """A publisher and a subscriber that is served."""
+        """Return a publisher and a subscriber that is served."""
         subscriber = self.connect(encode_header(ASK))
         publisher = self.upstream()
         assert self.gets_header(subscriber) == HEADER
         return publisher, subscriber
 
     def close(self) -> None:
-        """End everything."""
+        """Close everything."""
         self.engine.close()
         self.link.close()
         self.loop.close()

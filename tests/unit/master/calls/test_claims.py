@@ -1,4 +1,4 @@
-"""Registering calls under one name wait for each other; other names do not, also not those below it."""
+"""Registering calls under one name wait for each other; calls under other names, even names below it, do not."""
 
 import asyncio
 
@@ -10,7 +10,7 @@ pytestmark = pytest.mark.anyio
 
 
 async def test_one_after_the_other_by_name() -> None:
-    """Calls under one name are served in order of arrival; unused names take no memory."""
+    """Calls under one name are served in order of arrival; unused names use no memory."""
     order: list[str] = []
 
     async def register(names: KeyTurns, name: str, mark: str, go: asyncio.Event) -> None:

@@ -1,4 +1,4 @@
-"""The gate decides on parameters (the key, all below it, replaced values) and on names in use."""
+"""The gate decides on parameters (the key, all keys below it, replaced values) and on names in use."""
 
 import ipaddress
 from typing import Any
@@ -61,7 +61,7 @@ def ask(rules: str, host: str, method: str, *arguments: Any, tree: Any = None) -
 
 @pytest.mark.parametrize("key", ["/arm/max/x", "/arm/max/x/y"])
 def test_a_value_that_may_not_be_written_is_not_replaced_from_below(key: str) -> None:
-    """Setting a key below a value turns the value into a namespace: that is a write of the value."""
+    """Setting a key below a value turns the value into a namespace, so it needs the right to write the value."""
     tree = {"arm": {"max": 5, "speed": 1}}
     denied = ask(LIMITED, OPERATOR, "setParam", key, 0, tree=tree)
     assert not denied.allowed
@@ -73,7 +73,7 @@ def test_a_value_that_may_not_be_written_is_not_replaced_from_below(key: str) ->
 
 
 def test_only_a_value_blocks_a_write_below_it() -> None:
-    """Below a namespace, or an unset key, the key itself decides."""
+    """Below a namespace, or below an unset key, the right to the key itself decides."""
     trees: list[Tree] = [{}, {"arm": {}}, {"arm": {"max": {"y": 1}}}]
     for tree in trees:
         assert ask(LIMITED, OPERATOR, "setParam", "/arm/max/x", 0, tree=tree).allowed
@@ -101,7 +101,7 @@ def test_a_dictionary_is_a_namespace_before_it_is_there() -> None:
 
 
 def test_without_the_section_commands_decide() -> None:
-    """A policy that has no [Parameters] decides by [Commands] alone."""
+    """Without [Parameters], [Commands] alone decides on parameter calls."""
     rules = "[Clients]\ndefault = *\n"
     tree: Tree = {"arm": {"max": 5}}
     text = BASE.replace("[Parameters]\n", "") + rules
@@ -117,7 +117,7 @@ API = "http://127.0.0.1:4000/"
 
 
 def held(name: str, host: str, *, own: bool) -> Registry:
-    """A registry in which a node of this host, or one of the appliance's, holds a name."""
+    """Return a registry in which a node of this host holds `name`; with `own`, it is the appliance's node."""
     registry = Registry()
     address, uri = ipaddress.ip_address(host), parse_node_uri(API)
     node = Incarnation("key", name, address, uri, API, host, 19001, 19002, own=own)
@@ -137,9 +137,9 @@ def held(name: str, host: str, *, own: bool) -> Registry:
 def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
     method: str, arguments: tuple[Any, ...], does: bool
 ) -> None:
-    """Without isolation the robot's nodes and the appliance's have the same address: the listener tells them apart.
+    """Without isolation the robot's nodes and the appliance's have the same address: the listener separates them.
 
-    The policy does not apply at that listener: the actions of the appliance's node are known (`does`).
+    The policy does not apply at the listener of the appliance's node, whose allowed actions are known (`does`).
     """
     policy = compile_policy(
         "[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n[Commands]\ndefault = *\n", file="test.ini"
@@ -164,7 +164,7 @@ def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
     ids=lambda one: one.name,
 )
 def test_no_call_is_made_under_the_name_of_another_hosts_node(call: RosCall[Any]) -> None:
-    """No policy grants such a call; a registration waits for the probe of the present holder."""
+    """No policy grants such a call; a registration waits until the present holder is probed."""
     sections = ("Nodes", "Publishers", "Subscribers", "Services", "Clients", "Commands")
     text = "".join(f"[{name}]\ndefault = *\n" for name in sections)
     policy = compile_policy(f"{text}getRVState = *\nshutdownMaster = *\n", file="test.ini")
@@ -180,7 +180,7 @@ def test_no_call_is_made_under_the_name_of_another_hosts_node(call: RosCall[Any]
 
 @pytest.mark.parametrize(("path", "allowed"), [(PUBLISHER_PATH, False), ("/", True)])
 def test_no_node_replaces_a_service_of_the_appliance(path: str, allowed: bool) -> None:
-    """The last registration of a service wins, as in plain ROS, except for the appliance's services."""
+    """As in plain ROS, the last registration of a service wins, except for the appliance's services."""
     policy = compile_policy("[Nodes]\ndefault = *\n", file="test.ini")
     registry = Registry()
     uri, robot = f"http://127.0.0.1:4000{path}", ipaddress.ip_address("10.0.0.5")
@@ -206,9 +206,9 @@ def test_no_node_replaces_a_service_of_the_appliance(path: str, allowed: bool) -
 
 
 def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:
-    """The rosout aggregator subscribes at other nodes' proxy endpoints, whatever the policy says of this machine.
+    """The rosout aggregator subscribes at other nodes' proxy endpoints, even if the policy gives this machine no right.
 
-    Other machines may not use its name, and on this machine its name allows nothing else.
+    Other machines may not use the aggregator's name, and on this machine the name grants nothing else.
     """
     policy = compile_policy(
         f"[Nodes]\ndefault = {OPERATOR}\n[Subscribers]\ndefault = {OPERATOR}\n", file="p.ini"
@@ -254,7 +254,7 @@ def test_a_contest_ends_as_the_probe_found_the_holder(presence: Presence, words:
 
 
 def test_a_host_has_as_many_registrations_as_are_left() -> None:
-    """Every host that registers as many as it can leaves enough for the next one."""
+    """Even if every host registers as many topics as it can, enough remain for the next host."""
     policy = compile_policy(BASE + LIMITED + "[Publishers]\ndefault = *\n", file="test.ini")
     registry = Registry()
     limits = HostLimits(nodes=500, registrations=60, registrations_in_all=100)

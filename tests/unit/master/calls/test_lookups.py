@@ -1,4 +1,4 @@
-"""Look-ups are answered from the registry, whatever the ROS master does."""
+"""Look-ups are answered from the registry, whatever state the ROS master is in."""
 
 import ipaddress
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.anyio
 
 
 class Site:
-    """A registry, and the look-ups that it answers, without a ROS master."""
+    """A registry, and the look-ups on it, without a ROS master."""
 
     def __init__(self, unseen: str | None = None) -> None:
         self.registry = Registry()
@@ -35,14 +35,14 @@ class Site:
         self.calls = LookupCalls(**parts, port=11311, stop=lambda _reason: None, unseen=unseen)
 
     def node(self, name: str, port: int) -> Incarnation:
-        """A node that is known and has nothing yet."""
+        """Add a live node that has no registrations yet."""
         uri = f"http://10.0.0.5:{port}/"
         one = Incarnation(f"{name}{port}", name, HOST, parse_node_uri(uri), uri, "10.0.0.1", port, port + 100)
         self.registry.add(one)
         return one
 
     def service_granted(self, incarnation: Incarnation, *_given: object) -> None:
-        """As `Graph`."""
+        """Act as `RosGraph`."""
         self.granted.append(incarnation)
 
     async def types(self, subgraph: str = "") -> object:
@@ -51,7 +51,7 @@ class Site:
 
 
 async def test_the_state_lists_all_live_registrations() -> None:
-    """Publishers, subscribers and services, in the order of registration; a publisher that is not shown is left out."""
+    """The state lists publishers, subscribers and services in the order of registration, without hidden publishers."""
     site = Site(unseen="/rosrv")
     talker, own = site.node("/talker", 4000), site.node("/rosrv", 4001)
     for node, kind, name in (
@@ -72,7 +72,7 @@ async def test_the_state_lists_all_live_registrations() -> None:
 
 
 def test_types_of_unused_topics_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The oldest is dropped; types from the ROS master are adopted, and a new ROS master has none."""
+    """The oldest type is dropped. Types from the ROS master are adopted, and forgotten with a new ROS master."""
     monkeypatch.setattr(registry, "_MOST_UNUSED_TYPES", 2)
     site = Site()
     node = site.node("/a", 4000)

@@ -1,4 +1,4 @@
-"""Requests about connections take time in proportion to the connections, not to the topics of a host."""
+"""Requests about connections take time in proportion to the connections, not to connections times topics."""
 
 import ipaddress
 from types import SimpleNamespace
@@ -21,19 +21,19 @@ TOPICS, CONNECTIONS = 200, 300
 
 
 class Counted(dict[Any, Any]):
-    """Connections that count how often one of them is read."""
+    """A table of connections that counts how often a connection is read."""
 
     looks = 0
 
     def values(self) -> Any:
-        """Count each access."""
+        """Yield the connections, and count each one."""
         for connection in super().values():
             self.looks += 1
             yield connection
 
 
 async def test_each_connection_is_read_once() -> None:
-    """`getBusStats` and the graph have a row for each topic and each connection; their numbers are not multiplied."""
+    """`getBusStats` and the graph read each connection once, however many topics a node has."""
     registry, uri, host = Registry(), "http://10.0.0.5:4000/", ipaddress.ip_address("10.0.0.5")
     node = Incarnation("key", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
     registry.add(node)

@@ -1,4 +1,4 @@
-"""The mirror of the parameters equals the tree of rosmaster's own code after every step."""
+"""After every step, the mirror of the parameters equals the tree of rosmaster's own code."""
 
 import asyncio
 import copy
@@ -59,7 +59,7 @@ STEP = st.one_of(st.tuples(st.just("set"), KEY, VALUE), st.tuples(st.just("delet
 
 @pytest.fixture(scope="module")
 def oracle() -> Any:
-    """rosmaster's ParamDictionary, run by the interpreter it is installed for."""
+    """rosmaster's ParamDictionary, run by the interpreter that rosmaster is installed for."""
     with subprocess.Popen(
         [PYTHON, "-c", ORACLE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -71,7 +71,7 @@ def oracle() -> Any:
 @settings(max_examples=examples(300), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=st.lists(STEP, max_size=12))
 def test_the_mirror_equals_the_tree_of_rosmaster(oracle: Any, steps: list[Any]) -> None:
-    """After any sequence of settings and deletions both trees are equal, and the weight is that of the tree."""
+    """After any sequence of settings and deletions both trees are equal, and the mirror's weight fits its tree."""
     oracle.stdin.write(json.dumps(steps) + "\n")
     oracle.stdin.flush()
     there = mirror()
@@ -85,7 +85,7 @@ def test_the_mirror_equals_the_tree_of_rosmaster(oracle: Any, steps: list[Any]) 
 
 
 def test_a_value_beyond_the_bound_is_refused_before_it_is_set() -> None:
-    """All parameters together are bounded; deleting one makes room."""
+    """The size of all parameters together is limited; deleting a parameter makes room."""
     there = mirror(whole=1000)
     put(there, "/a", "x" * 500, HOST)
     with pytest.raises(LimitReachedError, match="the quota of one host is 1000"):
@@ -95,7 +95,7 @@ def test_a_value_beyond_the_bound_is_refused_before_it_is_set() -> None:
 
 
 def test_key_and_value_together_are_bounded_in_depth() -> None:
-    """The ROS master answers recursively: values too deep for its answers are refused."""
+    """The ROS master answers recursively, so values too deep for its answers are refused."""
     there = mirror(depth_limit=5)
     there.check("/a/b/c", measure({"d": [1]})[1])
     with pytest.raises(ProtocolError, match="nest deeper"):
@@ -117,14 +117,14 @@ class OrderedServer:
         self.told: list[tuple[str, str | None]] = []
 
     def carry_out(self, _effects: object) -> None:
-        """As `Enactor`."""
+        """Act as `Enactor`."""
 
     def parameter_set(self, key: str, _value: Any, caller_id: str) -> None:
-        """As `Graph`."""
+        """Act as `RosGraph`."""
         self.told.append((key, caller_id))
 
     def parameter_deleted(self, key: str) -> None:
-        """As `Graph`."""
+        """Act as `RosGraph`."""
         self.told.append((key, None))
 
     async def call(self, method: str, *params: Any) -> Any:
@@ -172,7 +172,7 @@ def test_a_run_is_one_request_in_its_order() -> None:
 @settings(max_examples=examples(100))
 @given(st.lists(STEP, max_size=12))
 def test_a_run_has_the_effect_of_single_calls(steps: list[tuple[str, str, Any]]) -> None:
-    """Any calls give the same tree together and one by one."""
+    """A run of any calls gives the same tree as the calls one by one."""
     calls = [("setParam", key, value) if do == "set" else ("deleteParam", key) for do, key, value in steps]
     together, single = (OrderedServer(mirror()) for _ in range(2))
     ordered(together, *copy.deepcopy(calls))
@@ -183,7 +183,7 @@ def test_a_run_has_the_effect_of_single_calls(steps: list[tuple[str, str, Any]])
 
 
 def test_an_unserializable_value_delays_no_other_call() -> None:
-    """Only the value that no request can carry fails; calls before and after it are carried out in order."""
+    """Only the call with the unserializable value fails; calls before and after it are carried out in order."""
     server = OrderedServer(mirror())
     answers = ordered(server, ("setParam", "/a", 1), ("setParam", "/b", "unwritable"), ("setParam", "/c", 3))
     assert isinstance(answers[1], EncodingError)
@@ -192,7 +192,7 @@ def test_an_unserializable_value_delays_no_other_call() -> None:
 
 
 def test_a_run_beyond_the_bound() -> None:
-    """The limit holds for the sum of a run; a replaced value is not counted twice."""
+    """The limit holds for the total of a run; a replaced value is not counted twice."""
     server = OrderedServer(mirror(whole=1100))
     big = "x" * 400
     answers = ordered(
@@ -208,7 +208,7 @@ def test_a_run_beyond_the_bound() -> None:
 
 
 def test_a_failing_part_and_a_lost_master() -> None:
-    """A fault fails one part only; without an answer every part fails, and the mirror is unchanged."""
+    """A fault fails only its own part. Without an answer every part fails, and the mirror is unchanged."""
     server = OrderedServer(mirror())
     answers = ordered(server, ("deleteParam", "/fault"), ("setParam", "/a", 1))
     assert isinstance(answers[0], CallFailedError)
@@ -223,7 +223,7 @@ def test_a_failing_part_and_a_lost_master() -> None:
 @settings(max_examples=examples(200))
 @given(st.lists(STEP, max_size=14), st.data())
 def test_repeated_changes_give_the_same_tree(steps: list[tuple[str, str, Any]], data: st.DataObject) -> None:
-    """A stored tree, with the changes since then or since any earlier time, gives the last tree."""
+    """A stored tree and the changes since then, repeated from any earlier time, give the current tree."""
     noted: list[tuple[str, Any]] = []
     there = mirror(note=lambda key, value: noted.append((key, copy.deepcopy(value))))
     kept = []
@@ -242,7 +242,7 @@ def test_repeated_changes_give_the_same_tree(steps: list[tuple[str, str, Any]], 
 
 @pytest.mark.parametrize("together", [False, True], ids=["alone", "in a run"])
 def test_a_value_that_rosmaster_keeps_despite_its_error(together: bool) -> None:
-    """The ROS master keeps a value even if notifying subscribers then fails: the mirror has it also."""
+    """The ROS master keeps a value even if notifying a subscriber fails; the mirror keeps the value as well."""
     steps: list[Any] = [["/q", {"b": 1, "b/c": 2}], ["/", 7], ["/r", 3]]
     answered = subprocess.run(
         [PYTHON, "-c", WHOLE, json.dumps(steps)], capture_output=True, text=True, check=True, timeout=60
@@ -251,7 +251,7 @@ def test_a_value_that_rosmaster_keeps_despite_its_error(together: bool) -> None:
     assert codes[:2] == [-1, -1]
 
     class Failing(OrderedServer):
-        """A ROS master with the answers that the real one gave."""
+        """A ROS master that gives the answers recorded from the real one."""
 
         async def call_in_order(self, calls: Any) -> list[Any]:
             keys = [key for key, _ in steps]
@@ -270,7 +270,7 @@ def test_a_value_that_rosmaster_keeps_despite_its_error(together: bool) -> None:
 
 
 async def test_the_loop_runs_while_thousands_of_names_are_decided() -> None:
-    """`getParamNames` checks each name: the loop runs meanwhile, and the answer has the readable names."""
+    """`getParamNames` checks each name while the loop runs; its answer has only the readable names."""
     there = mirror(tree={"mine": {f"p{number}": 1 for number in range(5000)}, "hidden": {"key": 1}})
     none: Any = None
     master = SimpleNamespace(reachable=True)

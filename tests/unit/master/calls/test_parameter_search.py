@@ -1,4 +1,4 @@
-"""searchParam finds readable keys as the ROS master does, and reveals no others."""
+"""searchParam finds readable keys as the ROS master does, and reveals no unreadable keys."""
 
 import asyncio
 import ipaddress
@@ -32,7 +32,7 @@ class Site:
         self.records: list[tuple[str, Decision]] = []
 
     def decided(self, _caller: Any, method: str, _category: str, resource: str, decision: Decision) -> str:
-        """As `AuditTrail`."""
+        """Act as `AuditTrail`."""
         assert method == "searchParam"
         self.records.append((resource, decision))
         return f"id{len(self.records)}"
@@ -67,7 +67,7 @@ class Site:
     ],
 )
 def test_the_answer_does_not_reveal_whether_a_key_exists(caller_id: str, key: str) -> None:
-    """An unreadable key has the same answer whether or not it exists: the rule, and the id of the record."""
+    """An unreadable key gets the same answer whether or not it exists: the rule, and the id of the record."""
     answers = [Site(tree).search(caller_id, key) for tree in ({"secret": {"key": 1}, "open": 1}, {"open": 1})]
     assert answers[0] == answers[1]
     assert answers[0][0] != 1
@@ -76,7 +76,7 @@ def test_the_answer_does_not_reveal_whether_a_key_exists(caller_id: str, key: st
 
 
 def test_a_denial_is_recorded_with_its_name() -> None:
-    """A global key is decided before the search; a search upwards is recorded with its first hidden key."""
+    """A global key is decided before the search; an upward search is recorded with the first key it may not reveal."""
     site = Site({"secret": {"key": 1}})
     site.search("/me", "/secret/key")
     assert not site.asked
@@ -97,7 +97,7 @@ def test_a_search_goes_on_above_a_hidden_name() -> None:
 
 
 def test_readable_keys_are_found_as_in_plain_ros() -> None:
-    """Where the policy hides nothing, the answer is that of the ROS master, also if it finds nothing."""
+    """Where the policy hides nothing, the answer equals the ROS master's, even if nothing is found."""
     site = Site({"arm": {"gain": 1}, "top": 2})
     assert site.search("/arm/node", "gain") == [1, "Found [/arm/gain]", "/arm/gain"]
     assert site.search("/arm/node", "/top") == [1, "Found [/top]", "/top"]

@@ -65,32 +65,32 @@ class Records:
         self.events: list[str] = []
 
     def shut_out(self, _host: str) -> str:
-        """As `AuditTrail`."""
+        """Act as `AuditTrail`."""
         return ""
 
     def owing(self, _host: str) -> str:
-        """As `AuditTrail`."""
+        """Act as `AuditTrail`."""
         return self.debt
 
     async def still_owing(self, _host: str) -> str:
-        """As `AuditTrail`."""
+        """Act as `AuditTrail`."""
         return self.debt
 
     def decided(
         self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, **about: Any
     ) -> str:
-        """As `AuditTrail`."""
+        """Act as `AuditTrail`."""
         self.decisions.append((method, about.get("key", resource), decision))
         return "id"
 
     def happened(self, event: str, _reason: str, **_more: Any) -> str:
-        """As `AuditTrail`."""
+        """Act as `AuditTrail`."""
         self.events.append(event)
         return "id"
 
 
 class Site:
-    """A running pipeline, its ROS master (whose calls wait for `go`), and the records."""
+    """A running pipeline, its ROS master (whose calls wait for `go`), and the audit records."""
 
     def __init__(self, rules: str = LIMITED, tree: Any = None, *, bytes_limit: int = 64 << 20) -> None:
         self.policy_text = POLICY + rules
@@ -102,8 +102,8 @@ class Site:
         self.arrived: list[str] = []
         self.go = asyncio.Event()
         self.go.set()
-        self.faults: set[str] = set()  # keys that it answers with a fault
-        self.dies_at = ""  # a key whose request it does not outlive
+        self.faults: set[str] = set()  # keys that the ROS master answers with a fault
+        self.dies_at = ""  # the key whose request kills the ROS master
         self.serve = serving(
             policy=lambda: self.policy,
             registry=self.registry,
@@ -118,11 +118,11 @@ class Site:
         )
 
     async def learn(self, _peer: Peer) -> None:
-        """As `Addresses`."""
+        """Act as `AdvertisedAddresses`."""
 
     @property
     def reachable(self) -> bool:
-        """Report that the ROS master is not being rebuilt: calls reach it."""
+        """Report that the ROS master can be called, because it is not being rebuilt."""
         return False
 
     async def call(self, method: str, *params: Any) -> Any:
@@ -172,14 +172,14 @@ def part(method: str, *params: Value) -> Value:
 
 
 async def others() -> None:
-    """Let all other tasks run until they wait."""
+    """Let every other task run until it waits."""
     for _ in range(20):
         await asyncio.sleep(0)
 
 
 @pytest.mark.parametrize("together", [False, True], ids=["alone", "in a multicall"])
 async def test_a_pending_value_is_not_replaced_from_below(together: bool, site: Site) -> None:
-    """A write below a key that is being set is decided after the key is set."""
+    """A write below a key that is being set is decided only after the key is set."""
     site.go.clear()
     setting = asyncio.create_task(site.ask(ADMIN, "setParam", "/admin", "/arm/max", 5))
     await others()
@@ -233,7 +233,7 @@ async def test_parts_are_decided_and_answered_in_their_places(site: Site) -> Non
 
 
 def sets(*keys: str) -> list[Value]:
-    """Return parts of a multicall that set these."""
+    """Return the parts of a multicall that sets these keys."""
     return [part("setParam", key, 1) for key in keys]
 
 
@@ -277,7 +277,7 @@ async def test_a_long_multicall_yields_after_a_few_parts(site: Site) -> None:
     ids=["a write elsewhere", "a write below", "a write above", "a read", "another call"],
 )
 async def test_calls_after_a_run_wait_for_it(following: Value, site: Site) -> None:
-    """They are decided and answered with the state after the run."""
+    """Calls after a run are decided and answered with the state that the run left."""
     asked = await held(site, [*sets(*RUNS[0]), following, *sets(*RUNS[1])])
     assert len(site.trail.decisions) == len(RUNS[0])
     site.go.set()
@@ -286,7 +286,7 @@ async def test_calls_after_a_run_wait_for_it(following: Value, site: Site) -> No
 
 
 async def test_writes_after_a_waiting_read_are_decided_again() -> None:
-    """A new policy, a broken log or a new holder of the name counts for them."""
+    """These writes see a new policy, a broken audit log or a new holder of their name."""
 
     async def scene(change: Callable[[Site], None], *, denied: bool = True) -> None:
         site, keys = Site(), RUNS[0][:7]
@@ -321,13 +321,13 @@ async def test_a_failure_in_a_run_stops_no_other_part(site: Site) -> None:
     assert answers == [1] * 5 + [0] + [1] * 57 + [0] + [0] * 62 + [-1, 0] + [1] * 64
     assert site.there.tree == {"arm": {key[5:]: 1 for key in RUNS[0][:63] + RUNS[2] if key != RUNS[0][5]}}
     assert site.there.tree == site.parameters.tree
-    again = await site.ask(OPERATOR, "system.multicall", sets(*RUNS[0], *RUNS[2]))  # no turn is left over
+    again = await site.ask(OPERATOR, "system.multicall", sets(*RUNS[0], *RUNS[2]))  # no turn is left locked
     assert told(again).count(1) == 127
 
 
 @pytest.mark.timeout(300)
 async def test_a_multicall_equals_its_parts_one_by_one() -> None:
-    """Answers, decisions with their order, the tree of the ROS master and the mirror are the same."""
+    """Together and one by one, the calls give the same answers, the same decisions in order, and the same two trees."""
 
     async def scene(dice: random.Random) -> None:
         keys = ["/arm", "/arm/a", "/arm/a/b", "/arm/max", "/leg", "/leg/x", *RUNS[0]]
@@ -352,9 +352,9 @@ async def test_a_multicall_equals_its_parts_one_by_one() -> None:
 
 
 async def test_a_namespace_that_appears_after_the_decision_is_hidden() -> None:
-    """A host receives a new namespace only if it may read all of it."""
+    """A host receives a namespace that appeared meanwhile only if it may read all of it."""
     site = Site("read /arm = ocu adm\nread default = adm\nwrite default = adm\n")
-    put(site.there, "/arm", {"speed": 4711}, HOST)  # and the mirror does not know yet
+    put(site.there, "/arm", {"speed": 4711}, HOST)  # and the mirror does not have it yet
     answer = await site.ask(OPERATOR, "getParam", "/me", "/arm")
     assert answer[0] == 0
     assert "4711" not in str(answer)
@@ -364,7 +364,7 @@ async def test_a_namespace_that_appears_after_the_decision_is_hidden() -> None:
 
 
 async def test_the_answers_of_a_multicall_are_bounded_together() -> None:
-    """A small request cannot make the appliance hold many large answers: the rest is refused and recorded once."""
+    """A small request cannot make the appliance hold many large answers: the rest is refused, with one record."""
     site = Site(tree={"arm": {"model": "x" * 100_000, "speed": 1}}, bytes_limit=1_000_000)
     wanted: list[Value] = [part("getParam", "/arm/model")] * 100
     answers = await site.ask(OPERATOR, "system.multicall", wanted)
@@ -379,7 +379,7 @@ async def test_the_answers_of_a_multicall_are_bounded_together() -> None:
 
 @pytest.mark.parametrize("together", [False, True], ids=["alone", "in a multicall"])
 async def test_large_answers_are_made_a_few_at_a_time(together: bool) -> None:
-    """A host gets one large answer at a time, and delays no other host."""
+    """Each host gets one large answer at a time, and delays no other host."""
     site = Site(tree={"arm": {"model": "x" * OFFLOAD}, "leg": 1})
 
     async def dump(host: str) -> None:
@@ -403,7 +403,7 @@ async def test_large_answers_are_made_a_few_at_a_time(together: bool) -> None:
 async def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The event loop runs meanwhile; small bodies and answers use no thread."""
+    """Large bodies and answers leave the event loop free; small ones use no thread."""
     threads: list[tuple[str, bool]] = []
 
     def observed(name: str) -> None:
@@ -440,7 +440,7 @@ async def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
     ],
 )
 async def test_the_answer_to_a_denied_host_follows_the_policy(tell: str, told: str) -> None:
-    """The answer has the id of the record and the details that `[Options] tell` allows; the record has all."""
+    """The answer has the id of the record and the details that `[Options] tell` allows; the record has all details."""
     site = Site(LIMITED + (f"[Options]\ntell = {tell}\n" if tell else ""))
     answer = await site.ask(OPERATOR, "setParam", "/n", "/arm/max", 1)
     assert answer[0] == 0

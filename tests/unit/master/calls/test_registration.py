@@ -14,7 +14,7 @@ SERVICE_URI = "rosrpc://10.0.0.5:4101"
 
 
 async def test_a_registration_that_waited_over_a_reload_is_decided_again() -> None:
-    """A registration that the new policy does not allow is taken back."""
+    """If the new policy does not allow the registration, it is undone."""
     world = await ControlParts.begun()
     world.rosmaster.shut()
     call = asyncio.ensure_future(world.ask("registerPublisher", "/n", "/secret", "std_msgs/String", URI))
@@ -30,7 +30,7 @@ async def test_a_registration_that_waited_over_a_reload_is_decided_again() -> No
 
 
 async def test_a_service_that_is_looked_up_over_a_reload_is_not_granted() -> None:
-    """The answer has the port, but no connection to it is accepted."""
+    """The answer has the service's port, but no connection to that port is accepted."""
     world = await ControlParts.begun()
     await world.ask("registerService", "/n", "/s", SERVICE_URI, URI)
     world.rosmaster.shut()
@@ -44,7 +44,7 @@ async def test_a_service_that_is_looked_up_over_a_reload_is_not_granted() -> Non
 
 
 async def test_a_tool_unregisters_with_the_uris_of_lookups() -> None:
-    """`rosnode cleanup`, on the node's own host, unregisters a node by the URIs from lookups."""
+    """On the node's own host, `rosnode cleanup` may unregister the node with the URIs from look-ups."""
     world = await ControlParts.begun()
     await world.ask("registerPublisher", "/n", "/t", "std_msgs/String", URI)
     await world.ask("registerService", "/n", "/s", SERVICE_URI, URI)
@@ -58,7 +58,7 @@ async def test_a_tool_unregisters_with_the_uris_of_lookups() -> None:
 
 
 async def test_reading_a_parameter_does_not_wait_for_the_master() -> None:
-    """The mirror answers; only a large namespace is requested from the ROS master."""
+    """The mirror answers; only a large namespace is fetched from the ROS master."""
     world = await ControlParts.begun()
     await world.ask("setParam", "/n", "/arm/speed", 3)
     before = len(world.hidden.calls)

@@ -1,4 +1,4 @@
-"""The record of a request that is refused by the beginning of its body."""
+"""The record of a request that is refused after only the beginning of its body was read."""
 
 import ipaddress
 from typing import Any
@@ -34,9 +34,9 @@ PARTS: list[Value] = [{"methodName": "setParam", "params": []}, {"methodName": "
 def test_a_record_names_what_was_asked_for(
     method: str, params: tuple[Value, ...], record: tuple[Any, ...]
 ) -> None:
-    """As a decision has it: category, resource, claimed name; the key resolved, the first parts of a multicall.
+    """The record has category, resource (with keys resolved), claimed name, and the first parts of a multicall.
 
-    Wrong arguments still name the call and its caller; a method that is not served has no category of its own.
+    Wrong arguments still give the call and its caller; an unknown method has no category of its own.
     """
     assert tuple(asked_for(PEER, build_call(method, params))) == record
 
@@ -50,5 +50,5 @@ def test_a_body_that_is_cut_names_its_method(cut: int) -> None:
 
 @pytest.mark.parametrize("body", [b"", b"\0\xff", b"<methodName>", b"<methodName><!-- --></methodName>"])
 def test_a_body_without_a_method(body: bytes) -> None:
-    """An unreadable body has no resource, and raises no error."""
+    """A body without a method gives a record without a resource, and raises no error."""
     assert asked_for(PEER, body) == (Category.COMMAND, "", None, {"call": "unknown"})

@@ -26,12 +26,12 @@ def peer(host: str, local: str) -> Peer:
     ],
 )
 def test_the_appliance_listens_on_the_address_in_answers(listen: str, local: str, told: str) -> None:
-    """It is the address the peer connected to, but not loopback, where proxy endpoints and relay may not listen."""
+    """Answers have the address that the peer connected to, unless the appliance does not listen there."""
     assert AdvertisedAddresses([], None, listen).address_for(peer("127.0.0.1", local)) == told
 
 
 def test_configured_and_translated_addresses_come_first() -> None:
-    """`advertise` for a network, then the address that the supervisor knows for this peer."""
+    """`advertise` for the peer's network comes first, then the address that the supervisor knows for this peer."""
 
     async def route(host: str) -> str | None:
         return "192.168.1.7" if host == "10.0.0.5" else None

@@ -1,4 +1,4 @@
-"""The queues of calls to nodes: their bounds, and the fate of an undelivered call."""
+"""The queues of calls to nodes: their limits, and the fate of an undelivered call."""
 
 import asyncio
 import ipaddress
@@ -29,7 +29,7 @@ class Node:
         self.heard: list[Value] = []
 
     async def call(self, _method: str, _caller: str, *parameters: Value) -> None:
-        """As `XmlRpcClient`."""
+        """Act as `XmlRpcClient`."""
         await self.answers.wait()
         if self.fails:
             raise CallFailedError("it does not answer") from self.fault
@@ -37,7 +37,7 @@ class Node:
 
 
 class Post:
-    """A delivery to one node, and its undelivered calls."""
+    """Deliveries to one node, and the calls that stayed undelivered."""
 
     def __init__(self, **bounds: Any) -> None:
         self.node, self.lost = Node(), list[tuple[str, Value]]()
@@ -61,13 +61,13 @@ class Post:
         return node
 
     def push(self, *topics: str, publishers: list[str]) -> None:
-        """Return a list of publishers for each of these topics."""
+        """Queue an updated list of publishers for each of these topics."""
         for topic in topics:
             self.delivery.push(self.incarnation, NodeCall("publisherUpdate", (topic, list(publishers))))
 
 
 async def test_lists_of_publishers_are_bounded_in_bytes() -> None:
-    """The queue of a hanging node is bounded in bytes; the node later receives what was dropped."""
+    """The queue of a hanging node is limited in bytes; the node receives the dropped lists later."""
     post = Post(queued=Bounds(100_000, 100_000, 0, 0))
     post.push(*(f"/t{number}" for number in range(50)), publishers=LONG)
     assert post.delivery.waiting < 8
@@ -80,7 +80,7 @@ async def test_lists_of_publishers_are_bounded_in_bytes() -> None:
 
 
 async def test_a_dropped_queue_frees_its_bytes() -> None:
-    """After the node is gone, its queue no longer counts."""
+    """When the node is gone, its queue no longer counts."""
     post = Post()
     post.push("/a", "/b", publishers=LONG)
     assert post.delivery.weight > 20_000
@@ -111,7 +111,7 @@ async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
 
 
 async def test_a_host_loses_only_its_own_calls() -> None:
-    """Queues of a guest fill all memory: the robot loses no call, though its queue is the longest."""
+    """A guest's queues fill all memory: the robot loses no call, even if its queue is the longest."""
     post = Post(queued=Bounds(400_000, 400_000, 0, 0))
     post.push("/a", "/b", publishers=LONG)
     for number in range(200):

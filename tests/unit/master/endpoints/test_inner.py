@@ -1,4 +1,4 @@
-"""The master-side endpoint acknowledges calls of the ROS master to a node and does nothing else."""
+"""The master-side endpoint only acknowledges the calls that the ROS master makes to a node."""
 
 import ipaddress
 from typing import Any
@@ -22,7 +22,7 @@ CALLS: list[tuple[str, tuple[Value, ...]]] = [
 
 
 async def call(face: MasterSideApi, path: str, method: str, params: tuple[Value, ...]) -> Any:
-    """Make a call of the ROS master."""
+    """Call the endpoint as the ROS master does."""
     request = HttpRequest(Peer(MASTER, "127.0.0.1", "127.0.0.1"), path, build_call(method, params), 0)
     return parse_response(await face.handle(request))
 

@@ -1,4 +1,4 @@
-"""A process that reuses the port of a killed node is not taken for that node."""
+"""A process that reuses the port of a killed node is not mistaken for that node."""
 
 from typing import Any, cast
 
@@ -15,10 +15,10 @@ pytestmark = pytest.mark.anyio
 
 
 class Street(ControlParts):
-    """Control, with the queues of calls to nodes; the process that owns a port answers there."""
+    """Control, with queues of calls to nodes, and the processes that answer at their ports."""
 
     def surround(self) -> None:
-        """As `ControlParts`."""
+        """Act as `ControlParts`."""
         self.heard: list[tuple[int, str]] = []
         self.process = 1
         cast(Any, self.nodes).client = lambda node: _Door(self, node)
@@ -50,7 +50,7 @@ class _Door:
 
 
 async def test_the_name_of_a_dead_node_is_registered_again() -> None:
-    """The shutdown order for the earlier incarnation does not end the node that reuses its port."""
+    """The order to shut down the earlier incarnation does not end the node that now uses its port."""
     street = Street()
     dead, heir = await street.two_at_one_address()
     await street.register(street.node("/first", 2), Kind.SUBSCRIPTION, "/t")
@@ -61,7 +61,7 @@ async def test_the_name_of_a_dead_node_is_registered_again() -> None:
 
 
 async def test_the_earlier_incarnation_is_shut_down() -> None:
-    """This holds if no other node has its address."""
+    """The earlier incarnation is shut down if no other node has its address."""
     street = Street()
     await street.round()
     await street.register(street.node("/first", 1), Kind.SUBSCRIPTION, "/t")
@@ -71,7 +71,7 @@ async def test_the_earlier_incarnation_is_shut_down() -> None:
 
 
 async def test_the_answer_of_another_process_does_not_revive_a_node() -> None:
-    """The dead node is lost at the next check; only a registration brings it back."""
+    """The dead node counts as lost after the next check; only a registration brings it back."""
     street = Street()
     dead, heir = await street.two_at_one_address()
     street.process = 2
@@ -85,11 +85,11 @@ async def test_the_answer_of_another_process_does_not_revive_a_node() -> None:
 
 
 async def test_a_node_that_restarts_at_its_address() -> None:
-    """It registers, and the new process is the node."""
+    """When the new process registers, it becomes the node."""
     street = Street()
     node, _other = await street.two_at_one_address()
     street.process = 2
-    node.touched += 1  # as at each registering call
+    node.touched += 1  # as each registering call does
     await street.look(node)
     await street.look(node)
     assert node.life is Life.LIVE

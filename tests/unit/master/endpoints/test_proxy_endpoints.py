@@ -9,20 +9,20 @@ from roswire.uris import parse_node_uri
 
 
 class Told:
-    """Stands for the parts that a proxy endpoint uses; remembers its calls."""
+    """Stands in for the parts that a proxy endpoint uses; records their calls."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[str, Any]] = []
 
     def close(self, *given: Any) -> None:
-        """As a server, and as `Places`."""
+        """Stand in for a server, and for `NodePorts`."""
         self.calls.append(("close", given))
 
 
 def test_ports_are_closed_once() -> None:
-    """A node is closed when it is replaced and again when it is forgotten: its ports only the first time.
+    """A node is closed when it is replaced and again when it is forgotten; its ports are closed only the first time.
 
-    In between the ports may have become another node's.
+    By the second time, another node may have these ports.
     """
     places, server = Told(), Told()
     faces = ProxyEndpoints(cast(Any, None), cast(Any, places), *[cast(Any, None)] * 3)

@@ -36,13 +36,13 @@ _UNUSED = object()  # a part that is not used
 
 
 class Ports:
-    """A socket for each port, told apart by its descriptor."""
+    """One socket for each port, distinguished by its descriptor."""
 
     def __init__(self) -> None:
         self.sockets: dict[int, socket.socket] = {}
 
     def socket(self, port: int) -> socket.socket:
-        """As `NodePorts`."""
+        """Act as `NodePorts`."""
         if port not in self.sockets:
             self.sockets[port] = socket.socket()
         return self.sockets[port]
@@ -52,18 +52,18 @@ class NoPermissions:
     """A store that keeps no grants."""
 
     def permissions(self) -> list[PermissionRow]:
-        """As `StateStore`."""
+        """Act as `StateStore`."""
         return []
 
     def save_permission(self, row: PermissionRow) -> None:
-        """As `StateStore`."""
+        """Act as `StateStore`."""
 
     def remove_permission(self, row: PermissionRow) -> None:
-        """As `StateStore`."""
+        """Act as `StateStore`."""
 
 
 class NoDelivery:
-    """No node is called."""
+    """Deliveries that call no node."""
 
 
 class Link:
@@ -74,15 +74,15 @@ class Link:
         self.end: Callable[[], None] = lambda: None
 
     def attach(self, _loop: Any, received: Any, closed: Callable[[], None], _refused: object) -> None:
-        """As `Channel`."""
+        """Act as `Channel`."""
         self.say, self.end = received, closed
 
     def send(self, message: messages.Message, descriptors: tuple[int, ...] = (), **_when: bool) -> None:
-        """As `Channel`."""
+        """Act as `Channel`."""
         self.told.append((message, descriptors))
 
     def close(self) -> None:
-        """As `Channel`."""
+        """Act as `Channel`."""
 
     def heard(self) -> list[messages.Message]:
         """Return the messages since the last call."""
@@ -151,15 +151,15 @@ class World:
             self.relay.place(self.node, kind, name, detail)
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
-        """As `Monitors`."""
+        """Act as `Monitors`."""
         return stated(1, [], {}, {}, restarted=False)
 
     def relay_lost(self, relay: int) -> None:
-        """As `Monitors`."""
+        """Act as `Monitors`."""
         self.lost.append(relay)
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
-        """As `AuditTrail`."""
+        """Act as `AuditTrail`."""
         self.records.append((event, reason, fields))
         return ""
 
@@ -191,7 +191,7 @@ async def world() -> AsyncIterator[World]:
 
 
 async def test_an_order_is_done_when_every_relay_confirms_it(world: World) -> None:
-    """A relay that is gone or was restarted counts as confirmed; an absent relay is not waited for."""
+    """A relay that is gone or was restarted counts as confirmed; control does not wait for an absent relay."""
     relay, (first, second) = world.relay, world.links
 
     async def waiting() -> asyncio.Task[None]:
@@ -214,7 +214,7 @@ async def test_an_order_is_done_when_every_relay_confirms_it(world: World) -> No
 
 
 async def test_each_relay_receives_its_topics(world: World) -> None:
-    """Publications, grants, withdrawals and the state for a restarted relay have its own port of the node."""
+    """Publications, grants, withdrawals, and the state for a restarted relay have the node's port at that relay."""
     relay, node, (first, second) = world.relay, world.node, world.links
     placed = messages.NodePlaced("key", "/node", "10.0.0.5")
     assert (placed, (world.ports.socket(2).fileno(),)) in first.told
@@ -240,7 +240,7 @@ async def test_each_relay_receives_its_topics(world: World) -> None:
 
 
 async def test_relays_know_which_hosts_the_policy_names(world: World) -> None:
-    """Publications and grants say whether their host is named; a policy that changes this sends them again."""
+    """Publications and grants say whether the policy names their host; if that changes, they are sent again."""
     (first, second) = world.links
     world.grant_topic("/right", HOST, "/ear")
     world.enactor.carry_out(world.graph.service_granted(world.node, "/serve", HOST, "/client"))
@@ -261,7 +261,7 @@ async def test_relays_know_which_hosts_the_policy_names(world: World) -> None:
 
 
 async def test_a_topic_moves_with_its_grants(world: World) -> None:
-    """It is withdrawn from the old relay and placed on the new one; other topics are not touched."""
+    """The topic is withdrawn from the old relay and placed on the new one; other topics do not move."""
     relay, (first, second) = world.relay, world.links
     world.grant_topic("/right", HOST, "/ear")
     world.grant_topic("/left", HOST, "/ear")
@@ -283,7 +283,7 @@ async def test_a_topic_moves_with_its_grants(world: World) -> None:
 
 
 async def test_a_grant_that_is_revoked_after_a_move_is_invalid_everywhere(world: World) -> None:
-    """It stays invalid on the first relay if the topic returns; the same holds for a service."""
+    """The grant stays invalid on the first relay even if the topic returns there; the same holds for a service."""
     relay, (first, second) = world.relay, world.links
     world.enactor.carry_out(world.graph.service_granted(world.node, "/serve", HOST, "/c"))
     first.heard()
@@ -301,7 +301,7 @@ async def test_a_grant_that_is_revoked_after_a_move_is_invalid_everywhere(world:
 
 
 async def test_a_lost_relay_loses_its_connections(world: World) -> None:
-    """Each relay numbers its own connections; the combined list has unique numbers."""
+    """Each relay numbers its own connections; when they are combined, the numbers are unique."""
     relay, (first, second) = world.relay, world.links
     for link, topic in ((first, "/left"), (second, "/right")):
         link.say(messages.ConnectionOpened(7, "key", topic, "topic", "10.0.0.5", "/ear"), ())
@@ -314,7 +314,7 @@ async def test_a_lost_relay_loses_its_connections(world: World) -> None:
 
 
 async def test_a_publisher_that_is_cut_for_its_messages_is_recorded(world: World) -> None:
-    """The record is a folded denial with its address and name; a broken connection has no record."""
+    """Cutting a publisher is recorded as a folded denial with address and name; a broken connection has no record."""
     say = world.links[0].say
     say(messages.UpstreamLost("key", "/left", "the publisher closed the connection"), ())
     assert world.records == []
@@ -328,7 +328,7 @@ async def test_a_publisher_that_is_cut_for_its_messages_is_recorded(world: World
 
 
 async def test_unreported_events_of_a_relay_are_recorded(world: World) -> None:
-    """It reports unrecorded connections, and the traffic of the time without control as a rate."""
+    """A relay reports connections that were not recorded; traffic from the time without control counts as a rate."""
     row = messages.TopicTraffic("key", "/left", 400, 4000, 0, 1)
     world.links[0].say(messages.TrafficReported([row], 40.0, 7), ())
     assert world.relay.carried.traffic["key", "/left"].messages_per_second == 10
@@ -338,7 +338,7 @@ async def test_unreported_events_of_a_relay_are_recorded(world: World) -> None:
 
 
 async def test_limits_of_the_policy_are_sent_and_sent_again_on_change(world: World) -> None:
-    """The relay of the topic gets them with publications and grants; unchanged ones are not sent again."""
+    """A topic's relay gets its limits with publications and grants; unchanged limits are not sent again."""
     relay, (first, second) = world.relay, world.links
     world.grant_topic("/right", HOST, "/ear")
     world.grant_topic("/left", HOST, "/ear")
@@ -372,7 +372,7 @@ async def test_limits_of_the_policy_are_sent_and_sent_again_on_change(world: Wor
 
 
 async def test_drops_of_a_limit_are_recorded_with_its_line(world: World) -> None:
-    """Drops of publishers are warnings, intended throttling is informational; both are counted."""
+    """Drops of publishers are warnings, intended throttling is information; both are counted."""
     world.policy = policy("/left = publisher 30 Hz, subscriber 5 Hz")
     rows = [
         messages.LimitedRow("key", "/left", "publisher", "10.0.0.5", "/node", 7, 70),
@@ -387,7 +387,7 @@ async def test_drops_of_a_limit_are_recorded_with_its_line(world: World) -> None
 
 
 async def test_grants_of_all_hosts_are_bounded() -> None:
-    """A host at its quota, or the one with most grants, loses unused grants; others lose nothing."""
+    """A host at its quota, or the host with most grants, loses unused grants; other hosts lose nothing."""
     world = World(Bounds(whole=100, host=60, unknown=0, kept=0))
     robot = ipaddress.ip_address("10.0.0.9")
     world.grant_topic("/left", robot, "/ear")

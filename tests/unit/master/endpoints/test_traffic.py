@@ -1,4 +1,4 @@
-"""Records of a relay's reports of refused connections."""
+"""Audit records made from a relay's reports of refused connections."""
 
 import ipaddress
 from typing import Any, cast
@@ -13,13 +13,13 @@ from roswire.uris import parse_node_uri
 
 
 class Kept:
-    """A trail that keeps what it is given."""
+    """A trail that keeps its records."""
 
     def __init__(self) -> None:
         self.records: list[dict[str, Any]] = []
 
     def happened(self, event: str, reason: str, **fields: Any) -> None:
-        """As the trail has it."""
+        """Keep a record, as `AuditTrail` does."""
         self.records.append({"event": event, "reason": reason, **fields})
 
 
@@ -28,7 +28,7 @@ class Kept:
     [("10.0.0.2", "/rosout", False), ("10.0.0.2", "/camera", True), ("10.0.0.66", "/rosout", True)],
 )
 def test_a_late_connection_of_our_own_node_is_not_an_attack(host: str, topic: str, attack: bool) -> None:
-    """A connection of rosout to a node that has gone is not a denial; other hosts with its name are denied."""
+    """If rosout connects to a node that has gone, it is not a denial; if another host uses rosout's name, it is."""
     kept = Kept()
     registry = Registry()
     for key, name, own in (("k", "/talker", False), ("o", "/rosout", True)):
@@ -47,7 +47,7 @@ def test_a_late_connection_of_our_own_node_is_not_an_attack(host: str, topic: st
 
 
 def test_a_refusal_without_a_name_has_no_category() -> None:
-    """A host that is refused before it sends a header has requested neither a topic nor a service."""
+    """A host that is refused before it sends a header has not yet requested a topic or a service."""
     kept = Kept()
     told = RelayTraffic(cast(Any, kept), Registry(), 1)
     told.refused(ConnectionRefused("k", "", "", "10.0.0.66", "", "said nothing", 2))

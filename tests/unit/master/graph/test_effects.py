@@ -1,4 +1,4 @@
-"""Every caller that changes the graph carries out the returned effects."""
+"""Every caller of a method that changes the graph carries out the effects it returns."""
 
 import ast
 import inspect
@@ -16,7 +16,7 @@ _EFFECTS = {"Effects", "list[Durable]"}
 
 
 def verbs() -> set[tuple[str, str]]:
-    """The name of a part of the core, and one of its methods that returns effects."""
+    """Names a part of the core, and its methods that return effects."""
     return {
         (part.__name__.removeprefix("Ros").lower(), node.name)
         for part in (RosGraph, Registry, Grants, Revocation)
@@ -28,7 +28,7 @@ def verbs() -> set[tuple[str, str]]:
 
 
 def dropped(tree: ast.Module, known: set[tuple[str, str]]) -> Iterator[str]:
-    """Return the calls of these methods whose result is dropped."""
+    """Yield the calls of these methods whose result is unused."""
     for node in ast.walk(tree):
         match node:
             case ast.Expr(value=ast.Call(func=ast.Attribute(value=part, attr=verb))):
@@ -38,7 +38,7 @@ def dropped(tree: ast.Module, known: set[tuple[str, str]]) -> Iterator[str]:
 
 
 def test_no_effect_is_dropped() -> None:
-    """No call in RVMaster or control drops effects."""
+    """No call in RVMaster or control ignores returned effects."""
     files = [*(ROOT / "master").rglob("*.py"), *(ROOT / "control").rglob("*.py")]
     known = verbs()
     assert [
@@ -47,7 +47,7 @@ def test_no_effect_is_dropped() -> None:
 
 
 def test_the_rule_finds_what_it_forbids() -> None:
-    """A call whose result is dropped is found; one whose effects are carried out is not."""
+    """A call with an unused result is found; a call whose effects are carried out is not."""
     assert {
         ("graph", "registered"),
         ("registry", "add"),

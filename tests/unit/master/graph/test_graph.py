@@ -14,7 +14,7 @@ pytestmark = pytest.mark.anyio
 
 @pytest.mark.parametrize("forgotten", [False, True], ids=["it unregisters", "it is forgotten"])
 async def test_a_lost_incarnation_takes_nothing_from_its_successor(forgotten: bool) -> None:
-    """A hung node wakes up and shuts down after its successor started: the grant of both, by name and host, stays."""
+    """A hung node wakes up and shuts down after its successor started: their grant, by name and host, stays."""
     world = await ControlParts.begun()
     talker, old, new = world.node("/talker"), world.node("/ear", 2), world.node("/ear", 3)
     await world.register(talker, Kind.PUBLICATION, "/a")
@@ -33,7 +33,7 @@ async def test_a_lost_incarnation_takes_nothing_from_its_successor(forgotten: bo
 
 
 async def test_the_next_control_repeats_the_news_of_a_lost_topic() -> None:
-    """If control died before the update, subscribers would otherwise keep the old publisher."""
+    """If control died before the update, the next control sends it; else subscribers would keep the old publisher."""
     world = await ControlParts.begun()
     node = world.node("/ear")
     await world.register(node, Kind.SUBSCRIPTION, "/secret")
@@ -49,7 +49,7 @@ async def test_the_next_control_repeats_the_news_of_a_lost_topic() -> None:
 
 
 async def test_subscribers_without_a_connection_are_absent() -> None:
-    """They have a publisher on the relay and no connection, with or without a grant."""
+    """A subscriber is absent if its publisher is on the relay and it has no connection, with or without a grant."""
     world = await ControlParts.begun()
     talker, ear, other = world.node("/talker", 1), world.node("/ear", 2), world.node("/other", 3)
     await world.register(talker, Kind.PUBLICATION, "/a")
@@ -62,7 +62,7 @@ async def test_subscribers_without_a_connection_are_absent() -> None:
 
 
 async def test_no_subscriber_is_absent_without_the_relay() -> None:
-    """Topics that the relay does not carry have no connections there; the appliance's own nodes always have."""
+    """If the relay does not carry a topic, only the appliance's own nodes, which always use it, can be absent."""
     world = await ControlParts.begun()
     cast(Any, world.mediation).carries_topic = lambda _topic: False
     talker, ear, own = world.node("/talker", 1), world.node("/ear", 2), world.node("/rosout", 3)

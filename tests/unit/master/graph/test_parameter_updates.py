@@ -1,4 +1,4 @@
-"""Updates of parameters go to the nodes that rosmaster computes, and never carry an undecided key."""
+"""Updates of parameters go to the nodes that rosmaster computes, and never have a key that was not decided."""
 
 import asyncio
 import copy
@@ -43,7 +43,7 @@ SUBSCRIBED = st.lists(st.tuples(CALLER, KEY), max_size=8, unique=True)
 
 @pytest.fixture(scope="module")
 def oracle() -> Any:
-    """rosmaster's `compute_param_updates`, run by the interpreter it is installed for."""
+    """rosmaster's `compute_param_updates`, run by the interpreter that rosmaster is installed for."""
     with subprocess.Popen(
         [PYTHON, "-c", ORACLE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -53,7 +53,7 @@ def oracle() -> Any:
 
 
 def in_order(told: list[Any]) -> list[str]:
-    """Return the updates without their order within one call, which has no meaning."""
+    """Return the updates, sorted within each call, where their order has no meaning."""
     return sorted(json.dumps(one, sort_keys=True) for one in told)
 
 
@@ -91,14 +91,14 @@ def test_updates_equal_those_of_a_plain_master(
     st.lists(KEY, max_size=5),
 )
 def test_no_update_has_an_undecided_key(key: str, value: Any, others: list[str]) -> None:
-    """For any names in a value, an update has the key or a subscribed key below it."""
+    """For any names in a value, an update has the key that was set or a subscribed key below it."""
     below = [one for one in others if one != key and one.startswith(key.rstrip("/") + "/")]
     for update in updates_of(key, value, below):
         assert update.key in {key, *below}
 
 
 def test_an_update_has_the_value_that_was_set() -> None:
-    """A later call that sets a member does not change the value of a waiting update."""
+    """If a later call sets a member, the value of a waiting update stays the same."""
     tree: dict[str, Value] = {"a": {"b": 1}, "c": [1]}
     kept = settled(tree)
     before = copy.deepcopy(kept)
@@ -112,7 +112,7 @@ def test_an_update_has_the_value_that_was_set() -> None:
 @pytest.mark.parametrize("depth", range(3))
 @pytest.mark.anyio
 async def test_a_member_with_an_invalid_name_is_refused(name: str, depth: int) -> None:
-    """At every depth, alone and in a multicall, nothing is set or sent, and the error names the member."""
+    """At any depth, alone or in a multicall, the error names the member, and nothing is set or sent."""
     world = await ControlParts.begun()
     node = world.node("/robot")
     await world.register(node, Kind.PARAMETER, "/limits/speed", "")
@@ -135,7 +135,7 @@ async def test_a_member_with_an_invalid_name_is_refused(name: str, depth: int) -
 
 @pytest.mark.anyio
 async def test_a_subscription_during_a_write_gets_the_new_value() -> None:
-    """A node that subscribes during a write gets the new value by the answer or by an update."""
+    """A node that subscribes during a write gets the new value in the answer or in an update."""
     for first in ("subscribeParam", "setParam"):
         world = await ControlParts.begun()
         calls = {
@@ -153,7 +153,7 @@ async def test_a_subscription_during_a_write_gets_the_new_value() -> None:
 
 @pytest.mark.anyio
 async def test_an_update_of_the_whole_tree_needs_the_right_to_all_of_it() -> None:
-    """The rights to other updates are in `conversations.txt`."""
+    """`conversations.txt` covers the rights to other updates."""
     world = await ControlParts.begun()
     world.reload(f"{OPEN}[Parameters]\nread /arm = 10.0.0.5\nread default = 10.0.0.9\n")
     node = world.node("/n")

@@ -30,7 +30,7 @@ def incarnation(number: int) -> Incarnation:
 @settings(max_examples=examples(300))
 @given(steps=st.lists(STEP, max_size=40))
 def test_invariants(steps: list[tuple[str, int, Kind, str]]) -> None:
-    """A name has one live incarnation, replaced ones do not count, and the indexes equal a full scan."""
+    """A name has one live incarnation, replaced incarnations do not count, and the indexes equal a full scan."""
     registry = Registry()
     known = [incarnation(number) for number in range(6)]
     for one in known:
@@ -81,7 +81,7 @@ def check(registry: Registry, known: list[Incarnation]) -> None:
 
 
 def test_the_node_that_was_lost_first_makes_room() -> None:
-    """A host's longest-lost node is dropped first; a live one never is."""
+    """The node of a host that was lost first is dropped first; a live node is never dropped."""
     registry = Registry()
     known = [incarnation(number) for number in (0, 2, 4)]
     for one in known:
@@ -95,7 +95,7 @@ def test_the_node_that_was_lost_first_makes_room() -> None:
 
 
 def test_a_node_without_registrations_makes_room_first() -> None:
-    """A node without registrations is dropped before a lost one, also for other hosts, unless it is calling now."""
+    """A node without registrations is dropped before a lost one, even for another host, unless it is calling now."""
     registry = Registry()
     lost, idle, busy = incarnation(0), incarnation(2), incarnation(4)
     for one in (lost, idle, busy):
@@ -116,7 +116,7 @@ def test_a_node_without_registrations_makes_room_first() -> None:
 
 
 def test_forgetting_one_incarnation_keeps_the_next() -> None:
-    """Two incarnations of one identity (name, host and URI again): the later one stays when the first is dropped."""
+    """If two incarnations have the same identity (name, host and URI), dropping the first keeps the second."""
     registry = Registry()
     first, second = incarnation(0), incarnation(0)
     registry.add(first)
@@ -130,7 +130,7 @@ def test_forgetting_one_incarnation_keeps_the_next() -> None:
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_name_is_restored_to_the_node_with_registrations(order: tuple[int, int]) -> None:
-    """An idle incarnation that is still live does not get the name at a restart."""
+    """A restart does not give the name to an idle incarnation, even if that one is still live."""
     known = [incarnation(0), incarnation(3)]
     known[1].registrations[Kind.PUBLICATION, "/x"] = NodeRegistration(Kind.PUBLICATION, "/x", "t", 1)
     registry = Registry()

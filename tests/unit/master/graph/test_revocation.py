@@ -1,4 +1,4 @@
-"""After a change of the policy everything is decided again, whatever the nodes do meanwhile."""
+"""After a change of the policy every right is decided again, whatever the nodes do meanwhile."""
 
 import pytest
 
@@ -12,7 +12,7 @@ NO_SECRET = POLICY.format("/secret=\n", "/secret=\n")
 
 
 async def test_an_earlier_incarnation_gets_nothing_back() -> None:
-    """A restarted node keeps its name while the registration of its earlier incarnation is restored."""
+    """The name stays with a restarted node while the registration of its earlier incarnation is restored."""
     world = await ControlParts.begun()
     first, second = world.node("/n", 1), world.node("/n", 2)
     await world.register(first, Kind.PUBLICATION, "/secret")

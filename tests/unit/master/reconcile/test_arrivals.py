@@ -1,4 +1,4 @@
-"""Arrivals of incarnations: several at once, also without room for all of them."""
+"""Arrivals of incarnations: several at once, also when there is not room for all."""
 
 import asyncio
 from typing import Any, cast
@@ -16,13 +16,13 @@ _NODES = 4
 
 
 class FewPorts:
-    """Places: two ports for each of `_NODES` nodes."""
+    """Stands in for `NodePorts`: two ports for each of `_NODES` nodes."""
 
     def __init__(self, registry: Registry) -> None:
         self._registry = registry
 
     def open(self, _host: Address) -> tuple[int, ...]:
-        """As `Places`."""
+        """Act as `NodePorts`."""
         taken = {port for node in self._registry.all() for port in node.ports}
         free = [port for port in range(1, 2 * _NODES + 1) if port not in taken]
         if not free:
@@ -31,19 +31,19 @@ class FewPorts:
 
 
 class SlowFaces:
-    """Proxy endpoints that take some turns of the loop to open."""
+    """Proxy endpoints that open only after some turns of the event loop."""
 
     async def open(self, _incarnation: Incarnation) -> None:
-        """As `Faces`."""
+        """Act as `ProxyEndpoints`."""
         for _turn in range(3):
             await asyncio.sleep(0)
 
 
 class NoFaces:
-    """Proxy endpoints of a control that has no descriptor left."""
+    """Proxy endpoints of a control that has run out of file descriptors."""
 
     async def open(self, incarnation: Incarnation) -> None:
-        """As `Faces`."""
+        """Act as `ProxyEndpoints`."""
         raise NoPortError(f"no proxy endpoint for {incarnation.name}: Too many open files")
 
 
@@ -64,7 +64,7 @@ async def world_with(faces: NoFaces | SlowFaces) -> ControlParts:
 
 
 async def test_a_node_without_a_proxy_endpoint_is_not_registered() -> None:
-    """It receives the reason and may try again; nothing of it stays."""
+    """The node receives the reason and may try again; the registry keeps nothing."""
     world = await world_with(NoFaces())
     answer: Any = await world.ask("registerPublisher", "/n", "/t", "std_msgs/String", "http://10.0.0.5:4000/")
     assert (answer[0], "no proxy endpoint for /n: Too many open files" in answer[1]) == (0, True)
@@ -73,7 +73,7 @@ async def test_a_node_without_a_proxy_endpoint_is_not_registered() -> None:
 
 @pytest.mark.parametrize("count", [2, 4, 8])
 async def test_simultaneous_arrivals_do_not_take_each_others_room(count: int) -> None:
-    """With room for one more node, one gets it, and the others receive an error."""
+    """With room for one more node, one node gets it, and the others receive an error."""
     world = await world_with(SlowFaces())
 
     async def come(number: int) -> Any:

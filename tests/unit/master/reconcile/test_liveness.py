@@ -1,4 +1,4 @@
-"""Nodes that leave and return, while other nodes or the policy took their registrations."""
+"""Nodes that leave and return, while other nodes or the policy took over their registrations."""
 
 import asyncio
 import ipaddress
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.anyio
 
 
 async def test_a_clock_that_is_set_forward_forgets_no_node(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A node that was just lost returns with all registrations, whatever date the clock shows."""
+    """A node that was just lost returns with all registrations, whatever date the clock has."""
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
@@ -33,9 +33,9 @@ async def test_a_clock_that_is_set_forward_forgets_no_node(monkeypatch: pytest.M
 
 
 async def test_a_missed_list_is_sent_again_when_the_node_answers() -> None:
-    """A list that was lost in a short outage is sent again once, though the node never counted as lost.
+    """A list that was lost in a short outage is sent again once, even if the node never counted as lost.
 
-    The node may know the list but have lost the connection: so a list without the publisher is sent first.
+    The node may know the list but have lost the connection, so a list without the publisher is sent first.
     """
     world = ControlParts(silent=3600.0)
     await world.round()
@@ -56,7 +56,7 @@ async def test_a_missed_list_is_sent_again_when_the_node_answers() -> None:
 
 
 async def test_a_node_that_lost_all_registrations_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An absent node without registrations is kept, and gets back those that are granted again."""
+    """An absent node without registrations is kept; when they are granted again, they are restored."""
     monkeypatch.setattr(liveness, "_IDLE_SECONDS", 0.0)
     world = await ControlParts.begun()
     node, idle = world.node("/n", 1), world.node("/idle", 2)
@@ -75,7 +75,7 @@ async def test_a_node_that_lost_all_registrations_is_kept(monkeypatch: pytest.Mo
 
 
 async def test_a_node_that_returns_during_its_removal_is_registered_again() -> None:
-    """It answers while its registrations are removed from the ROS master: all of them are restored."""
+    """The node answers while the ROS master drops its registrations: all of them are restored."""
     world = await ControlParts.begun()
     node = world.node("/n")
     for topic in ("/a", "/b", "/c"):
@@ -91,7 +91,7 @@ async def test_a_node_that_returns_during_its_removal_is_registered_again() -> N
 
 
 async def test_a_node_that_returns_to_a_new_master_is_restored_by_the_rebuild() -> None:
-    """Its registrations are restored with all others, and its call waits for the rebuild."""
+    """The rebuild restores its registrations with all others, and the node's call waits for the rebuild."""
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
@@ -138,7 +138,7 @@ async def test_silent_nodes_delay_no_check_of_other_hosts() -> None:
 
 
 async def test_a_node_that_is_lost_during_its_call_is_restored() -> None:
-    """Relays carry its topics, subscribers are notified, and the ROS master has it after the next round."""
+    """Relays carry its topics, subscribers are notified, and the next round registers it at the ROS master."""
     world = await ControlParts.begun()
     node, ear = world.node("/n", 1), world.node("/ear", 2)
     await world.register(ear, Kind.SUBSCRIPTION, "/a")

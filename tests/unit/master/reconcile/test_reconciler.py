@@ -15,7 +15,7 @@ NO_SECRET = POLICY.format("/secret=\n", "/secret=\n")
 
 @pytest.mark.parametrize("kind", [Kind.PUBLICATION, Kind.SUBSCRIPTION])
 async def test_a_revoked_registration_is_not_adopted(kind: Kind) -> None:
-    """A round before the revocation reaches the ROS master removes the registration there."""
+    """A round that runs before the revocation reaches the ROS master removes the registration there."""
     world = ControlParts()
     await world.round()
     node = world.node("/n")
@@ -30,7 +30,7 @@ async def test_a_revoked_registration_is_not_adopted(kind: Kind) -> None:
 
 
 async def test_a_parameter_that_was_set_when_control_died_is_sent() -> None:
-    """A new control sends subscribers the present values of the ROS master."""
+    """If control died while a parameter was set, the next control sends subscribers the ROS master's current value."""
     world = ControlParts()
     node = world.node("/n")
     for key in ("/speed", "/unset"):
@@ -44,7 +44,7 @@ async def test_a_parameter_that_was_set_when_control_died_is_sent() -> None:
 
 
 async def test_a_new_master_is_complete_before_the_first_call() -> None:
-    """A returning node does not open the way to a new ROS master; only the complete rebuild does."""
+    """A returning node does not make a new ROS master available; only the complete rebuild does."""
     world = ControlParts(silent=3600.0)
     await world.round()
     node, other = world.node("/n", 1), world.node("/other", 2)
@@ -61,7 +61,7 @@ async def test_a_new_master_is_complete_before_the_first_call() -> None:
 
 
 class _Patient:
-    """The ROS master, which answers `method` when `many` of these calls are under way."""
+    """A ROS master that answers `method` only when `many` of these calls are waiting."""
 
     def __init__(self, world: ControlParts, method: str, many: int) -> None:
         self._hidden, self._method, self._many = world.hidden, method, many
@@ -80,7 +80,7 @@ class _Patient:
 
 
 async def test_a_new_master_is_rebuilt_without_waiting_for_each_answer() -> None:
-    """All callers wait meanwhile, so thousands of registrations must not take thousands of round trips."""
+    """All callers wait during the rebuild, so thousands of registrations must not take thousands of round trips."""
     world = ControlParts()
     await world.round()
     node = world.node("/n")
@@ -95,7 +95,7 @@ async def test_a_new_master_is_rebuilt_without_waiting_for_each_answer() -> None
 
 
 async def test_a_lost_node_is_removed_without_waiting_for_each_answer() -> None:
-    """The same holds for thousands of registrations without an owner."""
+    """Thousands of registrations without an owner are removed without a round trip each."""
     world = ControlParts()
     await world.round()
     gone = world.faces.inner_uri(world.node("/n"))
@@ -108,7 +108,7 @@ async def test_a_lost_node_is_removed_without_waiting_for_each_answer() -> None:
 
 
 async def test_a_returning_node_is_restored_without_waiting_for_each_answer() -> None:
-    """The same holds for its registrations, which are restored in their first order."""
+    """The returning node's registrations are restored in their original order, without a round trip each."""
     world = ControlParts(silent=3600.0)
     await world.round()
     node = world.node("/n")

@@ -1,4 +1,4 @@
-"""Subscribers that do not return to a new relay receive their lists again."""
+"""Subscribers that do not reconnect to a new relay receive their lists again."""
 
 import ipaddress
 from typing import Any, cast
@@ -22,16 +22,16 @@ class Told:
         self.reminded: list[tuple[str, str, list[str]]] = []
 
     def absent(self, subscribers: list[Incarnation]) -> list[tuple[Incarnation, str, list[Incarnation]]]:
-        """As `Graph`."""
+        """Act as `RosGraph`."""
         self.absent_for -= 1
         ear, _other, mouth = subscribers
         return [(ear, "/chatter", [mouth])] if self.absent_for >= 0 else []
 
     def carry_out(self, _effects: object) -> None:
-        """As `Enactor`."""
+        """Act as `Enactor`."""
 
     def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> None:
-        """As `Graph`."""
+        """Act as `RosGraph`."""
         self.reminded.append((subscriber.name, topic, [one.key for one in absent]))
 
 
@@ -48,7 +48,7 @@ def node(registry: Registry, name: str, kind: Kind) -> Incarnation:
 async def test_reminded_until_back(
     monkeypatch: pytest.MonkeyPatch, absent_for: int, reminded: int, renewed: int
 ) -> None:
-    """Returned nodes get no reminder; absent ones are reminded to connect again, a limited number of times."""
+    """Absent nodes are reminded to connect again, a limited number of times; returned nodes get no reminder."""
     monkeypatch.setattr(reminders, "_PAUSES", (0.0,) * 8)
     registry = Registry()
     node(registry, "/ear", Kind.SUBSCRIPTION)

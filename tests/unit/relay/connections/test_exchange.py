@@ -10,7 +10,7 @@ from roswire.tcpros import encode_frame, encode_service_error, encode_service_re
 
 
 class Conversation:
-    """An exchange, what each side was sent, and what was counted."""
+    """An exchange, the bytes that each side was sent, and the counts."""
 
     def __init__(self, *, persistent: bool = False, limit: int = 1 << 20) -> None:
         self.service: list[bytes] = []
@@ -25,13 +25,13 @@ class Conversation:
         )
 
     def ask(self, data: bytes) -> None:
-        """The client sends, having read everything."""
+        """Send bytes as a client that has read everything."""
         self.exchange.from_client(data)
         self.exchange.advance()
 
 
 def test_a_call_is_one_request_and_one_reply() -> None:
-    """They pass unchanged and are counted; then the connection is done."""
+    """The request and the reply pass unchanged and are counted; then the connection ends."""
     call = Conversation()
     call.ask(encode_frame(b"ask"))
     assert (call.service, call.exchange.done) == ([encode_frame(b"ask")], False)
@@ -42,7 +42,7 @@ def test_a_call_is_one_request_and_one_reply() -> None:
 
 
 def test_a_persistent_connection_goes_on() -> None:
-    """Call after call."""
+    """A persistent connection carries one call after the other."""
     call = Conversation(persistent=True)
     for text in (b"1", b"2", b"3"):
         call.ask(encode_frame(text))
@@ -52,7 +52,7 @@ def test_a_persistent_connection_goes_on() -> None:
 
 
 def test_a_service_error_is_passed_on_with_its_text() -> None:
-    """The caller sees what the service said."""
+    """The caller gets the error text of the service."""
     call = Conversation()
     call.ask(encode_frame(b""))
     call.exchange.from_service(encode_service_error("no such bolt"))
@@ -72,7 +72,7 @@ def test_bytes_may_come_one_by_one() -> None:
 
 
 def test_a_second_request_waits_for_the_first_reply() -> None:
-    """And the client is not read while one waits."""
+    """While a request waits, the client is not read."""
     call = Conversation(persistent=True)
     readable = [call.exchange.may_read]
     call.ask(encode_frame(b"1") + encode_frame(b"2"))
@@ -86,7 +86,7 @@ def test_a_second_request_waits_for_the_first_reply() -> None:
 
 
 def test_a_reply_without_a_request_is_the_services_fault() -> None:
-    """It would be taken for the answer to the next."""
+    """Such a reply would be taken for the answer to the next request."""
     call = Conversation(persistent=True)
     with pytest.raises(ProtocolError, match="without a request"):
         call.exchange.from_service(encode_service_reply(b""))
@@ -94,7 +94,7 @@ def test_a_reply_without_a_request_is_the_services_fault() -> None:
 
 @pytest.mark.parametrize("length", [(1 << 20) + 1, 0xFFFFFFFF])
 def test_lengths_beyond_the_limit_are_refused(length: int) -> None:
-    """On both sides, as soon as they are declared."""
+    """The limit applies to both sides, as soon as a length is declared."""
     call = Conversation()
     with pytest.raises(LimitExceededError):
         call.exchange.from_client(struct.pack("<I", length))
@@ -105,7 +105,7 @@ def test_lengths_beyond_the_limit_are_refused(length: int) -> None:
 
 
 def test_an_ok_byte_that_is_neither_is_refused() -> None:
-    """A reply begins with 0 or 1."""
+    """A reply must begin with 0 or 1."""
     call = Conversation()
     call.ask(encode_frame(b""))
     with pytest.raises(ProtocolError):

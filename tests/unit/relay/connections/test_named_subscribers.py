@@ -1,4 +1,4 @@
-"""Subscribers that their publisher must see by name."""
+"""Subscribers that need a connection to the publisher under their own name."""
 
 import socket
 import time
@@ -30,7 +30,7 @@ def loop() -> Iterator[EventLoop]:
 
 @pytest.fixture
 def publisher() -> Iterator[socket.socket]:
-    """Where the publisher listens."""
+    """Return the publisher's listening socket."""
     with socket.create_server(("127.0.0.1", 0)) as sock:
         sock.settimeout(0.01)
         yield sock
@@ -42,7 +42,7 @@ def _nothing(_what: object) -> None:
 
 @pytest.fixture
 def presences(loop: EventLoop) -> Iterator[NamedSubscribers]:
-    """The presences of one topic."""
+    """Return the named subscribers of one topic."""
     limits = RelayLimits()
     reporter = Reporter(limits)
     memory = RelayMemory.of(limits, lambda _host: QuotaClass.REGISTERED)
@@ -54,7 +54,7 @@ def presences(loop: EventLoop) -> Iterator[NamedSubscribers]:
 
 
 def turn_until(loop: EventLoop, done: Callable[[], bool]) -> None:
-    """Let the loop turn until something has happened."""
+    """Let the loop turn until the condition holds."""
     deadline = time.monotonic() + 30
     while not done():
         assert time.monotonic() < deadline, "it did not happen"
@@ -62,7 +62,7 @@ def turn_until(loop: EventLoop, done: Callable[[], bool]) -> None:
 
 
 def accept(loop: EventLoop, publisher: socket.socket) -> tuple[socket.socket, dict[str, str]]:
-    """The next connection at the publisher, and its header."""
+    """Return the next connection at the publisher, and its header."""
     found: list[tuple[socket.socket, dict[str, str]]] = []
     parser, connections = HeaderParser(65536), list[socket.socket]()
 
@@ -93,7 +93,7 @@ def ended(sock: socket.socket) -> bool:
 def test_each_subscriber_is_seen_under_its_own_name_and_goes_when_it_leaves(
     loop: EventLoop, presences: NamedSubscribers, publisher: socket.socket
 ) -> None:
-    """One connection a name; the one that is served no longer is closed, the other stays."""
+    """Each name has one connection. When a subscriber leaves, its connection closes and the others stay."""
     address = publisher.getsockname()
     presences.update(frozenset({"/one", "/other"}), address)
     seen = dict(
@@ -110,7 +110,7 @@ def test_each_subscriber_is_seen_under_its_own_name_and_goes_when_it_leaves(
 def test_a_presence_that_breaks_is_made_again(
     loop: EventLoop, presences: NamedSubscribers, publisher: socket.socket
 ) -> None:
-    """The publisher closes it; it comes back under the same name."""
+    """If the publisher closes the connection, it is opened again under the same name."""
     presences.update(frozenset({"/one"}), publisher.getsockname())
     first, _header = accept(loop, publisher)
     first.close()
@@ -129,5 +129,5 @@ def test_a_presence_that_breaks_is_made_again(
     ],
 )
 def test_only_the_topics_of_actions_need_names(type_name: str, named: bool) -> None:
-    """Goals and cancellations; nothing else is sent twice."""
+    """These are goals and cancellations; no other topic is sent twice."""
     assert looks_for_names(type_name) is named

@@ -1,4 +1,4 @@
-"""The service that the appliance itself offers, with a control that a test plays."""
+"""The service that the appliance itself offers; the test plays control."""
 
 from collections.abc import Iterator
 
@@ -35,7 +35,7 @@ class Scene(World):
             self.state(ClientGranted("own", CALL["service"], host, "/client"))
 
     def client(self, host: str = LOOPBACK, **fields: str) -> Peer:
-        """A client that has read the service's header."""
+        """Return a client that has read the service's header."""
         peer = self.connect(encode_header(CALL | fields), host=host)
         assert self.gets_header(peer) == HEADER | {"callerid": "/rosrv"}
         return peer
@@ -47,14 +47,14 @@ class Scene(World):
 
 @pytest.fixture
 def scene(request: pytest.FixtureRequest) -> Iterator[Scene]:
-    """A relay."""
+    """Yield a relay."""
     scene = Scene(getattr(request, "param", LIMITS))
     yield scene
     scene.close()
 
 
 def reply(success: bool, text: str) -> bytes:
-    """A std_srvs/TriggerResponse as it comes."""
+    """Return a std_srvs/TriggerResponse as it is on the wire."""
     return encode_service_reply(bytes([success]) + encode_frame(text.encode()))
 
 
@@ -82,7 +82,7 @@ def test_control_answers_a_call(scene: Scene) -> None:
 
 
 def test_a_flood_of_one_host_is_one_call_to_control(scene: Scene) -> None:
-    """Calls during an open one get its answer; a call of another host reaches control at once."""
+    """Calls that arrive during an open call get its answer; a call from another host reaches control at once."""
     flood = [scene.client(persistent="1") for _one in range(5)]
     for client in flood:
         client.send(encode_frame(b""))
@@ -105,7 +105,7 @@ def test_a_flood_of_one_host_is_one_call_to_control(scene: Scene) -> None:
 
 
 def test_a_call_is_answered_when_control_ends(scene: Scene) -> None:
-    """With false, and why; a call that the next control is asked gets its answer."""
+    """The answer is false with the reason; a call that the next control receives gets that control's answer."""
     client = scene.client()
     client.send(encode_frame(b""))
     scene.hears(OwnServiceCalled)
@@ -121,7 +121,7 @@ def test_a_call_is_answered_when_control_ends(scene: Scene) -> None:
 
 
 def test_a_client_with_another_type_gets_an_error(scene: Scene) -> None:
-    """As a node would; control hears nothing of it."""
+    """The client gets the error that a node would send; control receives no call."""
     client = scene.connect(encode_header(CALL | {"md5sum": "0" * 32}))
     assert f"not {'0' * 32}" in scene.gets_header(client)["error"]
     assert scene.called() == []
@@ -129,7 +129,7 @@ def test_a_client_with_another_type_gets_an_error(scene: Scene) -> None:
 
 @pytest.mark.parametrize("scene", [IMPATIENT], indirect=True)
 def test_without_a_grant_no_client_calls(scene: Scene) -> None:
-    """The policy decides at lookupService, as of each service."""
+    """The policy decides at lookupService, as for every service."""
     client = scene.connect(encode_header(CALL | {"callerid": "/unknown"}))
     assert "no grant for [/unknown]" in scene.gets_header(client)["error"]
     assert scene.called() == []

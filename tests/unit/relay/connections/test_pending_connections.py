@@ -1,4 +1,4 @@
-"""Peers that wait at the relay, and the order in which they make room."""
+"""Peers that wait at the relay, and the order in which they are closed to make room."""
 
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import RELAY_HEADERS
@@ -16,11 +16,11 @@ class World:
         self.room = PendingConnections(lambda: self.now, self.quota_class, self.held)
 
     def quota_class(self, host: str) -> QuotaClass:
-        """A host with a grant is known."""
+        """Return `REGISTERED` for a host with a grant, `UNKNOWN` for others."""
         return QuotaClass.REGISTERED if host in self.granted else QuotaClass.UNKNOWN
 
     def guest(self, host: str) -> "Peer":
-        """A peer that has come."""
+        """Add a peer that just connected."""
         peer = Peer(self.room)
         self.room.enter(peer, host)
         return peer
@@ -33,13 +33,13 @@ class Peer:
         self.room, self.ended = room, False
 
     def make_room(self) -> None:
-        """Go."""
+        """Close the connection to make room."""
         self.ended = True
         self.room.leave(self)
 
 
 def test_unknown_hosts_make_room_before_hosts_with_a_grant() -> None:
-    """A new unknown host makes room before a host with a grant, which has a second for its header."""
+    """A waiting unknown host is closed first; a host with a grant is safe for a second."""
     world = World()
     world.granted |= {"robot", "guest"}
     granted, unknown = world.guest("guest"), world.guest("nobody")
@@ -53,7 +53,7 @@ def test_unknown_hosts_make_room_before_hosts_with_a_grant() -> None:
 
 
 def test_a_grant_counts_for_a_waiting_peer() -> None:
-    """The grant is on its way while the peer is faster: it keeps its place."""
+    """If a peer arrives before its grant, the grant protects the waiting peer."""
     world = World()
     early, unknown = world.guest("robot"), world.guest("nobody")
     world.granted.add("robot")
@@ -62,7 +62,7 @@ def test_a_grant_counts_for_a_waiting_peer() -> None:
 
 
 def test_long_headers_make_room_for_short_ones() -> None:
-    """Even with all long headers of unknown hosts and guests, a normal header always has room."""
+    """Even when all long headers of unknown hosts and guests wait, a normal header has room."""
     world = World()
     world.granted |= {"robot", *(f"guest{number}" for number in range(200))}
     for number in range(200):
@@ -79,7 +79,7 @@ def test_long_headers_make_room_for_short_ones() -> None:
 
 
 def test_a_host_at_its_quota_of_long_headers_ends_no_other() -> None:
-    """It is refused, and what it has stays."""
+    """A further long header is refused, and the host's earlier ones stay."""
     world = World()
     peers = [world.guest("greedy") for _ in range(300)]
     refusals = [world.room.hold(peer, 64 << 10) for peer in peers]

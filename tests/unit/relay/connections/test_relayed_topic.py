@@ -1,4 +1,4 @@
-"""One relayed topic, told as a story of its publisher and its subscribers."""
+"""One relayed topic: the story of its publisher and its subscribers."""
 
 import struct
 from collections.abc import Callable, Mapping
@@ -17,14 +17,14 @@ HEADER = {"callerid": "/liar", "type": "std_msgs/String", "md5sum": "m", "latchi
 
 
 def batch(*texts: bytes) -> Batch:
-    """Frames with these bodies."""
+    """Return frames with these bodies."""
     frames = [struct.pack("<I", len(text)) + text for text in texts]
     data = b"".join(frames)
     return Batch(memoryview(data), len(frames), len(data) - len(frames[-1]))
 
 
 class RecordedUpstream(Upstream):
-    """Writes down what the topic asks of its publisher's connection."""
+    """A publisher's connection that records the topic's requests."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []
@@ -39,24 +39,24 @@ class RecordedUpstream(Upstream):
         self.asked.append("spare")
 
     def pause(self, seconds: float) -> None:
-        """Do not read."""
+        """Record that reading pauses."""
         self.asked.append(f"pause {seconds:.2f}")
 
     def resume(self) -> None:
-        """Read."""
+        """Record that reading resumes."""
         self.asked.append("resume")
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
-        """These are served."""
+        """Record the served subscribers."""
         self.announced = (sorted(names()), type_name)
 
     def request_latched(self) -> None:
-        """The latched message is wanted once more."""
+        """Record the request to send the latched message again."""
         self.asked.append("give again")
 
 
 class RecordedMember:
-    """A subscriber that takes everything until a test sets it behind."""
+    """A subscriber that accepts everything until the test makes it slow."""
 
     def __init__(self, *, fits: bool = True, caller_id: str = "/listener", host: str = "10.0.0.2") -> None:
         self.caller_id = caller_id
@@ -70,30 +70,30 @@ class RecordedMember:
         self._fits = fits
 
     def greet(self, header: Mapping[str, str]) -> bool:
-        """Take the header."""
+        """Record the header."""
         self.header = header
         return self._fits
 
     def deliver(self, batch: Batch) -> int:
-        """Take the frames."""
+        """Record the frames."""
         self.received += bytes(batch.view)
         return 0
 
     @property
     def full(self) -> bool:
-        """As told."""
+        """Whether the test made it slow."""
         return self.behind_since is not None
 
     def trim(self) -> int:
-        """Pretend to drop three."""
+        """Pretend to drop three messages."""
         self.trimmed += 1
         return 3
 
     def check_stall(self) -> None:
-        """Nothing is looked at."""
+        """Do nothing: this subscriber never stalls."""
 
     def cut(self, reason: str) -> None:
-        """Remember why."""
+        """Record the reason."""
         self.was_cut = reason
 
 
@@ -125,18 +125,18 @@ class Story:
         self.topic.upstream = self.upstream
 
     def receive(self, frames: Batch, late: float = 0.0) -> None:
-        """Frames have come, so long ago."""
+        """Receive these frames, read from the publisher this many seconds ago."""
         self.topic.received(frames, self.now - late)
 
     def join(self, caller_id: str = "/listener") -> RecordedMember:
-        """One more subscriber."""
+        """Add a subscriber."""
         member = RecordedMember(caller_id=caller_id)
         self.topic.join(member)
         return member
 
 
 def test_subscribers_wait_for_the_publishers_header_and_get_it_with_the_true_name() -> None:
-    """The publisher is asked for when the first comes; the header names the node, whatever it claims."""
+    """The publisher is connected when the first subscriber arrives; the header has the node's true name."""
     story = Story()
     member = story.join()
     assert (story.upstream.asked, member.header) == (["want"], {})
@@ -145,7 +145,7 @@ def test_subscribers_wait_for_the_publishers_header_and_get_it_with_the_true_nam
 
 
 def test_all_subscribers_get_every_message_in_order() -> None:
-    """From the moment a subscriber is served."""
+    """A subscriber gets all messages from the time at which it is served."""
     story = Story()
     first = story.join()
     story.topic.upstream_opened(HEADER)
@@ -157,7 +157,7 @@ def test_all_subscribers_get_every_message_in_order() -> None:
 
 
 def test_messages_beyond_a_limit_reach_no_monitor_or_subscriber() -> None:
-    """And the last message of a latching publisher goes on later, to both."""
+    """The last message of a latching publisher is delivered later, to monitors and subscribers."""
     story, judged = Story(), []
     member = story.join()
     story.topic.monitor(lambda batch: judged.append(batch.first) or batch, wanted=True)  # type: ignore[func-returns-value]  # the call is noted
@@ -176,7 +176,7 @@ def test_messages_beyond_a_limit_reach_no_monitor_or_subscriber() -> None:
 
 
 def test_a_subscriber_whose_limit_kept_the_latched_message_from_it_gets_it_later() -> None:
-    """At the next look, and once."""
+    """The subscriber gets the latched message at the next `tidy`, once."""
     story = Story()
     member = story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
@@ -189,7 +189,7 @@ def test_a_subscriber_whose_limit_kept_the_latched_message_from_it_gets_it_later
 
 
 def test_messages_are_numbered_as_they_come() -> None:
-    """Over batches and over connections: a record says which message of the publication it is about."""
+    """Numbers continue over batches and connections: a record names a message by its number in the publication."""
     story = Story()
     story.topic.upstream_opened(HEADER)
     batches = [batch(b"1", b"2"), batch(b"3"), batch(b"4")]
@@ -202,7 +202,7 @@ def test_messages_are_numbered_as_they_come() -> None:
 
 
 def test_the_publisher_is_let_go_with_the_last_subscriber() -> None:
-    """Not before."""
+    """The publisher stays connected as long as a subscriber is left."""
     story = Story()
     first, second = story.join(), story.join()
     story.topic.upstream_opened(HEADER)
@@ -213,7 +213,7 @@ def test_the_publisher_is_let_go_with_the_last_subscriber() -> None:
 
 
 def test_a_latched_message_is_given_once_to_each() -> None:
-    """The first subscriber gets it from the publisher, later ones from the relay; none gets it twice."""
+    """The first subscriber gets it from the publisher, later subscribers from the relay; none gets it twice."""
     story = Story()
     first = story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
@@ -241,7 +241,7 @@ def monitored(*, latching: str = "0", fresh: bool = True) -> Story:
 
 
 def test_the_first_messages_of_a_publisher_are_replayed() -> None:
-    """Subscribers that are connecting get them once and without a gap; later ones do not."""
+    """Subscribers that are still connecting get them once and without a gap; later subscribers do not get them."""
     story = monitored()
     story.receive(batch(b"0"))
     story.now += 0.2
@@ -273,7 +273,7 @@ def test_a_later_subscriber_gets_no_old_messages(seconds: float) -> None:
 
 @pytest.mark.parametrize("case", ["relay restarted", "connected again", "monitor loaded late", "came back"])
 def test_a_publisher_that_has_been_there_said_nothing_first(case: str) -> None:
-    """Only one that has just appeared may have spoken because of the monitor."""
+    """Only a publisher that has just appeared may have sent its first messages because of the monitor."""
     story = monitored(fresh=case != "relay restarted") if case != "monitor loaded late" else Story()
     if case == "connected again":
         story.topic.upstream_closed()
@@ -291,7 +291,7 @@ def test_a_publisher_that_has_been_there_said_nothing_first(case: str) -> None:
 
 
 def test_first_messages_without_subscribers_are_dropped_soon() -> None:
-    """It is let go at the next look at the counters, though no other message comes."""
+    """They are dropped at the next `tidy`, even if no further message arrives."""
     story = monitored()
     story.receive(batch(b"1"))
     story.topic.tidy()
@@ -302,7 +302,7 @@ def test_first_messages_without_subscribers_are_dropped_soon() -> None:
 
 
 def test_a_latched_message_beyond_the_quota_is_not_kept() -> None:
-    """It is passed on, with one report; later subscribers get it from the publisher once there is room."""
+    """Such a message is delivered and reported once; later subscribers get it from the publisher when there is room."""
     story = Story(memory=100)
     early = story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
@@ -326,7 +326,7 @@ def test_a_latched_message_beyond_the_quota_is_not_kept() -> None:
 
 
 def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscriber() -> None:
-    """The last message of a latched one; the next message of one whose subscriber triggered the connection."""
+    """A latched topic gives its last message. A topic that had a subscriber gives only the next message."""
     story = monitored(latching="1")
     story.receive(batch(b"1"))
     story.receive(batch(b"2"))
@@ -340,7 +340,7 @@ def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscr
 
 
 def test_a_latched_message_is_forgotten_with_the_connection() -> None:
-    """The publisher sends it again when it is reached again; an old one is not made up for it."""
+    """The publisher sends the message again after it reconnects; until then no subscriber gets the old one."""
     story = Story()
     story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
@@ -353,7 +353,7 @@ def test_a_latched_message_is_forgotten_with_the_connection() -> None:
 
 
 def test_subscribers_survive_the_loss_of_the_publisher() -> None:
-    """When it is reached again, messages go on on the same connections."""
+    """When the publisher is connected again, messages continue on the same connections."""
     story = Story()
     member = story.join()
     story.topic.upstream_opened(HEADER)
@@ -365,7 +365,7 @@ def test_subscribers_survive_the_loss_of_the_publisher() -> None:
 
 
 def test_a_publisher_that_comes_back_with_another_type_loses_its_subscribers() -> None:
-    """They must read the new header before they read a message of it."""
+    """Subscribers must read the new header before they read a message of the new type."""
     story = Story()
     member = story.join()
     story.topic.upstream_opened(HEADER)
@@ -375,7 +375,7 @@ def test_a_publisher_that_comes_back_with_another_type_loses_its_subscribers() -
 
 
 def test_an_old_header_is_dropped_with_its_last_subscriber() -> None:
-    """A subscriber that comes after the publisher and all subscribers are gone waits for a new header."""
+    """A subscriber that arrives after the publisher and all subscribers have left waits for a new header."""
     story = Story()
     first = story.join()
     story.topic.upstream_opened(HEADER)
@@ -388,7 +388,7 @@ def test_an_old_header_is_dropped_with_its_last_subscriber() -> None:
 
 
 def test_a_subscriber_of_another_type_is_not_served() -> None:
-    """It refuses itself, and gets nothing."""
+    """The subscriber is refused and gets no message."""
     story = Story()
     member = RecordedMember(fits=False)
     story.topic.join(member)
@@ -398,7 +398,7 @@ def test_a_subscriber_of_another_type_is_not_served() -> None:
 
 
 def test_the_publisher_is_paused_only_while_all_are_behind() -> None:
-    """One that keeps up is never delayed by the others; the full one drops."""
+    """A subscriber that keeps up is never delayed by the others; a full subscriber loses messages."""
     story = Story()
     slow, quick = story.join(), story.join()
     story.topic.upstream_opened(HEADER)
@@ -413,7 +413,7 @@ def test_the_publisher_is_paused_only_while_all_are_behind() -> None:
 
 
 def test_a_stuck_subscriber_is_not_waited_for() -> None:
-    """After the grace the oldest of its messages are dropped and counted, and the publisher is read."""
+    """After the grace period its oldest messages are dropped and counted, and the publisher is read again."""
     story = Story()
     member = story.join()
     story.topic.upstream_opened(HEADER)
@@ -426,7 +426,7 @@ def test_a_stuck_subscriber_is_not_waited_for() -> None:
 
 
 def test_traffic_is_reported_once() -> None:
-    """Nothing new, nothing to report."""
+    """Without new traffic there is no report."""
     story = Story()
     assert story.topic.traffic() is None
     story.join()
@@ -437,7 +437,7 @@ def test_traffic_is_reported_once() -> None:
 
 
 def test_a_withdrawn_topic_cuts_served_and_waiting_subscribers() -> None:
-    """Each with the reason."""
+    """Each subscriber is cut with the reason."""
     story = Story()
     served = story.join()
     story.topic.upstream_opened(HEADER)
@@ -450,25 +450,25 @@ def test_a_withdrawn_topic_cuts_served_and_waiting_subscribers() -> None:
 
 
 class LeavingMember(RecordedMember):
-    """One that leaves when it is cut, as a real one does."""
+    """A subscriber that leaves when it is cut, as a real one does."""
 
     topic: RelayedTopic
 
     def cut(self, reason: str) -> None:
-        """Its connection is closed."""
+        """Close its connection."""
         super().cut(reason)
         self.topic.leave(self)
 
 
 @pytest.mark.parametrize("served", [True, False], ids=["served", "waiting"])
 def test_a_subscriber_costs_the_same_among_thousands(served: bool) -> None:
-    """Joining and leaving cost the same; subscribers that all end at once delay the loop only by their number."""
+    """Joining and leaving do not scan the others; many ends at once delay the loop in proportion to their number."""
 
     def work(many: int) -> int:
         story = Story()
         if served:
             story.topic.upstream_opened(HEADER)
-        story.topic.upstream = None  # who is served it asks once in a turn
+        story.topic.upstream = None  # the topic lists its served subscribers once in a turn of the loop
         members = [LeavingMember() for _ in range(many)]
 
         def come_and_go() -> None:
@@ -485,7 +485,7 @@ def test_a_subscriber_costs_the_same_among_thousands(served: bool) -> None:
 
 
 def test_the_upstream_hears_who_is_served() -> None:
-    """By name and type: when a subscriber is served, and when one leaves."""
+    """The connection gets name and type of the served subscribers when one is served and when one leaves."""
     scene = Story()
     topic, upstream = scene.topic, scene.upstream
     one, other = RecordedMember(caller_id="/one"), RecordedMember(caller_id="/other")
@@ -498,7 +498,7 @@ def test_the_upstream_hears_who_is_served() -> None:
 
 
 def test_a_host_with_hundreds_of_names_is_seen_by_a_few() -> None:
-    """Each name costs a connection to the publisher; another host's subscriber always gets one."""
+    """Each name needs a connection to the publisher; another host's subscriber always gets one."""
     scene = Story()
     for number in range(300):
         scene.topic.join(RecordedMember(caller_id=f"/guest_{number}", host="10.0.0.66"))
@@ -510,7 +510,7 @@ def test_a_host_with_hundreds_of_names_is_seen_by_a_few() -> None:
 
 
 def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
-    """The delay is that from receiving a batch to sending each message; without subscribers there is none."""
+    """The delay is counted from receiving a batch to sending each message; without subscribers there is none."""
     story = Story()
     story.topic.upstream_opened(HEADER)
     story.receive(batch(b"1"), late=0.003)

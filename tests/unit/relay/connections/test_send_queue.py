@@ -1,4 +1,4 @@
-"""The queue of one slow subscriber, compared with a naive one."""
+"""The queue of one slow subscriber is compared with a naive queue."""
 
 import struct
 from dataclasses import replace
@@ -21,19 +21,19 @@ def frame(size: int, fill: int = 0) -> bytes:
 
 
 class NaiveOutbox:
-    """The same rules on a list of frames and the rest of the one being sent."""
+    """The same rules on a list of frames, and the rest of the frame that is being sent."""
 
     def __init__(self) -> None:
         self.started = b""
         self.frames: list[bytes] = []
 
     def append(self, frames: list[bytes], sent: int) -> None:
-        """Queue frames of which some bytes are sent."""
+        """Queue frames, the first of which is partly sent."""
         self.frames += frames
         self.advance(sent)
 
     def advance(self, sent: int) -> None:
-        """Take bytes off the front."""
+        """Remove sent bytes from the front."""
         taken = min(sent, len(self.started))
         self.started, sent = self.started[taken:], sent - taken
         while sent:
@@ -42,7 +42,7 @@ class NaiveOutbox:
             self.started, sent = first[taken:], sent - taken
 
     def trim(self) -> int:
-        """Drop the oldest beyond the bounds."""
+        """Drop the oldest frames beyond the limits."""
         dropped = 0
         while len(self.frames) > LIMITS.queue_messages or sum(map(len, self.frames)) > LIMITS.queue_bytes:
             self.frames.pop(0)
@@ -57,7 +57,7 @@ steps = st.lists(st.one_of(batches, st.floats(0, 1), st.none()), max_size=30)
 @settings(max_examples=examples(300))
 @given(steps)
 def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | float | None]) -> None:
-    """Whatever is queued, sent in parts and trimmed: same bytes, same counts, and memory accounted for."""
+    """For anything queued, partly sent and trimmed, bytes, counts and used memory are the same."""
     budget = share(1 << 30)
     queue, naive, number = SendQueue(LIMITS, budget), NaiveOutbox(), 0
     for step in script:
@@ -96,7 +96,7 @@ def test_the_memory_of_a_message_that_is_nearly_sent_is_given_back() -> None:
 
 
 def test_a_message_that_has_been_started_is_never_dropped() -> None:
-    """The oldest are dropped, but what the subscriber has begun to read is finished."""
+    """The oldest messages are dropped, but a message that the subscriber has begun to read is completed."""
     queue = SendQueue(LIMITS, share(1 << 30))
     queue.append(memoryview(b"".join(frame(4, index) for index in range(20))), 20, 3)
     assert queue.full
@@ -105,7 +105,7 @@ def test_a_message_that_has_been_started_is_never_dropped() -> None:
 
 
 def test_one_message_larger_than_the_queue_is_dropped_whole() -> None:
-    """The byte bound holds for a single message too."""
+    """The limit in bytes also holds for a single message."""
     queue = SendQueue(LIMITS, share(1 << 30))
     queue.append(memoryview(frame(500)), 1)
     assert queue.trim() == 1
@@ -113,7 +113,7 @@ def test_one_message_larger_than_the_queue_is_dropped_whole() -> None:
 
 
 def test_nothing_is_queued_when_the_process_is_out_of_memory() -> None:
-    """The bound of the whole process comes before a subscriber's own."""
+    """The limit of the whole process comes before the subscriber's own limit."""
     budget = share(10)
     queue = SendQueue(LIMITS, budget)
     queue.append(memoryview(frame(4) + frame(4)), 2)
@@ -122,7 +122,7 @@ def test_nothing_is_queued_when_the_process_is_out_of_memory() -> None:
 
 
 def test_the_rest_of_a_connection_header_goes_first() -> None:
-    """A header that the socket did not take whole precedes all messages and is not counted as one."""
+    """If the socket accepts only a part of a header, the rest precedes all messages and is not counted as one."""
     queue = SendQueue(LIMITS, share(1 << 30))
     queue.begin(memoryview(b"header"))
     queue.append(memoryview(frame(4)), 1)

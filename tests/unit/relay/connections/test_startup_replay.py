@@ -1,4 +1,4 @@
-"""The first messages of a publisher are kept within bounds, and without a gap."""
+"""The first messages of a publisher are kept within limits, and without a gap."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from tests.support.relay_memory import share
 
 
 def frames(messages: int, size: int = 8) -> Batch:
-    """Return a batch of frames with this number and size."""
+    """Return a batch of this number of frames, each of this size."""
     return Batch(memoryview(bytes(size)), messages, 0)
 
 
@@ -17,7 +17,7 @@ def frames(messages: int, size: int = 8) -> Batch:
     [[(1, 8)] * 201, [(150, 8), (51, 8)], [(1, 600 << 10), (1, 600 << 10)], [(201, 8)], [(1, 2 << 20)]],
 )
 def test_never_more_than_the_bounds(added: list[tuple[int, int]]) -> None:
-    """Beyond the bounds all first messages are dropped, so that no gap is left."""
+    """Beyond the limits all first messages are dropped, so that no gap is left."""
     memory = share()
     words = StartupReplay(memory, 0.0)
     assert [words.add(frames(*one), 0.0) for one in added] == [True] * (len(added) - 1) + [False]
@@ -26,7 +26,7 @@ def test_never_more_than_the_bounds(added: list[tuple[int, int]]) -> None:
 
 
 def test_nothing_is_kept_when_the_quota_of_its_host_is_spent() -> None:
-    """Two messages fit, a third does not."""
+    """Two messages fit, but the third does not."""
     memory = share(16)
     words = StartupReplay(memory, 0.0)
     assert [words.add(frames(1), 0.0) for _ in range(3)] == [True, True, False]
@@ -34,7 +34,7 @@ def test_nothing_is_kept_when_the_quota_of_its_host_is_spent() -> None:
 
 
 def test_the_time_ends_for_speech_for_keeping_and_for_appearing() -> None:
-    """A speech is short, it is kept for a second, and who was silent for long has not just appeared."""
+    """Messages are collected for `SPEECH` seconds and kept for `SECONDS`. A publisher is new for `APPEARED` seconds."""
     words = StartupReplay(share(), 10.0)
     assert (words.over(10.0 + APPEARED), words.over(10.1 + APPEARED)) == (False, True)
     assert words.add(frames(1), 12.0)

@@ -1,4 +1,4 @@
-"""Whether a subscriber's type fits a publisher's (test_data_plane has the other tests of subscribers)."""
+"""Whether a subscriber's type fits a publisher's; test_data_plane.py has the other tests of subscribers."""
 
 import pytest
 
@@ -17,13 +17,13 @@ OFFERED = {"type": "std_msgs/String", "md5sum": "aaa"}
     ],
 )
 def test_the_md5sum_decides_and_an_asterisk_fits_all(wanted: dict[str, str]) -> None:
-    """As rospy and roscpp publishers do it."""
+    """The rule is that of rospy and roscpp publishers."""
     assert describe_mismatch(wanted, OFFERED) == ""
     assert describe_mismatch(wanted | {"md5sum": "bbb"}, OFFERED | {"md5sum": "*"}) == ""
 
 
 def test_a_mismatch_names_both_sides() -> None:
-    """The types where they differ, the md5sums where only those do."""
+    """The error names the types if they differ, otherwise the md5sums."""
     assert describe_mismatch({"type": "std_msgs/Int32", "md5sum": "b"}, OFFERED) == (
         "topic types do not match: [std_msgs/Int32] vs. [std_msgs/String]"
     )

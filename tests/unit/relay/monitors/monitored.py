@@ -1,4 +1,4 @@
-"""A relay with monitors, whose control states specifications, and dialogues with it as text."""
+"""A relay with monitors whose control sends specifications, and dialogues with this relay as text."""
 
 import struct
 from typing import Any, ClassVar
@@ -38,13 +38,13 @@ BEGINNING = GUARD.replace("guard()", "begin guard()")
 
 
 def string(text: str) -> bytes:
-    """The frame of a std_msgs/String."""
+    """Return the frame of a std_msgs/String."""
     data = text.encode()
     return encode_frame(struct.pack("<I", len(data)) + data)
 
 
 def data_of(peer: Peer) -> bytes:
-    """Everything the peer has been sent."""
+    """Return everything that was sent to the peer."""
     peer.read()
     return bytes(peer.data)
 
@@ -54,10 +54,10 @@ COSTLY = """a() { int n; event e(std::string s) /chatter std_msgs/String '{data:
 
 
 class Monitored(World):
-    """A relay whose control states specifications, and keeps what monitors did."""
+    """A relay whose control sends specifications and records the actions of monitors."""
 
     def load(self, *texts: str, revision: int = 1, restarted: bool = False, **enabled: bool) -> Any:
-        """State these files; the relay's answer."""
+        """Send these files to the relay, and return its answer."""
         files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
         self.state(stated(revision, files, {}, enabled, restarted))
         return self.until(
@@ -65,7 +65,7 @@ class Monitored(World):
         )
 
     def taken(self, kind: type[Any], revision: int) -> Any:
-        """The answer of this kind to a statement, once."""
+        """Return the answer of this kind to a statement, and remove it."""
         for message in self.told:
             if isinstance(message, kind) and message.revision == revision:
                 self.told.remove(message)
@@ -88,7 +88,7 @@ class Monitored(World):
         return found
 
     def typed(self) -> tuple[Peer, Peer]:
-        """A publisher of std_msgs/String and a subscriber that is served."""
+        """Return a publisher of std_msgs/String and a subscriber that is served."""
         publisher = self.upstream(TYPED)
         subscriber = self.connect(encode_header(WANTED))
         assert self.gets_header(subscriber) == TYPED
@@ -197,7 +197,7 @@ class MonitoredDialogue(Dialogue):
 
 
 def _text(word: str) -> str:
-    """Return a specification by its name, with a text replaced (`NAME|old|new`), `hold:` in front if it is to hold."""
+    """Return the named specification; `NAME|old|new` replaces text, and `hold:` in front makes it hold its topics."""
     name, *change = word.removeprefix("hold:").split("|")
     text = SPECIFICATIONS.get(name, name)
     text = text.replace(*change) if change else text  # type: ignore[arg-type]  # two texts

@@ -1,4 +1,4 @@
-"""A batch through the monitors together is what its messages are one by one: bytes, records, counters, state."""
+"""A batch through the monitors has the effect of its single messages: bytes, records, counters and state."""
 
 import struct
 from collections.abc import Collection, Iterable
@@ -42,7 +42,7 @@ MONITORS = Path(__file__).parents[4] / "monitors"
 
 
 class Heard(Reporter):
-    """Keeps what would be sent."""
+    """Keeps the messages that would be sent to control."""
 
     def __init__(self) -> None:
         super().__init__(RelayLimits())
@@ -50,16 +50,16 @@ class Heard(Reporter):
 
     @property
     def attached(self) -> bool:
-        """There is a control."""
+        """Report that a control is attached."""
         return True
 
     def send(self, told: Message) -> None:
-        """Keep it."""
+        """Keep the message."""
         self.messages.append(told)
 
 
 class Monitored:
-    """Monitors, with a clock that is set, with or without the module that takes messages together."""
+    """Monitors with a clock that the test sets, with or without the module that handles batches."""
 
     def __init__(
         self,
@@ -92,14 +92,14 @@ class Monitored:
         self.interceptor.loaded(stated(1, [], {}, {}, restarted=restarted), self.set)
 
     def close(self) -> None:
-        """End."""
+        """Close the monitors and their loop."""
         self.interceptor.close()
         self._loop.close()
 
     def through(
         self, traffic: Traffic, first: int = 1, publisher: str = "/talker"
     ) -> tuple[int, bytes, bytes]:
-        """Return the remaining messages: their number, all of them, the last one."""
+        """Return the messages that passed: their number, all of them, and the last one."""
         if " " in traffic.topic:
             return self._asked(traffic, publisher)
         scratch = Scratch()
@@ -118,7 +118,7 @@ class Monitored:
         return left.messages, bytes(left.view), bytes(left.keep_last().view)
 
     def _asked(self, traffic: Traffic, client: str) -> tuple[int, bytes, bytes]:
-        """The same of requests or replies, one by one; of those that are refused what is read instead."""
+        """Judge requests or replies one by one, and return the same as `through`, with errors for refused ones."""
         service, part = traffic.topic.split()
         judged = [
             self.interceptor.judge(ObservationPoint("key", service, "10.0.0.7", client), part, body)
@@ -128,7 +128,7 @@ class Monitored:
         return sum(one.refused is None for one in judged), b"\0".join(left), left[-1]
 
     def told(self) -> list[str]:
-        """Everything that was sent to control, the counts of a second in a fixed order."""
+        """Return everything sent to control, sorted within each second."""
         self.interceptor.tick()
         self.interceptor.observations.flush()
         told = sorted(repr(one) for one in self.sent())
@@ -136,16 +136,16 @@ class Monitored:
         return told
 
     def sent(self) -> Iterable[object]:
-        """All that was sent to control, rows and events one by one."""
+        """Yield everything sent to control, with rows and events as single items."""
         for one in self.heard.messages:
             yield from getattr(one, "events", None) or getattr(one, "rows", None) or [one]
 
     def rows(self) -> list[MonitorRow]:
-        """The counters."""
+        """Return the counters."""
         return self.interceptor.observer.rows(self.set.monitors, self.interceptor.now())
 
     def state(self) -> list[object]:
-        """Variables, states of properties, what is due (`next_due` may be too early: what moves on is asked later)."""
+        """Return variables, states of properties and due times. (`next_due` is left out: it may be too early.)"""
         state: list[object] = []
         for monitor in self.set.monitors:
             state.append((monitor.name, monitor.seen, monitor.faults, monitor.held))
@@ -161,7 +161,7 @@ class Monitored:
 
 def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traffic], on_fault: str = "drop",
           switched: tuple[int, str] | None = None) -> Monitored:  # fmt: skip
-    """The same traffic both ways; fails at the first difference."""
+    """Send the same traffic as batches and as single messages; fail at the first difference."""
     ways = [Monitored(texts, known, together=together, on_fault=on_fault) for together in (False, True)]
     try:
         for number, traffic in enumerate(all_traffic):
@@ -187,7 +187,7 @@ def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traff
 
 
 def random_case(seed: int) -> tuple[dict[str, str], list[Traffic]]:
-    """Specifications that are right, and what comes."""
+    """Return valid specifications and their traffic."""
     texts = Specifications(seed).texts()
     messages = Messages(seed)
     return {f"{number}.rv": text for number, text in enumerate(texts)}, [
@@ -198,7 +198,7 @@ def random_case(seed: int) -> tuple[dict[str, str], list[Traffic]]:
 @settings(max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow], derandomize=True)
 @given(st.integers(0, 1 << 40))
 def test_random_monitors_do_the_same_together(seed: int) -> None:
-    """Whatever monitors do, a batch taken together is what its messages are one by one."""
+    """A batch has the effect of its single messages, whatever the monitors do."""
     texts, traffic = random_case(seed)
     try:
         agree(texts, definitions(), traffic, ("drop", "pass")[seed % 2], (2, "s1") if seed % 3 == 0 else None)
@@ -215,14 +215,14 @@ HARD = {
 @pytest.mark.parametrize("name", HARD)
 @pytest.mark.parametrize("on_fault", ["drop", "pass"])
 def test_hard_cases_are_the_same_together(name: str, on_fault: str) -> None:
-    """Changes that are taken back, faults in the middle, drops after changes: as one by one."""
+    """Covers changes that are undone, faults in the middle, and drops after changes."""
     for seed in range(examples(18)):
         messages = Messages(seed)
         agree({"x.rv": HARD[name]}, definitions(), [messages.traffic() for _ in range(10)], on_fault)
 
 
 def _shipped_traffic(seed: int) -> list[Traffic]:
-    """Messages on the topics of the shipped specifications."""
+    """Return messages on the topics of the shipped specifications."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     kinds = {
         "/landshark/battery": lambda: message("sensor_msgs/BatteryState", percentage=random.random(), voltage=12.0),
@@ -248,7 +248,7 @@ def _shipped_traffic(seed: int) -> list[Traffic]:
 
 
 def test_shipped_monitors_do_the_same_together() -> None:
-    """The specifications in `monitors/`, all in force, on traffic of the LandShark."""
+    """All specifications in `monitors/` are in force, on traffic of the LandShark."""
     known = definitions().extended(
         Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": "Header header\nuint8 trigger\n"})
     )
@@ -258,7 +258,7 @@ def test_shipped_monitors_do_the_same_together() -> None:
 
 
 def test_the_engine_sees_only_reported_requests_and_replies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In each second these are the first verdict and change, and all refusals."""
+    """In each second the engine handles the first verdict, the first change, and all refusals."""
     text = """s() { int n = 0; bool b = false;
         event ask(bool wish) service /mode std_srvs/SetBool request '{data:wish}' {
             n++; ROS_INFO("%d", n); if (n % 10 == 9) { return; } if (wish) { wish = false; } }
@@ -299,7 +299,7 @@ def test_the_engine_sees_only_reported_requests_and_replies(monkeypatch: pytest.
 
 
 def test_most_messages_are_taken_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A monitor that reads, writes and steps looks at no message of a batch singly, but for the first of a second."""
+    """A monitor that reads, writes and steps handles only the first message of a second singly."""
     text = """s() { event e(int count, double x) /plain own/Plain '{count:count, x:x}' { x = count + 0.5; }
                   fsm: a [ e -> b ] b [ e -> a ] @fail { } }"""
     monitored = Monitored({"x.rv": text}, definitions(), together=True)
@@ -325,7 +325,7 @@ def test_most_messages_are_taken_together(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_lines_describe_the_received_message() -> None:
-    """The message has a header that is also changed, or is shorter than a header."""
+    """The message has a header that is changed as well, or is shorter than a header."""
     text = """s() { event e(unsigned int n) /h geometry_msgs/PointStamped '{header.seq:n}' { n = 3; } }
         t() { int k = 0; event e() /h geometry_msgs/PointStamped '{}' { k++; ROS_INFO("came %d", k); } }
         u() { event e(std::string f) /j geometry_msgs/PointStamped '{header.frame_id:f}' {
@@ -349,7 +349,7 @@ def test_a_batch_is_prepared_once_until_an_event_happens(does: str, monkeypatch:
     monitored = Monitored({"x.rv": text}, definitions(), together=True)
     body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
     batch = Traffic("/plain", (struct.pack("<I", len(body)) + body) * 50, 50)
-    for _ in range(2):  # the engine takes the first message, and the first change
+    for _ in range(2):  # the engine handles the first message, and the first change
         monitored.through(batch)
     asked = []
     walks = MonitorSet.lane_ready
@@ -369,7 +369,7 @@ def test_a_batch_is_prepared_once_until_an_event_happens(does: str, monkeypatch:
 
 
 def test_a_change_by_several_monitors_counts_for_each() -> None:
-    """A message counts for each monitor that changed it, in a batch (by bits and runs) as one by one."""
+    """A message counts for each monitor that changed it, in a batch (by bits and runs) as well as singly."""
     body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
     quiet = struct.pack("<BidfBII3qI", 1, 17, 2.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
     far = struct.pack("<BidfBII3qI", 2, 5, 9.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
@@ -383,7 +383,7 @@ def test_a_change_by_several_monitors_counts_for_each() -> None:
 def test_a_defect_of_the_walk_is_reported_once_and_the_engine_goes_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Messages continue one by one; the walk of this topic is not tried again."""
+    """Messages continue one by one; the batch function of this topic is not tried again."""
     monitored = Monitored(
         {"x.rv": "s() { event e(int count) /plain own/Plain '{count:count}' { count = 3; } }"},
         definitions(),

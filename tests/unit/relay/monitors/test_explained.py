@@ -1,8 +1,8 @@
-"""Everything that a monitor does explains itself: who, which events, which values, which line.
+"""Every action of a monitor is explained: the host, the events, the values and the line.
 
-Each row of the tables is a kind of event and what comes of it. The events that a record names are given alone to the
-same specification in its initial state; they must have the same effect. The lines for people are made of the record as
-`rosrv audit why`, REST and the console show them.
+Each row of the tables has a kind of event and its effect. The events that a record names are replayed alone, from the
+initial state; they must have the same effect. The lines for people come from the record, as `rosrv audit why`, REST and
+the console show it.
 """
 
 import struct
@@ -32,7 +32,7 @@ START = time.time_ns() + 3_600_000 * MS
 
 
 class Given(NamedTuple):
-    """A message of a topic, or what a client or a server says; milliseconds after the beginning."""
+    """A message of a topic, a request or a reply, with milliseconds since the beginning."""
 
     at: int
     where: str
@@ -68,7 +68,7 @@ class Trail(idle_class(AuditTrail)):  # type: ignore[misc]  # it is made
         self, event: str, reason: str, *, severity: Severity, host: str | None, caller_id: str | None, category: str,
         resource: str, more: dict[str, Any], **detail: Any,
     ) -> str:  # fmt: skip
-        """As `AuditTrail`."""
+        """Act as `AuditTrail`."""
         self.records.append(
             AuditRecord(
                 id="1", time=1, event=event, severity=severity, host=host, caller_id=caller_id, category=category,
@@ -121,13 +121,13 @@ def told(row: Row, given: Iterable[Given], *, together: bool, shadow: bool = Fal
 
 
 def place(text: str, piece: str) -> str:
-    """Where a piece of a text stands; of the head of a property where its formula does."""
+    """Return the position of a piece of text; for a formula, the position of its property's head."""
     before = text[: text.index(piece) + (len(piece) + 1) * piece.endswith(":")]
     return f"x.rv:{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
 
 
 def check(row: Row, *, together: bool, shadow: bool = False) -> None:
-    """The event, the record of it and its lines say what the row does, and the events named are enough."""
+    """Check the event, its record and its lines against the row, and that the named events are enough."""
     found = told(row, row.given, together=together, shadow=shadow)
     assert found is not None
     detail = found.detail
@@ -182,8 +182,9 @@ BOTH = [("a", ARM), ("b", STICK)]
 
 
 def given(text: str) -> list[Given]:
-    """Messages `a5` (5 on /a, of the arm) and `b1` (1 on /b, of the stick), 10 ms after each other; `.` is 10 ms more;
-    `c0` lets the time pass.
+    """Return messages `a5` (5 on /a, from the arm) and `b1` (1 on /b, from the stick), 10 ms apart.
+
+    A `.` adds 10 ms, and `c0` lets the time pass.
     """
     who = {"a": ARM, "b": STICK, "c": "/clock", "q": "/client", "r": "/server"}
     where = {"c": "/clock", "q": "request", "r": "response"}
@@ -196,7 +197,7 @@ def given(text: str) -> list[Given]:
 
 
 def logic(formula: str, words: str, because: list[tuple[str, str]], by: str = STICK) -> Row:
-    """A verdict of a formula over `a` and `b`."""
+    """Return the row of a verdict of a formula over `a` and `b`."""
     text = f"m() {{ {A} {{ }} {B} {{ }} {CLOCK}\n {formula} {{ }} }}"
     return Row(text, given(words), "verdict", by, formula[: formula.index(":") + 1], because, {})
 
@@ -360,11 +361,11 @@ OUTCOMES = {
 
 @pytest.mark.parametrize("name", OUTCOMES)
 def test_the_outcome_of_an_event(name: str) -> None:
-    """Every kind of event with every outcome."""
+    """Covers every kind of event with every outcome."""
     check(OUTCOMES[name], together=True)
 
 
 @pytest.mark.parametrize("name", [name for name in OUTCOMES if name not in ("what is held",)])
 def test_the_outcome_in_shadow_mode(name: str) -> None:
-    """The same of a specification that is given copies; it holds nothing."""
+    """In shadow mode the same specification judges copies and holds nothing."""
     check(OUTCOMES[name], together=False, shadow=True)

@@ -1,4 +1,4 @@
-"""Monitors, as transcripts of the whole relay: specifications in, messages through, reports out."""
+"""Monitors as transcripts of the whole relay: specifications and messages in, messages and reports out."""
 
 import struct
 import threading
@@ -60,14 +60,14 @@ def test_dialogue(world: Monitored, title: str) -> None:
 
 @pytest.fixture
 def world() -> Iterator[Monitored]:
-    """A relay with one node."""
+    """Yield a relay with one node."""
     world = Monitored()
     yield world
     world.close()
 
 
 def test_a_topic_without_an_enabled_event_never_goes_through_monitors(world: Monitored) -> None:
-    """Not with specifications for other topics, and not while its monitor is disabled; then messages are untouched."""
+    """Neither specifications for other topics nor a disabled monitor touch its messages."""
     world.load(GUARD.replace("/chatter", "/other"))
     publisher, subscriber = world.subscribed()
     relayed, _publisher = world.engine.topics["k", "/chatter"]
@@ -82,7 +82,7 @@ def test_a_topic_without_an_enabled_event_never_goes_through_monitors(world: Mon
 
 @pytest.fixture
 def compiled(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
-    """Set it to let the specifications be loaded that are stated from now on."""
+    """Return an event; while it is not set, specifications stay uncompiled."""
     compiled, load_now = threading.Event(), Loader.load
 
     def load_late(message: SpecificationsStated, holder_of: HolderOf) -> Any:
@@ -96,7 +96,7 @@ def compiled(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 def test_the_first_specifications_delay_only_their_topics(
     world: Monitored, compiled: threading.Event
 ) -> None:
-    """However long they take to compile: the loop serves on (its supervisor), and nothing goes past the monitors."""
+    """However long compiling takes, the loop still answers, and no message bypasses the monitors."""
     late = GUARD.replace("/chatter", "/late")
     world.state(stated(1, [("0.rv", late)], {}, {}, True, statement=7))
     world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
@@ -116,7 +116,7 @@ def test_the_first_specifications_delay_only_their_topics(
 
 
 def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_order(world: Monitored) -> None:
-    """Statements that waited may have other specifications, and then the first again."""
+    """The statements that waited may have other specifications, and then the first ones again."""
     other = GUARD.replace("/chatter", "/other")
     for revision, text in enumerate((GUARD, other, GUARD, "nonsense", other, other), 1):
         world.control.send(stated(revision, [("0.rv", text)], {}, {}, True, statement=revision))
@@ -128,7 +128,7 @@ def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_ord
     assert world.engine.interceptor.wants("/other")
     assert not world.engine.interceptor.wants("/chatter")
     assert isinstance(world.load(GUARD, revision=7), SpecificationsTaken)
-    for _ in range(20):  # nothing is left that the loop is woken for
+    for _ in range(20):  # no work is left that would wake the loop
         world.loop.turn(0.01)
 
 
@@ -136,7 +136,7 @@ def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_ord
 def test_specifications_of_a_new_control_are_in_force_before_its_placements(
     world: Monitored, compiled: threading.Event, text: str
 ) -> None:
-    """After a crash during a change, control may begin with another revision than the relay's, or a refused one."""
+    """If control crashed during a change, the next control may begin with another revision, or a refused one."""
     compiled.set()
     world.load(GUARD)
     compiled.clear()
@@ -149,7 +149,7 @@ def test_specifications_of_a_new_control_are_in_force_before_its_placements(
 
 
 def test_ticks_that_take_longer_than_their_period_do_not_starve_the_relay(world: Monitored) -> None:
-    """Each would find more of them late than the one before: they are left out, told, and everything else goes on."""
+    """Late ticks are left out and reported, so that they do not pile up; everything else continues."""
     slow = "slow() { int n; event tick() every 1ms { for (int i = 0; i < 60000; i++) n += i; } }"
     world.load(slow)
     longest = 0.0
@@ -163,7 +163,7 @@ def test_ticks_that_take_longer_than_their_period_do_not_starve_the_relay(world:
 
 
 def test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn(world: Monitored) -> None:
-    """In order and unchanged, while those before them go on."""
+    """These messages stay in order and unchanged; the messages before them are delivered."""
     world.load(COSTLY)
     lane = TopicPipeline(world.engine.interceptor, ObservationPoint("k", "/chatter"))
     frames = bytearray(string("x" * 3000) + string("last") * 3)
@@ -179,7 +179,7 @@ def test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn(worl
 
 
 def test_hosts_that_the_policy_does_not_name_have_one_pace(world: Monitored) -> None:
-    """One that sent a message that took all of its time slows down the messages of all of them, and no others."""
+    """If such a host's message uses its whole time, the messages of all such hosts slow down, and no others."""
     interceptor = world.engine.interceptor
     for key, host, named in (("a", "10.9.0.1", False), ("b", "10.9.0.2", False), ("c", "10.0.0.1", True)):
         world.state(NodePlaced(key, "/node", host), world.listen())
@@ -195,7 +195,7 @@ def test_hosts_that_the_policy_does_not_name_have_one_pace(world: Monitored) -> 
 
 
 def test_waiting_messages_survive_new_specifications_in_order(world: Monitored) -> None:
-    """The specifications in force at their turn judge messages that wait; none is lost or overtaken."""
+    """Waiting messages are judged by the specifications in force at their turn; none is lost or overtaken."""
     world.load(COSTLY)
     publisher, subscriber = world.typed()
     many = [string(f"{number:05}" + "x" * 100) for number in range(3000)]
@@ -221,7 +221,7 @@ def test_waiting_messages_end_with_the_publication(world: Monitored) -> None:
 def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(
     world: Monitored, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Even one that is ours."""
+    """The message is dropped even if the defect is our own; the relay continues."""
     world.load(GUARD)
     publisher, subscriber = world.typed()
     monitors = world.engine.interceptor.monitors
@@ -235,7 +235,7 @@ def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(
 
 
 def test_a_large_message_goes_through_a_monitor(world: Monitored) -> None:
-    """Unchanged, changed and dropped ones alike."""
+    """A large message may be passed unchanged, changed or dropped."""
     spec = GUARD.replace('text == "bad"', "text.size() == 300000").replace(
         'text == "one"', "text.size() == 400000"
     )
@@ -293,7 +293,7 @@ latch() {
 
 
 def test_a_verdict_is_reported_with_its_property_logic_and_category(world: Monitored) -> None:
-    """And counted for the state of the monitors."""
+    """The verdict is also counted in the state of the monitors."""
     world.load(BUTTON.replace("/mode", "/chatter"))
     publisher, subscriber = world.typed()
     publisher.send(string("a") * 3)
@@ -312,7 +312,7 @@ def test_a_verdict_is_reported_with_its_property_logic_and_category(world: Monit
 
 
 def _called(world: Monitored, persistent: bool = True) -> tuple[Peer, Peer]:
-    """A client and its connection at the service."""
+    """Return a client and its connection at the service."""
     fields = {"callerid": "/client", "service": "/mode", "md5sum": "*"}
     client = world.connect(encode_header(fields | ({"persistent": "1"} if persistent else {})))
     service = world.accept(world.service)
@@ -327,7 +327,7 @@ class Killed(BaseException):
 
 
 class Mortal(bytearray):
-    """A memory of the state of monitors; the first write after `kills` is set is the last act of the process."""
+    """A memory for the state of monitors that kills the process at the first write after `kills` is set."""
 
     kills = False
 
@@ -385,7 +385,7 @@ def _replies(world: Monitored) -> tuple[Peer, Peer, bytes]:
 def test_state_is_written_before_its_effect(
     world: Monitored, begin: Callable[[Monitored], tuple[Peer, Peer, bytes]]
 ) -> None:
-    """A relay that is killed at the write has sent nothing of what follows from it."""
+    """A relay that is killed at the write has not sent any effect of the new state."""
     memory = Mortal(1 << 20)
     world.engine.interceptor.remember(StateKeeper(StateGiven(True, "boot", 0), memory))
     sender, receiver, message = begin(world)
@@ -397,7 +397,7 @@ def test_state_is_written_before_its_effect(
 
 
 def test_the_client_of_a_service_reads_why_its_request_could_not_be_judged(world: Monitored) -> None:
-    """The fault, as well as what a monitor says; services whose monitors are off are not judged."""
+    """The client gets the fault, as it gets a monitor's message; services with disabled monitors are not judged."""
     world.load(LATCH.replace("open = wish;", "int zero = 0; open = 1 / zero;"))
     interceptor = world.engine.interceptor
     refused = interceptor.judge(ObservationPoint("k", "/mode"), "request", b"\0").refused
@@ -407,7 +407,7 @@ def test_the_client_of_a_service_reads_why_its_request_could_not_be_judged(world
 
 
 def test_events_without_a_control_reach_the_next_one(world: Monitored) -> None:
-    """Nothing of it is lost."""
+    """No event is lost."""
     world.load(GUARD)
     publisher, subscriber = world.typed()
     world.engine.attach(None)
@@ -421,7 +421,7 @@ def test_events_without_a_control_reach_the_next_one(world: Monitored) -> None:
 
 
 def test_nothing_is_lost_while_specifications_come_and_go(world: Monitored) -> None:
-    """Compiled beside the loop and swapped between two messages: each message once, in order."""
+    """Specifications compile in a thread and are swapped between two messages: each message arrives once, in order."""
     specification = (
         "mark() { event said(std::string t) /chatter std_msgs/String '{data:t}' { t = \"%s\" + t; } }"
     )
@@ -451,7 +451,7 @@ def test_nothing_is_lost_while_specifications_come_and_go(world: Monitored) -> N
 
 
 def test_a_replaced_monitor_counts_from_zero(world: Monitored) -> None:
-    """Its predecessor's counts that were not yet summed up are dropped also; a monitor that stays goes on counting."""
+    """Counts of its predecessor that were not yet added up are dropped; a monitor that stays keeps counting."""
     other = "other() { event e() /chatter std_msgs/String '{}' { } }"
     world.load(other, GUARD)
     publisher, subscriber = world.typed()
@@ -472,7 +472,7 @@ def test_a_replaced_monitor_counts_from_zero(world: Monitored) -> None:
 def test_a_monitor_that_comes_from_another_relay_holds_its_topics_if_it_is_declared_so(
     world: Monitored,
 ) -> None:
-    """It begins in its initial state here, as after a restart; others of the same text do not."""
+    """A monitor declared `hold` holds its topics on the new relay until it is resumed; other monitors do not."""
     held = "hold gate() { event e() /chatter std_msgs/String '{}' { } }"
     free = "free() { event e() /other std_msgs/String '{}' { } }"
     world.load(free)
@@ -493,7 +493,7 @@ def test_a_monitor_that_comes_from_another_relay_holds_its_topics_if_it_is_decla
 def test_a_text_that_changes_while_a_state_is_to_lose_holds_the_topics(
     world: Monitored, modifier: str, said: list[str], held: bool
 ) -> None:
-    """So no load forgets an emergency stop; what had not left its beginning, or is declared `begin`, goes on."""
+    """So no load forgets an emergency stop. A monitor in its initial state, or declared `begin`, holds nothing."""
     world.load(GUARD)
     publisher, subscriber = world.typed()
     for text in said:
@@ -510,7 +510,7 @@ def test_a_text_that_changes_while_a_state_is_to_lose_holds_the_topics(
 
 
 def test_a_verdict_names_its_senders_and_messages(world: Monitored) -> None:
-    """Those that alone give it, by name, though others came between and most went through the module."""
+    """The verdict names only the messages that cause it, even if others arrived in between."""
     world.load("""latch() {
     event on(std::string text) /chatter std_msgs/String '{data:text}' when (text == "on") { }
     event off(std::string text) /chatter std_msgs/String '{data:text}' when (text == "off") { }

@@ -22,7 +22,7 @@ LOOK = """look() { event drive(double y) /cmd geometry_msgs/Twist '{linear:{y:y}
 
 
 class Told:
-    """Three monitors on one topic: two that limit, and one after them that changes nothing."""
+    """Three monitors on one topic: two that limit, and a third after them that changes nothing."""
 
     def __init__(
         self, *, together: bool, on_fault: str = "drop", texts: tuple[str, ...] = (STOP, TURN, LOOK)
@@ -31,7 +31,7 @@ class Told:
         self.monitored = Monitored(files, definitions(), together=together, on_fault=on_fault)
 
     def send(self, *commands: tuple[float, float, float]) -> None:
-        """Commands (forward, sideways, turn) in one batch."""
+        """Send commands (forward, sideways, turn) in one batch."""
         bodies = [message(COMMAND, linear__x=x, linear__y=y, angular__z=z) for x, y, z in commands]
         frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
         self.monitored.through(Traffic("/cmd", frames, len(bodies)))
@@ -45,20 +45,20 @@ class Told:
         return found
 
     def counts(self) -> dict[str, tuple[int, int]]:
-        """Drops and changes by monitor."""
+        """Return drops and changes by monitor."""
         return {row.name: (row.drops, row.changes) for row in self.monitored.rows()}
 
 
 @pytest.fixture(params=[False, True], ids=["one by one", "together"])
 def told(request: pytest.FixtureRequest) -> Iterator[Told]:
-    """Both ways."""
+    """Yield the monitors twice: with single messages, and with batches."""
     told = Told(together=request.param)
     yield told
     told.monitored.close()
 
 
 def test_a_change_is_recorded_under_the_monitor_that_made_it(told: Told) -> None:
-    """Though events of two others happen after it, which change nothing."""
+    """The record names this monitor even if events of two other monitors follow without a change."""
     told.send((5, 0, 0))
     [change] = told.events("change")
     assert (change.monitor, change.text) == ("stop", "stop changed a message")
@@ -73,7 +73,7 @@ def test_a_change_is_recorded_under_the_monitor_that_made_it(told: Told) -> None
 
 
 def test_a_change_of_two_monitors_names_both_and_counts_for_both(told: Told) -> None:
-    """One record, under the last of them; so does the count of the others in the same second."""
+    """One record names the last monitor, and the others with it; the counts of that second name both."""
     told.send((5, 0, 5), *[(0, 0, 5)] * 3, *[(0.5, 0, 3), (4, 0, 3)] * 2)
     full, *summed = told.events("change")
     assert (full.monitor, full.text) == ("turn", "stop and turn changed a message")
@@ -86,7 +86,7 @@ def test_a_change_of_two_monitors_names_both_and_counts_for_both(told: Told) -> 
 
 
 def test_a_drop_is_recorded_under_the_monitor_that_dropped(told: Told) -> None:
-    """With what it said itself, if anything: not with what another one did; and nothing has changed."""
+    """The record has only the text of the monitor that dropped, not of another one, and lists no change."""
     told.send((5, 5, 5))
     [drop] = told.events("drop")
     assert (drop.monitor, drop.text) == ("look", "look.drive dropped it")
@@ -94,14 +94,14 @@ def test_a_drop_is_recorded_under_the_monitor_that_dropped(told: Told) -> None:
 
 
 def test_a_publication_is_recorded_under_its_monitor(told: Told) -> None:
-    """This holds although events of other monitors follow it."""
+    """The record names this monitor even if events of other monitors follow."""
     told.send((5, 0, 0))
     [published] = told.events("publish")
     assert (published.monitor, published.resource) == ("stop", "/alarm")
 
 
 def test_a_fault_that_was_passed_over_is_not_what_dropped() -> None:
-    """With `on_fault: pass`, the drop has the reason and the name of who dropped."""
+    """With `on_fault: pass`, the drop has the reason and the name of the monitor that dropped."""
     faulty = STOP.replace("v = 1;", "v = 1 / (int) (v - 5);")
     told = Told(together=False, on_fault="pass", texts=(faulty, LOOK))
     told.send((5, 5, 0))
@@ -111,7 +111,7 @@ def test_a_fault_that_was_passed_over_is_not_what_dropped() -> None:
 
 
 def test_a_fault_drops_under_the_name_of_its_monitor() -> None:
-    """Though the last event that happened was another's."""
+    """The drop names this monitor even if the last event was another monitor's."""
     faulty = LOOK.replace("'{linear:{y:y}}'", "'{linear:{y:y}}' when (1 / (int) (y - 5) == 0)")
     told = Told(together=False, texts=(STOP, faulty))
     told.send((5, 5, 0))
@@ -123,7 +123,7 @@ def test_a_fault_drops_under_the_name_of_its_monitor() -> None:
 
 @pytest.mark.parametrize("together", [False, True])
 def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(together: bool) -> None:
-    """A publisher that makes every message another set's fills neither the log nor loses what is counted."""
+    """If each message is changed by another set of monitors, the log does not fill and every change is counted."""
     texts = {
         f"{bit}.rv": f"m{bit}() {{ event e(double v) /pose geometry_msgs/PoseWithCovariance '{{covariance[{bit}]:v}}'"
         " { if (v > 1) { v = 1; } } }"
@@ -149,7 +149,7 @@ def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(
 
 
 def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: Told) -> None:
-    """A drop in the audit log is already in the counters, events included."""
+    """When the audit log has a drop, the counters already include it and its events."""
     told.send((1, 5, 0))
     told.monitored.interceptor.observations.flush()
     *_before, events, counters = told.monitored.heard.messages
@@ -163,7 +163,7 @@ def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: T
 @pytest.mark.parametrize("together", [False, True], ids=["one by one", "together"])
 @pytest.mark.parametrize("equal", [False, True], ids=["of any length", "equally long"])
 def test_reports_name_publisher_and_message(together: bool, equal: bool) -> None:
-    """Caller id and host, the number in the publication, and the header as it was received."""
+    """A report has the publisher's name and host, the message's number, and the header as received."""
     look = """look() { event far(int seq) /scan geometry_msgs/PoseStamped '{header:{seq:seq}}' {
         if (seq == 7 || seq == 9) { seq = 0; return; } if (seq == 8) { int zero = 0; seq = 1 / zero; } } }"""
     told = Told(together=together, texts=(look,), on_fault="pass")
@@ -188,7 +188,7 @@ def test_reports_name_publisher_and_message(together: bool, equal: bool) -> None
 
 
 def test_clients_of_one_host_are_counted_together_and_those_of_two_are_not() -> None:
-    """A client that calls itself by ever new names makes no record for each; the first is named, hosts are apart."""
+    """A client that keeps changing its name makes no record for each name; the first is named, per host."""
     told = Told(together=True)
     observations = told.monitored.interceptor.observations
     for number in range(50):
@@ -210,7 +210,7 @@ def test_clients_of_one_host_are_counted_together_and_those_of_two_are_not() -> 
 
 @pytest.mark.parametrize("together", [False, True])
 def test_a_verdict_names_its_binding(together: bool) -> None:
-    """The verdict of each binding is reported in full, not counted with that of another one."""
+    """The verdict of each binding is reported in full, and not counted with another binding's."""
     turns = (
         "turns(double x) { event on(double x) /cmd geometry_msgs/Twist '{linear.x:x}' { } "
         'ere: on on @match { ROS_INFO("twice"); } }'
@@ -226,7 +226,7 @@ def test_a_verdict_names_its_binding(together: bool) -> None:
 
 
 def test_how_many_slices_there_are() -> None:
-    """Beside how many there may be; none of what has no parameters."""
+    """The number of slices is reported with its limit, but not for monitors without parameters."""
     told = Told(together=False, texts=(AGAIN, TURNED))
     told.send((5, 0, 0), (6, 0, 0), (5, 0, 0))
     rows = {row.name: (row.slices, row.slice_limit) for row in told.monitored.rows()}

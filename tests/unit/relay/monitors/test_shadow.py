@@ -21,10 +21,10 @@ from tests.unit.relay.monitors.monitored import (
 
 
 class Trying(Monitored):
-    """A relay whose control states specifications, some of them in shadow mode."""
+    """A relay whose control sends specifications, some of them in shadow mode."""
 
     def state_shadows(self, *texts: str, shadowed: tuple[str, ...] = (), revision: int = 1) -> list[str]:
-        """State these; those that began."""
+        """Send these specifications, and return the names of the monitors that began."""
         files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
         self.state(stated(revision, files, {}, {}, False, shadows=shadowed))
         taken: SpecificationsTaken = self.until(lambda: self.taken(SpecificationsTaken, revision))
@@ -49,7 +49,7 @@ class Trying(Monitored):
 
 @pytest.fixture
 def world() -> Iterator[Trying]:
-    """A relay with one node."""
+    """Yield a relay with one node."""
     world = Trying()
     yield world
     world.close()
@@ -58,11 +58,11 @@ def world() -> Iterator[Trying]:
 def test_waiting_messages_are_judged_before_it_is_promoted(
     world: Trying, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So what it has seen is complete."""
+    """Judging them first makes the monitor's state complete."""
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()
     interceptor = world.engine.interceptor
-    monkeypatch.setattr(interceptor.shadow, "have_turn", lambda: None)  # it never has its turn
+    monkeypatch.setattr(interceptor.shadow, "have_turn", lambda: None)  # the monitor never gets its turn
     publisher.send(string("a") * 3)
     world.gets(subscriber, string("a") * 3)
     assert len(interceptor.shadow.waiting) == 3
@@ -73,7 +73,7 @@ def test_waiting_messages_are_judged_before_it_is_promoted(
 
 
 def test_a_loop_without_end_delays_and_drops_nothing(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It ends at a tenth of the normal budget, once in a second, and begins again, as its input is incomplete."""
+    """The loop ends at a tenth of the normal budget, once a second; the monitor then begins again."""
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()
     monkeypatch.setattr(shadow.ShadowMonitors, "tick", lambda _self: None)  # the second is not over
@@ -93,7 +93,7 @@ def test_a_loop_without_end_delays_and_drops_nothing(world: Trying, monkeypatch:
 
 
 def test_ticks_without_end_rest_for_the_second(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One is tried, and the loop goes on; another when the second is over."""
+    """One tick is tried and the relay continues; the next tick is tried when the second is over."""
     monkeypatch.setattr(shadow.ShadowMonitors, "tick", lambda _self: None)
     text = "s() { int n = 0; event tick() every 1ms { while (true) { n = n; } } }"
     world.state_shadows(text, shadowed=("s",))
@@ -110,7 +110,7 @@ def test_ticks_without_end_rest_for_the_second(world: Trying, monkeypatch: pytes
 def test_shadow_mode_has_a_bounded_part_of_the_processor(
     world: Trying, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Monitors miss the messages beyond it; messages pass."""
+    """Shadow monitors miss messages beyond their part of the processor time; the messages pass."""
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()
     thread_time, more = time.thread_time, [0.0]
@@ -133,7 +133,7 @@ def test_shadow_mode_has_a_bounded_part_of_the_processor(
 
 
 def test_waiting_messages_are_bounded(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The shadow monitor misses messages beyond the limit; the subscriber gets them all."""
+    """The shadow monitor misses messages beyond the limit; the subscriber gets all of them."""
     monkeypatch.setattr(shadow, "_MOST_WAITING", 5)
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()
@@ -143,7 +143,7 @@ def test_waiting_messages_are_bounded(world: Trying, monkeypatch: pytest.MonkeyP
 
 
 def test_a_defect_in_it_ends_no_message(world: Trying) -> None:
-    """An unexpected exception is reported, and the relay goes on."""
+    """An unexpected exception is reported, and the relay continues."""
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()
     assert world.engine.interceptor.monitors is not None

@@ -1,4 +1,4 @@
-"""The state of monitors outlives the relay: one that is killed after any batch goes on where it was."""
+"""The state of monitors outlives the relay: after a kill at any batch, the next process continues it."""
 
 import time
 from dataclasses import replace
@@ -32,7 +32,7 @@ STOP = """{modifier} stop() {{
 
 
 def begun(monitors: MonitorSet, memory: bytearray, given: StateGiven = GIVEN) -> StateKeeper:
-    """A process begins with this memory, as `Interceptor` does."""
+    """Start a process with this memory, as `Interceptor` does."""
     keeper = StateKeeper(given, memory)
     left = keeper.recovered()
     if left is None:
@@ -44,12 +44,12 @@ def begun(monitors: MonitorSet, memory: bytearray, given: StateGiven = GIVEN) ->
 
 
 def again(monitors: MonitorSet) -> MonitorSet:
-    """The same specifications in another process."""
+    """Start another process with the same specifications."""
     return on_module(monitors.compiled, monitors.on_fault)
 
 
 def unexplained(outcome: Outcome) -> Outcome:
-    """Without what only explains, which is not kept, and output that a throttle may let through once more."""
+    """Return the effects without explanations, which are not kept, and without output that a throttle may repeat."""
     outcome.verdicts = tuple(replace(verdict, why=None) for verdict in outcome.verdicts)
     outcome.log = []
     outcome.before = [unexplained(before) for before in outcome.before]
@@ -59,7 +59,7 @@ def unexplained(outcome: Outcome) -> Outcome:
 @FEW
 @given(seed=st.integers(0, 1 << 30), step_ns=st.sampled_from([1, 700_000]))
 def test_random_specifications_go_on_where_a_killed_process_was(seed: int, step_ns: int) -> None:
-    """With every logic and type of variable, timers and deadlines, a cut at any point changes nothing."""
+    """With every logic, type of variable, timer and deadline, a kill at any point changes nothing."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     sources = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
     messages = Messages(seed)
@@ -67,7 +67,7 @@ def test_random_specifications_go_on_where_a_killed_process_was(seed: int, step_
     try:
         monitors = on_module(compiled_from(sources, definitions()))
     except SpecificationError:
-        return  # a draw that means nothing
+        return  # the random text is not a valid specification
     whole, memory = again(monitors), bytearray(SIZE)
     whole.start(0)
     keeper = begun(monitors, memory)
@@ -87,13 +87,13 @@ def test_random_specifications_go_on_where_a_killed_process_was(seed: int, step_
 
 
 def stop(modifier: str = "", more: str = "") -> MonitorSet:
-    """An emergency stop that is latched."""
+    """Return an emergency stop that latches."""
     text = STOP.format(modifier=modifier, more=more)
     return on_module(compiled_from({"stop.rv": text}, standard_definitions()))
 
 
 def press(monitors: MonitorSet, keeper: StateKeeper) -> None:
-    """The button is pressed twice: the first message of a monitor is the engine's, the second the module's."""
+    """Press the button twice: the engine handles a monitor's first message, the module the second."""
     for on in (b"\x00", b"\x01"):
         monitors.judge("/stop", on, 1)
         keeper.keep("/stop")
@@ -114,7 +114,7 @@ OTHERS = {
 @pytest.mark.parametrize("other", OTHERS)
 @pytest.mark.parametrize("modifier", ["", "hold", "begin"])
 def test_a_state_that_may_be_stale_is_not_used(other: str, modifier: str) -> None:
-    """After it a monitor that acts by a state holds its topics, and says why; one declared `begin` begins."""
+    """A monitor that acts by a state then holds its topics with the reason; a monitor declared `begin` starts again."""
     memory = bytearray(SIZE)
     first = stop(modifier)
     press(first, begun(first, memory))
@@ -126,7 +126,7 @@ def test_a_state_that_may_be_stale_is_not_used(other: str, modifier: str) -> Non
 
 
 def test_an_orderly_end_outlives_the_machine() -> None:
-    """After an orderly end and a start of the machine the state is used again."""
+    """After an orderly end, a restarted machine uses the state again."""
     memory = bytearray(SIZE)
     first = stop()
     press(first, begun(first, memory))
@@ -138,7 +138,7 @@ def test_an_orderly_end_outlives_the_machine() -> None:
 
 
 def test_another_text_loses_the_state_and_says_so() -> None:
-    """A specification that was changed while nothing ran holds its topics; one that was never loaded begins."""
+    """A specification that changed while the relay was stopped holds its topics; one never loaded before begins."""
     memory = bytearray(SIZE)
     first = stop()
     press(first, begun(first, memory))
@@ -157,7 +157,7 @@ def test_another_text_loses_the_state_and_says_so() -> None:
 
 
 def test_held_topics_are_held_by_the_next_process() -> None:
-    """The death of a process never releases held topics; only an operator does."""
+    """A killed process never releases held topics; only an operator does."""
     memory = bytearray(SIZE)
     first = stop()
     press(first, begun(first, memory))
@@ -173,7 +173,7 @@ def test_held_topics_are_held_by_the_next_process() -> None:
 
 
 def test_an_unreadable_memory_does_not_start_monitors_over() -> None:
-    """A damaged memory does not show its monitors: all monitors that act by a state hold their topics."""
+    """A damaged memory does not reveal its monitors, so all monitors that act by a state hold their topics."""
     memory = bytearray(SIZE)
     first = stop()
     press(first, begun(first, memory))
@@ -185,7 +185,7 @@ def test_an_unreadable_memory_does_not_start_monitors_over() -> None:
 
 
 def test_a_newer_state_that_is_lost_is_not_replaced_by_an_older_one() -> None:
-    """The last process that had a monitor counts, whatever earlier ones left."""
+    """Only the last process that had a monitor counts, whatever earlier processes left."""
     older, newer = bytearray(SIZE), bytearray(SIZE)
     first = stop()
     begun(first, older)
@@ -221,7 +221,7 @@ PROPERTIES = (
 @pytest.mark.parametrize("shown", PROPERTIES)
 @pytest.mark.parametrize("seed", range(12))
 def test_slices_go_on_where_a_killed_process_had_them(shown: str, seed: int) -> None:
-    """Their variables, automata, deadlines, which have ended, and the order in which they began."""
+    """Covers variables, automata, deadlines, ended slices, and the order in which slices began."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     monitors = MonitorSet.of(
         compiled_from({"s.rv": SLICED.replace("PROPERTY", shown)}, standard_definitions())
@@ -248,7 +248,7 @@ def test_slices_go_on_where_a_killed_process_had_them(shown: str, seed: int) -> 
 
 
 def test_many_slices_are_kept_and_a_message_writes_a_part_of_them() -> None:
-    """With two thousand a message writes a hundredth; where they have no room, none is restored, and that holds."""
+    """With two thousand slices, a message writes a hundredth; without room none is restored, and topics stay held."""
     text = SLICED.replace("PROPERTY", PROPERTIES[0]).replace("event look() every 3ms", "void look()")
     monitors = MonitorSet.of(compiled_from({"s.rv": text}, standard_definitions()))
     memory = bytearray(8 * SIZE)

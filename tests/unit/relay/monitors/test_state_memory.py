@@ -1,4 +1,4 @@
-"""After a process was killed anywhere, the memory has the state before or after, never another."""
+"""If a process is killed at any write, the memory has the state before or after it, and no other."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +11,7 @@ SIZE = 8192
 
 
 class Written:
-    """A memory that notes each byte that is stored, in order."""
+    """A memory that records each stored byte, in order."""
 
     def __init__(self, data: bytearray) -> None:
         self.data = data
@@ -32,7 +32,7 @@ class Written:
 
 
 def killed_anywhere(data: bytearray, act: Callable[[Any], object]) -> list[StoredState | None]:
-    """Return the result of a read after each prefix of the stores of an action."""
+    """Return what can be read after each prefix of an action's writes."""
     torn, written = bytearray(data), Written(data)
     act(written)
     found = [read(torn)]
@@ -44,7 +44,7 @@ def killed_anywhere(data: bytearray, act: Callable[[Any], object]) -> list[Store
 
 
 def write_both(memory: StateMemory) -> None:
-    """First cells of a section, then its base."""
+    """Write a section's cells, then its base."""
     memory.write_cells(1, b"........")
     memory.write_base(1, b"base")
 
@@ -60,7 +60,7 @@ ACTS: dict[str, Callable[[StateMemory], object]] = {
 @pytest.mark.parametrize("act", ACTS)
 @pytest.mark.parametrize("rounds", [0, 1, 2])
 def test_a_kill_leaves_what_was_before_or_after(act: str, rounds: int) -> None:
-    """After any number of stored bytes: each section is as before or as after, and they change once."""
+    """After any number of stored bytes each section has the old or the new content, and changes only once."""
     data = bytearray(SIZE)
     memory = StateMemory(written := Written(data))
     assert memory.lay_out(b"head", [(b"one", 0), (b"two", 8)])
@@ -88,7 +88,7 @@ def test_the_first_kill_leaves_nothing_or_all() -> None:
 
 
 def test_a_state_without_room_changes_nothing() -> None:
-    """A state beyond its place is refused, and the one before stays; so is a set beyond the memory."""
+    """A state that is too large is refused and the previous one stays; so is a set of monitors that is too large."""
     data = bytearray(SIZE)
     memory = StateMemory(data)
     assert memory.lay_out(b"head", [(b"one", 0)])
@@ -100,7 +100,7 @@ def test_a_state_without_room_changes_nothing() -> None:
 
 @pytest.mark.parametrize("place", range(0, 200, 3))
 def test_arbitrary_bytes_are_refused(place: int) -> None:
-    """Any byte may be wrong: what is read is some bytes, or `ValueError`."""
+    """For arbitrary bytes, reading returns some bytes or raises `ValueError`."""
     data = bytearray(SIZE)
     StateMemory(data).lay_out(b"head", [(b"one", 8), (b"two", 0)])
     for value in (0, 1, 3, 0x7F, 0xFF):

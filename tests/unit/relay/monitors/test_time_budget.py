@@ -1,4 +1,4 @@
-"""The processor time of messages after one that used up its budget."""
+"""The processor time for messages after one message used up its budget."""
 
 from itertools import pairwise
 
@@ -8,7 +8,7 @@ _SECOND = 10**9
 
 
 def reductions(budget: TimeBudget, seconds: float) -> list[float]:
-    """Cut off every message that has the whole budget, 100 a second; return the seconds at which one was."""
+    """Cut off 100 messages a second; return the seconds at which a message had the whole budget."""
     times = [number / 100 for number in range(round(100 * seconds))]
     cut = []
     for time in times:
@@ -20,13 +20,13 @@ def reductions(budget: TimeBudget, seconds: float) -> list[float]:
 
 
 def test_a_sender_of_costly_messages_has_the_whole_budget_ever_more_rarely() -> None:
-    """After 4, 8 and then every 16 seconds."""
+    """The whole budget is available again after 4, then 8, and then every 16 seconds."""
     cut = reductions(TimeBudget(), 64)
     assert [after - before for before, after in pairwise(cut)] == [4, 8, 16, 16, 16]
 
 
 def test_one_costly_message_reduces_the_budget_for_four_seconds() -> None:
-    """Also when there was another one eight seconds before."""
+    """Another such message eight seconds earlier does not lengthen the time."""
     budget = TimeBudget()
     for begin in (5 * _SECOND, 13 * _SECOND, 30 * _SECOND):
         budget.cut(begin)

@@ -1,4 +1,4 @@
-"""Whole frames out of a stream of bytes, however it is cut."""
+"""Splitting a stream of bytes into whole frames, however the stream is cut."""
 
 import struct
 
@@ -30,13 +30,13 @@ def frame(size: int, fill: int = 7) -> bytes:
 
 
 def receiver(limit: int = LIMIT, memory: int = 1 << 30) -> tuple[FrameReceiver, HostMemory]:
-    """A receiver with a scratch area of its own."""
+    """Return a receiver with its own scratch area."""
     budget = share(memory)
     return FrameReceiver(Scratch(), limit, budget), budget
 
 
 def feed(one: FrameReceiver, data: bytes, cuts: list[int]) -> list[tuple[bytes, int, int]]:
-    """Give `data` in reads of the sizes `cuts` (the last repeats); what the batches held."""
+    """Feed `data` in reads of the sizes `cuts` (the last one repeats); return the contents of the batches."""
     batches, position, turn = [], 0, 0
     while position < len(data):
         buffer = one.buffer()
@@ -60,12 +60,12 @@ cut_sizes = st.lists(st.integers(1, 2 * LARGE), min_size=1, max_size=20)
 @settings(max_examples=examples(150))
 @given(sizes, cut_sizes)
 def test_every_way_of_cutting_the_stream_gives_the_same_frames(lengths: list[int], cuts: list[int]) -> None:
-    """Nothing is lost, repeated or torn, and each batch says where its last frame begins."""
+    """No frame is lost, repeated or torn, and each batch knows where its last frame begins."""
     data = b"".join(frame(size, index) for index, size in enumerate(lengths))
     one, budget = receiver()
     batches = feed(
         one, data, [*cuts, max(cuts[-1], len(data) // 2000)]
-    )  # millions of single bytes add nothing
+    )  # millions of single bytes would test no more
     assert b"".join(view for view, _messages, _last in batches) == data
     assert sum(messages for _view, messages, _last in batches) == len(lengths)
     for view, _messages, last in batches:
@@ -83,7 +83,7 @@ def test_a_torn_frame_is_never_part_of_a_batch() -> None:
 
 
 def test_receivers_share_the_scratch_area_without_mixing_their_bytes() -> None:
-    """A torn frame of one connection survives what another receives meanwhile."""
+    """A torn frame of one connection survives the data that another connection receives meanwhile."""
     scratch, budget = Scratch(), share(1 << 30)
     one, other = FrameReceiver(scratch, LIMIT, budget), FrameReceiver(scratch, LIMIT, budget)
     data = frame(100, 1)
@@ -93,7 +93,7 @@ def test_receivers_share_the_scratch_area_without_mixing_their_bytes() -> None:
 
 
 def test_the_scratch_area_moves_between_two_reads() -> None:
-    """A torn frame goes on in the other area; nothing is received into the first one any more."""
+    """A torn frame continues in the new area; the old one receives no more bytes."""
     scratch, first, other = Scratch(), bytearray(SCRATCH), bytearray(SCRATCH)
     one = FrameReceiver(scratch, LIMIT, share(1 << 30))
     scratch.move(memoryview(first))
@@ -105,7 +105,7 @@ def test_the_scratch_area_moves_between_two_reads() -> None:
 
 @pytest.mark.parametrize("size", [LIMIT + 1, 0xFFFFFFFF])
 def test_a_length_beyond_the_limit_is_refused_at_its_first_bytes(size: int) -> None:
-    """The connection is given up before anything of the message is kept."""
+    """The connection is closed before any byte of the message is stored."""
     one, budget = receiver()
     with pytest.raises(LimitExceededError, match=str(size)):
         feed(one, struct.pack("<I", size), [4])
@@ -113,14 +113,14 @@ def test_a_length_beyond_the_limit_is_refused_at_its_first_bytes(size: int) -> N
 
 
 def test_the_limit_holds_for_a_frame_after_a_large_one() -> None:
-    """Also where reading goes on in the large frame's own area."""
+    """The limit also holds when reading continues in the large frame's own area."""
     one, _budget = receiver()
     with pytest.raises(LimitExceededError):
         feed(one, frame(2 * LARGE) + struct.pack("<I", LIMIT + 1), [SCRATCH])
 
 
 def test_a_declared_length_costs_nothing_until_its_bytes_come() -> None:
-    """Only received bytes count, so lengths cannot be used to fill the relay."""
+    """Only received bytes count, so declared lengths cannot fill the relay."""
     one, budget = receiver()
     feed(one, struct.pack("<I", LIMIT) + b"x" * 10, [14])
     assert budget.used == 14
@@ -129,7 +129,7 @@ def test_a_declared_length_costs_nothing_until_its_bytes_come() -> None:
 
 
 def test_a_large_message_is_given_up_when_the_process_is_out_of_memory() -> None:
-    """The error says whose fault it is not, and the receiver can be abandoned."""
+    """The error does not blame the peer, and the receiver can be abandoned."""
     one, budget = receiver(memory=2 * LARGE)
     with pytest.raises(PeerError, match="no memory"):
         feed(one, frame(4 * LARGE), [LARGE])
@@ -139,7 +139,7 @@ def test_a_large_message_is_given_up_when_the_process_is_out_of_memory() -> None
 
 @pytest.mark.parametrize("size", [2 * LARGE, 3 << 20, 9 << 20])
 def test_a_kept_large_frame_is_not_overwritten_by_the_next(size: int) -> None:
-    """A queue that holds a frame keeps its bytes, whatever comes after; also beyond the areas that are kept."""
+    """A queue that holds a frame keeps its bytes, whatever follows, even when all spare areas are in use."""
     one, _budget = receiver(limit=16 << 20)
     kept = []
     for fill in (1, 2, 3):
@@ -168,7 +168,7 @@ def test_a_kept_batch_survives_the_reuse_of_its_buffer() -> None:
 
 
 def test_for_little_of_a_large_frame_its_memory_is_not_kept() -> None:
-    """The next frame is received there; for more of it, or where all is kept already, nothing is copied."""
+    """The next frame reuses the large area; if much of it is kept, or all areas are in use, nothing is copied."""
     view = memoryview(bytearray(frame(1 << 20)))
     batch = Batch(view, 1, 0, owned=True)
     little, kept = batch.rest(len(view) - 1000), batch.kept
@@ -180,7 +180,7 @@ def test_for_little_of_a_large_frame_its_memory_is_not_kept() -> None:
 
 
 def test_boundary_at_finds_the_frame_a_send_stopped_in() -> None:
-    """How many frames are sent, and where the one in progress ends."""
+    """The result is the number of frames sent, and the end of the frame in progress."""
     view = memoryview(frame(6) + frame(0) + frame(10))
     assert [boundary_at(view, offset) for offset in (0, 3, 10, 11, 14, 15, 28)] == [
         (0, 0),
@@ -196,7 +196,7 @@ def test_boundary_at_finds_the_frame_a_send_stopped_in() -> None:
 @given(st.lists(st.sampled_from([0, 5, 5, 5, 252, 256, 65_536]), max_size=12), st.integers(0, 9))
 @example([5, 5, 5, 5, 0], 0)
 def test_equal_frames_are_seen_at_once_exactly_if_all_are_equal(lengths: list[int], torn: int) -> None:
-    """The result for the whole buffer equals that of a walk from frame to frame."""
+    """The result for the whole buffer equals the result of a walk from frame to frame."""
     data = b"".join(frame(length) for length in lengths) + frame(20)[:torn]
     stride, count = equal_frames(memoryview(data), len(data))
     if count:
@@ -208,7 +208,7 @@ def test_equal_frames_are_seen_at_once_exactly_if_all_are_equal(lengths: list[in
 
 
 def test_a_batch_of_equal_frames_says_so() -> None:
-    """A reader can take all fields at once; a frame of another size ends that."""
+    """A reader can then read all fields at once; a frame of another size ends this."""
     one, _ = receiver()
     data = frame(6) * 5 + frame(6)[:3]
     one.buffer()[: len(data)] = data
@@ -223,7 +223,7 @@ def test_a_batch_of_equal_frames_says_so() -> None:
 
 
 def test_the_last_frame_is_looked_for_where_it_is_not_known() -> None:
-    """A batch that something was cut out of is latched all the same."""
+    """A batch from which frames were removed can still be latched."""
     view = memoryview(frame(6) + frame(0) + frame(10, 3))
     assert last_frame(view) == 14
     assert bytes(Batch(view, 3, None).keep_last().view) == frame(10, 3)

@@ -1,4 +1,4 @@
-"""A channel served by the relay's loop."""
+"""A channel served by the relay's event loop."""
 
 import os
 import socket
@@ -39,14 +39,14 @@ class Ends:
         return False
 
     def close(self) -> None:
-        """End both."""
+        """Close both ends."""
         self.link.close()
         self.other.close()
         self.loop.close()
 
 
 def send(sock: socket.socket, count: int) -> None:
-    """Return this number of withdrawals in one piece, as the kernel takes them at once."""
+    """Send this number of withdrawals as one piece, as the kernel may deliver them."""
     bodies = [msgspec.msgpack.encode(NodeWithdrawn(str(number))) for number in range(count)]
     data = b"".join(struct.pack(">I", len(body)) + body for body in bodies)
     assert sock.send(data) == len(data)
@@ -54,14 +54,14 @@ def send(sock: socket.socket, count: int) -> None:
 
 @pytest.fixture
 def ends() -> Iterator[Ends]:
-    """Both ends."""
+    """Yield both ends."""
     ends = Ends()
     yield ends
     ends.close()
 
 
 def test_thousands_of_messages_are_carried_out_a_quantum_at_a_time_and_in_order(ends: Ends) -> None:
-    """Other sockets have their turn in between, as messages cost a hundredth of a quantum here."""
+    """Other sockets get their turns in between, because a message here costs a hundredth of a quantum."""
     send(ends.raw, 1000)
     ends.loop.turn(1)
     assert 0 < len(ends.received) <= 210
@@ -71,14 +71,14 @@ def test_thousands_of_messages_are_carried_out_a_quantum_at_a_time_and_in_order(
 
 
 def test_catch_up_carries_out_everything_that_was_sent(ends: Ends) -> None:
-    """Peers are judged by the latest grants."""
+    """Catching up ensures that peers are judged by the latest grants."""
     send(ends.raw, 1000)
     ends.link.catch_up()
     assert len(ends.received) == 1000
 
 
 def test_messages_sent_before_the_end_are_read(ends: Ends) -> None:
-    """The end is reported after them, once."""
+    """The end is reported once, after these messages."""
     send(ends.raw, 600)
     ends.other.close()
     for _ in range(4):
@@ -88,7 +88,7 @@ def test_messages_sent_before_the_end_are_read(ends: Ends) -> None:
 
 
 def test_closing_closes_descriptors_that_were_not_taken(ends: Ends) -> None:
-    """A replaced control leaves nothing open."""
+    """A replaced control leaves no descriptor open."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         for number in range(40):
             ends.other.send(NodePlaced(str(number), "/n", "h"), (listening.fileno(),))
@@ -98,7 +98,7 @@ def test_closing_closes_descriptors_that_were_not_taken(ends: Ends) -> None:
 
 
 def test_while_messages_wait_no_more_is_read(ends: Ends) -> None:
-    """Waiting messages are bounded, and reports go out meanwhile. All are then handled in order, the end last."""
+    """Waiting messages are limited while reports are still sent. Later all are handled in order, the end last."""
     ends.waits = True
     body = msgspec.msgpack.encode(NodeWithdrawn("k"))
     frame, sent = struct.pack(">I", len(body)) + body, 0
@@ -123,7 +123,7 @@ def test_while_messages_wait_no_more_is_read(ends: Ends) -> None:
 
 
 def test_an_end_that_does_not_read_yet_gets_everything_later(ends: Ends) -> None:
-    """Nothing is lost while the socket is full, and nothing blocks."""
+    """While the socket is full no message is lost, and no call blocks."""
     for number in range(20_000):
         ends.link.send(UpstreamWanted(str(number), "/topic"))
     keys: list[str] = []

@@ -1,4 +1,4 @@
-"""No host takes the memory that the others need, and nothing holds memory for what never comes."""
+"""No host takes memory that others need, and no memory is held for data that never arrives."""
 
 from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.relay.relay_limits import RelayLimits
@@ -6,12 +6,12 @@ from appliance.relay.transport.memory import MemoryPool, RelayMemory, StallDetec
 
 
 def shares(whole: int) -> MemoryPool:
-    """The quotas of registered hosts, any of which may have all."""
+    """Return a pool of bytes; all hosts are registered, and each may take all."""
     return MemoryPool("bytes", Bounds(whole, whole, 0, 0), lambda _host: QuotaClass.REGISTERED)
 
 
 def take_all(pool: MemoryPool, host: str, step: int = 1) -> int:
-    """Have a host take what it can get; how much."""
+    """Let a host take all that it can get; return the amount."""
     share = pool.of(host)
     while not share.refusal(step):
         share.add(step)
@@ -19,7 +19,7 @@ def take_all(pool: MemoryPool, host: str, step: int = 1) -> int:
 
 
 def test_a_host_may_have_as_much_as_is_left() -> None:
-    """One that is alone has half, the next half of the rest; what is given back is for all."""
+    """A host alone gets half, the next host half of the rest; released memory is available to all."""
     pool = shares(96)
     assert [take_all(pool, host) for host in "abc"] == [48, 24, 12]
     assert pool.of("a").refusal() == (
@@ -31,7 +31,7 @@ def test_a_host_may_have_as_much_as_is_left() -> None:
 
 
 def test_however_many_hosts_take_all_they_can_the_next_finds_room() -> None:
-    """When those give up what is beyond their shares, two hundred leave a part."""
+    """If hosts are cut back to their quotas, even two hundred of them leave a part."""
     pool = shares(1 << 20)
     hosts = [f"10.0.0.{number}" for number in range(200)]
     for _ in range(3000):
@@ -46,7 +46,7 @@ def test_however_many_hosts_take_all_they_can_the_next_finds_room() -> None:
 
 
 def test_the_memory_of_a_relay_is_parted_as_the_table_says() -> None:
-    """Whatever its size, queues and latched messages leave half for messages on their way."""
+    """For any size, queues and latched messages leave half of the memory for messages in transit."""
     memory = RelayMemory.of(RelayLimits(memory_bytes=1 << 28), lambda _host: QuotaClass.REGISTERED)
     wholes = [one.bounds.whole >> 20 for one in (memory.frames, memory.queues, memory.latched)]
     assert wholes == [128, 64, 64]
@@ -63,7 +63,7 @@ def test_a_host_that_is_gone_leaves_nothing() -> None:
 
 
 def test_a_stall_is_what_does_not_change() -> None:
-    """Neither what grows nor what is finished."""
+    """Growing or completed messages are not stalled."""
     stall = StallDetector(10)
     assert not any(stall.seen(held, now) for held, now in ((5, 0), (5, 10), (6, 11), (6, 21)))
     assert stall.seen(6, 21.5)

@@ -1,4 +1,4 @@
-"""Messages that pass a limit, over any time and in any pieces."""
+"""Limits on messages, for any times and any pieces."""
 
 import struct
 
@@ -28,12 +28,12 @@ def frames(*sizes: int) -> Batch:
 
 
 def alone(limit: FlowLimit) -> RateAllowance:
-    """The part of the only holder of a flow."""
+    """Return the quota of the only holder of a flow."""
     return SharedRateLimit(limit, 0.0).of("")
 
 
 def sent(flow: RateAllowance, *batches: tuple[float, Batch]) -> int:
-    """How many messages of these, each at its time, pass."""
+    """Return how many of these messages pass, each sent at its time."""
     passed = 0
     for now, batch in batches:
         count = flow.room(batch, batch.messages, now)
@@ -45,12 +45,12 @@ def sent(flow: RateAllowance, *batches: tuple[float, Batch]) -> int:
 @pytest.mark.parametrize("rate", [0.1, 1.0, 5.0, 10.0, 1000.0])
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
 def test_a_publisher_within_the_limit_loses_nothing(rate: float, jitter: float) -> None:
-    """Also when messages come a little too early and a little too late, and at slow rates."""
+    """This also holds for messages that are a little early or late, and for slow rates."""
     times = [(number + jitter * (number % 2)) / rate for number in range(1000)]
     assert sent(alone(FlowLimit(messages=rate)), *((now, frames(8)) for now in times)) == 1000
 
 
-@example(rate=1.75, size=4, gaps=[(0.0, 2)])  # the bytes end where a message does
+@example(rate=1.75, size=4, gaps=[(0.0, 2)])  # the bytes end at the end of a message
 @given(
     rate=st.floats(0.5, 500),
     size=st.integers(4, 50),
@@ -59,7 +59,7 @@ def test_a_publisher_within_the_limit_loses_nothing(rate: float, jitter: float) 
 def test_no_more_passes_than_the_rate_and_a_burst(
     rate: float, size: int, gaps: list[tuple[float, int]]
 ) -> None:
-    """However the messages come; and what could have passed is never held back longer than that takes."""
+    """This holds however the messages arrive; a message is never held back longer than the rate requires."""
     now, batches = 0.0, []
     for gap, count in gaps:
         now += gap
@@ -71,13 +71,13 @@ def test_no_more_passes_than_the_rate_and_a_burst(
 
 
 def test_a_message_that_is_larger_than_the_limit_passes_and_is_made_up_for() -> None:
-    """A map of a megabyte over a link of 100 kB/s comes every ten seconds: it does not starve."""
+    """A map of a megabyte over a link of 100 kB/s passes every ten seconds, instead of never."""
     flow, map_ = alone(FlowLimit(bytes=100_000)), frames(1_000_000)
     assert sent(flow, *((now / 2, map_) for now in range(200))) == 10
 
 
 def test_the_first_of_a_batch_pass() -> None:
-    """By messages and by bytes, whichever is less; frames of one length and of several."""
+    """The number is limited by messages and by bytes, for frames of one length and of several."""
     flow = alone(FlowLimit(messages=20, bytes=200))
     assert flow.room(frames(*[4] * 30), 30, 0.0) == 10
     assert flow.room(frames(50, 30, 30, 4), 4, 0.0) == 3
@@ -87,7 +87,7 @@ def test_the_first_of_a_batch_pass() -> None:
 
 
 def test_another_limit_counts_at_once() -> None:
-    """A looser one gives no second burst, and one after none begins full."""
+    """A looser limit gives no second burst; a limit after none begins with a full burst."""
     flow = SharedRateLimit(FlowLimit(messages=10), 0.0)
     share = flow.of("")
     assert sent(share, (0.0, frames(*[4] * 9))) == 5
@@ -100,7 +100,7 @@ def test_another_limit_counts_at_once() -> None:
 
 
 def test_connections_with_the_same_names_have_one_flow() -> None:
-    """Several of one subscriber get no more than one."""
+    """Several connections of one subscriber share one limit."""
     flows = RateLimits(lambda: 0.0)
     one = flows.of(FlowLimit(5), "/scan", "10.0.0.1", "/ear")
     assert one is not None
@@ -110,7 +110,7 @@ def test_connections_with_the_same_names_have_one_flow() -> None:
 
 
 def test_unused_flows_are_forgotten_once_they_are_paid() -> None:
-    """However many names come and go, and whatever they owe, the number of flows is bounded."""
+    """However many names appear and whatever they owe, the number of flows is limited."""
     now = 0.0
     flows = RateLimits(lambda: now)
 
@@ -127,12 +127,12 @@ def test_unused_flows_are_forgotten_once_they_are_paid() -> None:
 
 
 def flood(share: RateAllowance, until: float) -> list[tuple[float, RateAllowance, Batch]]:
-    """A holder that sends fifty messages every ten milliseconds."""
+    """Return a holder that sends fifty messages every ten milliseconds."""
     return [(number / 100, share, frames(*[4] * 50)) for number in range(int(until * 100))]
 
 
 def passed(events: list[tuple[float, RateAllowance, Batch]]) -> dict[RateAllowance, int]:
-    """How many messages of each holder pass."""
+    """Return how many messages of each holder pass."""
     counts = {holder: 0 for _, holder, _ in events}
     for now, holder, batch in sorted(events, key=lambda event: event[0]):
         counts[holder] += sent(holder, (now, batch))
@@ -141,7 +141,7 @@ def passed(events: list[tuple[float, RateAllowance, Batch]]) -> dict[RateAllowan
 
 @pytest.mark.parametrize("guests", [1, 2, 20])
 def test_a_host_within_its_part_loses_nothing_because_of_others(guests: int) -> None:
-    """Whatever the guests send on the topic, the robot's messages up to its equal part of the limit pass."""
+    """Whatever the guests send on the topic, the robot's messages pass up to its equal part of the limit."""
     flow = SharedRateLimit(FlowLimit(messages=40), 0.0)
     robot, *others = (flow.of(name) for name in ["robot", *map(str, range(guests))])
     part = 40 / (guests + 1)
@@ -152,7 +152,7 @@ def test_a_host_within_its_part_loses_nothing_because_of_others(guests: int) -> 
 
 
 def test_the_unused_part_of_a_host_goes_to_the_others() -> None:
-    """Silent publishers take nothing: one that sends alone has the whole limit, two have equal parts of it."""
+    """A publisher that sends alone has the whole limit; two have equal parts, whatever the silent ones do not use."""
     flow = SharedRateLimit(FlowLimit(messages=100), 0.0)
     idle = [flow.of(str(number)) for number in range(8)]
     one, other = flow.of("one"), flow.of("other")
@@ -180,7 +180,7 @@ def test_holders_together_get_no_more_than_the_limit(sends: list[tuple[float, in
 
 
 def test_a_large_message_is_made_up_for_by_its_host_alone() -> None:
-    """A guest's message far beyond the limit of bytes delays none of the robot's."""
+    """A guest's message far above the byte limit delays none of the robot's messages."""
     flow = SharedRateLimit(FlowLimit(bytes=1000), 0.0)
     robot, guest = flow.of("robot"), flow.of("guest")
     assert sent(guest, (0.0, frames(1_000_000))) == 1
@@ -189,7 +189,7 @@ def test_a_large_message_is_made_up_for_by_its_host_alone() -> None:
 
 
 def test_a_holder_that_leaves_and_comes_back_wins_nothing() -> None:
-    """A publisher's use still counts after it registers again, alone or beside others, under any name."""
+    """A publisher's use still counts after it registers again, alone or with others, under any name."""
     flows = RateLimits(lambda: 0.0)
     limit = FlowLimit(messages=20)
     counts = 0
@@ -202,7 +202,7 @@ def test_a_holder_that_leaves_and_comes_back_wins_nothing() -> None:
 
 
 def test_names_of_a_host_share_its_limit() -> None:
-    """Fifteen nodes of one host together get what one of them would get, and each its part."""
+    """Fifteen nodes of one host together get what one node would get, in equal parts."""
     flows = RateLimits(lambda: 0.0)
     shares = [flows.of(FlowLimit(messages=30), "/scan", "10.0.0.9", holder=str(name)) for name in range(15)]
     counts = passed([event for share in shares if share is not None for event in flood(share, 10)])
@@ -223,7 +223,7 @@ def test_a_publication_has_its_own_limit_and_a_part_of_its_topics() -> None:
 
 
 def test_the_last_message_of_a_latching_publisher_comes_later() -> None:
-    """When it may, with its own number, unless another one has come; it counts as memory of its host."""
+    """The last message is sent when the limit allows, with its own number, unless a newer one came; its host pays."""
     memory = share()
     flow = PublicationRateLimit(memory, lambda _part, _messages, _size: None)
     flow.set(alone(FlowLimit(messages=2)), None)
