@@ -1,4 +1,4 @@
-"""A public class name says which class is meant: it is used once in the product."""
+"""Each public class name is used once in the product, so that it identifies the class."""
 
 import ast
 from collections import defaultdict

@@ -1,4 +1,4 @@
-"""The number of a descriptor that was closed is not kept: another file gets it next."""
+"""No object keeps the number of a closed descriptor, because the next open file gets that number."""
 
 import ast
 
@@ -6,7 +6,7 @@ from tests.support.sources import ROOT, product_files
 
 
 def kept_after_closing(source: str) -> list[int]:
-    """The lines where a function closes the descriptor in an attribute and leaves its number there."""
+    """Return the lines where a function closes a descriptor in an attribute without resetting the attribute."""
     found = []
     for function in ast.walk(ast.parse(source)):
         if not isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -31,7 +31,7 @@ def kept_after_closing(source: str) -> list[int]:
 
 
 def test_no_object_keeps_the_number_of_a_closed_descriptor() -> None:
-    """A function that closes an attribute sets it to -1 or None: a later use fails, and reaches no other file."""
+    """A function that closes an attribute sets it to -1 or None, so that a later use fails and hits no other file."""
     found = [
         f"{path.relative_to(ROOT)}:{line}"
         for path in product_files()

@@ -1,4 +1,4 @@
-"""Tests that Dockerfile, compose.yaml and documentation keep step with the processes (the rest: system tests)."""
+"""Tests that Dockerfile, compose.yaml and documentation match the processes; system tests cover the rest."""
 
 import re
 from pathlib import Path
@@ -17,18 +17,18 @@ TRUE = Path("/bin/true")
 
 
 def granted() -> set[str]:
-    """The capabilities in compose.yaml."""
+    """Return the capabilities in compose.yaml."""
     return set(yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["cap_add"])
 
 
 def test_the_image_has_every_user() -> None:
-    """Each process's user is made in the image, with its number."""
+    """The image creates each process's user with its number."""
     made = re.findall(r"\b(ros[a-z-]+):(610\d\d)\b", (ROOT / "Dockerfile").read_text())
     assert {name: int(number) for name, number in made} == NUMERIC_IDS
 
 
 def test_the_archive_of_a_site_has_what_its_compose_files_mount() -> None:
-    """The archive has compose.yaml and compose.host.yaml, and the files beside them that they mount."""
+    """The archive has compose.yaml, compose.host.yaml, and the files that they mount."""
     for name in ("compose.yaml", "compose.host.yaml"):
         assert name in BESIDE
         services = yaml.safe_load((ROOT / name).read_text())["services"].values()
@@ -48,7 +48,7 @@ def test_every_process_is_in_the_table_of_rights() -> None:
 
 
 def test_the_container_is_given_what_the_supervisor_knows() -> None:
-    """A right that the supervisor would give up at once is not asked for."""
+    """The container has no capability that the supervisor would drop at once."""
     assert granted() <= set(SUPERVISOR_CAPABILITIES)
 
 
@@ -71,13 +71,13 @@ def environment(**outside: str) -> dict[str, str]:
 
 
 def test_the_endpoint_is_one_line_in_env() -> None:
-    """Kits get `ROSRV_ENDPOINT=192.168.1.20` from `.env`; without it the configuration is also valid."""
+    """Kits get `ROSRV_ENDPOINT=192.168.1.20` from `.env`; without it the configuration is still valid."""
     assert resolve(None, environment(), {}).ipsec.endpoint is None
     assert resolve(None, environment(ROSRV_ENDPOINT="192.168.1.20"), {}).ipsec.endpoint == "192.168.1.20"
 
 
 def test_no_script_is_written_that_cannot_reach_rest() -> None:
-    """While REST is published on loopback no host can enrol itself by a token; the error says so, and what to do."""
+    """While REST is published on loopback, no host can enrol itself by a token; the error says so and gives advice."""
     published = [
         port
         for port in yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["ports"]
@@ -93,7 +93,7 @@ def test_no_script_is_written_that_cannot_reach_rest() -> None:
 
 
 def test_a_flood_ends_in_the_container() -> None:
-    """Memory and processes are bounded, and the relay's own limit is within these bounds."""
+    """Memory and processes are limited, and the relay's own limit is below these limits."""
     appliance = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]
     assert appliance["mem_limit"] == appliance["memswap_limit"] == "2g"
     assert 100 <= appliance["pids_limit"] <= 1000

@@ -1,4 +1,4 @@
-"""docs/iec-62443.md: every requirement of SL 2 has one row, with tests that are there or a reason in words."""
+"""docs/iec-62443.md: every requirement of SL 2 has one row, with existing tests or a reason in words."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 PAGE = Path(__file__).parents[2] / "docs" / "iec-62443.md"
-# A network device at SL 2. CR 2.3, 5.4 and 7.5 ask nothing of a component; CR 2.7 begins at SL 3.
+# A network device at SL 2. CR 2.3, 5.4 and 7.5 require nothing of a component; CR 2.7 begins at SL 3.
 REQUIRED = """
 CR 1.1, CR 1.1 RE 1, CR 1.2, CR 1.3, CR 1.4, CR 1.5, NDR 1.6, NDR 1.6 RE 1, CR 1.7, CR 1.8, CR 1.9, CR 1.10, CR 1.11,
 CR 1.12, NDR 1.13, CR 1.14,
@@ -25,13 +25,13 @@ ROWS = re.findall(
 
 
 def test_every_requirement_has_one_row() -> None:
-    """None is left out, none stands there twice, in the order of the standard."""
+    """No requirement is missing or listed twice, and the order is that of the standard."""
     assert [row[0] for row in ROWS] == [name.strip() for name in REQUIRED.strip().split(",")]
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: str(row[0]))
 def test_every_claim_names_a_test(row: tuple[str, str, str, str]) -> None:
-    """A requirement met in whole or in part names a test (test_threat_model.py finds it); others give a reason."""
+    """A requirement that is met, even in part, names a test (test_threat_model.py checks it); others give a reason."""
     requirement, state, how, shown = row
     assert state in ("met", "site", "partly", "no", "none"), requirement
     assert len(how) > 10, requirement

@@ -1,4 +1,4 @@
-"""Check which modules import which."""
+"""Rules for imports between modules."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -14,15 +14,15 @@ _MOST_IMPORTS = 25
 
 @pytest.fixture(scope="module")
 def imports() -> dict[str, set[str]]:
-    """The modules of the project that each module imports."""
+    """Return the modules of the project that each module imports."""
     graph = grimp.build_graph("appliance", "roswire", "rosmop", cache_dir=None)
     return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
 
 
 def test_no_module_needs_one_that_needs_it(imports: dict[str, set[str]]) -> None:
-    """There is no circle of modules, those included that are imported for their types only."""
+    """Imports have no cycle, including imports for types only."""
     assert "rosmop.run.engine" in imports["appliance.api.monitor_judgement"], "a type-only import is seen"
-    # A circle is a CycleError that names its modules.
+    # A cycle raises a CycleError that names its modules.
     assert len(list(TopologicalSorter(imports).static_order())) == len(imports)
 
 
@@ -70,7 +70,7 @@ def test_the_appliance_imports_only_public_modules_of_the_language(imports: dict
 
 
 def test_the_tests_of_the_language_import_only_the_language() -> None:
-    """They run without the appliance: rosmop, roswire, and libraries."""
+    """The tests run without the appliance: they import rosmop, roswire and libraries."""
     folder = Path(rosmop.__file__).parent / "tests"
     files = list(folder.rglob("*.py"))
     assert files
@@ -84,7 +84,7 @@ def test_the_tests_of_the_language_import_only_the_language() -> None:
 
 
 def test_no_module_of_the_appliance_imports_too_many(imports: dict[str, set[str]]) -> None:
-    """A module that connects more others than a reader can keep in mind is split."""
+    """A module that connects more modules than a reader can remember must be split."""
     wide = {
         module
         for module, imported in imports.items()

@@ -1,4 +1,4 @@
-"""No text that comes from outside is ever made into code of Python."""
+"""Text from outside is never turned into Python code."""
 
 import ast
 
@@ -8,7 +8,7 @@ MAKE_CODE = {"eval", "exec", "compile", "__import__"}
 
 
 def made_of_text(source: str) -> list[int]:
-    """The lines at which a source makes code of a text."""
+    """Return the lines where a source turns text into code."""
     return [
         node.lineno
         for node in ast.walk(ast.parse(source))

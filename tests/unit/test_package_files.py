@@ -1,4 +1,4 @@
-"""Tests that the Debian package keeps step with the program, the container image and the list of packages."""
+"""Tests that the Debian package matches the program, the container image and the list of packages."""
 
 import re
 from dataclasses import fields
@@ -47,7 +47,7 @@ def test_the_installed_configuration_is_right() -> None:
 
 
 def test_it_serves_the_interpreters_that_it_says() -> None:
-    """The dependency on python3 and the environments that are built are of the same versions."""
+    """The package depends on the python3 versions for which its environments are built."""
     control = (ROOT / "distribution/debian/control").read_text()
     bounds = re.findall(r"python3 \((>=|<<) 3\.(\d+)\)", control)
     assert [f"3.{minor}" for minor in range(int(bounds[0][1]), int(bounds[1][1]))] == list(INTERPRETERS)

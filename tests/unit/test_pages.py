@@ -63,14 +63,14 @@ def test_generated_pages_are_current(module: ModuleType) -> None:
     "page", ["docs/dev/architecture.md", "docs/reference/compatibility.md", "CONTRIBUTING.md"]
 )
 def test_modules_that_are_named_are_there(page: str) -> None:
-    """A newcomer who follows the page finds the file under the name it gives."""
+    """The file exists under the name that the page gives, so that a newcomer finds it."""
     names = re.findall(r"\b(?:[a-z_]+/)+[a-z_]+\.(?:py|sh|js|rv|toml|yaml)\b", (ROOT / page).read_text())
     folders = (ROOT, ROOT / "appliance", ROOT / "appliance" / "api" / "console")
     assert [name for name in names if not any((folder / name).exists() for folder in folders)] == []
 
 
 def test_every_operation_of_rest_is_on_its_page() -> None:
-    """Each path that the command line calls, with a name in the place of each parameter."""
+    """Covers each path that the command line calls, with a name for each parameter."""
     text = (ROOT / "docs" / "reference" / "rest.md").read_text()
     paths = {re.sub(r"{\w+}", r"[^/\\s?\"]+", one.path) for one in OPERATIONS if one.path}
     assert [path for path in paths if not re.search(rf"{path}(?![\w/])", text)] == []

@@ -1,4 +1,4 @@
-"""The models in `proofs/` name what they model, and that is there."""
+"""The models in `proofs/` name the code that they model, and that code exists."""
 
 import ast
 import re
@@ -17,7 +17,7 @@ NAMED = sorted(
 
 @pytest.mark.parametrize(("path", "name"), NAMED)
 def test_the_model_names_existing_code(path: str, name: str) -> None:
-    """A reader finds the code that a step models, under the name that the step gives."""
+    """The code that a step models exists under the name that the step gives."""
     inside: list[ast.stmt] = ast.parse((ROOT / path).read_text()).body
     for part in name.split("."):
         found = [
@@ -30,7 +30,7 @@ def test_the_model_names_existing_code(path: str, name: str) -> None:
 
 
 def test_every_process_names_what_it_models() -> None:
-    """All but the observer at rest, before it or in it; and no name is written in a way that is not looked at."""
+    """Every process except the observer at rest names its code, before or inside the process, in a checked notation."""
     parts = re.split(r"^proctype (\w+)", TEXT, flags=re.MULTILINE)
     heads = [part.rpartition("\n}\n")[2] for part in parts[0:-1:2]]
     bodies = [part.partition("\n}\n")[0] for part in parts[2::2]]
@@ -41,5 +41,5 @@ def test_every_process_names_what_it_models() -> None:
 
 
 def test_every_mutant_is_tried() -> None:
-    """The mutants of the model are those of the table."""
+    """The table has exactly the mutants of the model."""
     assert set(re.findall(r"MUTANT_(\w+)", TEXT)) == set(MUTANTS)

@@ -1,4 +1,4 @@
-"""An object gets the functions that it calls when it is made: no attribute for a function may stay empty."""
+"""An object gets its functions when it is made: no attribute for a function may stay empty."""
 
 import ast
 from collections.abc import Iterator
@@ -7,10 +7,10 @@ from tests.support.sources import ROOT, product_files
 
 
 def test_no_slot_can_stay_unfilled() -> None:
-    """No attribute begins as nothing, or as a function that does nothing, and is given a function by another file.
+    """No attribute begins as None, or as a function that does nothing, and gets its function from another file.
 
-    Such a slot, forgotten, does nothing and says nothing. Make it an argument of the constructor, which cannot be
-    forgotten.
+    If such a slot is forgotten, it silently does nothing. Make the function an argument of the constructor, which
+    cannot be forgotten.
     """
     begun: dict[object, set[str]] = {}
     filled: dict[str, set[object]] = {}
@@ -29,7 +29,7 @@ def test_no_slot_can_stay_unfilled() -> None:
 
 
 def test_the_rule_finds_what_it_forbids() -> None:
-    """However the slot is written: a lambda, None, a class that makes nothing, a field of a dataclass."""
+    """Covers a lambda, None, a class that makes nothing, and a field of a dataclass."""
     for value in ("lambda: None", "lambda topic: 0", "None", "dict", "lambda *_: ''", "lambda: False"):
         assert list(slots(ast.parse(f"self.changed: Callable[[], int] | None = {value}"))) == ["changed"], (
             value
@@ -49,7 +49,7 @@ def test_the_rule_finds_what_it_forbids() -> None:
 
 
 def slots(tree: ast.Module) -> Iterator[str]:
-    """The attributes that are functions by their type and begin empty, or begin as a function that does nothing."""
+    """Yield the attributes for functions that begin empty, or with a function that does nothing."""
     for node in ast.walk(tree):
         match node:
             case ast.AnnAssign(target=target, annotation=annotation, value=ast.expr() as value):
@@ -60,14 +60,14 @@ def slots(tree: ast.Module) -> Iterator[str]:
 
 
 def own(target: ast.expr) -> Iterator[str]:
-    """The name of an object's own attribute, or of a field of a class."""
+    """Yield the name of an object's own attribute, or of a field of a class."""
     match target:
         case ast.Attribute(value=ast.Name(id="self"), attr=name) | ast.Name(id=name):
             yield name
 
 
 def empty(value: ast.expr) -> bool:
-    """Whether this is nothing, or makes nothing of whatever it is given."""
+    """Whether this is None, or a function that ignores its arguments and returns nothing."""
     match value:
         case ast.Constant(value=None) | ast.Name(id="dict" | "list" | "set" | "str" | "int" | "bool"):
             return True
@@ -77,7 +77,7 @@ def empty(value: ast.expr) -> bool:
 
 
 def set_elsewhere(tree: ast.Module) -> Iterator[str]:
-    """The attributes of others that are set."""
+    """Yield the attributes of other objects that are set."""
     for node in ast.walk(tree):
         targets = node.targets if isinstance(node, ast.Assign) else []
         if isinstance(node, ast.AnnAssign):

@@ -1,4 +1,4 @@
-"""docs/threat-model.md and docs/iec-62443.md: their claims are tried by tests that are there."""
+"""docs/threat-model.md and docs/iec-62443.md: existing tests check each of their claims."""
 
 import ast
 import re
@@ -11,14 +11,14 @@ TESTS = Path(__file__).parents[1]
 
 @pytest.mark.parametrize("page", ["threat-model.md", "iec-62443.md"])
 def test_every_test_that_is_named_exists(page: str) -> None:
-    """Each test in the tables is a function of that name in that file, and runs."""
+    """Each test in the tables is a function with that name in that file, and is not skipped."""
     text = (TESTS.parent / "docs" / page).read_text()
     assert len(named(text)) > 40
     assert missing(text, TESTS) == []
 
 
 def test_a_test_that_was_removed_is_missed(tmp_path: Path) -> None:
-    """So is one that was renamed, moved or switched off, and a name that is none."""
+    """Renamed, moved and disabled tests are found as well, and names that are not tests."""
     (tmp_path / "unit").mkdir()
     (tmp_path / "unit/test_a.py").write_text(
         "def test_there(): ...\n@pytest.mark.skip('later')\ndef test_off(): ...\n"
@@ -38,7 +38,7 @@ def named(text: str) -> list[str]:
 
 
 def missing(text: str, tests: Path) -> list[str]:
-    """The tests that a page names and that are not there, or do not run."""
+    """Return the tests that a page names but that do not exist or do not run."""
     return [one for one in named(text) if not _runs(tests, *one.partition("::")[::2])]
 
 

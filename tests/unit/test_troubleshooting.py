@@ -1,4 +1,4 @@
-"""docs/troubleshooting.md quotes messages that the program really has."""
+"""docs/troubleshooting.md quotes only messages that the program can print."""
 
 import ast
 import re
@@ -8,7 +8,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def texts() -> str:
-    """Return all strings of the appliance; f-strings have a gap at each value."""
+    """Return all strings of the appliance; an f-string has a gap for each value."""
     found = []
     for path in (ROOT / "appliance").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -22,7 +22,7 @@ def texts() -> str:
 
 
 def test_quoted_messages_are_in_the_program() -> None:
-    """Each message in the first column of a table is in a string of the program."""
+    """Each message in the first column of a table occurs in a string of the program."""
     page = (ROOT / "docs/troubleshooting.md").read_text()
     cells = re.findall(r"^\| ([^|]*`[^|]*) \|", page, re.MULTILINE)
     quoted = [piece for cell in cells for piece in re.findall(r"`([^`(]+)`", cell) if " " in piece]

@@ -1,4 +1,4 @@
-"""Spans are measured by the monotonic clock: the machine's date is set, forward and back, while a robot runs."""
+"""Durations use the monotonic clock, because the machine's date may be set while a robot runs."""
 
 import ast
 from pathlib import Path
@@ -43,7 +43,7 @@ _WALL = {("time", "time"), ("time", "time_ns"), ("time", "CLOCK_REALTIME")} | {
 def _reads_wall_clock(path: Path) -> bool:
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module == "time":
-            return True  # a bare `time()` does not show its clock
+            return True  # a bare `time()` does not reveal which clock is used
         if isinstance(node, ast.Attribute):
             of = node.value.attr if isinstance(node.value, ast.Attribute) else getattr(node.value, "id", "")
             if (of, node.attr) in _WALL:
@@ -52,6 +52,6 @@ def _reads_wall_clock(path: Path) -> bool:
 
 
 def test_only_these_files_read_the_wall_clock() -> None:
-    """Any other timeout, expiry or duration would be wrong after someone sets the clock."""
+    """In any other file, a timeout, expiry or duration would be wrong after the clock is set."""
     found = {str(path.relative_to(ROOT)) for path in product_files() if _reads_wall_clock(path)}
     assert found == {f"appliance/{file}" for files in READERS.values() for file in files}

@@ -1,4 +1,4 @@
-"""Tests of what the wheel says of itself: bounds, version, what it brings (installed: tests/package)."""
+"""Tests of the wheel's metadata: bounds, version and contents (tests/package covers the installation)."""
 
 import re
 import subprocess
@@ -24,7 +24,7 @@ LOCKED = dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / "requirements.lock").r
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel of this checkout."""
+    """Return the wheel of this checkout."""
     folder = tmp_path_factory.mktemp("wheel")
     command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
@@ -32,7 +32,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def metadata(wheel: Path) -> Message:
-    """Its METADATA."""
+    """Return the wheel's METADATA."""
     with zipfile.ZipFile(wheel) as archive:
         name = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
         return message_from_bytes(archive.read(name))
@@ -40,7 +40,7 @@ def metadata(wheel: Path) -> Message:
 
 @pytest.mark.parametrize("requirement", sorted({*RUNS, *LANGUAGE_RUNS}, key=str), ids=lambda one: one.name)
 def test_each_dependency_has_both_bounds(requirement: Requirement) -> None:
-    """The version that is tested is within them; none older than it is promised, and no major version ahead."""
+    """The tested version is within the bounds; no older version and no newer major version is allowed."""
     locked = LOCKED[requirement.name]
     major, minor = locked.split(".")[:2]
     bounds = {one.operator: one.version for one in requirement.specifier}
@@ -48,7 +48,7 @@ def test_each_dependency_has_both_bounds(requirement: Requirement) -> None:
 
 
 def test_it_says_what_it_is(wheel: Path) -> None:
-    """Name, version, licence, readme and interpreter are those of the project."""
+    """Name, version, licence, readme and interpreter equal those of the project."""
     says = metadata(wheel)
     assert (says["Name"], says["Version"]) == ("rosrv-appliance", __version__)
     assert (says["License-Expression"], says["Requires-Python"]) == ("Apache-2.0", ">=3.11")
@@ -57,7 +57,7 @@ def test_it_says_what_it_is(wheel: Path) -> None:
 
 
 def test_it_brings_what_is_not_code(wheel: Path) -> None:
-    """Every policy, monitor, example and page, and every file of the console."""
+    """The wheel contains every policy, monitor, example and page, and every file of the console."""
     with zipfile.ZipFile(wheel) as archive:
         names = {name.partition(".data/data/")[2] or name for name in archive.namelist()}
     tracked = subprocess.run(

@@ -1,6 +1,6 @@
 """Transcripts: a line at the margin is an action, the indented lines below it are its effects.
 
-A file has several, each with a title behind `# ` that states the promise, and an empty line between two.
+A file has several transcripts, separated by an empty line; the title of each, after `# `, states its promise.
 """
 
 from collections.abc import Awaitable, Callable
@@ -15,7 +15,7 @@ def transcripts(file: Path) -> dict[str, list[str]]:
 
 
 async def played(written: list[str], say: Callable[[str], Awaitable[list[str]]]) -> list[str]:
-    """Play the actions; return them with their effects, an equal effect that repeats in one line."""
+    """Play the actions; return them with their effects, with equal repeated effects on one line."""
     lines: list[str] = []
     for action in written:
         if not action.startswith(" "):

@@ -1,4 +1,4 @@
-"""Tests of the text that `rosrv protect` makes, without a kernel."""
+"""Tests of the rules file that `rosrv protect` makes, without a kernel."""
 
 import pytest
 
@@ -15,7 +15,7 @@ RANGE = PortRange(32768, 60999)
 
 
 def test_the_file_closes_the_range_after_all_that_stays_open() -> None:
-    """Loopback, the appliances and the services come first, then TCP by SYN and new UDP, then outgoing packets."""
+    """Loopback, appliances and services are accepted first; then TCP SYN and new UDP are closed, then output."""
     services = parse_services(["tcp/40022,udp/40123", "tcp/41000-41009", "tcp/40022"])
     text = protection(["192.168.1.20", "fd00::20"], RANGE, services)
     rules = [line.strip() for line in text.splitlines() if line.startswith("        ")]
@@ -37,7 +37,7 @@ def test_the_file_closes_the_range_after_all_that_stays_open() -> None:
 
 
 def test_no_appliance_is_an_error() -> None:
-    """A file that would block every host, including the appliance, is not made."""
+    """Without an appliance the file would block every host, including the appliance, so it is not made."""
     with pytest.raises(ValueError, match="at least one appliance"):
         protection([], RANGE, ())
 
@@ -46,7 +46,7 @@ def test_no_appliance_is_an_error() -> None:
     "text", ["ssh", "tcp", "tcp/", "tcp/0", "tcp/65536", "icmp/1", "tcp/9-3", "tcp/22;", ""]
 )
 def test_a_wrong_service_is_named(text: str) -> None:
-    """An invalid service is an error that quotes it, and nothing of it gets into a file."""
+    """The error quotes the invalid service, and none of its text gets into a file."""
     with pytest.raises(ValueError, match=r"--open .* is not a service"):
         parse_services([f"tcp/22,{text}"])
 
@@ -62,7 +62,7 @@ def test_a_wrong_range_is_named(text: str) -> None:
     "text", ["0.0.0.0", "::", "127.0.0.1", "::1", "224.0.0.1", "10.0.0.0/8", "10.0.0.1; x"]
 )
 def test_an_address_that_no_appliance_can_have_is_named(text: str) -> None:
-    """Wildcard, multicast and loopback addresses are refused, and so is text for nft."""
+    """Wildcard, multicast and loopback addresses are rejected, and so is text that is nft syntax."""
     with pytest.raises(ValueError, match="appliance"):
         parse_address(text)
 

@@ -1,4 +1,4 @@
-"""Tests of the choice where ESP runs."""
+"""Tests of the choice between ESP in the kernel and in user space."""
 
 import errno
 import os
@@ -27,7 +27,7 @@ def answers(monkeypatch: pytest.MonkeyPatch, status: int) -> list[list[str]]:
 
 
 def test_a_kernel_that_takes_the_cipher_is_used_and_left_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The trial state is removed again."""
+    """The state that was added as a test is removed again."""
     given = answers(monkeypatch, 0)
     assert esp.choose_esp(Namespace.own()) == "kernel"
     assert [command[3] for command in given] == ["add", "delete"]
@@ -37,7 +37,7 @@ def test_a_kernel_that_takes_the_cipher_is_used_and_left_as_it_was(monkeypatch: 
 
 
 def test_the_device_is_lent_to_one_user(tmp_path: Path) -> None:
-    """A device that only root may open can then be opened by that user and by no other; its mode allows no more."""
+    """A device that only root may open can then be opened by that user and no other; its mode allows no more."""
     need_root()
     place = Path(tempfile.mkdtemp(dir="/dev/shm"))
     try:
@@ -45,7 +45,7 @@ def test_the_device_is_lent_to_one_user(tmp_path: Path) -> None:
         device = place / "tun"
         device.touch(0o600)
         device.chmod(0o600)
-        for uid in (61016, 61016, 61099):  # also a second time, and for another as well
+        for uid in (61016, 61016, 61099):  # also a second time, and for another user
             esp.lend_tun(uid, uid, device)
             assert _opens(uid, device)
         assert _opens(61016, device)
@@ -61,7 +61,7 @@ def test_the_device_is_lent_to_one_user(tmp_path: Path) -> None:
 
 
 def test_a_device_that_cannot_be_lent_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The message says what is missing and what to do, before charon is started."""
+    """Before charon starts, the message says what is missing and what to do."""
     (tmp_path / "tun").touch(0o600)
 
     def refuse(*_arguments: object) -> None:
@@ -91,7 +91,7 @@ def _opens(uid: int, path: Path) -> bool:
 
 
 def test_without_it_esp_runs_in_user_space(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The TUN device must be there."""
+    """ESP in user space needs the TUN device."""
     answers(monkeypatch, 2)
     (tmp_path / "tun").touch()
     monkeypatch.setattr(esp, "TUN", tmp_path / "tun")
@@ -99,7 +99,7 @@ def test_without_it_esp_runs_in_user_space(monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 def test_with_neither_the_message_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """It has the kernel's error, and how a container gets the device."""
+    """If neither works, the message has the kernel's error and how to give a container the device."""
     answers(monkeypatch, 2)
     monkeypatch.setattr(esp, "TUN", tmp_path / "none")
     with pytest.raises(NetworkError, match=r"AEAD algorithm not found.*--device"):

@@ -38,14 +38,14 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_busy_program_is_waited_for_with_a_report(caplog: pytest.LogCaptureFixture) -> None:
-    """A program that computes for longer than a hang may last is waited for; it gets its input, whatever its size."""
+    """A program that computes for longer than the hang limit is waited for; it gets its input, whatever the size."""
     with caplog.at_level(logging.WARNING), program(BUSY) as busy:
         assert communicate(busy, "x" * 1_000_000, "a table of rules") == ("1000000", "")
     assert "a table of rules, which has run for" in caplog.text
 
 
 def test_a_hanging_program_is_ended_with_a_report() -> None:
-    """A program that waits for missing input uses no processor time: it is ended, and the error says so."""
+    """A program that waits for missing input uses no processor time: it is ended, and the error gives this reason."""
     with program("import signal; signal.pause()") as hanging:
         with pytest.raises(TimeoutError, match=r"nft made no progress for \d+ seconds: ended after"):
             communicate(hanging, "", "nft")

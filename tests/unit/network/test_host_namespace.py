@@ -1,4 +1,4 @@
-"""Tests of the check whether the network namespace is the machine's own."""
+"""Tests of the check whether a network namespace is the machine's own."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ from appliance.network.namespaces import bridges, is_contained, lives_on_the_mac
 
 
 def test_only_the_machines_own_network_has_its_settings(tmp_path: Path) -> None:
-    """A namespace that was made later lacks the settings of the whole machine."""
+    """A network namespace that was made later lacks the settings of the whole machine."""
     settings = tmp_path / "sys/net/core"
     settings.mkdir(parents=True)
     (settings / "somaxconn").touch()
@@ -23,7 +23,7 @@ def test_a_container_is_known_by_its_engines_mark(tmp_path: Path) -> None:
 
 
 def test_a_container_is_known_by_its_process_ids(tmp_path: Path) -> None:
-    """Kubernetes' containers have no mark, but process ids of their own."""
+    """Containers of Kubernetes have no mark file, but their own process ids."""
     namespaces = tmp_path / "proc/self/ns"
     namespaces.mkdir(parents=True)
     (namespaces / "pid").symlink_to("pid:[4026531836]")

@@ -26,7 +26,7 @@ def test_each_range_is_forwarded_on_both_families() -> None:
 
 
 def test_tunnels_are_forwarded_on_request() -> None:
-    """UDP ports come besides the TCP ports, for both families, and TCP of the same number is not forwarded."""
+    """On request, UDP ports are forwarded besides the TCP ports, for both families, without TCP of that number."""
     udp = (PortRange.one(500), PortRange.one(4500))
     added = set(isolation_rules(SETTINGS, ENDS, (), udp=udp)) - set(isolation_rules(SETTINGS, ENDS, ()))
     assert {(str(rule.udp_ports), rule.tcp_ports, rule.to) for rule in added} == {
@@ -38,7 +38,7 @@ def test_tunnels_are_forwarded_on_request() -> None:
 
 
 def test_packets_to_the_appliance_keep_their_source() -> None:
-    """Packets on the link keep their source, for both families, before any other chain; only loopback is translated."""
+    """Packets on the link keep their source in both families, ahead of any other chain; only loopback is translated."""
     rules = [rule for rule in isolation_rules(SETTINGS, ENDS, ()) if rule.chain is Chain.KEPT_SOURCE]
     kept = [rule.family for rule in rules if rule.verdict is PacketVerdict.KEEP_SOURCE]
     assert kept == [4, 6]
@@ -49,7 +49,7 @@ def test_packets_to_the_appliance_keep_their_source() -> None:
 
 
 def test_a_host_that_routed_before_is_not_cut_off() -> None:
-    """The refusal to route for others is left out for the families for which the host was a router."""
+    """The rule against routing for others is left out for each family in which the host was already a router."""
     purposes = [rule.purpose for rule in isolation_rules(SETTINGS, ENDS, (4,)) if rule.chain is Chain.FORWARD]
     assert "the host is no IPv6 router" in purposes
     assert "the host is no IPv4 router" not in purposes
@@ -62,5 +62,5 @@ def test_a_port_is_needed() -> None:
 
 
 def test_the_interface_name_fits() -> None:
-    """A long name of the appliance still gives an interface name that the kernel takes."""
+    """A long appliance name still gives an interface name that the kernel accepts."""
     assert len(IsolationSettings(ports=SETTINGS.ports, name="a-rather-long-name").link) <= 15

@@ -14,7 +14,7 @@ from appliance.network.scan import addresses_of, scan
 
 
 def test_open_and_refused_ports_differ() -> None:
-    """A port with a listener is open; one that is bound without listening is refused."""
+    """A port with a listener is open; a port that is bound but not listening is refused."""
     with socket.create_server(("127.0.0.1", 0)) as server, socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         listening, bound = server.getsockname()[1], closed.getsockname()[1]
@@ -23,7 +23,7 @@ def test_open_and_refused_ports_differ() -> None:
 
 
 def test_few_file_descriptors_make_a_scan_slower_without_an_error() -> None:
-    """A process that may open few files, of which others are open, scans with fewer connections at once."""
+    """If the process may open few more files, the scan uses fewer connections at once."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with socket.create_server(("127.0.0.1", 0), backlog=500) as server, contextlib.ExitStack() as others:
         for _ in range(50):
@@ -38,12 +38,12 @@ def test_few_file_descriptors_make_a_scan_slower_without_an_error() -> None:
 
 
 class Stuck(socket.socket):
-    """A socket whose connection fails at once, before a packet leaves."""
+    """A socket whose connection fails at once, before any packet is sent."""
 
     number = errno.ENETUNREACH
 
     def connect_ex(self, _address: object) -> int:
-        """Return the kernel's error; the socket itself does not show it later."""
+        """Return the kernel's error; the socket does not report it again later."""
         return self.number
 
     def connect(self, address: object) -> None:
@@ -55,7 +55,7 @@ class Stuck(socket.socket):
 def test_a_port_that_could_not_be_tried_is_neither_open_nor_closed(
     monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    """Without a route, or with a firewall rule of this machine, the reason is reported."""
+    """Without a route, or with a firewall rule on this machine, the scan reports the reason."""
     monkeypatch.setattr("appliance.network.scan.socket.socket", Stuck)
     monkeypatch.setattr(Stuck, "number", number)
     result = scan("192.0.2.7", [1, 2, 3], seconds=10)
@@ -101,7 +101,7 @@ def test_a_scan_of_no_ports_ends() -> None:
 
 
 def test_the_machine_itself_is_not_another() -> None:
-    """The machine's own addresses are refused for a check from outside."""
+    """A check from outside refuses the machine's own addresses."""
     for address in ("127.0.0.1", "::1", "localhost"):
         with pytest.raises(NetworkError, match="is this machine"):
             addresses_of(address)

@@ -1,4 +1,4 @@
-"""Mistakes in policies and their messages: one for each line of `mistakes.txt`, with columns between ` => `."""
+"""Rows of `mistakes.txt`: each line has a mistake in a policy and its messages, separated by ` => `."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Addresses of hosts: `address_of` returns objects that equal those of `ipaddress`."""
+"""`address_of` returns objects that equal those of `ipaddress`."""
 
 import ipaddress
 
@@ -12,7 +12,7 @@ from appliance.policy.model import address_of
 
 @given(address=st.ip_addresses())
 def test_addresses_equal_those_of_ipaddress(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> None:
-    """They have the same hash, text, order and networks; the next call returns the same object."""
+    """The objects have the same hash, text, order and networks; the next call returns the same object."""
     ours = address_of(str(address))
     assert ours == address and hash(ours) == hash(address) and str(ours) == str(address) and repr(ours)
     assert {address: 1}[ours] == {ours: 1}[address] == 1
@@ -23,14 +23,14 @@ def test_addresses_equal_those_of_ipaddress(address: ipaddress.IPv4Address | ipa
 
 @pytest.mark.parametrize("text", ["", "host", "10.0.0", "10.0.0.1/8", "1", "::g", "10.0.0.1:1"])
 def test_an_invalid_address_is_refused(text: str) -> None:
-    """It raises the same error as `ipaddress`, also the second time."""
+    """An invalid address raises the same error as in `ipaddress`, also the second time."""
     for _ in range(2):
         with pytest.raises(ValueError, match=r"\S"):
             address_of(text)
 
 
 def test_hosts_that_are_named_alike() -> None:
-    """Addresses of one network share their rights at every call; other addresses do not."""
+    """Addresses of one network that the policy names share their rights at every call; other addresses do not."""
     table = HostSets()
     table.network(ipaddress.ip_network("10.1.0.0/16"))
     for _ in range(2):

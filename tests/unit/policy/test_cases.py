@@ -28,12 +28,12 @@ audit-only = Commands
 
 
 def run(text: str) -> list[CaseResult]:
-    """Return the results of cases against the policy above."""
+    """Return the results of cases against `POLICY`."""
     return run_cases(POLICY, text, "p.ini.tests.yaml")
 
 
 def test_cases_pass_and_fail_with_their_place() -> None:
-    """Each action is one check with its line and column, and the decision that was made."""
+    """Each action is one check with its line, its column and the decision."""
     results = run(
         "cases:\n"
         "  - host: 10.0.0.5\n"
@@ -48,7 +48,7 @@ def test_cases_pass_and_fail_with_their_place() -> None:
 
 
 def test_given_addresses_stand_for_robot_and_enrolled_hosts() -> None:
-    """Cases may give the addresses that the policy leaves open, and use them by name."""
+    """Cases may set the addresses that the policy leaves open, and refer to them by name."""
     results = run(
         "given: {robot: 192.0.2.1, hosts: {ocu-1: 10.77.0.11}}\n"
         "cases:\n"
@@ -88,7 +88,7 @@ PIECES = [*VERBS, *WORDS.split(), "\n  "]
 @settings(max_examples=examples(200))
 @given(st.one_of(st.text(), st.lists(st.sampled_from(PIECES), max_size=40).map(" ".join)))
 def test_any_text_gives_results_or_a_policy_error(text: str) -> None:
-    """Whatever the text, there are results or a PolicyError; nothing else."""
+    """Any text gives results or a `PolicyError`, and no other exception."""
     try:
         assert run(text)
     except PolicyError as error:

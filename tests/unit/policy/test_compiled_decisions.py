@@ -1,6 +1,6 @@
-"""The compiled policy against a naive decider written from the documentation.
+"""The compiled policy is compared with a naive decider written from the documentation.
 
-The naive decider is slow and simple: it tries every rule on every request, and shares no code with the policy.
+The naive decider tries every rule on every request, and shares no code with the policy.
 """
 
 import fnmatch
@@ -21,14 +21,14 @@ Rules = list[tuple[str, str, list[str]]]  # section, key, words of the value
 
 
 def group_members(word: str, groups: dict[str, list[str]], seen: tuple[str, ...] = ()) -> list[str]:
-    """Return the addresses, networks and stars that a word of a value means."""
+    """Return the addresses, networks and stars that a word of a value stands for."""
     if word not in groups or word in seen:
         return [word]
     return [leaf for inner in groups[word] for leaf in group_members(inner, groups, (*seen, word))]
 
 
 def names_host(words: list[str], groups: dict[str, list[str]], host: str) -> bool:
-    """Whether a value means a host."""
+    """Whether a value names a host."""
     address = ipaddress.ip_address(host)
     for leaf in (leaf for word in words for leaf in group_members(word, groups)):
         if leaf == "*" or address in ipaddress.ip_network(leaf):
@@ -45,14 +45,14 @@ def key_matches(key: str, name: str) -> bool:
 
 
 def rank(key: str) -> tuple[int, int, int]:
-    """Return a rank; the greater one is more specific."""
+    """Return the rank of a key; a greater rank is more specific."""
     return ("*" not in key, len(key.partition("*")[0]), "**" not in key)
 
 
 def decide_slowly(
     rules: Rules, groups: dict[str, list[str]], section: str, host: str, name: str
 ) -> bool | None:
-    """Return whether a request is allowed; None without the section."""
+    """Return whether a request is allowed; None if the policy lacks the section."""
     mine = [(key, words) for its, key, words in rules if its == section]
     if not mine:
         return None
@@ -79,7 +79,7 @@ NAME = st.lists(st.sampled_from([*NAMES, "arms"]), min_size=1, max_size=4).map(l
 
 @st.composite
 def policies(draw: st.DrawFn) -> tuple[Rules, dict[str, list[str]]]:
-    """Draw rules and groups; groups name later groups only, so that none contains itself."""
+    """Draw rules and groups; a group names only later groups, so that no group contains itself."""
     leaves = st.lists(WORDS.filter(lambda word: not word.startswith("g")), max_size=2, unique=True)
     groups = {
         f"g{n}": draw(leaves) + ([f"g{n + 1}"] if n < 2 and draw(st.booleans()) else []) for n in range(3)
@@ -111,7 +111,7 @@ def test_compiled_decisions_are_those_of_the_naive_decider(
         assert len(decision.reason) < 300
 
 
-# Every literal of the keys, and a new name for each prefix before a star.
+# Covers every literal of the keys, and a new name for each prefix before a star.
 LEVELS = ["a", "b", "ab", "arm", "ax", "arx", "zz"]
 BELOW = ["/" + "/".join(parts) for depth in (1, 2, 3) for parts in itertools.product(LEVELS, repeat=depth)]
 BELOW += [f"{below}/zz" for below in BELOW if below.count("/") == 3]
@@ -122,9 +122,9 @@ BELOW += [f"{below}/zz" for below in BELOW if below.count("/") == 3]
 def test_namespace_may_be_touched_only_if_everything_in_it_may(
     policy: tuple[Rules, dict[str, list[str]]], host: str, key: str
 ) -> None:
-    """A call on a namespace passes if and only if every key that can be in it is allowed.
+    """A call on a namespace is allowed if and only if every key that can be in it is allowed.
 
-    With stars before the end of keys only "only if" holds: an overridden rule may deny too much.
+    For keys with a star before their end only "only if" holds: an overridden rule may deny too much.
     """
     rules, groups = policy
     text = "[Groups]\n" + "".join(f"{name} = {' '.join(words)}\n" for name, words in groups.items())
@@ -141,7 +141,7 @@ def test_namespace_may_be_touched_only_if_everything_in_it_may(
 @settings(max_examples=examples(400))
 @given(st.lists(KEYS, min_size=2, max_size=2, unique=True), st.lists(NAME, max_size=30))
 def test_keys_that_load_together_never_tie(keys: list[str], names: list[str]) -> None:
-    """Two keys that load together never match a name with the same rank; refused ones have the same."""
+    """If two keys load together, they never match a name with equal rank; refused pairs do."""
     text = "[Publishers]\n" + "".join(f"{key} = *\n" for key in keys)
     try:
         compile_policy(text, file="p.ini")

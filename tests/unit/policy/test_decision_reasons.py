@@ -50,7 +50,7 @@ def test_the_word_that_matches_the_host_is_shown() -> None:
 
 
 def test_node_rule_is_part_of_the_answer() -> None:
-    """Publishing under a name the host may not use is denied although [Publishers] grants the topic."""
+    """Publishing under a node name that the host may not use is denied although [Publishers] grants the topic."""
     found = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd", node="/radar")
     assert found.decision.allowed
     assert not found.allowed
@@ -68,7 +68,7 @@ def test_command_is_explained_under_its_wire_name_too() -> None:
 
 
 def test_text_says_decision_and_place() -> None:
-    """The rendered text has the sentence of the decision and the file and line of every rule."""
+    """The rendered text has the decision as a sentence, and the file and line of every rule."""
     lines = list(render(explained("10.0.0.9", Category.COMMAND, "getPid")))
     assert lines[0].startswith(
         "denied: 10.0.0.9 is not among the hosts that may call getPid: only ocu (10.0.0.5)"
@@ -77,7 +77,7 @@ def test_text_says_decision_and_place() -> None:
 
 
 def test_dependence_on_a_namespace_is_explained() -> None:
-    """An exact key grants a value, not a namespace of that name; the answer says so."""
+    """An exact key grants a value, not a namespace of that name; the explanation says so."""
     policy = compile_policy("[Parameters]\nread /arm = 10.0.0.5\nread /leg/** = 10.0.0.5\n", file="p.ini")
     host = ipaddress.ip_address("10.0.0.5")
     lines = list(render(explain(policy, Request(host, "/ocu", Category.READ, "/arm"))))

@@ -1,4 +1,4 @@
-"""Decisions as text: a policy, and below it requests with their verdicts (`decisions.txt`).
+"""Decisions as text: a policy, followed by requests with their verdicts (`decisions.txt`).
 
 > 10.0.0.1 publish, subscribe /a, /b: deny by [Publishers] /a     each category with each name, and the rule
 > 10.0.0.1 as /node publish /a: allow                              the node's name as well
@@ -39,7 +39,7 @@ def decided(policy: Policy, line: re.Match[str], category: str, name: str) -> De
 
 @pytest.mark.parametrize("title", _CASES)
 def test_decisions(title: str) -> None:
-    """Each request has the verdict beside it, by the rule that is named."""
+    """Each request has the verdict beside it, from the rule that the line names."""
     lines = _CASES[title].splitlines()
     first = next(number for number, line in enumerate(lines) if line.startswith("> "))
     policy = compile_policy("\n".join(lines[:first]), file="p.ini")

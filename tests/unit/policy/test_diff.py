@@ -1,4 +1,4 @@
-"""Comparing two policies on requests that were seen."""
+"""Comparing two policies by recorded requests."""
 
 import ipaddress
 
@@ -36,7 +36,7 @@ def test_lost_node_name_is_a_difference() -> None:
 
 
 def test_audit_only_is_between_allowed_and_denied() -> None:
-    """When a policy leaves audit-only mode, requests that passed with a mark become denials."""
+    """When a section leaves audit-only mode, requests that were allowed and marked become denials."""
     old = compile_policy(OLD + "[Options]\naudit-only = Publishers\n", file="old.ini")
     new = compile_policy(OLD, file="new.ini")
     found = diff(old, new, [request("10.0.0.9", "/cmd"), request("10.0.0.1", "/x")])

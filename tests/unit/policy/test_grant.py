@@ -1,4 +1,4 @@
-"""The smallest change that grants a denied request grants nothing else to any host."""
+"""The smallest change that grants a denied request, and grants no other host anything."""
 
 import ipaddress
 from itertools import product
@@ -44,7 +44,7 @@ def compiled(text: str) -> Policy:
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: str(file.stem))
 @pytest.mark.parametrize("wanted", everything(HOST), ids=lambda one: f"{one.category} {one.resource}")
 def test_it_grants_that_and_nothing_else(file: Path, wanted: Request) -> None:
-    """In every shipped policy no host loses a right, no other host gains one, and the rest of the text stays."""
+    """In every shipped policy no host loses a right, no other host gains one, and the rest of the text is unchanged."""
     text = file.read_text(encoding="utf-8")
     found = grant(text, "p.ini", KNOWN, DecidedRequest(wanted, rights_of(wanted)))
     before, after = compiled(text), compiled(found.text)
@@ -61,7 +61,7 @@ def test_it_grants_that_and_nothing_else(file: Path, wanted: Request) -> None:
 
 
 def changed(text: str, category: str, resource: str, host: str = str(HOST), **detail: object) -> list[str]:
-    """Return the lines that are added or changed."""
+    """Return the lines that were added or changed."""
     found = grant(text, "p.ini", KNOWN, asked(host, "/it", category, resource, detail))
     return [line[1:] for line in found.diff(text, "p.ini") if line[:1] == "+" and line[:3] != "+++"]
 
@@ -72,7 +72,7 @@ BASE = (
 
 
 def test_the_host_is_added_to_the_deciding_key() -> None:
-    """The line keeps its commas and its comment; the reported change is the rule alone."""
+    """The line keeps its commas and its comment; the reported change is only the rule."""
     assert changed(BASE, "publish", "/x") == ["/x = 10.0.0.1, 10.0.0.2, 10.0.0.9  # the two"]
     padded = BASE.replace("/x =", "/x      =   ")
     found = grant(padded, "p.ini", KNOWN, asked(str(HOST), "/it", "publish", "/x", {}))
@@ -80,14 +80,14 @@ def test_the_host_is_added_to_the_deciding_key() -> None:
 
 
 def test_a_new_key_keeps_the_hosts_of_the_deciding_rule() -> None:
-    """Hosts that a pattern allowed stay allowed; a section without rules gets its first one."""
+    """Hosts that a pattern allowed stay allowed; a section without rules gets its first rule."""
     assert changed(BASE, "publish", "/yes") == ["/yes = 10.0.0.1 10.0.0.9"]
     assert changed(BASE, "subscribe", "/z") == ["/z = 10.0.0.9"]
     assert changed("[Nodes]\ndefault = *\n", "publish", "/z") == ["", "[Publishers]", "/z = 10.0.0.9"]
 
 
 def test_a_host_is_named_by_its_group_or_certificate() -> None:
-    """It is named by a group of its own, its certificate or as the robot; otherwise by its address."""
+    """A host is named by its own group, by its certificate or as the robot; otherwise by its address."""
     grouped = "[Groups]\nocu = 10.0.0.9\nall = 10.0.0.9 10.0.0.1\n" + BASE
     assert changed(grouped, "subscribe", "/z") == ["/z = ocu"]
     assert changed(BASE, "subscribe", "/z", "10.0.0.77") == ["/z = host:laptop"]
@@ -95,7 +95,7 @@ def test_a_host_is_named_by_its_group_or_certificate() -> None:
 
 
 def test_a_call_about_a_parameter_needs_the_parameter_too() -> None:
-    """It needs the command and the key; rules below the key that deny get the host as well."""
+    """Such a call needs the command and the key; denying rules below the key get the host as well."""
     text = (
         "[Nodes]\ndefault=*\n[Commands]\nsetParam = 10.0.0.1\n"
         "[Parameters]\nwrite /arm/max = 10.0.0.1\nwrite default = 10.0.0.1\n"
@@ -137,7 +137,10 @@ PARAMETERS = [
 def test_a_parameter_that_only_the_record_describes_is_granted(
     text: str, call: str, key: str, value: Value, tree: Tree
 ) -> None:
-    """The parameter held others, its value does, or it blocked another one; no other host gains the right."""
+    """Covers a parameter that is a namespace, a dictionary as value, and a key below a value.
+
+    No other host gains the right.
+    """
 
     def answer(policy: Policy, host: object, key: str = key, tree: Tree = tree) -> Decision:
         command = request(Category.COMMAND, call, host)
@@ -161,7 +164,7 @@ def test_a_parameter_that_only_the_record_describes_is_granted(
 
 
 def test_a_text_keeps_its_line_endings() -> None:
-    """A policy that was written on another system; a new section, a new line and a longer one."""
+    """A policy from another system keeps its line endings with a new section, a new line or a longer line."""
     for resource in ("/x", "/yes", "/new"):
         found = grant(
             BASE.replace("\n", "\r\n"), "p.ini", KNOWN, asked(str(HOST), "/it", "publish", resource, {})
@@ -183,13 +186,13 @@ def test_a_text_keeps_its_line_endings() -> None:
     ],
 )
 def test_a_request_that_no_policy_can_grant(host: str, category: str, resource: str, why: str) -> None:
-    """The answer has the reason."""
+    """If no policy can grant a request, the answer has the reason."""
     with pytest.raises(UngrantableError, match=why):
         changed(BASE, category, resource, host)
 
 
 def test_failing_cases_are_reported() -> None:
-    """The policy has a test case that denies this host."""
+    """If a test case denies this host, the result names the case that fails."""
     known = PolicyContext(
         cases_file="p.tests.yaml", cases="cases:\n  - {host: 10.0.0.9, node: /it, deny: [subscribe /z]}\n"
     )

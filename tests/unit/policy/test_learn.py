@@ -21,7 +21,7 @@ NAMES = ["/a", "/a/b", "/a/b/c", "/cmd_vel", "/a_1", "/tool_4711_1700000000000",
 def seen(
     host: str, category: Category, resource: str, *, node: str = "/n", call: str = "", key: str = ""
 ) -> Observation:
-    """Return one request that passed."""
+    """Return one allowed request."""
     return Observation(Request(ipaddress.ip_address(host), node, category, resource), call, key)
 
 
@@ -31,7 +31,7 @@ def compiled(learned: LearnedPolicy) -> Policy:
 
 
 def test_only_observed_requests_are_granted() -> None:
-    """The host gets the topic and its node name, but not the other direction, name or host."""
+    """The host gets the topic and its node name, but not the other direction, another name or another host."""
     policy = compiled(learn([seen("10.0.0.1", Category.PUBLISH, "/cmd_vel", node="/joy")]))
     host, other = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
     assert decide(policy, rights_of(Request(host, "/joy", Category.PUBLISH, "/cmd_vel"))).allowed
@@ -50,7 +50,7 @@ def test_only_observed_requests_are_granted() -> None:
 
 
 def test_anonymous_names_become_patterns() -> None:
-    """The next run of a tool has another number, and is allowed; a name that only looks alike is denied."""
+    """A tool that restarts with another number is allowed; a name that only looks similar is denied."""
     listener = "/listener_1700000000123456789"
     learned = learn([
         seen("10.0.0.1", Category.SUBSCRIBE, "/chatter", node="/rostopic_4711_1700000000000"),
@@ -68,7 +68,7 @@ def test_anonymous_names_become_patterns() -> None:
 
 
 def test_a_parameter_call_needs_the_call_and_the_key() -> None:
-    """A host that read a namespace may read all below it, also where another host used a narrower key."""
+    """A host that read a namespace may read all keys below it, even where another host used a narrower key."""
     policy = compiled(learn([
         seen("10.0.0.1", Category.COMMAND, "getParam", call="getParam", key="/arm"),
         seen("10.0.0.2", Category.COMMAND, "getParam", call="getParam", key="/arm/max"),
@@ -87,7 +87,7 @@ def test_a_parameter_call_needs_the_call_and_the_key() -> None:
 
 
 def test_the_robot_is_called_robot() -> None:
-    """Its address is written as the group, so that the policy holds where the robot has another."""
+    """The robot's address is written as the group `robot`, so that the policy also holds at another address."""
     learned = learn(
         [seen("192.0.2.10", Category.PUBLISH, "/a"), seen("10.0.0.1", Category.PUBLISH, "/a")], [ROBOT]
     )
@@ -96,7 +96,7 @@ def test_the_robot_is_called_robot() -> None:
 
 
 def test_hosts_that_are_named_together_are_a_group() -> None:
-    """Several lines with the same hosts use a group; each line has its number of uses and its nodes."""
+    """Several lines with the same hosts use a group; each line has its number of uses and its nodes as a comment."""
     learned = learn([
         seen(host, Category.PUBLISH, topic, node="/joy")
         for host in ("10.0.0.1", "10.0.0.2") for topic in ("/a", "/b", "/a")
@@ -112,7 +112,7 @@ def test_hosts_that_are_named_together_are_a_group() -> None:
 
 
 def test_a_parameter_is_left_out_where_the_one_above_says_the_same() -> None:
-    """This holds for the same hosts; another host's own key stays."""
+    """A parameter is omitted if the one above has the same hosts; the key of another host stays."""
     learned = learn([
         seen(host, Category.COMMAND, "getParam", call="getParam", key=key)
         for host, key in (("10.0.0.1", "/arm"), ("10.0.0.1", "/arm/max"), ("10.0.0.2", "/arm/min"))
@@ -127,7 +127,7 @@ def test_a_parameter_is_left_out_where_the_one_above_says_the_same() -> None:
      (Category.PUBLISH, "/a\n[Commands]\ndefault = *"), (Category.PUBLISH, "/a = *  #"), (Category.NODE, "/é")],
 )  # fmt: skip
 def test_text_of_unknown_hosts_never_becomes_a_rule(category: Category, resource: str) -> None:
-    """Requests that cannot be granted are left out and counted; no text of a peer is copied into the policy."""
+    """Requests that cannot be granted are omitted and counted; no text of a peer is copied into the policy."""
     learned = learn([seen("10.0.0.1", category, resource), seen("10.0.0.1", Category.PUBLISH, "/ok")])
     assert (learned.requests, learned.left_out) == (1, 1)
     assert resource not in learned.text
@@ -166,7 +166,7 @@ def test_the_same_run_passes_under_what_was_learned(observations: list[Observati
 
 @given(st.lists(_observations, min_size=1, max_size=20), _observations)
 def test_a_host_that_did_nothing_may_do_nothing(observations: list[Observation], other: Observation) -> None:
-    """Rights go to hosts that were seen only."""
+    """Only hosts that made requests get rights."""
     policy = compiled(learn(observations, [ROBOT]))
     unknown = Request(
         ipaddress.ip_address("203.0.113.9"), "/n", other.request.category, other.request.resource

@@ -83,7 +83,7 @@ default = few
 
 
 def test_denial_names_who_may_and_the_rule() -> None:
-    """The reason of a denial is a sentence with the host, the action, the allowed hosts, and file and line."""
+    """The reason for a denial is one sentence with the host, action, allowed hosts, file and line."""
     decision = ask(compiled(FIGURE), "10.0.0.9", "publish", "/landshark_control/trigger")
     assert decision.reason == (
         "10.0.0.9 is not among the hosts that may publish /landshark_control/trigger: "
@@ -98,7 +98,7 @@ def test_denial_names_who_may_and_the_rule() -> None:
 
 
 def test_reason_stays_short_and_keeps_the_place() -> None:
-    """However long names, values and file are, a reason has fewer than 300 characters and ends with the line."""
+    """However long names, values and file names are, a reason has fewer than 300 characters and ends with the line."""
     name = "/" + "n" * 900
     text = (
         f"[Groups]\n{'g' * 500} = ::1\n[Parameters]\nwrite {name} = {'g' * 500} host:{'h' * 200} fd00::/16\n"
@@ -118,14 +118,14 @@ def test_reason_stays_short_and_keeps_the_place() -> None:
 
 
 def test_an_empty_value_denies_all_hosts() -> None:
-    """A key without a value denies every host, and says so."""
+    """A key without a value denies every host, and the reason says so."""
     decision = ask(compiled("[Publishers]\ndefault = *\n/cmd =\n"), "10.0.0.1", "publish", "/cmd")
     assert not decision.allowed
     assert "no host may" in decision.reason
 
 
 def test_robot_and_enrolled_hosts_come_from_outside() -> None:
-    """`robot` and host:NAME are the addresses the caller gives; a name that is not enrolled means no host."""
+    """The caller gives the addresses of `robot` and host:NAME; a name that is not enrolled matches no host."""
     text = "[Nodes]\ndefault = robot host:ocu-1 host:gone\n"
     given_hosts: dict[str, Address] = {"ocu-1": ipaddress.ip_address("10.77.0.11")}
     policy = compiled(text, hosts=given_hosts, robot=[ipaddress.ip_address("172.17.0.1")])
@@ -137,7 +137,7 @@ def test_robot_and_enrolled_hosts_come_from_outside() -> None:
 
 @pytest.mark.parametrize("category", ["node", "publish", "subscribe", "command"])
 def test_missing_section_of_the_thesis_denies(category: str) -> None:
-    """Without its section a category of the thesis grants nothing."""
+    """A category of the thesis grants nothing if the policy lacks its section."""
     resource = "getPid" if category == "command" else "/x"
     decision = ask(compiled("[Groups]\n"), "127.0.0.1", category, resource)
     assert not decision.allowed
@@ -146,7 +146,7 @@ def test_missing_section_of_the_thesis_denies(category: str) -> None:
 
 @pytest.mark.parametrize("category", ["offer", "call", "read", "write"])
 def test_missing_extension_keeps_the_behaviour_of_the_thesis(category: str) -> None:
-    """Without [Services], [Clients], [Parameters] every host is allowed; with an empty one no host is."""
+    """Without [Services], [Clients] or [Parameters] every host is allowed; with an empty section no host is allowed."""
     section = {"offer": "Services", "call": "Clients"}.get(category, "Parameters")
     assert ask(compiled(FIGURE), "10.9.9.9", category, "/x").allowed
     assert not compiled(FIGURE).has_section(Category(category))
@@ -154,7 +154,7 @@ def test_missing_extension_keeps_the_behaviour_of_the_thesis(category: str) -> N
 
 
 def test_an_unknown_call_is_denied_with_any_default() -> None:
-    """A call that is in no table is not granted by `default = *`, nor one that other sections decide."""
+    """`default = *` does not grant a call that is in no table, nor a call that other sections decide."""
     policy = compiled("[Commands]\ndefault = *\n")
     assert all(ask(policy, "127.0.0.1", "command", name).allowed for name in COMMANDS - NAMED_ONLY)
     for name in ("getparam", "foo", "", "default", *DECIDED_ELSEWHERE):
@@ -165,7 +165,7 @@ def test_an_unknown_call_is_denied_with_any_default() -> None:
     "name", ["", "/", "x", "//x", "/x/", "/x\n", "/x y", "~x", "/ä", "/**", "/x/*", "/" + "a" * 2000]
 )
 def test_name_that_is_not_resolved_is_denied(name: str) -> None:
-    """No spelling bypasses the rules: a name that is not canonical is denied even by `*`."""
+    """No spelling bypasses the rules: a name that is not canonical is denied even under `*`."""
     policy = compiled("[Nodes]\n/** = *\n[Publishers]\n/** = *\n[Subscribers]\ndefault = *\n")
     assert not any(
         ask(policy, "10.0.0.1", category, name).allowed for category in ("node", "publish", "subscribe")
@@ -181,7 +181,7 @@ def ask_parameter(
 
 
 def test_audit_only_allows_and_reports_would_deny() -> None:
-    """A section in audit-only mode passes what its rules deny, marked; other sections still deny."""
+    """In an audit-only section, requests that its rules deny are allowed and marked; other sections still deny."""
     policy = compiled(f"{FIGURE}[Options]\naudit-only = publishers\n")
     decision = ask(policy, "10.9.9.9", "publish", "/landshark_control/trigger")
     assert (decision.allowed, decision.would_deny) == (True, True)
@@ -192,7 +192,7 @@ def test_audit_only_allows_and_reports_would_deny() -> None:
 
 
 def test_unknown_address_is_known_as_such() -> None:
-    """An address is unknown if no rule or only an unused group names it; `*` names every host."""
+    """An address is unknown if only `*` or an unused group covers it; any other rule makes it known."""
     policy = compiled(f"[Groups]\nunused = 10.8.8.8\n{FIGURE.replace('[Groups]', '')}")
     assert policy.knows(ipaddress.ip_address("10.0.0.5"))
     assert policy.knows(ipaddress.ip_address("::ffff:10.0.0.5"))
@@ -203,7 +203,7 @@ def test_unknown_address_is_known_as_such() -> None:
 
 
 def test_memory_does_not_grow_with_requests() -> None:
-    """Answers are kept for a bounded number of names, and never for long ones."""
+    """Answers are cached for a limited number of names, and never for long names."""
     policy = compiled(FIGURE)
     for number in range(20_000):
         ask(policy, "10.0.0.1", "publish", f"/topic{number}")

@@ -1,4 +1,4 @@
-"""Compiling a policy: any text gives a policy, or one error with the place of every mistake."""
+"""Compiling a policy: any text gives a policy, or one error with the position of every mistake."""
 
 import ipaddress
 import time
@@ -81,7 +81,7 @@ def test_policy_of_the_shape_of_rosrvs_loads() -> None:
 
 
 def test_uses_of_a_commented_out_group_are_errors() -> None:
-    """Where a group that rules still use is commented out, each use is an error with its place."""
+    """If rules still use a group that is commented out, each use is an error with its position."""
     found = errors_of(SAMPLE_OF_ROSRV.replace("\nocu =", "\n#ocu ="))
     assert found[0].startswith('17:22: no group "ocu" is defined')
     assert len(found) == 8
@@ -89,20 +89,20 @@ def test_uses_of_a_commented_out_group_are_errors() -> None:
 
 @pytest.mark.parametrize(("text", "expected"), mistakes("policy"))
 def test_a_mistake_is_an_error_with_its_place_and_a_hint(text: str, expected: str) -> None:
-    """Each kind of mistake refuses the file with line, column, the mistake and the text to write."""
+    """Each kind of mistake refuses the file; the error has line, column, the mistake and a valid text."""
     found = errors_of(text)
     assert len(found) == 1
     assert found[0].startswith(expected)
 
 
 def test_all_mistakes_are_reported_at_once() -> None:
-    """A file with many mistakes shows all of them at once, in the order of the file."""
+    """All mistakes of a file are reported at once, in the order of the file."""
     text = "[Groups]\na = 10.0.0\n[Nodes]\nx = a\n/y = b\n[Commands]\nfoo = a\n[Options]\ntakeover = no\n"
     assert [line.split(":")[0] for line in errors_of(text)] == ["2", "4", "5", "7", "9"]
 
 
 def test_misspelt_section_is_one_mistake() -> None:
-    """[Group] for [Groups] is one error, not one more for each use of its groups."""
+    """[Group] instead of [Groups] is one error, without further errors for each use of its groups."""
     assert len(errors_of("[Group]\na = ::1\n[Nodes]\ndefault = a\n")) == 1
 
 
@@ -114,7 +114,7 @@ def test_error_says_file_line_and_column_as_compilers_do() -> None:
 
 
 def test_a_file_beyond_the_limit_is_refused_with_the_limit() -> None:
-    """A file that is too long is refused unread, and the error has the limit."""
+    """A file that is too long is refused unread, and the error names the limit."""
     found = errors_of("#" * (MAXIMUM_CHARACTERS + 1))
     assert str(MAXIMUM_CHARACTERS) in found[0]
 
@@ -136,7 +136,7 @@ def test_a_file_beyond_the_limit_is_refused_with_the_limit() -> None:
     ids=["garbage", "undefined", "chain", "stars", "deep", "many groups"],
 )
 def test_hostile_file_is_judged_in_bounded_time(text: str) -> None:
-    """The worst texts of the allowed length are loaded or refused within seconds, with a bounded list."""
+    """The worst texts of the allowed length are loaded or refused within seconds; the list of errors is limited."""
     start = time.process_time()
     try:
         compile_policy(text, file="p.ini")
@@ -158,7 +158,7 @@ TEXTS = st.one_of(st.text(), *(st.lists(PIECES, max_size=60).map(glue.join) for 
 @given(TEXTS)
 @example("[Groups]\nrobot\n=")
 def test_any_text_is_a_policy_or_a_policy_error(text: str) -> None:
-    """Any text gives a Policy, or a PolicyError with places inside the text."""
+    """Any text gives a `Policy`, or a `PolicyError` with positions inside the text."""
     try:
         policy = compile_policy(text, file="p.ini", robot=[ipaddress.ip_address("172.17.0.1")])
     except PolicyError as error:
@@ -173,7 +173,7 @@ def test_any_text_is_a_policy_or_a_policy_error(text: str) -> None:
 
 
 def test_options_and_ports_have_their_documented_defaults() -> None:
-    """Without [Ports] and [Options]: 19001-26000, takeover by the same host, no audit-only mode."""
+    """Without [Ports] and [Options] the defaults apply: 19001-26000, takeover by the same host, no audit-only mode."""
     policy = compile_policy("", file="p.ini")
     assert policy.ports == range(19001, 26001)
     assert policy.takeover == "same-host"

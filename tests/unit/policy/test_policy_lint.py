@@ -1,4 +1,4 @@
-"""The lint: rights that an operator most likely did not mean."""
+"""The lint warns of rights that an operator most likely did not intend."""
 
 import ipaddress
 
@@ -36,13 +36,13 @@ def test_a_correct_policy_has_no_warning() -> None:
 
 @pytest.mark.parametrize(("old", "new", "expected"), mistakes("doubtful"))
 def test_doubtful_policy_is_warned_about_with_its_place(old: str, new: str, expected: str) -> None:
-    """Each kind of doubtful rule is a warning with file, line and column, and the policy loads."""
+    """Each kind of doubtful rule is a warning with file, line and column, and the policy still loads."""
     assert old in RIGHT
     assert any(warning.startswith(expected) for warning in warnings_of(RIGHT.replace(old, new)))
 
 
 def test_host_that_lacks_a_node_name_is_named_once() -> None:
-    """A host that many rules let publish but [Nodes] does not name is one warning that counts the rules."""
+    """If many rules let a host publish but [Nodes] does not name it, one warning counts these rules."""
     text = RIGHT.replace("/ocu = op\n", "").replace("[Subscribers]", "/a = op\n/b = op\n[Subscribers]")
     found = [warning for warning in warnings_of(text) if "10.0.0.5" in warning]
     assert len(found) == 1
@@ -50,13 +50,13 @@ def test_host_that_lacks_a_node_name_is_named_once() -> None:
 
 
 def test_network_that_overlaps_a_node_right_is_not_dead() -> None:
-    """A rule for a network counts as alive when one of its addresses may be a node, and the other way round."""
+    """A rule for a network is not dead if one of its addresses may be a node, and the other way round."""
     assert warnings_of(RIGHT.replace("default = op\n", "default = 10.0.0.0/24\n")) == []
     assert warnings_of(RIGHT.replace("/ocu = op", "/ocu = 10.0.0.0/8")) == []
 
 
 def test_loopback_is_warned_about_where_the_robot_is_elsewhere() -> None:
-    """127.0.0.1 where the robot is elsewhere, or not known, is the appliance itself; the warning names the robot."""
+    """The appliance itself is 127.0.0.1 if the robot is elsewhere or unknown; the warning names the robot."""
     text = RIGHT.replace("10.0.0.1", "127.0.0.1")
     (unknown,) = warnings_of(text)
     assert "127.0.0.1 is the appliance itself (unless isolation is none): write robot" in unknown

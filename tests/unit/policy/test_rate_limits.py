@@ -56,7 +56,7 @@ def policy(*lines: str):  # type: ignore[no-untyped-def]  # what compile_policy 
 def test_a_limit_is_for_messages_or_bytes_of_hosts(
     line: str, part: LimitScope, host: ipaddress.IPv4Address, rate: Rate
 ) -> None:
-    """A limit counts messages or bytes a second, for all hosts if none is named; the strictest clause wins."""
+    """A limit is in messages or bytes a second, for all hosts unless it names some; the strictest clause wins."""
     assert policy(line).limit(part, "/camera/front/image", host) == rate
 
 
@@ -75,7 +75,7 @@ def test_the_most_specific_key_decides_alone() -> None:
 
 @pytest.mark.parametrize(("line", "place", "text"), mistakes("limits"))
 def test_a_mistake_is_reported_with_its_place(line: str, place: str, text: str) -> None:
-    """It refuses the file, as every error does."""
+    """As every error does, a mistake in a limit refuses the file."""
     with pytest.raises(PolicyError) as refused:
         policy(line)
     found = [str(one) for one in refused.value.findings]
@@ -85,13 +85,13 @@ def test_a_mistake_is_reported_with_its_place(line: str, place: str, text: str) 
 
 
 def test_the_number_of_limits_is_bounded() -> None:
-    """So the time to read them is bounded."""
+    """A policy has at most 1,000 limits, so that reading them takes a bounded time."""
     with pytest.raises(PolicyError, match="more than 1000 limits"):
         policy(*(f"/a{number}* = topic 1 Hz" for number in range(1001)))
 
 
 def test_a_default_that_never_limits_is_a_warning() -> None:
-    """This holds as in the sections that decide."""
+    """A default that is never reached is a warning, as in the sections that decide."""
     warnings = [str(one) for one in policy("/** = topic 1 Hz", "default = topic 2 Hz").warnings]
     assert [one for one in warnings if "group" not in one] == [
         "p.ini:14:1: warning: never limits: /** at line 13 matches every name before it"
@@ -114,7 +114,7 @@ def test_hosts_share_as_the_policy_names_them() -> None:
 
 
 def test_explain_shows_the_limit_and_its_line() -> None:
-    """An allowed request shows the limit of its host and that of all hosts together."""
+    """The explanation of an allowed request has the limit of its host and the limit of all hosts together."""
     limits = policy("/scan = publisher guests 20 Hz 1500 kB/s, topic 100 Hz, subscriber 5 Hz")
     [publish, subscribe] = [
         list(render(explain(limits, Request(GUEST, "/lidar", category, "/scan"))))
@@ -138,7 +138,7 @@ def test_explain_shows_the_limit_and_its_line() -> None:
     ],
 )
 def test_diff_shows_changed_limits(old: str, new: str, word: str) -> None:
-    """The decision itself is the same."""
+    """The diff lists changed limits even if no decision changes."""
     request = Request(GUEST, "/lidar", Category.PUBLISH, "/scan")
     [difference] = diff(policy(old), policy(new), [request, request])
     assert (difference.word, difference.count) == (word, 2)

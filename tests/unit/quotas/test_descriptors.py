@@ -1,4 +1,4 @@
-"""No process runs out of descriptors before a quota is spent."""
+"""No process runs out of file descriptors before a quota is used up."""
 
 import resource
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ def test_all_quotas_together_fit_the_descriptors() -> None:
     """Each process may open all connections, all ports of nodes and a call to every node at once."""
     files = {role.name: role.files for role in ROLES}
     ports = NODE_PORTS.bounds.whole
-    nodes = ports // 2  # with one relay, which is where there are most
+    nodes = ports // 2  # with one relay, which gives the most nodes
     connections = RVMASTER_CONNECTIONS.bounds.whole + RVMASTER_FAREWELLS.bounds.whole
     assert (
         connections + ports + 3 * nodes + BESIDE <= files["control"]
@@ -41,7 +41,7 @@ def test_all_quotas_together_fit_the_descriptors() -> None:
 
 
 def test_the_configuration_has_the_tables_bounds() -> None:
-    """The defaults of the configuration equal those of the page."""
+    """The defaults of the configuration equal those in the table of quotas."""
     settings = Settings()
     for given, row in (
         (settings.limits, RVMASTER_CONNECTIONS),
@@ -63,5 +63,5 @@ def few_descriptors() -> Iterator[None]:
 
 
 def test_where_the_system_allows_fewer_connections_have_half(few_descriptors: None) -> None:
-    """A larger bound is lowered to half, so that no process runs out of descriptors."""
+    """A bound above half of the allowed descriptors is lowered to half, so that no process runs out of them."""
     assert [connections_within(wanted) for wanted in (100, 4096)] == [100, 500]

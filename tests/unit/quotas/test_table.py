@@ -12,12 +12,12 @@ _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def test_the_page_is_up_to_date() -> None:
-    """docs/reference/quotas.md is what `python -m distribution.quotas_page` writes."""
+    """docs/reference/quotas.md equals the output of `python -m distribution.quotas_page`."""
     assert (ROOT / "docs/reference/quotas.md").read_text() == page()
 
 
 def test_each_row_is_attacked_by_a_test_that_exists() -> None:
-    """A row without an existing test is an unchecked claim."""
+    """Every row names an existing test; without one, the row would be an unchecked claim."""
     for row in QUOTA_ROWS:
         assert row.shown_by, row.thing
         for place in row.shown_by:

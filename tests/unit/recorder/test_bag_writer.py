@@ -1,4 +1,4 @@
-"""Bags: other programs read them, also after the writer was killed in the middle."""
+"""Other programs can read the bags, even if the writer was killed in the middle."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def body(text: bytes) -> bytes:
 
 
 def read(path: Path) -> list[tuple[str, int, bytes]]:
-    """Return the messages that `rosbags` reads, in the order of time."""
+    """Return the messages that `rosbags` reads, ordered by time."""
     with Reader(path) as reader:
         return [(connection.topic, time, bytes(data)) for connection, time, data in reader.messages()]
 
@@ -46,7 +46,7 @@ def test_read_by_rosbags(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("torn", [0, 1, 50, 200])
 def test_another_writer_continues_a_bag(tmp_path: Path, torn: int) -> None:
-    """A bag that ends in the middle of a chunk keeps everything before it, and more can be written."""
+    """A bag that ends in the middle of a chunk keeps all earlier chunks, and can be continued."""
     path = tmp_path / "left.bag"
     bag = BagWriter(tmp_path / "a.bag", {})
     size = bag.write([BagMessage(bag.connect(HEADER), SECOND, body(b"one"))])
@@ -61,7 +61,7 @@ def test_another_writer_continues_a_bag(tmp_path: Path, torn: int) -> None:
 
 
 def test_data_lost_in_a_power_cut_is_left_out_and_reported(tmp_path: Path) -> None:
-    """After a cut at any byte all whole chunks but the last stay, and more can be written."""
+    """After a cut at any byte all whole chunks except the last stay, and the bag can be continued."""
     path, whole, headers = (
         tmp_path / "cut.bag",
         tmp_path / "whole.bag",
@@ -92,7 +92,7 @@ def test_data_lost_in_a_power_cut_is_left_out_and_reported(tmp_path: Path) -> No
 
 
 def test_stock_tools_find_beginning_and_end(tmp_path: Path) -> None:
-    """They take them from the first and the last chunk, in any order of the chunks."""
+    """Stock tools read beginning and end from the first and last chunk, in any order of the chunks."""
     bag = BagWriter(tmp_path / "a.bag", {})
     chatter = bag.connect(HEADER)
     for times in ((5, 9), (3, 4), (7, 8)):

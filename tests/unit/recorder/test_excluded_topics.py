@@ -1,4 +1,4 @@
-"""Topics that are never recorded, by configuration or by a publisher's type."""
+"""Topics that are never recorded because of the configuration or of a publisher's type."""
 
 import pytest
 
@@ -41,7 +41,7 @@ def test_the_sums_of_excluded_types_are_those_of_their_definitions() -> None:
 def test_a_publishers_type_is_compared_with_the_definition(
     topic: str, type_name: str, md5sum: str, why: str
 ) -> None:
-    """A topic that claims a type of `never` with the md5sum of another type is recorded."""
+    """A topic whose claimed type is in `never`, but whose md5sum is another type's, is recorded."""
     never = ["/camera/*", IMAGE, "my_msgs/Face"]
     found = left_out_because(never, known_sums(never), topic, {"type": type_name, "md5sum": md5sum})
     assert found.endswith(why) if why else found == ""

@@ -1,4 +1,4 @@
-"""When the disk fills, the recorder reports it and goes on, and each named recording is whole."""
+"""When the disk fills, the recorder reports it and continues, and each named recording is complete."""
 
 import hashlib
 import subprocess
@@ -28,7 +28,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.mark.parametrize("what", ["bytes", "files"])
 def test_each_step_on_a_full_disk(disk: Path, tmp_path: Path, what: str) -> None:
-    """After each step the disk is full: orders are answered, no half recording stays, and recording resumes later."""
+    """The disk fills before each step in turn: orders are answered, no half recording stays, and recording resumes."""
     scene = Scene(tmp_path, disk=8 << 20)
     order = Trigger(scene.clock.now, "order", "r", "eve")
 

@@ -1,4 +1,4 @@
-"""A recorder that is killed at any file operation leaves whole recordings, and loses none silently."""
+"""A recorder killed at any file operation leaves complete recordings, and loses none silently."""
 
 import hashlib
 import os
@@ -45,7 +45,7 @@ def _life(scene: Scene) -> None:
 
 
 def _killed_at(scene: Scene, operation: int) -> bool:
-    """Return whether a recorder was killed before this change of a file or folder."""
+    """Run a recorder in a child process; return whether it was killed before this change of a file or folder."""
     child = os.fork()
     if not child:
         done = count(1)
@@ -68,7 +68,7 @@ def _killed_at(scene: Scene, operation: int) -> bool:
 
 
 def _read_both_ways(bag: Path, target: Path) -> int:
-    """Return the number of messages on /chatter; it is the same as a bag and as MCAP."""
+    """Return the number of messages on /chatter, which is the same in the bag and as MCAP."""
     with Reader(bag) as reader:
         rows = [(one.topic, time, bytes(data)) for one, time, data in reader.messages()]
     target.write_bytes(b"".join(as_mcap(bag)).replace(b"ros1", b"ros2"))
@@ -82,7 +82,7 @@ def _read_both_ways(bag: Path, target: Path) -> int:
 
 @pytest.mark.parametrize("memory", ["same", "another"])
 def test_killed_at_each_file_operation(tmp_path: Path, memory: str) -> None:
-    """Each named recording is whole, removals are reported until they are noted, and nothing else is left."""
+    """Each named recording is complete, removals are reported until they are noted, and no other file remains."""
     removed, kept, chatter = set[int](), set[int](), dict[str, int]()
     for operation in count(1):
         folder = tmp_path / str(operation)
@@ -110,7 +110,7 @@ def test_killed_at_each_file_operation(tmp_path: Path, memory: str) -> None:
             place = scene.folder / found.id
             assert msgspec.json.decode((place / "recording.json").read_bytes(), type=Recording) == found
             assert hashlib.sha256((place / "recording.bag").read_bytes()).hexdigest() == found.sha256
-            if found.sha256 not in chatter:  # equal bytes are read alike
+            if found.sha256 not in chatter:  # equal bags are converted only once
                 chatter[found.sha256] = _read_both_ways(place / "recording.bag", folder / "a.mcap")
             assert sum(topic.messages for topic in found.topics) == chatter[found.sha256]
         kept.add(len(stated))

@@ -1,4 +1,4 @@
-"""MCAP: another library reads the file, with types, senders and their hosts, and times."""
+"""Another library reads the MCAP file, with types, senders, their hosts, and times."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from tests.unit.recorder.test_bag_writer import HEADER, SECOND, body
 def read(path: Path, bag: Path) -> tuple[list[tuple[str, str, int]], list[tuple[str, int, bytes]]]:
     """Return connections (topic, type, messages) and messages, as `rosbags` reads them.
 
-    The reader accepts files marked as ROS 2 only; all else is the same for both.
+    The reader accepts only files marked as ROS 2; everything else is the same for both.
     """
     path.write_bytes(b"".join(as_mcap(bag)).replace(b"ros1", b"ros2"))
     reader = McapReader(path)
@@ -31,7 +31,7 @@ def read(path: Path, bag: Path) -> tuple[list[tuple[str, str, int]], list[tuple[
 
 @pytest.mark.parametrize("size", [5, 600_000])
 def test_another_library_reads_it(tmp_path: Path, size: int) -> None:
-    """Messages of all chunks are in the order of time; two publishers of a topic are two channels."""
+    """Messages of all chunks are in time order; two publishers of a topic are two channels."""
     bag = BagWriter(tmp_path / "a.bag", {})
     first, second = bag.connect(HEADER), bag.connect(HEADER | {"callerid": "/other"})
     third = bag.connect(HEADER | {"topic": "/quiet", "type": "std_msgs/Empty", "message_definition": "\n"})
@@ -52,13 +52,13 @@ def test_another_library_reads_it(tmp_path: Path, size: int) -> None:
 
 
 def test_a_bag_without_messages_is_a_valid_file(tmp_path: Path) -> None:
-    """The file has no messages."""
+    """The converted file has no messages, and is valid."""
     BagWriter(tmp_path / "a.bag", {}).close()
     assert read(tmp_path / "a.mcap", tmp_path / "a.bag") == ([], [])
 
 
 def test_a_file_that_is_not_a_bag_is_an_error(tmp_path: Path) -> None:
-    """The error comes before the first byte."""
+    """The error is raised before the first byte is written."""
     (tmp_path / "a.bag").write_text("no bag")
     with pytest.raises(ValueError, match="not a bag"):
         next(as_mcap(tmp_path / "a.bag"))

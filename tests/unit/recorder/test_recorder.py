@@ -1,4 +1,4 @@
-"""The recorder on a real log and a real ring: how a recording begins, is extended, ends and is limited."""
+"""The recorder on a real log and a real ring: how recordings begin, grow, end and are limited."""
 
 import hashlib
 import json
@@ -31,7 +31,7 @@ TEXT = (5).to_bytes(4, "little") + b"hello"
 
 
 class Scene:
-    """A relay's ring, an audit log and the recorder, by a clock that the test sets."""
+    """A relay's ring, an audit log and the recorder, with a clock that the test sets."""
 
     def __init__(self, folder: Path, *, disk: int = 64 << 20, **rules: Any) -> None:
         self.clock = Clock(BEGAN)
@@ -89,7 +89,7 @@ class Scene:
         return [one.recording for one in answers if isinstance(one, messages.RecordingClosed)]
 
     def bag(self, recording: Recording) -> list[tuple[str, int, bytes]]:
-        """Return the messages of its bag."""
+        """Return the messages in the bag of a recording."""
         path = self.folder / recording.id / "recording.bag"
         assert hashlib.sha256(path.read_bytes()).hexdigest() == recording.sha256
         assert path.stat().st_size == recording.size
@@ -107,7 +107,7 @@ def scene(tmp_path: Path) -> Iterator[Scene]:
 
 
 def test_before_and_after(scene: Scene) -> None:
-    """The recording has the seconds before and after, the record as a message, and a description beside the bag."""
+    """The recording has the seconds before and after its record, the record as a message, and a description."""
     scene.later(20)
     scene.say(TEXT.replace(b"hello", b"alarm"))
     scene.later(1)
@@ -115,7 +115,7 @@ def test_before_and_after(scene: Scene) -> None:
     assert not scene.closed(scene.later(0.2))
     scene.say()
     assert not scene.closed(scene.later(4.9))
-    scene.say()  # after its end
+    scene.say()  # after the recording's end
     [recording] = scene.closed(scene.later(SETTLE_SECONDS + 0.1))
     assert recording == scene.closed(scene.later(0, messages.RecordingsAsked()))[0]
     happened = BEGAN + 21 * SECOND
@@ -138,7 +138,7 @@ def test_before_and_after(scene: Scene) -> None:
 
 
 def test_a_recording_of_the_memory_is_temporary(scene: Scene) -> None:
-    """It has the requested time as far as the memory goes back, for ten minutes or until the next recorder."""
+    """The recording has the requested time, as far as memory has it, for ten minutes or until the next recorder."""
     trigger = Trigger(BEGAN, "order", "r", "eve: of what is in memory")
 
     def asked(since: int, until: int) -> messages.Message:
@@ -185,7 +185,7 @@ def test_a_recording_of_the_memory_is_temporary(scene: Scene) -> None:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):
         patch.setattr(
             RecordingInProgress, "finish", lambda made, *_given: sys.exit(made.leave())
-        )  # it is killed
+        )  # the recorder is killed
         lent(0, scene.clock.now)
     assert there()
     scene.begin_anew()
@@ -194,7 +194,7 @@ def test_a_recording_of_the_memory_is_temporary(scene: Scene) -> None:
 
 
 def test_triggers_that_overlap_make_one_recording(scene: Scene) -> None:
-    """It grows to the maximum length; later triggers begin another."""
+    """The recording is extended to the maximum length; later triggers begin another."""
     scene.happen()
     scene.later(0.1)
     for _second in range(20):
@@ -212,7 +212,7 @@ def test_triggers_that_overlap_make_one_recording(scene: Scene) -> None:
 
 
 def test_a_flood_of_triggers_does_not_fill_the_disk(tmp_path: Path) -> None:
-    """A kind begins a limited number of recordings an hour, control gets one report, and orders still work."""
+    """Each kind begins a limited number of recordings an hour; control gets one report, and orders still work."""
     scene = Scene(tmp_path, per_hour=3)
     told: list[messages.Message] = []
     for _minute in range(10):
@@ -231,7 +231,7 @@ def test_a_flood_of_triggers_does_not_fill_the_disk(tmp_path: Path) -> None:
 
 
 def planned(scene: Scene, recording_id: str, charged_to: str) -> str:
-    """Write a record for which control has planned a recording."""
+    """Write a record for which control planned a recording."""
     return scene.happen(detail={"recording": recording_id, "charged_to": charged_to})
 
 
@@ -251,7 +251,7 @@ def test_a_planned_recording_is_made(scene: Scene) -> None:
 
 
 def test_a_guest_does_not_change_the_robots_recording(scene: Scene) -> None:
-    """Each has its own recording at the same time, also over a restart of the recorder."""
+    """Robot and guest have separate recordings at the same time, also over a restart of the recorder."""
     planned(scene, "a" * 20, "10.0.0.9")
     scene.later(1)
     planned(scene, "b" * 20, "robot")
@@ -281,7 +281,7 @@ def test_a_recording_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch
 
 
 def test_a_flood_of_service_calls_does_not_fill_the_disk(tmp_path: Path) -> None:
-    """Calls have an hourly limit as triggers have: each is answered; control gets one report of the limit."""
+    """Service calls have an hourly limit, as triggers do: each call is answered, and control gets one report."""
     scene = Scene(tmp_path, per_hour=2)
     told: list[messages.Message] = []
     for number in range(6):
@@ -298,7 +298,7 @@ def test_a_flood_of_service_calls_does_not_fill_the_disk(tmp_path: Path) -> None
 
 
 def test_a_recording_has_at_most_an_eighth_of_the_disk(tmp_path: Path) -> None:
-    """Messages beyond it are counted, and the recording has the reason of its end."""
+    """Messages beyond an eighth of the disk are counted, and the recording says why it ended."""
     scene = Scene(tmp_path, disk=8 * 100_000)
     scene.happen()
     for _message in range(12):
@@ -313,7 +313,7 @@ def test_a_recording_has_at_most_an_eighth_of_the_disk(tmp_path: Path) -> None:
 
 
 def test_excluded_topics_are_listed_with_the_reason(scene: Scene) -> None:
-    """A recording without a topic that claims a type of `never` is not complete; one that names the topic is."""
+    """The configuration may exclude a topic; one that only claims an excluded type makes a recording incomplete."""
     named = scene.writer.open("/camera", "10.0.0.1", HEADER | {LEFT_OUT: NAMED})
     assert named is not None
     ExcludedStream(named).write(memoryview(frame(TEXT)), 1, 1)
@@ -351,7 +351,7 @@ def test_messages_that_had_left_the_memory_are_reported(scene: Scene) -> None:
 
 
 def test_the_next_recorder_continues_after_a_crash(scene: Scene) -> None:
-    """The recording keeps its name, and has each message and the trigger once."""
+    """The recording keeps its name, and has each message once and the trigger once."""
     scene.happen()
     scene.later(0.1)
     [part] = scene.folder.iterdir()
@@ -369,7 +369,7 @@ def test_the_next_recorder_continues_after_a_crash(scene: Scene) -> None:
 
 
 def test_a_restart_of_the_appliance_ends_a_recording(scene: Scene) -> None:
-    """The memory is new: the written part is kept, marked as incomplete; an empty part is removed."""
+    """The memory is new, so the written part is kept and marked as incomplete; an empty part is removed."""
     scene.happen()
     scene.later(0.1)
     (scene.folder / f".{'a' * 20}.part").mkdir()
@@ -382,7 +382,7 @@ def test_a_restart_of_the_appliance_ends_a_recording(scene: Scene) -> None:
 
 
 def test_a_late_recorder_handles_earlier_triggers(scene: Scene) -> None:
-    """It handles triggers within the time of the memory; one with a recording begins no other."""
+    """A new recorder handles triggers that its memory still covers; a trigger with a recording begins no second one."""
     scene.happen()
     scene.clock.now += 3 * SECOND
     scene.begin_anew()
@@ -395,7 +395,7 @@ def test_a_late_recorder_handles_earlier_triggers(scene: Scene) -> None:
 
 
 def test_a_recording_is_reported_until_it_is_noted(scene: Scene) -> None:
-    """It is removed by order; removing an unknown one is refused."""
+    """A recording can be removed by order; an order for an unknown recording is refused."""
     scene.happen()
     scene.later(0.1)
     [recording] = scene.closed(scene.later(6))
@@ -411,7 +411,7 @@ def test_a_recording_is_reported_until_it_is_noted(scene: Scene) -> None:
 
 
 def test_revisions_are_the_last_that_control_sent(scene: Scene) -> None:
-    """They are read when a recording begins and ends."""
+    """The revisions are read when a recording begins and when it ends."""
     scene.happen()
     assert messages.RevisionsWanted() in scene.later(0.1)
     scene.later(0, messages.RevisionsStated(4, 2))
@@ -420,7 +420,7 @@ def test_revisions_are_the_last_that_control_sent(scene: Scene) -> None:
 
 
 def test_a_header_that_is_not_text_is_recorded(scene: Scene) -> None:
-    """A definition's comments may be in Latin-1, and a field anything: the bag can be read all the same."""
+    """Comments in Latin-1 in a definition, and any bytes in a field, still give a readable bag."""
     hostile = {"message_definition": "# caf\udce9\nstring data\n", "latching": "x", "type": "t" * 10_000}
     scene.stream = scene.writer.open("/cafe", "10.0.0.2", HEADER | hostile)
     scene.said = 0
@@ -440,7 +440,7 @@ def test_a_header_that_is_not_text_is_recorded(scene: Scene) -> None:
 def test_a_recorder_killed_after_the_last_write_loses_nothing(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All but the recording's name is on disk: the next start of the appliance, with a new memory, names it."""
+    """Only the final name is missing: the appliance's next start, with a new memory, names the recording."""
     scene.happen()
     scene.later(0.1)
 
@@ -460,7 +460,7 @@ def test_a_recorder_killed_after_the_last_write_loses_nothing(
 
 
 def test_a_clock_that_is_set_back_ends_one_recording_only(scene: Scene) -> None:
-    """The clock goes back an hour, to before the memory was made: the recording ends, the next one is normal."""
+    """The clock goes back an hour, to before the memory was made: the recording ends, and the next one is normal."""
     scene.happen()
     scene.later(0.1)
     scene.clock.now -= 100 * SECOND
@@ -476,7 +476,7 @@ def test_a_clock_that_is_set_back_ends_one_recording_only(scene: Scene) -> None:
 
 
 def test_the_number_of_headers_is_bounded(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Messages beyond it are missing, and the recording says so; others are in it."""
+    """Messages whose headers exceed the limit are missing, and the recording says so; other messages are in it."""
     monkeypatch.setattr("appliance.recorder.recording._MOST_HEADERS", 20_000)
     scene.happen()
     scene.later(0.1)

@@ -1,4 +1,4 @@
-"""The plan: the recording of each event, its host, and the reason where there is none."""
+"""The plan gives each event its recording and its host, or the reason for having no recording."""
 
 from collections.abc import Callable
 from itertools import count
@@ -41,7 +41,7 @@ def dropped() -> Callable[..., dict[str, str]]:
 
 
 def test_each_host_has_its_own_hour_of_each_kind() -> None:
-    """This holds over a restart of the process: saved recordings count."""
+    """The hourly limit is per host and kind, also over a restart: saved recordings count."""
     limit = HourlyLimit(2, [recording(1, "drop", charged_to=GUEST)])
     now = 10 * SECOND
 
@@ -56,7 +56,7 @@ def test_each_host_has_its_own_hour_of_each_kind() -> None:
 
 
 def test_a_guests_flood_leaves_the_robot_its_recording(dropped: Callable[..., dict[str, str]]) -> None:
-    """A guest's drops use up its own hour, and each record says so; the robot's incident has a recording."""
+    """A guest's drops use up only the guest's hourly limit, and each record says so; the robot gets its recording."""
     plan = made(longest=80)
     said = [dropped(plan, GUEST, NOW + number * 20 * SECOND) for number in range(100)]
     recordings = {row["recording"] for row in said if "recording" in row}
@@ -69,21 +69,21 @@ def test_a_guests_flood_leaves_the_robot_its_recording(dropped: Callable[..., di
 
 
 def test_unknown_hosts_are_one(dropped: Callable[..., dict[str, str]]) -> None:
-    """Two hundred addresses get what one of them gets."""
+    """Two hundred unknown addresses get as many recordings as one of them."""
     plan = made(longest=80)
     said = [dropped(plan, f"10.9.0.{number}", NOW + number * 15 * SECOND) for number in range(200)]
     assert len({row["recording"] for row in said if "recording" in row}) == 6
 
 
 def test_a_monitor_that_keeps_dropping_prolongs_one_recording(dropped: Callable[..., dict[str, str]]) -> None:
-    """A drop each half minute for a quarter of an hour: the second recording continues the first."""
+    """With a drop each half minute for a quarter of an hour, the second recording continues the first."""
     plan = made(longest=3600)
     said = [dropped(plan, GUEST, NOW + number * 30 * SECOND)["recording"] for number in range(30)]
     assert [said.count(name) for name in dict.fromkeys(said)] == [1, 29]
 
 
 def test_recordings_of_a_host_do_not_overlap() -> None:
-    """A recording whose memory overlaps the last one begins at its end."""
+    """A recording whose memory would overlap the previous one begins at the previous one's end."""
     rules = RecorderRules(before=60, after=10, longest=600)
     first = span(rules, NOW, 0)
     assert (first.began, first.ends) == (NOW - 60 * SECOND, NOW + 10 * SECOND)
@@ -97,7 +97,7 @@ def test_recordings_of_a_host_do_not_overlap() -> None:
 
 
 def test_a_recording_is_prolonged_to_the_maximum(dropped: Callable[..., dict[str, str]]) -> None:
-    """Then another begins, within the hourly limit."""
+    """After the maximum another recording begins, within the hourly limit."""
     plan = made(longest=100)
     said = [dropped(plan, GUEST, NOW + number * 5 * SECOND) for number in range(21)]
     assert said[0] == said[8] != said[9]
@@ -107,7 +107,7 @@ def test_a_recording_is_prolonged_to_the_maximum(dropped: Callable[..., dict[str
 def test_hosts_together_have_two_open_recordings_and_the_robot_its_own(
     dropped: Callable[..., dict[str, str]],
 ) -> None:
-    """A third guest gets the reason."""
+    """A third guest gets no recording but the reason; the robot still gets one."""
     plan = made()
     assert "recording" in dropped(plan, GUEST, NOW)
     assert "recording" in dropped(plan, "10.0.0.8", NOW)
@@ -117,7 +117,7 @@ def test_hosts_together_have_two_open_recordings_and_the_robot_its_own(
 
 
 def test_a_record_without_a_recording_has_the_reason(dropped: Callable[..., dict[str, str]]) -> None:
-    """The recorder is off, or the last recording could not be made."""
+    """The reason says that the recorder is off, or that the last recording could not be made."""
     assert "is off" in dropped(made(enabled=False), GUEST, NOW)["not_recorded"]
     plan = made()
     found = dropped(plan, GUEST, NOW)["recording"]
@@ -131,7 +131,7 @@ def test_a_record_without_a_recording_has_the_reason(dropped: Callable[..., dict
 def test_recordings_of_an_order_are_prolonged_and_closed_ones_are_not(
     dropped: Callable[..., dict[str, str]],
 ) -> None:
-    """Control knows the recordings that began for a node's call, and those that are over."""
+    """Control knows which recordings began with a node's call, and which are closed."""
     plan = made()
     plan.opened(ROBOT, "asked", NOW - 60 * SECOND, NOW + 10 * SECOND)
     assert dropped(plan, "127.0.0.1", NOW)["recording"] == "asked"

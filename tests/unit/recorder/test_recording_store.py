@@ -1,4 +1,4 @@
-"""The store: whole recordings only; hosts and kinds with the most bytes make room."""
+"""The store has complete recordings only; the hosts and kinds with the most bytes make room."""
 
 import time
 from pathlib import Path
@@ -54,7 +54,7 @@ def cleared(store: RecordingStore, now: int = 0, *, room: bool = False) -> list[
 
 
 def room_for(store: RecordingStore, charged_to: str) -> tuple[list[tuple[Recording, str]], str]:
-    """Return the recordings that make room for this host, and the reason if there is still no room."""
+    """Return the recordings that are removed for this host, and the reason if there is still not enough room."""
     gone: list[tuple[Recording, str]] = []
     while True:
         kept, why = store.in_the_way(charged_to)
@@ -65,7 +65,7 @@ def room_for(store: RecordingStore, charged_to: str) -> tuple[list[tuple[Recordi
 
 
 def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
-    """The next recorder finds them in the order of time; an unfinished one is a part, a damaged one is ignored."""
+    """The next recorder finds saved recordings in time order; unfinished ones are parts, damaged ones are ignored."""
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     second, first = put(store, recording(2)), put(store, recording(1))
     store.part("f" * 20).mkdir()
@@ -86,7 +86,7 @@ def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
 
 
 def test_a_noted_recording_is_reported_once(tmp_path: Path) -> None:
-    """Until it is noted, a recording is reported again."""
+    """A recording is reported again until control has noted it."""
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     first, second = put(store, recording(1)), put(store, recording(2))
     store.note(first.id)
@@ -122,7 +122,7 @@ def test_a_guest_makes_room_from_its_own_recordings(tmp_path: Path) -> None:
 
 
 def test_no_guest_displaces_a_recording_of_the_robot(tmp_path: Path) -> None:
-    """Ten guests take the free space and then each other's; the robot gets half of the disk back from them."""
+    """Ten guests take the free space and then each other's; for the robot, half of the disk is cleared again."""
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
 
     def arrive(number: int, charged_to: str) -> str:
@@ -144,7 +144,7 @@ def test_no_guest_displaces_a_recording_of_the_robot(tmp_path: Path) -> None:
 
 
 def test_a_guest_has_no_recording_if_the_robot_uses_all(tmp_path: Path) -> None:
-    """The reason is reported."""
+    """The reason for the missing recording is reported."""
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     for number in range(8):
         put(store, recording(number, size=8 * MIB, charged_to=ROBOT))
@@ -164,7 +164,7 @@ def test_descriptions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_old_recordings_are_removed(tmp_path: Path) -> None:
-    """A recording is removed after the configured time since it was saved, by the age clock."""
+    """A recording is removed when the configured time since its saving has passed, by the age clock."""
     age = 1000 * SECOND
 
     def make() -> RecordingStore:
@@ -181,7 +181,7 @@ def test_old_recordings_are_removed(tmp_path: Path) -> None:
 
 
 def test_a_recording_of_an_earlier_version_ages_from_its_end(tmp_path: Path) -> None:
-    """Its file with the time of saving is missing, or empty after a power cut."""
+    """The file with its time of saving is missing, or empty after a power cut."""
     age = 0
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
     (tmp_path / put(store, recording(1)).id / "since").unlink()

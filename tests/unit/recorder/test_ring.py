@@ -1,4 +1,4 @@
-"""The ring: messages are read back, also after the writer is killed, and a flood displaces only itself."""
+"""The ring: messages can be read even after the writer was killed, and a flood displaces only its own messages."""
 
 import mmap
 import os
@@ -31,7 +31,7 @@ def frame(body: bytes) -> bytes:
 
 
 class Clock:
-    """Return the nanoseconds that a test sets."""
+    """A clock with nanoseconds that a test sets."""
 
     def __init__(self, now: int = 1) -> None:
         self.now = now
@@ -42,12 +42,12 @@ class Clock:
 
 
 def ring(memory: memoryview, clock: Clock | None = None) -> RingWriter:
-    """Return a writer that first drops messages older than a microsecond."""
+    """Return a writer that drops messages older than a microsecond first."""
     return RingWriter(memory, topic_share=0.25, host_share=0.5, seconds=1e-6, clock=clock or Clock())
 
 
 def opened(writer: RingWriter, topic: str = "/a", host: str = "10.0.0.1", **header: str) -> RingStream:
-    """Open a stream, for which there is room."""
+    """Open a stream, and check that there was room for it."""
     stream = writer.open(topic, host, HEADER | header)
     assert stream is not None
     return stream
@@ -86,7 +86,7 @@ def test_read_as_written(memory: memoryview) -> None:
 
 
 def test_records_across_blocks(memory: memoryview) -> None:
-    """Records of every size around that of a block are read unchanged, at once and in pieces."""
+    """Records of every size around the size of a block are read unchanged, at once and in pieces."""
     block = geometry(SMALLEST).block
     bodies = [
         bytes([size % 251]) * size for size in (*range(block - 80, block + 9), 3 * block, 0, 5 * block + 1)
@@ -113,7 +113,7 @@ def test_only_the_requested_time_is_read(memory: memoryview) -> None:
 
 
 def test_later_messages_are_for_the_next_call(memory: memoryview) -> None:
-    """A call for the time until now loses no message that arrives while it reads."""
+    """A call that reads until now loses no message that arrives during the call."""
     clock = Clock(10)
     writer = ring(memory, clock)
     stream = opened(writer)
@@ -127,7 +127,7 @@ def test_later_messages_are_for_the_next_call(memory: memoryview) -> None:
 
 
 def test_table_that_changes_while_it_is_copied(memory: memoryview, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A block's row may be older than that of the block after it: nothing between them is lost."""
+    """A block's row may be older than the next block's row: no message between them is lost."""
     writer = ring(memory)
     stream = opened(writer)
     for number in range(1, 4):
@@ -147,7 +147,7 @@ def test_table_that_changes_while_it_is_copied(memory: memoryview, monkeypatch: 
 
 
 def test_a_flood_displaces_only_itself(memory: memoryview) -> None:
-    """A topic that writes a hundred rings full takes nothing from a quiet one, nor from a busy one within its quota."""
+    """A flooding topic that writes a hundred rings full displaces neither a quiet topic nor one within its quota."""
     writer = ring(memory)
     quiet, busy, flood = (
         opened(writer, "/quiet"),
@@ -171,7 +171,7 @@ def test_a_flood_displaces_only_itself(memory: memoryview) -> None:
 
 
 def test_many_topics_of_a_host_displace_only_its_own(memory: memoryview) -> None:
-    """A host with many topics within their quotas keeps its part of the ring; other hosts' messages stay."""
+    """A host whose many topics keep their quotas has a limited part of the ring; other hosts' messages stay."""
     writer = ring(memory)
     quiet = opened(writer, "/quiet")
     quiet.write(memoryview(frame(b"here")), 1, 1)
@@ -191,7 +191,7 @@ def test_a_single_topic_may_fill_the_ring(memory: memoryview) -> None:
 
 
 def test_large_messages_after_a_partly_displaced_one(memory: memoryview) -> None:
-    """All whole messages of many blocks are read after the beginning of the oldest is gone."""
+    """All whole messages of many blocks are read after the start of the oldest message is gone."""
     stream = opened(ring(memory))
     for number in range(1, 41):
         stream.write(memoryview(frame(bytes([number]) * 150_000)), 1, number)
@@ -215,7 +215,7 @@ def test_a_record_beyond_the_quota_is_counted(memory: memoryview) -> None:
 
 
 def test_headers_of_a_host_are_bounded(memory: memoryview) -> None:
-    """A host that opens stream after stream is refused at its part, counted, and leaves room for another host's."""
+    """A host that opens stream after stream is refused at its limit and counted; another host still finds room."""
     writer = ring(memory)
     assert None in [writer.open(f"/t{index}", "10.0.0.2", HEADER) for index in range(1000)]
     assert RingReader(memory).not_there[1] > 0
@@ -223,7 +223,7 @@ def test_headers_of_a_host_are_bounded(memory: memoryview) -> None:
 
 
 def test_headers_end_with_their_streams(memory: memoryview) -> None:
-    """Closed and displaced streams leave nothing: a thousand in succession find room."""
+    """Closed and displaced streams free their headers: a thousand streams in succession find room."""
     writer = ring(memory)
     for number in range(1000):
         stream = opened(writer, f"/t{number}")
@@ -247,7 +247,7 @@ def test_the_next_writer_continues(memory: memoryview) -> None:
 
 
 def test_old_messages_are_dropped_first(memory: memoryview) -> None:
-    """The old burst of a topic makes room for others; a quiet topic keeps all its messages."""
+    """A topic's old burst makes room for others; a quiet topic keeps all its messages."""
     clock = Clock()
     writer = ring(memory, clock)
     burst, seldom, flood = opened(writer, "/burst"), opened(writer, "/seldom"), opened(writer, "/flood")
@@ -264,7 +264,7 @@ def test_old_messages_are_dropped_first(memory: memoryview) -> None:
 
 
 def test_a_stream_that_lost_its_block_begins_another(memory: memoryview) -> None:
-    """A silent stream loses its open block, and does not write into a block of another stream."""
+    """A silent stream that lost its open block never writes into a block of another stream."""
     clock = Clock()
     writer = ring(memory, clock)
     silent, flood = opened(writer, "/silent"), opened(writer, "/flood")
@@ -296,7 +296,7 @@ _WRITER = textwrap.dedent("""
 
 
 def test_killed_at_random(tmp_path: Path) -> None:
-    """A writer that is killed at any moment, thirty times on the same memory, leaves whole messages without a gap."""
+    """A writer killed thirty times at random on the same memory leaves whole messages without a gap."""
     chance = random.Random(7)  # noqa: S311 - to find the same again
     descriptor = os.memfd_create("ring")
     os.ftruncate(descriptor, SMALLEST)
@@ -318,7 +318,7 @@ def test_killed_at_random(tmp_path: Path) -> None:
         words, wanted = words_of(memory), chance.randrange(1, 600)
         newest = max(words[birth_at(block)] for block, _row in rows(memory))
         while max(row.birth for _block, row in rows(memory)) < newest + wanted:
-            # The kill comes at a random time after this number of blocks.
+            # The kill comes at a random time after `wanted` blocks.
             assert os.waitpid(pid, os.WNOHANG) == (0, 0), "the writer has ended by itself"
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)

@@ -1,4 +1,4 @@
-"""The time line of a recording, and messages around a point in time, read from a bag of the recorder."""
+"""A recording's time line, and its messages around a point in time, read from one of the recorder's bags."""
 
 import json
 from pathlib import Path
@@ -54,7 +54,7 @@ def bag(tmp_path: Path) -> Path:
 
 
 def test_flows_and_events_are_in_their_columns(bag: Path) -> None:
-    """Both publishers count together, taps are not events, and a part of the time has its own columns."""
+    """Both publishers count together, taps are not events, and a part of the time span has its own columns."""
     found = timeline(RECORDING, bag, columns=10)
     [flow] = found.topics
     assert (flow.topic, flow.counts) == ("/chatter", [20] * 8 + [0, 0])
@@ -71,7 +71,7 @@ def test_flows_and_events_are_in_their_columns(bag: Path) -> None:
 
 
 def test_the_columns_equal_a_naive_count(bag: Path) -> None:
-    """For any number of columns nothing is counted twice, or lost at an edge."""
+    """For any number of columns, no message is counted twice or lost at an edge."""
     with BagReader.of(bag) as reader:
         times = [place.time for place, number in reader.messages({0, 1})]
     assert times == sorted(times)
@@ -87,7 +87,7 @@ def test_the_columns_equal_a_naive_count(bag: Path) -> None:
 
 
 def test_messages_around_a_moment_are_read(bag: Path) -> None:
-    """They are in the order of time over all publishers, with their senders; each page continues the last."""
+    """The messages of all publishers are in time order, with their senders; each page continues the last."""
     found = messages_around(RECORDING, bag, BEGAN + 2 * SECOND, neighbours=2)
     assert [(one.time - BEGAN, one.sender.node, one.fields["data"]) for one in found.messages] == [
         (1_900_000_000, "/talker", "0.19"),
@@ -109,7 +109,7 @@ def test_messages_around_a_moment_are_read(bag: Path) -> None:
 
 
 def test_pages_of_one_moment_end(tmp_path: Path) -> None:
-    """Messages of the same time also have an order: the pages show each of them once."""
+    """Messages of the same time also have an order, so the pages have each of them once."""
     writer = BagWriter(tmp_path / "a.bag", {})
     number = writer.connect(HEADER)
     writer.write(BagMessage(number, BEGAN, body(b"%d" % step)) for step in range(9))
@@ -129,14 +129,14 @@ def test_pages_of_one_moment_end(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["2026-02-30", "10000-01-01", "2026-03-01", "", "1795155949800000000-4109"])
 def test_an_impossible_date_is_refused(text: str) -> None:
-    """It is refused as a time instead of showing the beginning."""
+    """An invalid position is rejected instead of showing the beginning."""
     assert MessagePosition.parsed(text) is None
     place = MessagePosition(1795155949800000000, 4109, 2210)
     assert MessagePosition.parsed(str(place)) == place
 
 
 def test_publishers_cannot_forge_events(tmp_path: Path) -> None:
-    """A node's message on the recorder's own topic is a message like any other."""
+    """A node's message on the recorder's own topic counts as a message, not as an event."""
     writer = BagWriter(tmp_path / "a.bag", {})
     forger = writer.connect(RECORDS | {"host": "10.0.0.66"})
     writer.write([BagMessage(forger, BEGAN, record(1, event="message dropped", severity="alarm"))])
@@ -148,7 +148,7 @@ def test_publishers_cannot_forge_events(tmp_path: Path) -> None:
 
 
 def test_a_flood_of_events_is_counted(tmp_path: Path) -> None:
-    """The first are listed, all are in the columns."""
+    """Only the first events are listed, but the columns count all of them."""
     writer = BagWriter(tmp_path / "a.bag", {})
     decided = writer.connect(RECORDS)
     writer.write(

@@ -1,4 +1,4 @@
-"""Audit records that are triggers."""
+"""Audit records that trigger recordings."""
 
 from typing import get_args, get_type_hints
 
@@ -26,7 +26,7 @@ KINDS: tuple[TriggerKind, ...] = get_args(TriggerKind)
     ],
 )
 def test_records_are_triggers_of_the_kind_that_is_wanted(record: AuditRecord, what: str | None) -> None:
-    """A record has one kind; an alarm that is also another kind counts as that."""
+    """A record has one kind; an alarm that also has another kind counts as the other kind."""
     trigger = trigger_of(record, KINDS)
     assert (trigger and trigger.what) == what
     if trigger is not None:
@@ -36,7 +36,7 @@ def test_records_are_triggers_of_the_kind_that_is_wanted(record: AuditRecord, wh
 
 
 def test_a_trigger_has_no_content_of_messages() -> None:
-    """A list of recordings shows no messages, so the slice of a verdict is in the audit record only."""
+    """Lists of recordings contain no message content, so the slice of a verdict is only in the audit record."""
     detail = {"monitor": "goals", "category": "twice", "binding": {"id": "secret"}}
     reason = "property 1 of goals (fsm) with id = secret: twice"
     trigger = trigger_of(
@@ -47,6 +47,6 @@ def test_a_trigger_has_no_content_of_messages() -> None:
 
 
 def test_all_kinds_but_orders_can_be_configured() -> None:
-    """The words of the configuration are those of the recordings."""
+    """The configuration uses the same words for kinds as the recordings."""
     configurable = get_args(get_args(get_type_hints(RecorderRules)["triggers"])[0])
     assert set(configurable) == set(KINDS) - {"order"}

@@ -1,4 +1,4 @@
-"""Messages encoded by Debian's ROS: the oracle of the tests of definitions and layouts."""
+"""Messages encoded by Debian's ROS, as the reference for the tests of definitions and layouts."""
 
 import json
 import subprocess
@@ -18,7 +18,7 @@ PACKAGES = (
 
 @pytest.fixture(scope="session")
 def genpy_types() -> dict[str, dict[str, Any]]:
-    """Every installed message and service class: md5sum, full text, a serialised example and its values."""
+    """Return every installed message and service class: md5sum, full text, a serialised example and its values."""
     script = Path(__file__).with_name("genpy_messages.py")
     ran = subprocess.run(["/usr/bin/python3", str(script), *PACKAGES], check=True, capture_output=True)
     types: dict[str, dict[str, Any]] = json.loads(ran.stdout)
@@ -28,5 +28,5 @@ def genpy_types() -> dict[str, dict[str, Any]]:
 
 @pytest.fixture(scope="session")
 def standard() -> Definitions:
-    """ROS's own definitions."""
+    """Return ROS's own definitions."""
     return standard_definitions()

@@ -1,4 +1,4 @@
-"""Run by Debian's Python: resolves names as rosmaster does, one JSON request and answer per line."""
+"""Resolve names as rosmaster does, one JSON request and answer a line; Debian's Python runs this file."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Tables of texts for tests: `tables.txt` has a row in each line, its columns between ` => `, with Python's escapes."""
+"""Tables for tests: each line of `tables.txt` is a row, with columns between ` => ` and Python's escapes."""
 
 from pathlib import Path
 

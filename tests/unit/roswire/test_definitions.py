@@ -1,4 +1,4 @@
-"""Definitions: md5sums and full texts are those of ROS; what cannot be used is refused with the reason."""
+"""Definitions: md5sums and full texts equal those of ROS; an unusable definition is refused with the reason."""
 
 from typing import Any
 
@@ -21,14 +21,14 @@ def test_md5sums_of_full_texts_are_those_of_genpy(genpy_types: Types) -> None:
 
 
 def test_full_texts_come_back_as_they_were(genpy_types: Types) -> None:
-    """The full text that is made of definitions is byte for byte what ROS's generators write."""
+    """The full text that is built from definitions equals the output of ROS's generators, byte for byte."""
     for name, entry in genpy_types.items():
         if entry["kind"] == "msg":
             assert Definitions.from_full_text(name, entry["text"]).full_text(name) == entry["text"], name
 
 
 def test_files_are_found_by_both_forms_of_their_names() -> None:
-    """pkg/T.msg and pkg/msg/T.msg are the same type, likewise services."""
+    """pkg/T.msg and pkg/msg/T.msg are the same type; the same holds for services."""
     files = {"a/B.msg": "C c\n", "a/msg/C.msg": "int32 x\n", "a/D.srv": "B b\n---\n", "a/srv/E.srv": "---\n"}
     definitions = Definitions.from_files(files)
     assert definitions.message_types == [
@@ -49,7 +49,7 @@ def test_files_are_found_by_both_forms_of_their_names() -> None:
     "file", ["B.msg", "a/srv/B.msg", "a/b/B.msg", "a/B.txt", "../a/B.msg", "a/B.msg\n", "/a/B.msg", ""]
 )
 def test_other_file_names_are_refused(file: str) -> None:
-    """A file name says package and type, or is refused with the forms that do."""
+    """A file name without package and type is refused, and the error shows the valid forms."""
     with pytest.raises(DefinitionError, match=r"write pkg/T\.msg"):
         Definitions.from_files({file: ""})
 
@@ -65,7 +65,7 @@ def test_a_type_has_one_definition() -> None:
 
 
 def test_extending_lets_the_new_types_win(standard: Definitions) -> None:
-    """An operator's own version of a standard type counts, also inside other types."""
+    """An operator's own version of a standard type is used, also inside other types."""
     own = Definitions.from_files({"geometry_msgs/Point.msg": "float32 x\n"})
     both = standard.extended(own)
     assert both.md5sum("geometry_msgs/Point") == own.md5sum("geometry_msgs/Point")
@@ -75,7 +75,7 @@ def test_extending_lets_the_new_types_win(standard: Definitions) -> None:
 
 
 def test_unknown_types_are_named_with_similar_ones(standard: Definitions) -> None:
-    """A type that is not there is an error that helps."""
+    """The error for an unknown type suggests similar types."""
     with pytest.raises(
         DefinitionError, match=r"std_msgs/Strin: no such message type; did you mean .*std_msgs/String"
     ):
@@ -87,7 +87,7 @@ def test_unknown_types_are_named_with_similar_ones(standard: Definitions) -> Non
 
 
 def test_types_that_contain_themselves_are_refused() -> None:
-    """A circle of types is refused and named, whatever is asked of them, and the others still work."""
+    """A cycle of types is refused and named by every query, and the other types still work."""
     definitions = Definitions.from_files({"a/B.msg": "C[] c", "a/C.msg": "B[] b", "a/D.msg": "int8 x"})
     for ask in (definitions.md5sum, definitions.layout, definitions.full_text):
         with pytest.raises(DefinitionError, match="a/B contains a/C contains a/B"):
@@ -96,7 +96,7 @@ def test_types_that_contain_themselves_are_refused() -> None:
 
 
 def test_nesting_is_bounded() -> None:
-    """Types nested deeper than any robot's are refused, at the bound they are not."""
+    """Types nested deeper than any robot's are refused; types at the limit are not."""
     files = {f"a/T{level}.msg": f"T{level + 1} x" for level in range(64)} | {"a/T64.msg": "int8 x"}
     definitions = Definitions.from_files(files)
     with pytest.raises(DefinitionError, match="deeper than 64"):
@@ -106,7 +106,7 @@ def test_nesting_is_bounded() -> None:
 
 
 def test_layouts_do_not_explode() -> None:
-    """Definitions whose flattened form is exponentially large or beyond any message are refused at once."""
+    """Definitions whose flattened form is exponentially large, or larger than any message, are refused at once."""
     files = {f"a/T{level}.msg": f"T{level + 1} x\nT{level + 1} y" for level in range(40)} | {
         "a/T40.msg": "int8 x"
     }
@@ -131,7 +131,7 @@ def test_layouts_do_not_explode() -> None:
     ).map("".join)
 )
 def test_any_full_text_is_used_or_refused(text: str) -> None:
-    """No text of an unknown host's connection header raises anything but DefinitionError."""
+    """Text from an unknown host's connection header never raises anything but DefinitionError."""
     try:
         definitions = Definitions.from_full_text("a/B", text)
         assert len(definitions.md5sum("a/B")) == 32

@@ -1,4 +1,4 @@
-"""Layouts: every field is found where genpy put it."""
+"""Layouts: every field is found at the position where genpy wrote it."""
 
 import struct
 from itertools import pairwise
@@ -12,7 +12,7 @@ Values = dict[str, Any]
 
 
 def read(layout: MessageLayout, data: bytes, position: int) -> tuple[Values, int]:
-    """Read a whole message by its layout alone: values by path, and where it ends."""
+    """Read a whole message by its layout alone; return the values by path, and the end position."""
     values: Values = {}
     for part in layout.parts:
         match part:
@@ -71,7 +71,7 @@ def primitive(type_name: str, data: bytes, position: int) -> Any:
 
 
 def nested(values: Values) -> Values:
-    """Turn values by path into values by name, as genpy has them."""
+    """Convert values by path into values by name, in genpy's structure."""
     result: Values = {}
     for path, value in values.items():
         *outer, last = path.split(".")
@@ -96,7 +96,7 @@ def without_empty(value: Any) -> Any:
 
 
 def test_messages_of_genpy_are_read_by_their_layout(genpy_types: dict[str, dict[str, Any]]) -> None:
-    """For every installed message a serialised example is read whole and equal, to its last byte."""
+    """For every installed message, a serialised example is read completely, and its values are equal."""
     read_types = 0
     for name, entry in genpy_types.items():
         if entry["kind"] != "msg":
@@ -113,7 +113,7 @@ def test_messages_of_genpy_are_read_by_their_layout(genpy_types: dict[str, dict[
 
 
 def test_fixed_parts_are_never_neighbours(standard: Definitions) -> None:
-    """Whatever precedes the first variable part is one part, and leaves fill their part without a gap."""
+    """All bytes before the first variable part are one part, and leaves fill their part without a gap."""
     for name in standard.message_types:
         parts = standard.layout(name).parts
         for part, following in pairwise(parts):
@@ -125,7 +125,7 @@ def test_fixed_parts_are_never_neighbours(standard: Definitions) -> None:
 
 
 def test_places_find_fields_by_path(standard: Definitions) -> None:
-    """A path leads to the part and the leaf, string or array of a field; others lead nowhere."""
+    """A path leads to a field's part and its leaf, string or array; an unknown path has no result."""
     places = standard.layout("geometry_msgs/PoseWithCovarianceStamped").places
     assert places["header.frame_id"] == FieldLocation(1, StringPart("header.frame_id"))
     assert places["pose.pose.orientation.w"] == FieldLocation(
@@ -143,7 +143,7 @@ def test_places_find_fields_by_path(standard: Definitions) -> None:
 
 
 def test_arrays_of_every_kind() -> None:
-    """Fixed arrays of fixed elements are leaves; all others are parts of their own."""
+    """Fixed arrays of fixed elements are leaves; all other arrays are separate parts."""
     definitions = Definitions.from_files(
         {
             "a/A.msg": "B[2] b\nint16[3] i\nstring[2] s\nC[2] c\nuint8[] d\nB[] e\ntime[] t",

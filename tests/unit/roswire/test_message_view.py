@@ -1,4 +1,4 @@
-"""Messages as fields and values, for people."""
+"""Messages as fields and values, shown to people."""
 
 import struct
 
@@ -24,7 +24,7 @@ LONG = Definitions.from_files(
 
 
 def inner(x: float, name: str) -> bytes:
-    """The bytes of an a/Inner."""
+    """Return the bytes of an a/Inner."""
     return struct.pack("<dI", x, len(name)) + name.encode()
 
 
@@ -34,7 +34,7 @@ OUTER = (
 
 
 def test_fields_are_read_by_their_names() -> None:
-    """Times in seconds, bytes as hexadecimal digits."""
+    """Times are in seconds, and bytes are hexadecimal digits."""
     assert read_fields(DEFINITIONS, "a/Outer", OUTER) == {
         "stamp": 5.25,
         "parts": [{"x": 1.5, "name": "one"}, {"x": 2.5, "name": "two"}],
@@ -44,7 +44,7 @@ def test_fields_are_read_by_their_names() -> None:
 
 
 def test_a_truncated_message_is_read_to_its_end() -> None:
-    """This holds at every length; no bytes of a peer raise an exception."""
+    """A message may be cut at any length; no bytes of a peer raise an exception."""
     for length in range(len(OUTER)):
         fields = read_fields(DEFINITIONS, "a/Outer", OUTER[:length])
         assert fields is not None
@@ -54,7 +54,7 @@ def test_a_truncated_message_is_read_to_its_end() -> None:
 
 
 def test_long_values_are_shortened() -> None:
-    """A log record stays small."""
+    """Shortening keeps a log record small."""
     many = read_fields(DEFINITIONS, "a/Many", struct.pack("<I100i", 100, *range(100)))
     assert many == {"values": [*range(MOST_ELEMENTS), f"{CUT} {100 - MOST_ELEMENTS} more"]}
     assert read_fields(DEFINITIONS, "a/Inner", inner(float("nan"), "")) == {"x": "nan", "name": ""}
@@ -71,7 +71,7 @@ def test_long_values_are_shortened() -> None:
 
 
 def test_a_shortened_array_does_not_hide_later_fields() -> None:
-    """A laser scan, an image, a list of names: each later field is shown, with the number of omitted elements."""
+    """After a scan, an image or a list of names, later fields are shown, with the number of omitted elements."""
     scan = struct.pack("<720f", *range(720))
     names = b"".join(struct.pack("<I", 3) + b"abc" for _ in range(100))
     data = b"".join(struct.pack("<I", 720) + scan for _ in range(2)) + struct.pack("<I", 100) + names
@@ -88,7 +88,7 @@ def test_a_shortened_array_does_not_hide_later_fields() -> None:
 
 
 def test_every_field_is_named_where_the_bytes_end() -> None:
-    """Those that cannot be read any more have the sign of it."""
+    """Fields after the end of the bytes are marked as missing."""
     cut = read_fields(LONG, "a/Long", struct.pack("<I", 2**32 - 1) + b"\0" * 4000)
     assert cut is not None
     assert list(cut) == ["ranges", "intensities", "names", "data", "last"]
@@ -96,7 +96,7 @@ def test_every_field_is_named_where_the_bytes_end() -> None:
 
 
 def test_fields_that_are_too_many_to_name_are_counted() -> None:
-    """A message of a thousand fields says how many are not there."""
+    """A message with a thousand fields states how many are not shown."""
     wide = Definitions.from_files({"a/Wide.msg": "".join(f"int8 f{number}\n" for number in range(1000))})
     fields = read_fields(wide, "a/Wide", b"\0" * 1000)
     assert fields is not None
@@ -104,7 +104,7 @@ def test_fields_that_are_too_many_to_name_are_counted() -> None:
 
 
 def test_large_counts_of_unknown_hosts_take_no_time() -> None:
-    """Elements of no size, by the thousand million, and elements of many sizes more than are read."""
+    """Thousands of millions of empty elements, or more elements of varying size than are shown, are not walked."""
     empty = read_fields(LONG, "a/Empties", struct.pack("<I", 2**32 - 1) + b"\7")
     assert empty == {"values": [{}] * MOST_ELEMENTS + [f"{CUT} {2**32 - 1 - MOST_ELEMENTS} more"], "last": 7}
     many = read_fields(LONG, "a/Texts", struct.pack("<I", 100_000) + b"\0" * 400_001)

@@ -1,4 +1,4 @@
-"""Names: resolved as rosmaster does, or refused."""
+"""Names are resolved as in rosmaster, or refused."""
 
 import json
 import subprocess
@@ -45,7 +45,7 @@ def rosmaster() -> Iterator[Oracle]:
 @settings(max_examples=examples(2000))
 @given(name=NAME_LIKE, caller_id=CALLER_IDS)
 def test_resolve_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: str) -> None:
-    """Whatever is not refused resolves to what rosmaster acts on, is canonical and resolves to itself."""
+    """A name that is not refused resolves to rosmaster's name, which is canonical and resolves to itself."""
     try:
         resolved = names.resolve(name, caller_id)
     except InvalidNameError:
@@ -72,7 +72,7 @@ def test_resolve_parameter_agrees_with_rosmaster(rosmaster: Oracle, name: str, c
 @settings(max_examples=examples(500))
 @given(name=st.from_regex(r"[A-Za-z/~][A-Za-z0-9_/]{0,12}", fullmatch=True), caller_id=NODE_IDS)
 def test_every_ros_name_resolves(rosmaster: Oracle, name: str, caller_id: str) -> None:
-    """No name of the ROS grammar is refused but those that mean the global namespace."""
+    """No name of the ROS grammar is refused, except names of the global namespace."""
     resolved = rosmaster(name, caller_id)[0]
     assert names.resolve_namespace(name, caller_id) == resolved
     if resolved != "/":
@@ -81,7 +81,7 @@ def test_every_ros_name_resolves(rosmaster: Oracle, name: str, caller_id: str) -
 
 @given(text=st.text(max_size=30), caller_id=st.text(max_size=10))
 def test_any_text_resolves_or_is_refused(text: str, caller_id: str) -> None:
-    """No text makes the functions for names raise anything but the error for the peer."""
+    """Any text resolves or raises the error for the peer."""
     for function in (names.resolve, names.resolve_namespace, names.resolve_parameter):
         try:
             assert function(text, caller_id).isascii()
@@ -99,7 +99,7 @@ def test_any_text_resolves_or_is_refused(text: str, caller_id: str) -> None:
     ],
 )
 def test_resolve_makes_the_canonical_name(name: str, caller_id: str, expected: str) -> None:
-    """Global, relative and private names become the one global spelling."""
+    """Global, relative and private names are resolved to the global form."""
     assert names.resolve(name, caller_id) == expected
 
 
@@ -113,13 +113,13 @@ def test_resolve_makes_the_canonical_name(name: str, caller_id: str, expected: s
     ],
 )
 def test_resolve_refuses_what_is_not_a_ros_name(name: str) -> None:
-    """Empty, overlong, look-alike or meaningless names, and those outside the alphabet, are refused."""
+    """Names that are empty, overlong, look-alike or meaningless, or that leave the alphabet, are refused."""
     with pytest.raises(InvalidNameError):
         names.resolve(name, "/talker")
 
 
 def test_refusal_names_the_character_and_its_place() -> None:
-    """The error shows the name, the character that is wrong and its position."""
+    """The error has the name, the wrong character and its position."""
     with pytest.raises(InvalidNameError, match=r"'/a b'.*character 3 is ' '"):
         names.resolve("/a b", "/talker")
     with pytest.raises(InvalidNameError, match="starts with a letter"):
@@ -134,7 +134,7 @@ def test_refusal_names_the_character_and_its_place() -> None:
 
 @pytest.mark.parametrize("caller_id", ["talker", "//talker", "/talker/", "/", "~a", "/a b", "/\u0430"])
 def test_relative_names_need_a_valid_caller(caller_id: str) -> None:
-    """A caller_id that is not canonical resolves global names only."""
+    """A caller_id that is not canonical can only resolve global names."""
     for name in ("chatter", "~chatter"):
         with pytest.raises(InvalidNameError):
             names.resolve(name, caller_id)
@@ -142,7 +142,7 @@ def test_relative_names_need_a_valid_caller(caller_id: str) -> None:
 
 
 def test_tools_with_a_hyphen_resolve_what_is_a_name() -> None:
-    """`/rosparam-4711` may use relative names; only a parameter may have its hyphen."""
+    """`/rosparam-4711` may use relative names; only a parameter may keep the hyphen."""
     assert names.check_tool_id("/rosparam-4711") == "/rosparam-4711"
     assert names.resolve("chatter", "/rosparam-4711") == "/chatter"
     assert names.resolve_parameter("~a", "/rosparam-4711") == "/rosparam-4711/a"
@@ -155,7 +155,7 @@ def test_tools_with_a_hyphen_resolve_what_is_a_name() -> None:
 
 
 def test_a_name_may_not_grow_too_long() -> None:
-    """The bound on the length holds for what a name resolves to."""
+    """The length limit applies to the resolved name."""
     caller_id = "/" + "a" * 600
     assert names.is_global_name(names.resolve("~" + "b" * 400, caller_id))
     with pytest.raises(InvalidNameError, match="1202 characters; at most 1024"):
@@ -163,7 +163,7 @@ def test_a_name_may_not_grow_too_long() -> None:
 
 
 def test_namespace_variant_allows_the_root() -> None:
-    """`/` is a namespace and a parameter tree, but nothing that can be published."""
+    """`/` is a namespace and a parameter tree, but cannot be published."""
     assert names.resolve_namespace("/", "/talker") == "/"
     assert names.resolve_namespace("//", "/talker") == "/"
     assert names.resolve_parameter("/", "/talker") == "/"
@@ -200,7 +200,7 @@ def test_parameters_that_could_mislead_are_refused(name: str) -> None:
 
 
 def test_a_member_that_no_key_names_is_had_with_its_namespace() -> None:
-    """A dictionary may have any members, and the refusal of the key of such a one says how it is read and set."""
+    """A dictionary may have any members. The error for such a member's key says to use its namespace instead."""
     assert names.is_relative_member("\u00fc")
     with pytest.raises(InvalidNameError, match="such a member is read and set with its namespace"):
         names.resolve_parameter("/ns/\u00fc", "/talker")
@@ -208,7 +208,7 @@ def test_a_member_that_no_key_names_is_had_with_its_namespace() -> None:
 
 @pytest.mark.parametrize("caller_id", ["/a", "/a/b", "/rostopic_4_1699999999999", "/_a", "/1"])
 def test_caller_id_is_returned_unchanged(caller_id: str) -> None:
-    """A canonical global name is a caller_id."""
+    """A canonical global name is returned as it is."""
     assert names.check_caller_id(caller_id) is caller_id
 
 
@@ -223,7 +223,7 @@ def test_caller_id_must_be_canonical(caller_id: str) -> None:
 
 
 def test_namespace_and_join_are_inverse() -> None:
-    """A name is its namespace and its last segment; global and private names are not joined."""
+    """Joining a name's namespace and its last segment gives the name; global and private names are not joined."""
     assert [names.namespace(name) for name in ("/a/b/c", "/a", "/", "")] == ["/a/b/", "/", "/", "/"]
     assert names.join("/a/b/", "c") == names.join("/a/b", "c") == "/a/b/c"
     assert names.join("/a", "/c") == "/c"

@@ -1,4 +1,4 @@
-"""The tree of parameters is read as rosmaster reads it."""
+"""The tree of parameters is read with rosmaster's rules."""
 
 import json
 import random
@@ -18,13 +18,13 @@ for line in sys.stdin:
 
 
 def some_tree(chance: random.Random, depth: int) -> Tree:
-    """A tree with all kinds of keys, some of its namespaces empty."""
+    """Draw a tree with all kinds of keys and some empty namespaces."""
     keys = chance.sample(KEYS, chance.randrange(5))
     return {key: some_tree(chance, depth - 1) if depth and chance.random() < 0.4 else 1 for key in keys}
 
 
 def test_names_are_those_that_rosmaster_tells() -> None:
-    """They have its order, and its result for a key that begins with a slash or a tilde."""
+    """The names have rosmaster's order, and its result for a key that begins with a slash or a tilde."""
     chance = random.Random(1)  # noqa: S311  not a secret
     trees = [some_tree(chance, 4) for _ in range(500)]
     asked = "".join(f"{json.dumps(tree)}\n" for tree in trees)

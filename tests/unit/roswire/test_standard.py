@@ -1,4 +1,4 @@
-"""ROS's own definitions: the same types as on the robot."""
+"""ROS's own definitions have the same types as on the robot."""
 
 from typing import Any
 
@@ -8,14 +8,14 @@ from roswire.definitions import Definitions
 def test_md5sums_are_those_of_the_installed_packages(
     standard: Definitions, genpy_types: dict[str, dict[str, Any]]
 ) -> None:
-    """Every message and service type of ROS's own packages is there, with the md5sum that nodes compare."""
+    """Every message and service type of ROS's own packages exists with the md5sum that nodes compare."""
     for name, entry in genpy_types.items():
         md5sum = standard.service_md5sum if entry["kind"] == "service" else standard.md5sum
         assert md5sum(name) == entry["md5sum"], name
 
 
 def test_every_type_is_whole(standard: Definitions) -> None:
-    """Every type has a md5sum, a full text and a layout."""
+    """Every type has an md5sum, a full text and a layout."""
     for name in standard.message_types:
         assert len(standard.md5sum(name)) == 32
         text = standard.full_text(name)
@@ -31,7 +31,7 @@ def test_types_beside_the_type_store(standard: Definitions) -> None:
 
 
 def test_actions_and_drive_commands_beside_the_type_store(standard: Definitions) -> None:
-    """The messages of common actions are those that genaction makes: the md5sums of ROS Noetic."""
+    """The messages of common actions equal genaction's output: they have the md5sums of ROS Noetic."""
     known = {
         "move_base_msgs/MoveBaseAction": "70b6aca7c7f7746d8d1609ad94c80bb8",
         "move_base_msgs/MoveBaseActionGoal": "660d6895a1b9a16dce51fbdd9a64a56b",

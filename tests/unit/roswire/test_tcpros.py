@@ -1,4 +1,4 @@
-"""TCPROS: headers and frames as rospy and roscpp write them, in any pieces; lies are refused."""
+"""TCPROS: headers and frames from rospy and roscpp are read in any pieces; false lengths are refused."""
 
 import struct
 
@@ -42,7 +42,7 @@ def header(*fields: bytes) -> bytes:
 
 
 def test_the_notation_of_a_header() -> None:
-    """A header is its length and its fields, each with its length, in the order given."""
+    """A header is its length and then its fields, each with its length, in the given order."""
     assert encode_header({"topic": "/a", "type": "*"}) == b"\x16\0\0\0\x08\0\0\0topic=/a\x06\0\0\0type=*"
     assert decode_header(b"\x08\0\0\0topic=/a\x06\0\0\0type=*") == {"topic": "/a", "type": "*"}
 
@@ -51,7 +51,7 @@ def test_the_notation_of_a_header() -> None:
     fields=st.dictionaries(NAMES, st.text(st.characters(exclude_categories=["Cs"]))), cut=st.integers(1, 40)
 )
 def test_headers_come_back_in_any_pieces(fields: dict[str, str], cut: int) -> None:
-    """Whatever way a header arrives, the fields are those that were sent, and nothing behind it is lost."""
+    """However a header arrives, its fields equal those that were sent, and no byte after it is lost."""
     data = encode_header(fields) + b"behind"
     parser = HeaderParser(limit=1 << 20)
     result = None
@@ -70,7 +70,7 @@ def test_value_may_hold_equal_signs_and_be_empty() -> None:
 
 
 def test_message_definitions_keep_their_bytes() -> None:
-    """A definition with Latin-1 comments, as roscpp sends it, is passed on as it was."""
+    """A definition with Latin-1 comments, as roscpp sends it, is passed on unchanged."""
     raw = header(b"message_definition=# 20 \xb0C\nfloat64 t", b"topic=/a")
     fields = HeaderParser().feed(raw)
     assert fields is not None
@@ -97,13 +97,13 @@ def test_message_definitions_keep_their_bytes() -> None:
     ],
 )
 def test_headers_that_are_refused(data: bytes, error: type[ProtocolError], text: str) -> None:
-    """Lying lengths, missing or double names and broken text are refused with the place."""
+    """False lengths, missing or duplicate names and broken text are refused with the position."""
     with pytest.raises(error, match=text):
         HeaderParser().feed(data)
 
 
 def test_a_lying_length_is_refused_before_anything_is_kept() -> None:
-    """Four bytes are enough to refuse a header that would be too long."""
+    """Four bytes are enough to refuse a header that is too long, before it is stored."""
     parser = HeaderParser(limit=100)
     assert parser.feed(b"\x65\0\0") is None
     with pytest.raises(LimitExceededError):
@@ -118,7 +118,7 @@ def test_an_empty_header_is_complete() -> None:
 
 
 def test_a_complete_header_takes_nothing_more() -> None:
-    """Feeding on after the header is a mistake of the caller, not of the peer."""
+    """Feeding bytes after the end of the header is the caller's mistake, not the peer's."""
     parser = HeaderParser()
     parser.feed(encode_header(FIELDS))
     with pytest.raises(RuntimeError):
@@ -127,7 +127,7 @@ def test_a_complete_header_takes_nothing_more() -> None:
 
 @given(data=st.binary(max_size=80))
 def test_random_bytes_raise_only_the_error_for_the_peer(data: bytes) -> None:
-    """No bytes make a parser raise anything but PeerError."""
+    """Any bytes are parsed or raise PeerError."""
     for parser in (HeaderParser(limit=60), FrameParser(limit=60), ServiceReplyParser(limit=60)):
         try:
             parser.feed(length(len(data)) + data)
@@ -176,6 +176,6 @@ def test_frames_beyond_the_limit_are_refused_at_their_length() -> None:
 
 
 def test_the_notation_of_service_replies() -> None:
-    """A success has 1 in front of its frame, an error 0; text that is not UTF-8 is replaced."""
+    """A success is 1 before its frame, an error is 0; text that is not UTF-8 is replaced."""
     assert encode_service_reply(b"ab") == b"\x01\x02\0\0\0ab"
     assert encode_service_error("no\ud800") == b"\x00\x03\0\0\0no?"

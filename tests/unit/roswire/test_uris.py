@@ -1,4 +1,4 @@
-"""URIs of nodes and services: one reading or a refusal that helps."""
+"""URIs of nodes and services have one reading, or are refused with advice."""
 
 import pytest
 from hypothesis import given
@@ -24,7 +24,7 @@ from tests.unit.roswire.tables import rows
     ],
 )
 def test_node_uris_as_ros_writes_them(text: str, expected: NodeUri) -> None:
-    """Host names, IPv4 and IPv6 addresses (bracketed, or as rospy writes them) with a port are node API URIs."""
+    """Host names, IPv4 and IPv6 addresses (in brackets, or as rospy writes them) with a port are node URIs."""
     assert parse_node_uri(text) == expected
 
 
@@ -37,14 +37,14 @@ def test_node_uris_as_ros_writes_them(text: str, expected: NodeUri) -> None:
     ],
 )
 def test_refused_node_uris_say_why(text: str, complaint: str) -> None:
-    """Other URIs than http://host:port/path are rejected with the reason and what to write."""
+    """URIs other than http://host:port/path are rejected with the reason and a valid form."""
     with pytest.raises(InvalidUriError, match=complaint) as refused:
         parse_node_uri(text)
     assert str(refused.value).isprintable()
 
 
 def test_service_uris() -> None:
-    """A service is rosrpc://host:port, nothing behind it."""
+    """A service URI is rosrpc://host:port, with nothing after it."""
     assert parse_service_uri("rosrpc://robot:4321") == NodeUri("rosrpc", "robot", 4321, "")
     assert parse_service_uri("rosrpc://[::1]:4321/") == NodeUri("rosrpc", "::1", 4321, "")
     with pytest.raises(InvalidUriError, match="has a path"):
@@ -60,7 +60,7 @@ def test_service_uris() -> None:
     port=st.integers(1, 65535),
 )
 def test_a_written_uri_is_read_back(host: str, port: int) -> None:
-    """Any host and port come back from the URI that is written for them."""
+    """The URI written for any host and port is read back to that host and port."""
     assert parse_node_uri(node_uri(host, port)) == NodeUri("http", host, port, "/")
     assert parse_node_uri(node_uri(host, port, "/key/")) == NodeUri("http", host, port, "/key/")
     assert parse_service_uri(service_uri(host, port)) == NodeUri("rosrpc", host, port, "")
@@ -71,7 +71,7 @@ def test_a_written_uri_is_read_back(host: str, port: int) -> None:
     prefix=st.sampled_from(["", "http://", "rosrpc://"]),
 )
 def test_any_text_is_read_or_refused(text: str, prefix: str) -> None:
-    """No text raises anything but the error for the peer, and an accepted one is read again the same."""
+    """Any text is read or raises the error for the peer; an accepted URI is read again unchanged."""
     for parse, write in ((parse_node_uri, node_uri), (parse_service_uri, service_uri)):
         try:
             uri = parse(prefix + text)

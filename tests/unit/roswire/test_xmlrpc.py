@@ -1,4 +1,4 @@
-"""XML-RPC: what ROS clients send is read, exactly that; what is written, they read."""
+"""XML-RPC: exactly the documents of ROS clients are read, and ROS clients read our documents."""
 
 import datetime
 import math
@@ -54,17 +54,17 @@ def call(value: str) -> bytes:
 
 
 def read(value: str, limits: XmlRpcLimits | None = None) -> Value:
-    """Return what the element `value` is read as."""
+    """Return the result of reading the element `value`."""
     return parse_call(call(value), limits or XmlRpcLimits()).params[0]
 
 
 def python_loads(body: bytes) -> tuple[tuple[Any, ...], str | None]:
-    """Return what rosmaster and rospy read."""
+    """Return the result of the parser of rosmaster and rospy."""
     return xmlrpc.client.loads(body, use_builtin_types=True)  # noqa: TID251 - the oracle of these tests
 
 
 def without_bare_returns(value: Value) -> Value:
-    """Return `value` as it is after xmlrpc.client has written it: a bare `\\r` is read as a line feed."""
+    """Return `value` after xmlrpc.client wrote it: a bare `\r` is then read as a line feed."""
     match value:
         case str():
             return value.replace("\r\n", "\n").replace("\r", "\n")
@@ -80,7 +80,7 @@ def without_bare_returns(value: Value) -> Value:
 
 @given(params=st.lists(VALUES, max_size=4), method=st.from_regex(r"[A-Za-z_.]{1,20}", fullmatch=True))
 def test_calls_are_read_as_python_reads_them(params: list[Value], method: str) -> None:
-    """A built call is read back the same, here and by the parser of rosmaster and rospy."""
+    """A call that we build is read back unchanged, here and by the parser of rosmaster and rospy."""
     body = build_call(method, params)
     assert parse_call(body) == MethodCall(method, tuple(params))
     assert python_loads(body) == (tuple(params), method)
@@ -89,7 +89,7 @@ def test_calls_are_read_as_python_reads_them(params: list[Value], method: str) -
 @given(params=st.lists(VALUES, max_size=4))
 @example(params=[{"\r": 1}])
 def test_calls_of_python_are_read(params: list[Value]) -> None:
-    """Documents of xmlrpc.client (rospy, rosmaster) are read as the values it wrote."""
+    """Documents of xmlrpc.client (rospy, rosmaster) are read as the values that were written."""
     body = xmlrpc.client.dumps(tuple(params), "m").encode()
     expected = [without_bare_returns(value) for value in params]
     if body.count(b"<name>") == xmlrpc.client.dumps(tuple(expected), "m").count("<name>"):
@@ -98,7 +98,7 @@ def test_calls_of_python_are_read(params: list[Value]) -> None:
 
 @given(value=VALUES)
 def test_answers_are_read_as_python_reads_them(value: Value) -> None:
-    """An answer is read back the same here and by Python."""
+    """An answer is read back unchanged, here and by Python."""
     body = build_response(value)
     assert parse_response(body) == value
     assert python_loads(body) == ((value,), None)
@@ -106,7 +106,7 @@ def test_answers_are_read_as_python_reads_them(value: Value) -> None:
 
 @given(code=st.integers(-(2**31), 2**31 - 1), text=XML_TEXT)
 def test_faults_come_back(code: int, text: str) -> None:
-    """A fault is an error with its code and text, here and for Python."""
+    """A fault is an error with its code and text, both here and in Python."""
     body = build_fault(code, text)
     with pytest.raises(FaultReceived) as fault:
         parse_response(body)
@@ -118,7 +118,7 @@ def test_faults_come_back(code: int, text: str) -> None:
 
 @pytest.mark.parametrize("number", [math.inf, -math.inf, 1e308, 5e-324, -0.0, 1e16, 0.1])
 def test_doubles_keep_every_bit(number: float) -> None:
-    """Doubles are written so that the very same double is read back, infinities included."""
+    """Doubles, including infinities, are written so that exactly the same double is read back."""
     result = parse_response(build_response(number))
     assert isinstance(result, float)
     assert math.copysign(1, result) == math.copysign(1, number)
@@ -126,7 +126,7 @@ def test_doubles_keep_every_bit(number: float) -> None:
 
 
 def test_nan_survives() -> None:
-    """Not-a-number is a parameter that robots use."""
+    """Robots use not-a-number as a parameter."""
     for text in ("nan", "NaN", "-nan", "NAN"):
         assert math.isnan(read(f"<value><double>{text}</double></value>"))  # type: ignore[arg-type]  # it is a double
     assert b"<double>nan</double>" in build_response(math.nan)
@@ -145,7 +145,7 @@ ROSCPP_CALL = (
 
 
 def test_roscpp_calls_are_read() -> None:
-    """Strings without a type, as XmlRpc++ writes them, are strings."""
+    """Strings without a type, as XmlRpc++ writes them, are read as strings."""
     expected = ("/listener", "/chatter", "std_msgs/String", "http://h:4567/")
     assert parse_call(ROSCPP_CALL) == MethodCall("registerSubscriber", expected)
 
@@ -198,7 +198,7 @@ def test_values_as_ros_clients_write_them(element: str, expected: Value) -> None
 
 
 def test_rosjava_calls_are_read() -> None:
-    """The namespace and the extensions that Apache XML-RPC writes are understood, within ROS's ranges."""
+    """The namespace and extensions of Apache XML-RPC are read, within ROS's ranges."""
     namespace = "http://ws.apache.org/xmlrpc/namespaces/extensions"
     head = f'<?xml version="1.0" encoding="UTF-8"?><methodCall xmlns:ex="{namespace}">'
     values = "<value>/a</value>", "<value><ex:nil/></value>", "<value><ex:i8>7</ex:i8></value>"
@@ -214,7 +214,7 @@ def test_rosjava_calls_are_read() -> None:
 
 
 def test_calls_without_parameters() -> None:
-    """A call may have no parameters, with or without an empty element for them."""
+    """A call may have no parameters, with or without an empty <params>."""
     assert parse_call(b"<methodCall><methodName>m</methodName></methodCall>") == MethodCall("m", ())
     assert parse_call(b"<methodCall><methodName>m</methodName><params/></methodCall>") == MethodCall("m", ())
 
@@ -277,7 +277,7 @@ ENTITY_BOMB = (
     ],
 )
 def test_invalid_xml_rpc_is_refused(body: bytes, text: str) -> None:
-    """Input outside the grammar, ambiguous or out of range is refused with the place and the reason."""
+    """Input that is ungrammatical, ambiguous or out of range is refused with the position and the reason."""
     with pytest.raises(ProtocolError, match=text) as refused:
         parse_call(body)
     assert "byte" in str(refused.value)
@@ -297,13 +297,13 @@ def test_invalid_xml_rpc_is_refused(body: bytes, text: str) -> None:
     ],
 )
 def test_answers_that_are_refused(body: bytes) -> None:
-    """An answer has one value, or a fault with a code and a text."""
+    """An answer must be one value, or a fault with a code and a text."""
     with pytest.raises(ProtocolError):
         parse_response(body)
 
 
 def test_limits_hold() -> None:
-    """Size, count, depth, length of strings and parts are bounded, and the bound itself is allowed."""
+    """Size, count, depth, length of strings and parts are limited; the limit itself is allowed."""
     limits = XmlRpcLimits(body=2000, elements=4, depth=2, string=5, parts=2)
     array = "<value><array><data>{}</data></array></value>".format
     assert read(array(array("<value/>")), limits) == [[""]]
@@ -321,7 +321,7 @@ def test_limits_hold() -> None:
 
 
 def test_parts_of_a_multicall_are_bounded() -> None:
-    """A multicall has a bound of its own on its parts; other calls do not."""
+    """A multicall has a separate limit on its parts; other calls do not."""
     body = build_call("system.multicall", [["a"] * 3])
     assert len(parse_call(body, XmlRpcLimits(parts=3)).params) == 1
     with pytest.raises(LimitExceededError, match="3 calls; at most 2"):
@@ -342,13 +342,13 @@ PREFIX = b"<methodCall><methodName>m</methodName><params><param>"
     ],
 )
 def test_large_documents_are_refused_where_they_go_wrong(body: bytes, text: str) -> None:
-    """A long tag, a flood of attributes or of nested elements is refused without being collected."""
+    """A long tag, or a flood of attributes or nested elements, is refused without being stored."""
     with pytest.raises(ProtocolError, match=text):
         parse_call(body)
 
 
 def test_large_values_in_pieces() -> None:
-    """A document of many pieces is read like a small one, text that crosses them included."""
+    """A document in many pieces is read like a small one, including text that crosses pieces."""
     value: Value = [{"a": "x\u00e9<&" * 30_000, "b": list(range(20_000))}, "\U0001f916" * 60_000]
     assert parse_call(build_call("m", [value])).params == (value,)
 
@@ -385,7 +385,7 @@ SCRAPS = st.one_of(
 @settings(max_examples=examples(500))
 @given(scraps=st.lists(SCRAPS, max_size=12), whole=st.booleans(), raw=st.binary(max_size=3))
 def test_scraps_raise_only_the_error_for_the_peer(scraps: list[str], whole: bool, raw: bytes) -> None:
-    """No mixture of XML-RPC's own elements makes the parsers raise anything but PeerError."""
+    """Any mixture of XML-RPC's own elements is parsed or raises PeerError."""
     text = "".join(scraps)
     body = (call(text) if whole else text.encode()).replace(b"-5", raw)
     for parse in (parse_call, parse_response):
@@ -400,7 +400,7 @@ def test_scraps_raise_only_the_error_for_the_peer(scraps: list[str], whole: bool
 @settings(max_examples=examples(300))
 @given(data=st.data())
 def test_damaged_calls_raise_only_the_error_for_the_peer(data: st.DataObject) -> None:
-    """A call with bytes changed, cut or doubled is refused, or read as rosmaster would read it."""
+    """A call with bytes changed, cut or doubled is refused, or read as rosmaster reads it."""
     body = bytearray(build_call("m", [data.draw(VALUES)]))
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(body) - 1))
@@ -443,7 +443,7 @@ def test_random_bytes_are_refused(data: bytes) -> None:
     ],
 )
 def test_values_without_a_notation_are_errors(value: object, text: str) -> None:
-    """A value without a notation is an error of the sending program, never bad XML."""
+    """A value that XML-RPC cannot express is an error of the sending program, and never gives bad XML."""
     with pytest.raises(EncodingError, match=text):
         build_response(value)  # type: ignore[arg-type]  # the test is a value of a wrong type
     with pytest.raises(EncodingError, match=text):
@@ -459,13 +459,13 @@ def test_endless_values_are_errors() -> None:
 
 
 def test_texts_of_faults_are_always_sent() -> None:
-    """A fault is written whatever is in its text."""
+    """A fault is written whatever its text contains."""
     with pytest.raises(FaultReceived, match=r"fault 1: a\?<b>"):
         parse_response(build_fault(1, "a\x00<b>"))
 
 
 def test_the_deepest_readable_value_can_be_written() -> None:
-    """Reading and writing have the same limit of depth."""
+    """Reading and writing have the same depth limit."""
     depth = XmlRpcLimits().depth
     body = call("<value><array><data>" * depth + "</data></array></value>" * depth)
     assert parse_call(build_call("m", parse_call(body).params)) == parse_call(body)

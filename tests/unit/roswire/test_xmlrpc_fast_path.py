@@ -1,4 +1,4 @@
-"""Plain documents are read by a pattern: as the walk through their elements reads them, or not at all."""
+"""A pattern reads plain documents as the general parser does, or leaves them to that parser."""
 
 import time
 import xmlrpc.client
@@ -35,14 +35,14 @@ def walked(body: bytes, root: str, limits: XmlRpcLimits) -> tuple[str, list[Valu
 
 
 def dumped(values: list[Value], method: str | None) -> bytes:
-    """A call, or an answer, as Python's clients write it."""
+    """Return a call or an answer as Python's clients write it."""
     if method is not None:
         return xmlrpc.client.dumps(tuple(values), method).encode("utf-8", "surrogatepass")
     return xmlrpc.client.dumps((values,), methodresponse=True).encode("utf-8", "surrogatepass")
 
 
 def parts(*params: list[Value]) -> list[Value]:
-    """The parameter of a multicall that sets parameters, as roslaunch writes it."""
+    """Return the parameter of a multicall that sets parameters, as roslaunch writes it."""
     return [[{"methodName": "setParam", "params": one} for one in params]]
 
 
@@ -53,7 +53,7 @@ LISTS: st.SearchStrategy[Value] = st.lists(SCALARS, max_size=3)
 @given(values=st.lists(st.one_of(SCALARS, LISTS, st.lists(LISTS, max_size=2)), max_size=4), data=st.data())
 @settings(max_examples=examples(1000))
 def test_the_pattern_and_the_walk_read_the_same_values(values: list[Value], data: st.DataObject) -> None:
-    """Whole or damaged, a call or an answer has the same values both ways, or the pattern leaves it to the walk."""
+    """For a whole or damaged call or answer, both give the same values, or the pattern leaves it to the parser."""
     whole = [dumped(values, "registerService"), dumped(values, None), ROSCPP]
     whole.append(dumped(parts(values, ["/a", "/b", 1]), "system.multicall"))
     body = bytearray(data.draw(st.sampled_from(whole)))
@@ -92,7 +92,7 @@ def test_calls_of_ros_clients_and_answers_of_rosmaster_are_usual(quote: bytes) -
 
 @pytest.mark.parametrize("value", [7, True, False, -0.5, 1e-05, "", "a b", [1.5, 2.0], []])
 def test_a_multicall_of_roslaunch_is_usual_however_long(value: Value) -> None:
-    """Parts with scalars, or lists of them, are read one by one; the same limits hold."""
+    """Parts with scalars or lists of scalars are read one by one; the same limits hold."""
     params: list[Value] = ["/roslaunch", "/start/part/value", value]
     several = parts(*[params] * 2000)
     body = dumped(several, "system.multicall")
@@ -111,7 +111,7 @@ def test_a_multicall_of_roslaunch_is_usual_however_long(value: Value) -> None:
     "value", [{"a": {"b": [1, {}]}}, "x" * 40_000, [[[1]]], "<robot/>\n", "<struct>", "]]>", {}], ids=repr
 )
 def test_a_part_that_is_not_plain_is_left_to_the_walk_alone(value: Value) -> None:
-    """A struct is none of the pattern's, nor is a text with a mark-up, nor what is longer than one pattern may take."""
+    """The pattern leaves structs, text with mark-up, and parts that are too long for one pattern to the parser."""
     several = parts(["/a", "/b", 1], ["/a", "/c", value], ["/a", "/d", 2])
     body = dumped(several, "system.multicall")
     assert read_common_call(body, XmlRpcLimits()) == ("system.multicall", several)
@@ -121,7 +121,7 @@ def test_a_part_that_is_not_plain_is_left_to_the_walk_alone(value: Value) -> Non
 
 
 def test_two_values_are_not_taken_for_one_struct() -> None:
-    """Tags that balance only with those in comments are rejected, as by the general parser."""
+    """Tags that balance only together with tags in comments are rejected, as by the general parser."""
     first, second = (b"<value><struct><!--<%bstruct>--></struct></value>" % slash for slash in (b"", b"/"))
     within = first + b"</param><param>" + second
     body = dumped(parts(["/a"]), "system.multicall")
@@ -132,7 +132,7 @@ def test_two_values_are_not_taken_for_one_struct() -> None:
 
 
 def test_few_parts_are_walked_alone() -> None:
-    """With mostly complex parts, the general parser takes less time."""
+    """If most parts are complex, using only the general parser takes less time."""
     params: list[Value] = ["/a", "/b", {}]
     several = parts(*[params] * 256)
     body = dumped(several, "system.multicall")
@@ -156,7 +156,7 @@ PIECES = [
 @given(data=st.data())
 @settings(max_examples=examples(1000))
 def test_no_struct_hides_what_is_around_it(data: st.DataObject) -> None:
-    """Tags, comments and sections that begin in one part and end in another: as the walk has it, or left to it."""
+    """For tags, comments and sections that span parts, the result equals the parser's, or is left to it."""
     given: list[list[Value]] = [
         ["/a", "/b", 1],
         ["/a", "/c", {"d": {"e": 1}}],
@@ -177,14 +177,14 @@ def test_no_struct_hides_what_is_around_it(data: st.DataObject) -> None:
 @pytest.mark.parametrize("piece", [b" ", b"\n", b"<value>a</value>", b"<value>a</value> \n", b"1"])
 @pytest.mark.parametrize("before", [b"", b"<value>", b"<value><int>", LIST, LIST[:20]])
 def test_an_invalid_document_takes_linear_time(piece: bytes, before: bytes) -> None:
-    """A document that does not match in its last byte is left to the general parser in linear time."""
+    """A document that fails to match at its last byte is left to the general parser in linear time."""
     short, long = (spoilt(before, piece, 1_000_000 // shorter) for shorter in (16, 1))
     of_short, of_long = (min(seconds_to_leave(texts) for _ in range(3)) for texts in (short, long))
     assert of_long < 64 * (of_short + 0.0005)  # 16 times as long; a quadratic pattern takes 256 times as long
 
 
 def spoilt(before: bytes, piece: bytes, size: int) -> list[bytes]:
-    """An answer, a call and multicalls, of which each fits until its last byte."""
+    """Return an answer, a call and multicalls that match until their last byte."""
     some = piece * (size // 32 // len(piece))
     whole = dumped(["a"], None).partition(b"<value>")[0] + before + some + b"<"
     texts = [whole, whole.replace(b"<methodResponse>", b"<methodCall><methodName>m</methodName>")]
@@ -198,7 +198,7 @@ def spoilt(before: bytes, piece: bytes, size: int) -> list[bytes]:
 
 
 def seconds_to_leave(texts: list[bytes]) -> float:
-    """The processor time until each is known to be unusual."""
+    """Return the processor time until the pattern has rejected each document."""
     begun = time.thread_time()
     answer, *calls = texts
     assert read_common_answer(answer, XmlRpcLimits()) is None
@@ -207,7 +207,7 @@ def seconds_to_leave(texts: list[bytes]) -> float:
 
 
 def test_one_value_too_many_is_refused_however_short() -> None:
-    """The limits hold for short documents also."""
+    """The limits also hold for short documents."""
     body = dumped(["a"] * 4, "m")
     with pytest.raises(PeerError, match="more than 3 values"):
         parse_call(body, XmlRpcLimits(elements=3))

@@ -1,4 +1,4 @@
-"""XML-RPC between us and roscpp's own library: it reads what we write, we read what it writes."""
+"""XML-RPC with roscpp's own library: it reads our documents, and we read its documents."""
 
 import datetime
 import math
@@ -17,7 +17,7 @@ Peer = Callable[[bytes], MethodCall]
 
 @pytest.fixture(scope="module")
 def roscpp(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]:
-    """Give roscpp's library an answer and get the call that it writes with the value of it."""
+    """Give roscpp's library an answer, and return the call that it writes with the answer's value."""
     compiler, config = need_program("g++", "g++"), need_program("pkg-config", "pkg-config")
     program = tmp_path_factory.mktemp("xmlrpcpp") / "peer"
     flags = subprocess.run(
@@ -68,26 +68,26 @@ VALUES: list[Value] = [
 
 @pytest.mark.parametrize("value", VALUES, ids=repr)
 def test_values_survive_roscpp(roscpp: Peer, value: Value) -> None:
-    """A value that we write as an answer is read by roscpp, and read back from its call as the same value."""
+    """roscpp reads our answer, and the value in its call equals ours."""
     call = roscpp(build_response(value))
     assert call == MethodCall("echo", (value,))
     assert [type(param) for param in call.params] == [type(value)]
 
 
 def test_nan_survives_roscpp(roscpp: Peer) -> None:
-    """Not-a-number stays what it is."""
+    """Not-a-number stays not-a-number."""
     (value,) = roscpp(build_response(math.nan)).params
     assert isinstance(value, float)
     assert math.isnan(value)
 
 
 def test_faults_are_faults_for_roscpp(roscpp: Peer) -> None:
-    """roscpp sees a fault as one, with its code and text."""
+    """roscpp reads our fault as a fault, with its code and text."""
     call = roscpp(build_fault(-1, "no such <method>"))
     assert call == MethodCall("fault", ({"faultCode": -1, "faultString": "no such <method>"},))
 
 
 def test_a_large_answer_is_read_by_roscpp(roscpp: Peer) -> None:
-    """The state of a large robot is read whole."""
+    """roscpp reads the state of a large robot completely."""
     value: Value = [1, "state", [[f"/topic_{number}", [f"/node_{number}"]] for number in range(2000)]]
     assert roscpp(build_response(value)).params == (value,)

@@ -1,4 +1,4 @@
-"""Tests of `appliance.signing.request_signing`: the vectors of `docs/reference/rest.md`; a proof fits one request."""
+"""Tests of `appliance.signing.request_signing`, with the vectors of `docs/reference/rest.md`."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from appliance.signing.request_signing import (
     statement,
 )
 
-# Made with OpenSSL 3 (`openssl dgst -hmac`, `openssl pkeyutl -sign -rawin`), not with the code that is tested.
+# Made with OpenSSL 3 (`openssl dgst -hmac`, `openssl pkeyutl -sign -rawin`), not with the tested code.
 TOKEN = "rosrv_5c0f3d2b9a11_AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"  # noqa: S105  an example
 READING = "rosrv-read_5c0f3d2b9a11_AwwrT78sKKQ79xXtfC8OnQf5VEjcIKUbLcfJ4UooWjU"
 VERIFYING = "fe8e3dde8844937a82f36c38d3ffbe4d3deb3ebaa84abe88709aa8d246e0463f"
@@ -40,12 +40,12 @@ REQUEST = {
 
 
 def stated(challenge: str = "60.000.abc.def", **parts: object) -> bytes:
-    """The statement of the request above, with other parts."""
+    """Return the statement of the request above, with other parts."""
     return statement(challenge, **{**REQUEST, **parts})  # type: ignore[arg-type]  # each part is what it is there
 
 
 def test_the_vectors() -> None:
-    """Keys, statement and proof are those that another implementation makes of the same token and request."""
+    """Keys, statement and proof equal those of another implementation for the same token and request."""
     assert reading_key(TOKEN) == READING
     assert reading_id(READING) == "5c0f3d2b9a11"
     assert keys_of(TOKEN).verifying.hex() == VERIFYING
@@ -65,13 +65,13 @@ def test_the_vectors() -> None:
     ],
 )  # fmt: skip
 def test_a_proof_is_of_one_request(parts: dict[str, object]) -> None:
-    """With any part changed the signature is wrong."""
+    """If any part of the request changes, the signature is invalid."""
     _challenge, signature = parse_proof(PROOF)
     assert not is_signed(bytes.fromhex(VERIFYING), stated(**parts), signature)  # type: ignore[arg-type]  # as above
 
 
 def test_neither_the_reading_key_nor_the_saved_key_is_the_token() -> None:
-    """The reading key and the saved key are not the secret, and differ for each token."""
+    """The reading key and the saved key differ from the secret, and differ for each token."""
     other = "rosrv_5c0f3d2b9a12_AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"
     secret = TOKEN.rpartition("_")[2]
     assert secret not in reading_key(TOKEN)
@@ -82,7 +82,7 @@ def test_neither_the_reading_key_nor_the_saved_key_is_the_token() -> None:
 @pytest.mark.parametrize("part", ["method", "target", "if_match", "content_type"])
 @pytest.mark.parametrize("text", ["a\nb", "a\r", "\x00", "é", "a\x7f"])
 def test_no_part_spills_into_another(part: str, text: str) -> None:
-    """A control character, with which a line could be moved to another part, makes no statement."""
+    """A control character, which could move a line to another part, is refused."""
     with pytest.raises(BadProofError, match="character"):
         stated(**{part: text})
 
@@ -93,7 +93,7 @@ def test_no_part_spills_into_another(part: str, text: str) -> None:
     st.binary(max_size=20),
 )
 def test_different_requests_have_different_statements(one: list[str], two: list[str], body: bytes) -> None:
-    """There are no two requests with the same text."""
+    """No two requests have the same statement."""
 
     def text(parts: list[str]) -> bytes:
         challenge, method, target, match, kind = parts
@@ -108,13 +108,13 @@ def test_different_requests_have_different_statements(one: list[str], two: list[
     "header", ["", "x", "a b", f"{'c' * 201} {'A' * 86}", f"c {'A' * 85}", f"c {'A' * 87}", f"c\n {'A' * 86}"]
 )
 def test_a_malformed_proof_is_rejected(header: str) -> None:
-    """A header of another form is rejected before anything is computed."""
+    """A header in another form is rejected before any computation."""
     with pytest.raises(BadProofError, match="CHALLENGE SIGNATURE"):
         parse_proof(header)
 
 
 def test_the_page_shows_what_a_script_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The example of docs/reference/rest.md makes the reading key and the proof of the vectors."""
+    """The example of docs/reference/rest.md computes the reading key and the proof of the vectors."""
     page = (Path(__file__).parents[3] / "docs" / "reference" / "rest.md").read_text()
     [example] = [block.partition("```")[0] for block in page.split("```python\n")[1:]]
     monkeypatch.setenv("ROSRV_TOKEN", TOKEN)

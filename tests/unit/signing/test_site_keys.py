@@ -1,4 +1,4 @@
-"""Signatures of the site: OpenSSH's own are taken, and nothing but what a key of the site signed."""
+"""Signatures of the site: OpenSSH's own signatures are accepted, and only for text that a key of the site signed."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def test_a_signature_by_openssh_is_accepted(signature: str) -> None:
 
 
 def test_a_signature_is_openssh_s_byte_for_byte() -> None:
-    """`ssh-keygen -Y verify` of any version takes what `rosrv sign` writes."""
+    """`ssh-keygen -Y verify` of any version accepts the output of `rosrv sign`."""
     assert signed(TEXT) == OPENSSH
 
 
@@ -62,7 +62,7 @@ def test_a_signature_is_openssh_s_byte_for_byte() -> None:
     ],
 )
 def test_anything_else_is_refused_with_what_to_do(text: str, signature: str, why: str) -> None:
-    """A changed text or signature, another key, another purpose, another format."""
+    """Covers a changed text or signature, another key, another purpose and another format."""
     with pytest.raises(UnsignedError) as refused:
         signer([LINE], text, signature)
     assert str(refused.value).startswith(why) or why in str(refused.value)
@@ -70,7 +70,7 @@ def test_anything_else_is_refused_with_what_to_do(text: str, signature: str, why
 
 
 def test_every_bit_of_a_signature_counts() -> None:
-    """With any one character changed, it is not a signature of this text."""
+    """After a change of any one character, the signature is invalid for this text."""
     body = OPENSSH.removeprefix(BEGIN).removesuffix(END)
     taken = []
     for place, character in enumerate(body):
@@ -85,7 +85,7 @@ def test_every_bit_of_a_signature_counts() -> None:
 
 
 def test_without_keys_no_signature_is_needed() -> None:
-    """Signatures are ignored."""
+    """Without keys, signatures are ignored."""
     assert signer([], TEXT, "") == signer([], TEXT, "nonsense") == ""
 
 
@@ -101,7 +101,7 @@ def test_without_keys_no_signature_is_needed() -> None:
     ],
 )
 def test_an_invalid_key_is_an_error(line: str) -> None:
-    """The configuration is refused, and the error shows the form of a key."""
+    """The configuration is rejected, and the error shows the form of a key."""
     with pytest.raises(ValueError, match="ssh-keygen -t ed25519"):
         checked_key(line)
     assert checked_key(LINE) == LINE

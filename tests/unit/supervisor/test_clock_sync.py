@@ -17,7 +17,7 @@ from appliance.supervisor.clock_sync import clock_is_synchronised
 def test_the_kernels_flag_decides(
     monkeypatch: pytest.MonkeyPatch, status: int, answer: int, expected: bool | None
 ) -> None:
-    """Other trouble is ignored; if the call is forbidden, nothing is known. The clock is never set."""
+    """Other flags are ignored; if the call is forbidden, the state is unknown. The clock is never set."""
     asked = []
 
     def adjtimex(given: Any) -> int:
@@ -31,13 +31,13 @@ def test_the_kernels_flag_decides(
 
 
 def test_the_structure_is_the_kernels() -> None:
-    """The flags have the offset of the 64-bit kernel (adjtimex(2)), and the structure is large enough."""
+    """The flags are at the offset of the 64-bit kernel (adjtimex(2)), and the structure is large enough."""
     assert clock_sync.Timex.status.offset == 40
     assert ctypes.sizeof(clock_sync.Timex) >= 208
 
 
 def test_this_kernel_is_asked() -> None:
-    """The real call fills the structure: an answer has a positive maximum error."""
+    """The real call fills the structure: the maximum error is positive."""
     timex = clock_sync.Timex()
     answer = ctypes.CDLL(None).adjtimex(ctypes.pointer(timex))
     assert answer == -1 or timex.maxerror > 0

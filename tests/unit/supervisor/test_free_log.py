@@ -1,4 +1,4 @@
-"""Tests of ending processes that keep the audit log locked."""
+"""Tests of ending processes that lock the audit log."""
 
 import socket
 from pathlib import Path
@@ -20,7 +20,7 @@ class _Life:
         self.killed = False
 
     def kill(self) -> None:
-        """Note the signal."""
+        """Record the signal."""
         self.killed = True
 
 
@@ -36,7 +36,7 @@ class _Life:
     ],
 )
 def test_only_readers_of_the_log_are_ended(tmp_path: Path, holding: list[str | int], ended: set[str]) -> None:
-    """The named reader is ended, or all readers if the kernel names none of them; no other process is."""
+    """The named reader is ended, or all readers if the kernel names none; no other process is ended."""
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "c", rosmaster_port=1)
     supervisor = Supervisor(roles_of(syslog=True), facts, admin=admin, ready=lambda _said: None)

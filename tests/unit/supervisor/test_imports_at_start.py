@@ -1,4 +1,4 @@
-"""Processes import no library that they may never need before they are ready."""
+"""Before they are ready, processes import no library that they may never need."""
 
 import subprocess
 import sys
@@ -43,7 +43,7 @@ def test_a_process_imports_no_library_it_may_never_need(role: str) -> None:
 
 
 def test_the_supervisor_imports_no_library_it_may_never_need() -> None:
-    """This holds for `rosrv up` also, which uses `typer` for its flags."""
+    """This also holds for `rosrv up`, which uses `typer` for its flags."""
     assert imported("appliance.cli.main", "appliance.cli.up").isdisjoint(
         NEVER - {"typer"} | {"appliance.channel.admin", "appliance.configuration.inventory"}
     )

@@ -30,7 +30,7 @@ def _is_open(descriptor: int) -> bool:
 
 
 def test_a_kept_socket_is_there_until_it_is_dropped(kept: InheritedListeners) -> None:
-    """A kept socket is returned under its name; a dropped one is closed."""
+    """A kept socket is returned by its name; a dropped socket is closed."""
     descriptor = _listening()
     kept.keep("outer:a1", descriptor)
     assert list(kept) == [("outer:a1", descriptor)]
@@ -40,7 +40,7 @@ def test_a_kept_socket_is_there_until_it_is_dropped(kept: InheritedListeners) ->
 
 
 def test_a_name_stands_for_one_socket(kept: InheritedListeners) -> None:
-    """Keeping another socket under the same name closes the first, also when there is no more room."""
+    """Keeping another socket under the same name closes the first socket, even if the store is full."""
     first, second, other = _listening(), _listening(), _listening()
     kept.keep("other", other)
     kept.keep("rvmaster", first)
@@ -70,7 +70,7 @@ def test_only_plain_names_are_accepted(kept: InheritedListeners, name: str) -> N
 
 
 def test_only_listening_sockets_are_kept(kept: InheritedListeners) -> None:
-    """Neither a file nor a socket that does not listen is worth keeping, and neither stays open."""
+    """A file, or a socket that does not listen, is refused and closed."""
     read_end, write_end = os.pipe()
     os.close(write_end)
     with pytest.raises(ListenerRejectedError, match="not a socket"):

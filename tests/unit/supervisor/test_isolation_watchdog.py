@@ -17,7 +17,7 @@ pytestmark = pytest.mark.anyio
 
 
 class Surroundings(NoIsolation):
-    """An enclosure where a test chooses the findings of a probe."""
+    """An enclosure where the test chooses the findings of a probe."""
 
     kind = "container"
     probes = True
@@ -28,7 +28,7 @@ class Surroundings(NoIsolation):
         self.looked = threading.Event()
 
     def report(self) -> FirewallState:
-        """Return a report that can be recognised."""
+        """Return a recognisable report."""
         return FirewallState(backend="nft")
 
     def probe(self) -> str | None:
@@ -48,7 +48,7 @@ class Surroundings(NoIsolation):
         self.closed.append(inner_port)
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """Fail as a machine does that has no process left."""
+        """Fail as on a machine that has no process left."""
         raise OSError(errno.EAGAIN, "no process can be made")
 
 
@@ -59,7 +59,7 @@ def surroundings() -> Surroundings:
 
 
 async def test_control_learns_of_each_opening_and_closing(surroundings: Surroundings) -> None:
-    """A finding is sent with its reason, and so is its end, both with the report."""
+    """A finding is sent with its reason, and so is its end; both have the report."""
     told: list[Message] = []
     surroundings.found = ["reached", None]
     watchdog = IsolationWatchdog(surroundings, told.append)
@@ -78,7 +78,7 @@ async def test_a_probe_that_cannot_be_made_counts_as_open(surroundings: Surround
 
 
 async def test_a_new_control_receives_the_last_finding(surroundings: Surroundings) -> None:
-    """A control that started after the finding receives it also."""
+    """A control that starts after the finding still receives it."""
     surroundings.found = ["reached"]
     watchdog = IsolationWatchdog(surroundings, lambda _message: None)
     assert watchdog.news() == [FirewallReported("container", FirewallState())]
@@ -87,7 +87,7 @@ async def test_a_new_control_receives_the_last_finding(surroundings: Surrounding
 
 
 async def test_the_master_side_port_is_closed_and_then_probed(surroundings: Surroundings) -> None:
-    """The port is closed to others before it is probed; a failure to close it is a finding."""
+    """The port is closed to others and then probed; if it cannot be closed, that is a finding."""
     surroundings.found = [None]
     watchdog = IsolationWatchdog(surroundings, lambda _message: None)
     assert await watchdog.control_ready(4711, 4712) is None
@@ -100,7 +100,7 @@ async def test_the_master_side_port_is_closed_and_then_probed(surroundings: Surr
 async def test_a_master_side_port_that_cannot_be_closed_is_reported(
     surroundings: Surroundings, port: int
 ) -> None:
-    """For any reason, control learns that it must not serve, and so does the next control."""
+    """For any reason, this control and the next learn that they must not serve."""
     told: list[Message] = []
     watchdog = IsolationWatchdog(surroundings, told.append)
     assert "cannot be closed to others" in str(await watchdog.control_ready(port, 4712))
@@ -115,7 +115,7 @@ async def test_a_master_side_port_that_cannot_be_closed_is_reported(
 async def test_a_failing_probe_is_a_finding_and_probes_go_on(
     surroundings: Surroundings, broken: Exception
 ) -> None:
-    """A short lack of files or processes is reported as a fault, and its end after the next probe."""
+    """A short lack of files or processes is reported as a fault, and its end is reported after the next probe."""
     told: list[Message] = []
     surroundings.found = [broken, *[None] * 100_000]
     running = asyncio.create_task(IsolationWatchdog(surroundings, told.append, every=0.001).run())
@@ -129,7 +129,7 @@ async def test_a_failing_probe_is_a_finding_and_probes_go_on(
 
 
 def test_tunnels_that_cannot_be_opened_are_answered(surroundings: Surroundings) -> None:
-    """Control waits for the answer, so an unexpected error is answered also."""
+    """Control waits for the answer, so an unexpected error is also answered."""
     answer = asyncio.run(
         IsolationWatchdog(surroundings, lambda _message: None).open_tunnels("10.9.0.0/24", "10.9.0.1")
     )
@@ -138,7 +138,7 @@ def test_tunnels_that_cannot_be_opened_are_answered(surroundings: Surroundings) 
 
 
 async def test_probes_are_repeated(surroundings: Surroundings) -> None:
-    """While the appliance runs the enclosure is probed in turn, also after a finding."""
+    """While the appliance runs, the enclosure is probed repeatedly, also after a finding."""
     told: list[Message] = []
     surroundings.found = [None, "reached", None]
     surroundings.found += [None] * 100_000
@@ -151,7 +151,7 @@ async def test_probes_are_repeated(surroundings: Surroundings) -> None:
 
 
 async def test_without_isolation_nothing_is_probed() -> None:
-    """Isolation `none` has nothing to probe, and does not claim a proof."""
+    """Isolation `none` is not probed, and is not reported as proved."""
     told: list[Message] = []
     assert await IsolationWatchdog(NoIsolation(), told.append).look() is None
     assert told == [FirewallReported("none", FirewallState())]

@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.logs`, in a process of its own: logging is set up once for each."""
+"""Tests of `appliance.supervisor.logs` in a separate process, because logging is set up once for each process."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""The files with the state of monitors: of this run, of the last one, and after an orderly end."""
+"""The files with the state of monitors: of this run, of the last run, and after an orderly end."""
 
 import os
 from pathlib import Path
@@ -41,7 +41,7 @@ def test_only_relays_have_files_each_its_own(tmp_path: Path) -> None:
 
 
 def test_every_relay_reads_the_state_of_the_last_run(tmp_path: Path) -> None:
-    """This holds also without an orderly end, but then no mark says that the state outlived the machine."""
+    """Without an orderly end the state is read as well, but no mark says that the state outlived the machine."""
     first = MonitorMemory(tmp_path, 2)
     write(first, 0, b"a")
     write(first, 1, b"b")
@@ -77,7 +77,7 @@ def test_the_files_of_short_runs_are_bounded(tmp_path: Path) -> None:
 
 
 def test_fewer_relays_drop_the_state_of_the_others(tmp_path: Path) -> None:
-    """After all present relays have written, the other state does not return in a later run."""
+    """Once all present relays have written their state, the remaining state does not return in a later run."""
     first = MonitorMemory(tmp_path, 2)
     write(first, 0, b"a")
     write(first, 1, b"b")
@@ -101,7 +101,7 @@ def test_an_orderly_end_is_reported_once(tmp_path: Path) -> None:
 def test_on_a_full_disk_the_state_survives_relays_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The appliance starts, and reports the consequence."""
+    """The appliance starts, and reports that the state will not survive a restart of the appliance."""
 
     def full(_descriptor: int, _offset: int, _size: int) -> None:
         raise OSError(28, "No space left on device")

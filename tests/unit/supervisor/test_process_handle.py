@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.process_handle`: which process hangs, and which is only slow."""
+"""Tests of `appliance.supervisor.process_handle`: distinguish a hanging process from a slow one."""
 
 import errno
 import os
@@ -37,12 +37,12 @@ pytestmark = pytest.mark.anyio
 def test_a_slow_start_is_waited_for_and_a_hang_is_not(
     silent: float, starting: bool, still: float, hanging: bool
 ) -> None:
-    """A process that serves must answer within seconds; one that starts must only make progress."""
+    """A serving process must answer within seconds; a starting process must only make progress."""
     assert is_hanging(silent, starting=starting, still=still) is hanging
 
 
 async def test_a_process_that_cannot_be_watched_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With too many open files the start fails, and no process is left that holds the port of the next one."""
+    """If too many files are open, the start fails, and no process is left that uses the next one's port."""
     started: list[subprocess.Popen[bytes]] = []
     popen = subprocess.Popen
 

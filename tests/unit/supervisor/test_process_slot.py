@@ -34,7 +34,7 @@ def test_restarts_of_a_dying_process_wait_up_to_a_second(slot: ProcessSlot) -> N
 
 
 def test_restarts_of_an_optional_process_wait_up_to_a_minute() -> None:
-    """A tunnel process that dies at every start restarts ever later, and is failing until one run lasts."""
+    """A tunnel process that dies at every start is restarted more and more slowly, and is failing until a run lasts."""
     slot = ProcessSlot(
         Role(name="charon", user="rosrv-ipsec", part="ipsec", entry="m:f", dispensable=True), 0
     )
@@ -60,7 +60,7 @@ def test_a_process_that_ran_long_is_restarted_at_once(slot: ProcessSlot) -> None
 
 
 def test_a_plan_has_the_number_of_an_indexed_role_only(slot: ProcessSlot) -> None:
-    """A process of an indexed role receives its index."""
+    """Only a process of an indexed role receives its index."""
     facts = Facts(state=Path("/state"), config=Path("/state/run/config.json"), rosmaster_port=1)
     assert slot.plan(facts, 3).index == 1
     alone = ProcessSlot(Role(name="signer", user="rosrv-signer", part="signer", entry="m:f"), 0)

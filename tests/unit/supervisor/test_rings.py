@@ -1,4 +1,4 @@
-"""The memory of the flight recorder: each process gets its part, and cannot damage others."""
+"""The memory of the flight recorder: each process gets its part, and cannot damage the parts of others."""
 
 import mmap
 import os
@@ -30,7 +30,7 @@ def test_a_relay_writes_its_own_part_and_the_recorder_reads_all() -> None:
 
 
 def test_no_process_shrinks_it_and_the_recorder_cannot_write() -> None:
-    """A relay cannot make a read fail, and only the relay changes its messages."""
+    """Only its relay can change a part, and no relay can make a read fail."""
     rings = RecorderRings(RecorderRules(memory=ByteSize(16 * MIB)), 1)
     [(_given, written)] = rings.messages_for("relay", 0)
     [(_given, read)] = rings.messages_for("recorder", 0)
@@ -45,7 +45,7 @@ def test_no_process_shrinks_it_and_the_recorder_cannot_write() -> None:
 
 
 def test_another_user_cannot_reopen_it_for_writing() -> None:
-    """The recorder can find it in /proc, but the mode of the file does not let it write."""
+    """The recorder can find the memory in /proc, but the mode of the file forbids writing."""
     rings = RecorderRings(RecorderRules(memory=ByteSize(16 * MIB)), 1)
     [(_given, read)] = rings.messages_for("recorder", 0)
     assert os.fstat(read).st_mode & 0o777 == 0o600
@@ -53,7 +53,7 @@ def test_another_user_cannot_reopen_it_for_writing() -> None:
 
 
 def test_the_memory_is_there_from_the_start() -> None:
-    """A lack of memory shows at the start, not during an incident."""
+    """If memory is short, the start fails, instead of a recording during an incident."""
     rings = RecorderRings(RecorderRules(memory=ByteSize(16 * MIB)), 1)
     [(_given, written)] = rings.messages_for("relay", 0)
     assert os.fstat(written).st_blocks * 512 == 16 * MIB
@@ -61,6 +61,6 @@ def test_the_memory_is_there_from_the_start() -> None:
 
 
 def test_more_than_the_machines_memory_is_refused() -> None:
-    """The message says what to do, before any process starts."""
+    """The message gives advice before any process starts."""
     with pytest.raises(StartError, match=r"recorder\.memory: 1\.0PiB is more than .* set a smaller value"):
         RecorderRings(RecorderRules(memory=ByteSize(1 << 50)), 1)

@@ -15,7 +15,7 @@ BY_NAME = {role.name: role for role in ROLES}
 
 
 def test_rosmaster_binds_loopback_only() -> None:
-    """It is started on loopback, on the given port."""
+    """rosmaster listens only on loopback, on the given port."""
     role = BY_NAME["rosmaster"]
     assert role.program is not None
     program = role.program(FACTS)
@@ -31,7 +31,7 @@ def test_rosmaster_runs_no_code_of_its_home() -> None:
 
 
 def test_rosmaster_logs_warnings_and_no_calls(tmp_path: Path) -> None:
-    """A line for each call would cost it half of its time; its warnings are still written."""
+    """Logging each call would cost rosmaster half of its time; its warnings are still logged."""
     role = BY_NAME["rosmaster"]
     assert role.program is not None
     says = (
@@ -58,21 +58,21 @@ def test_rosout_writes_no_files() -> None:
 
 
 def test_a_missing_rosmaster_is_an_error_that_says_what_to_install(tmp_path: Path) -> None:
-    """The message has the command that installs it."""
+    """The message has the command that installs rosmaster."""
     with pytest.raises(StartError, match="apt install python3-rosmaster"):
         require_programs({HERE: "coreutils", tmp_path / "rosmaster": "python3-rosmaster"})
     require_programs({HERE: "coreutils"})
 
 
 def test_links_are_between_roles_and_go_both_ways() -> None:
-    """A restart of either end renews the link, so both rows name it."""
+    """A restart of either end renews the link, so the rows of both roles name it."""
     for role in ROLES:
         for other in role.links:
             assert role.name in BY_NAME[other].links
 
 
 def test_the_forwarder_runs_only_if_configured() -> None:
-    """It has a user of its own, in the group that may read the audit log; the other processes do not depend on it."""
+    """The forwarder has its own user, in the group that may read the audit log; no other process depends on it."""
     forwarder = BY_NAME["syslog"]
     assert forwarder in roles_of(syslog=True)
     assert forwarder not in roles_of()
@@ -83,7 +83,7 @@ def test_the_forwarder_runs_only_if_configured() -> None:
 
 
 def test_the_recorder_runs_only_if_configured() -> None:
-    """It has a user of its own and no network, reads the audit log, and the api reads its recordings."""
+    """The recorder has its own user and no network, and reads the audit log; the api reads its recordings."""
     recorder = BY_NAME["recorder"]
     assert recorder in roles_of(recorder=True)
     assert recorder not in roles_of()
@@ -93,7 +93,7 @@ def test_the_recorder_runs_only_if_configured() -> None:
 
 
 def test_the_compiler_has_only_its_link() -> None:
-    """The compiler has its own user, no network, file or right, and starts on demand."""
+    """The compiler has its own user, but no network, file or right, and starts on demand."""
     compiler = BY_NAME["compiler"]
     assert compiler in roles_of()
     assert compiler.user not in {role.user for role in ROLES if role is not compiler}
@@ -103,7 +103,7 @@ def test_the_compiler_has_only_its_link() -> None:
 
 
 def test_rows_are_consistent() -> None:
-    """Each role has a user of the design and is either ours or a program; no two of ours share a part."""
+    """Each role has a user of the design, and runs our code or a foreign program. No two of ours share a part."""
     assert all(role.user in NUMERIC_IDS for role in ROLES)
     assert all((role.entry is None) != (role.program is None) for role in ROLES)
     parts = [role.part for role in ROLES if role.entry]

@@ -9,7 +9,7 @@ from appliance.supervisor.service_manager import ServiceManager
 
 
 def listening(path: Path) -> socket.socket:
-    """Return a socket as systemd gives to a service."""
+    """Return a socket like the one that systemd gives to a service."""
     heard = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     heard.bind(str(path))
     heard.settimeout(10)
@@ -17,7 +17,7 @@ def listening(path: Path) -> socket.socket:
 
 
 def test_start_ready_and_stop_are_reported(tmp_path: Path) -> None:
-    """A start reports its steps and time; `READY=1` when nodes may connect, `STOPPING=1` at an orderly end."""
+    """A start reports its steps and times, `READY=1` when nodes may connect, and `STOPPING=1` at an orderly end."""
     with listening(tmp_path / "notify") as heard:
         manager = ServiceManager.of({"NOTIFY_SOCKET": str(tmp_path / "notify")})
         manager.starting("builds its firewall")
@@ -29,7 +29,7 @@ def test_start_ready_and_stop_are_reported(tmp_path: Path) -> None:
 
 
 def test_the_watchdog_is_fed_twice_in_its_time(tmp_path: Path) -> None:
-    """While the loop runs the watchdog is fed at each half of its time; a start gets more time."""
+    """While the loop runs, the watchdog is notified after each half of its interval; a start gets more time."""
     environment = {
         "NOTIFY_SOCKET": str(tmp_path / "notify"),
         "WATCHDOG_USEC": "20000",
@@ -54,7 +54,7 @@ def test_the_watchdog_is_fed_twice_in_its_time(tmp_path: Path) -> None:
 
 
 def test_without_a_service_manager_nothing_is_sent() -> None:
-    """There is no receiver after a start by hand, or if the watchdog is for another process."""
+    """After a manual start, or if the watchdog is for another process, nothing is sent."""
     manager = ServiceManager.of({"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"})
     manager.ready("nobody hears it")
     assert manager.watchdog_seconds is None

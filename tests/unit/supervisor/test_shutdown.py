@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.shutdown`, with processes whose end a test chooses."""
+"""Tests of `appliance.supervisor.shutdown` with simulated processes."""
 
 import asyncio
 import signal
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.anyio
 
 
 class Crowd:
-    """Processes, and the actions to end them, in order."""
+    """Processes, and the actions that end them, in order."""
 
     def __init__(self) -> None:
         self.slots: list[ProcessSlot] = []
@@ -23,14 +23,14 @@ class Crowd:
         self.done: list[tuple[str, str]] = []
 
     def add(self, name: str, ends_by: str, *, is_program: bool = False, last: bool = False) -> None:
-        """Add a process that ends by `Stop`, by a signal's name, or not at all."""
+        """Add a process that ends on `Stop`, on a signal of this name, or never."""
         role = Role(name=name, user="rosrv", part=name, outlives_control=last)
         slot = ProcessSlot(role, 0)
         slot.process = cast(ProcessHandle, Process(self, slot, ends_by, is_program=is_program))
         self.slots.append(slot)
 
     def end(self) -> list[tuple[str, str]]:
-        """Return the actions."""
+        """End all processes, and return the actions."""
         asyncio.run(shutdown.end_all(self.slots, self.died))
         return self.done
 
@@ -44,11 +44,11 @@ class Process:
         self.crowd, self.slot, self.ends_by, self.is_program = crowd, slot, ends_by, is_program
 
     def send(self, message: object) -> None:
-        """Note the request to stop."""
+        """Record the request to stop."""
         self._suffer(type(message).__name__)
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
-        """Note a signal."""
+        """Record a signal."""
         self._suffer(number.name)
 
     def _suffer(self, what: str) -> None:
@@ -67,7 +67,7 @@ def crowd(monkeypatch: pytest.MonkeyPatch) -> Crowd:
 
 
 def test_each_is_asked_first_and_rosmaster_last(crowd: Crowd) -> None:
-    """Our processes get a message, programs SIGTERM; processes that outlive control come last."""
+    """Our processes get a message, and programs get SIGTERM; processes that must outlive control come last."""
     crowd.add("rosmaster", "SIGTERM", is_program=True, last=True)
     crowd.add("control", "Stop")
     crowd.add("rosout", "SIGTERM", is_program=True)
@@ -88,7 +88,7 @@ def test_a_process_that_does_not_end_is_killed(crowd: Crowd) -> None:
 
 
 def test_an_unkillable_process_does_not_delay_the_end(crowd: Crowd) -> None:
-    """A process that the kernel itself cannot end (a broken disk) is left, and the others are ended."""
+    """A process that even the kernel cannot end (a broken disk) is left, and the others are ended."""
     crowd.add("control", "never")
     crowd.add("rosmaster", "Stop", last=True)
     done = crowd.end()
@@ -97,7 +97,7 @@ def test_an_unkillable_process_does_not_delay_the_end(crowd: Crowd) -> None:
 
 
 async def test_a_pending_restart_is_cancelled(crowd: Crowd) -> None:
-    """A restart that waits for its time does not happen."""
+    """A restart that is still delayed does not happen."""
     crowd.add("relay", "Stop")
     slot = crowd.slots[0]
     slot.process = None

@@ -1,6 +1,6 @@
-"""Tests of `appliance.supervisor.signals`: signals during operations that must be completed.
+"""Tests of `appliance.supervisor.signals`: signals that arrive during operations which must be completed.
 
-Each runs in a process of its own: a signal that a thread of the test runner takes would end it.
+Each test runs a separate process: a signal to a thread of the test runner would end the runner.
 """
 
 import subprocess
@@ -51,7 +51,7 @@ thread.join()
 
 
 def by_itself(script: str) -> None:
-    """Run a script in a process that has one thread."""
+    """Run a script in a process with one thread."""
     done = subprocess.run(
         [sys.executable, "-c", _BEGIN + script], capture_output=True, text=True, check=False, timeout=120
     )
@@ -59,10 +59,10 @@ def by_itself(script: str) -> None:
 
 
 def test_held_signals_arrive_when_a_handler_is_set() -> None:
-    """At first nothing happens, then each arrives; later ones are dropped, and the handlers are restored."""
+    """Held signals arrive when a handler is set; later ones are dropped, and the previous handlers are restored."""
     by_itself(_HELD)
 
 
 def test_a_thread_does_not_take_them() -> None:
-    """The kernel gives a signal to any thread that accepts it; if all block it, it waits."""
+    """The kernel delivers a signal to any thread that accepts it; if all block it, the signal waits."""
     by_itself(_THREAD)

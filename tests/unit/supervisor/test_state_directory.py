@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.state_directory`, as the user who runs the tests."""
+"""Tests of `appliance.supervisor.state_directory`, run as the user of the tests."""
 
 import os
 import socket
@@ -20,7 +20,7 @@ ROLES = (
 
 
 def test_parts_are_made_and_closed_to_others(tmp_path: Path) -> None:
-    """Every role gets its folder, for its user only; others can traverse the directory but not list it."""
+    """Every role gets a folder for its user only; others can traverse the directory but not list it."""
     state = StateDirectory(tmp_path / "deep" / "state")
     state.prepare(ROLES)
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in state.path.iterdir()}
@@ -45,7 +45,7 @@ def test_leftovers_of_a_killed_process_are_removed_at_the_next_start(tmp_path: P
 
 
 def test_a_second_user_of_the_directory_is_refused_by_name(tmp_path: Path) -> None:
-    """The message says which process has the directory; when that one is gone the directory is free."""
+    """The message names the process that uses the directory; when that process ends, the directory is free."""
     first = StateDirectory(tmp_path)
     with pytest.raises(StartError, match=f"process {os.getpid()}"):
         StateDirectory(tmp_path)
@@ -64,7 +64,7 @@ def test_a_stale_admin_socket_is_replaced(tmp_path: Path) -> None:
 
 
 def test_a_path_too_long_for_a_socket_is_a_clear_error(tmp_path: Path) -> None:
-    """The kernel takes 107 bytes; the message says to name a shorter path."""
+    """The kernel accepts at most 107 bytes; the message advises a shorter path."""
     state = StateDirectory(tmp_path / ("x" * 120))
     with pytest.raises(StartError, match="shorter path"):
         state.open_admin_socket()
@@ -73,7 +73,7 @@ def test_a_path_too_long_for_a_socket_is_a_clear_error(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["file", "link"])
 def test_a_part_that_is_not_a_folder_is_refused(tmp_path: Path, kind: str) -> None:
-    """Neither a file nor a symbolic link is taken for a role's folder, nor changed."""
+    """A file or symbolic link in place of a role's folder is refused and not changed."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir(mode=0o755)
     elsewhere.chmod(0o755)
@@ -89,15 +89,17 @@ def test_a_part_that_is_not_a_folder_is_refused(tmp_path: Path, kind: str) -> No
 
 
 def test_a_directory_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> None:
-    """The message names the directory and the flag."""
+    """The message names the directory and the flag that sets it."""
     (tmp_path / "file").write_text("")
     with pytest.raises(StartError, match=r"file/state cannot be used: .*--state DIR"):
         StateDirectory(tmp_path / "file" / "state")
 
 
 def test_a_part_that_a_group_may_traverse(tmp_path: Path) -> None:
-    """As root: the folder is in the reader's group, which new files get, also if the folder existed before.
-    Without root there is one user, who owns the folder alone."""
+    """As root: the folder has the reader's group, which new files inherit, even if the folder already existed.
+
+    Without root, a single user owns the folder.
+    """
     shared = (Role(name="control", user="rosrv", part="control", readable_by="rosrv-api"),)
     for roles in (ROLES[:1], shared, shared):
         state = StateDirectory(tmp_path)
@@ -122,7 +124,7 @@ def folder(path: Path, *files: str) -> Path:
 
 
 def test_a_directory_of_others_is_refused_and_unchanged(tmp_path: Path) -> None:
-    """`--state /tmp` must not close /tmp: the message says what is in it and what to name; its mode stays."""
+    """`--state /tmp` must not close /tmp: the message lists its contents and suggests a path; its mode stays."""
     theirs = folder(tmp_path / "theirs", "notes.txt", "a", "b", "c", "d")
     with pytest.raises(
         StartError, match=r"theirs is not the state directory.* contains a, b, c ….* name another"
@@ -135,14 +137,14 @@ def test_a_directory_of_others_is_refused_and_unchanged(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("files", [(), ("lost+found/x",), ("lock",), ("control/state.db",)])
 def test_a_directory_of_the_appliance_is_accepted(tmp_path: Path, files: tuple[str, ...]) -> None:
-    """An empty one, the root of a disk, one of an earlier run, and one with a restored backup."""
+    """Covers an empty directory, the root of a disk, a directory of an earlier run, and a restored backup."""
     state = StateDirectory(folder(tmp_path / "state", *files))
     assert stat.S_IMODE(state.path.stat().st_mode) == 0o711
     state.close()
 
 
 def test_a_lock_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
-    """Otherwise a user with write access could have any file of root truncated."""
+    """Otherwise a user with write access could have root truncate any file."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.write_text("kept")
     state = folder(tmp_path / "state")
@@ -154,7 +156,7 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can make files of others")
 def test_a_foreign_lock_makes_no_state_directory(tmp_path: Path) -> None:
-    """In a world-writable directory a file of that name proves nothing."""
+    """In a world-writable directory, a file with the lock's name proves nothing."""
     theirs = folder(tmp_path / "theirs", "lock")
     os.chown(theirs / "lock", 61099, 61099)
     with pytest.raises(StartError, match="is not the state directory"):
@@ -164,7 +166,7 @@ def test_a_foreign_lock_makes_no_state_directory(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives folders to other users")
 def test_a_start_that_was_killed_is_completed(tmp_path: Path) -> None:
-    """A folder that was made and not yet given to its user is given at the next start."""
+    """If a start was killed before a folder got its owner, the next start sets the owner."""
     (tmp_path / "lock").touch()
     (tmp_path / "control").mkdir()
     state = StateDirectory(tmp_path)

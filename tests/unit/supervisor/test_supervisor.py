@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.supervisor` in races that real processes seldom hit."""
+"""Tests of races in `appliance.supervisor.supervisor` that real processes seldom hit."""
 
 import asyncio
 import errno
@@ -42,11 +42,11 @@ class StandIn:
         self.stalled_seconds = 0.0
 
     def kill(self) -> None:
-        """Note the call."""
+        """Record the call."""
         self.killed = True
 
     def send(self, message: object, _descriptors: tuple[int, ...] = ()) -> None:
-        """Note the kind of the call."""
+        """Record the kind of the call."""
         self.told.append(type(message).__name__)
 
     def note_answer(self) -> None:
@@ -66,7 +66,7 @@ def made(
 async def test_a_master_that_dies_during_a_check_is_checked_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The answer came from an ended process: the start waits for the next one, and does not fail."""
+    """The answer came from a process that has ended: the start waits for the next process instead of failing."""
     supervisor = made(tmp_path, ROSMASTER)
     slot = supervisor.slots[0]
     first, second = StandIn(), StandIn()
@@ -74,7 +74,7 @@ async def test_a_master_that_dies_during_a_check_is_checked_again(
 
     async def answers(_seconds: float) -> bool:
         if not asked.is_set():
-            slot.process = None  # it died during the check
+            slot.process = None  # the process died during the check
             asked.set()
         return True
 
@@ -104,7 +104,7 @@ async def test_a_first_token_that_cannot_be_saved_ends_the_start(tmp_path: Path)
 async def test_a_machine_without_processes_causes_no_tight_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A process that cannot be started is retried like one that dies at once: slower each time."""
+    """If a process cannot be started, it is retried with a growing delay, as if it had died at once."""
 
     def none_left(*_arguments: object) -> ProcessHandle:
         raise OSError(errno.EAGAIN, "no process can be made")
@@ -121,7 +121,7 @@ async def test_a_machine_without_processes_causes_no_tight_loop(
 
 
 def test_a_control_that_asks_for_too_much_at_once_is_replaced(tmp_path: Path) -> None:
-    """Unanswered requests are bounded; earlier ones are answered."""
+    """Unanswered requests are limited; earlier requests are answered."""
 
     async def scene() -> tuple[StandIn, int]:
         supervisor, control = made(tmp_path, CONTROL), StandIn()
@@ -167,7 +167,7 @@ async def test_a_slow_start_is_waited_for_and_reported(
 
 @pytest.mark.parametrize("wanted", [False, True])
 def test_a_process_on_demand_may_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wanted: bool) -> None:
-    """Its end counts as no failure or restart; a new one starts only if requested meanwhile."""
+    """The end of such a process is not a failure or a restart; a new one starts only if requested meanwhile."""
     role = Role(name="compiler", user="rosrv-compiler", part="compiler", entry="m:f", on_demand=True)
     asyncio.run(_end_by_themselves(made(tmp_path, role), monkeypatch, wanted))
 
@@ -190,6 +190,6 @@ async def _end_by_themselves(supervisor: Supervisor, monkeypatch: pytest.MonkeyP
     slot.process, slot.starts = cast(ProcessHandle, StandIn()), 1
     cast(Any, slot.process).started = 0.0
     supervisor.died(slot.process, -9)
-    assert slot.due is not None  # a death is followed by a life
+    assert slot.due is not None  # each death is followed by a new start
     slot.due.cancel()
     supervisor.kept.close()

@@ -9,7 +9,7 @@ from appliance.supervisor.users import NUMERIC_IDS, account_of
 
 
 def test_without_a_user_of_that_name_the_numeric_id_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As root, on a machine without these users, each role still has its own id."""
+    """As root on a machine without these users, each role still has its own numeric id."""
     monkeypatch.setattr(os, "geteuid", lambda: 0)
 
     def unknown(name: str) -> pwd.struct_passwd:
@@ -32,7 +32,7 @@ def test_without_a_user_of_that_name_the_numeric_id_is_used(monkeypatch: pytest.
 
 
 def test_a_user_of_that_name_is_preferred(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As root, the users that an administrator made are used."""
+    """As root, the users that an administrator created are used."""
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     made = pwd.struct_passwd(("rosrv", "x", 123, 456, "", "/", "/bin/false"))
     monkeypatch.setattr(pwd, "getpwnam", lambda _name: made)

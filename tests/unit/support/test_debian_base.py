@@ -1,4 +1,4 @@
-"""Tests of how a small Debian learns to fetch packages the way this machine does (the tree itself: system tests)."""
+"""Tests of the package sources that a small Debian tree takes from this machine; system tests cover the tree."""
 
 from tests.support.debian_base import apt_settings, debian_sources, pip_settings
 
@@ -12,7 +12,7 @@ https://packages.example/tool nodistro main Somebody
 
 
 def test_only_the_suite_and_its_updates_are_used() -> None:
-    """The suite itself comes first; other suites and other people's packages are left out."""
+    """The suite itself comes first; other suites and third-party packages are left out."""
     assert debian_sources(TARGETS, "bookworm") == [
         "deb http://mirror.example/debian/ bookworm contrib main",
         "deb http://mirror.example/debian-security/ bookworm-security main",
@@ -20,12 +20,12 @@ def test_only_the_suite_and_its_updates_are_used() -> None:
 
 
 def test_a_machine_without_the_suite_has_no_lines_for_it() -> None:
-    """Where the machine knows nothing of a suite, nothing is made up."""
+    """If the machine has no line for a suite, no line is invented."""
     assert debian_sources(TARGETS, "sid") == []
 
 
 def test_apt_fetches_through_the_machines_proxy() -> None:
-    """The proxy in apt's configuration is kept; otherwise that of the environment is used."""
+    """The proxy of apt's configuration is kept; otherwise the proxy of the environment is used."""
     told = (
         'Acquire::http::Proxy "http://apt-proxy.example:3142";\nAcquire::Languages "none";\nAPT::Color "1";\n'
     )
@@ -39,7 +39,7 @@ def test_apt_fetches_through_the_machines_proxy() -> None:
 
 
 def test_pip_gets_only_indexes_that_the_tree_can_reach() -> None:
-    """Indexes on the network are kept; folders of this machine are not in the tree and are left out."""
+    """Indexes on the network are kept; folders of this machine are left out because the tree lacks them."""
     listed = (
         "global.extra-index-url='file:///srv/simple https://pypi.example/simple'\n"
         "global.find-links='/srv/wheels'\n:env:.index-url='https://mirror.example/simple'\n"

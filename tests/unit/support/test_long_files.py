@@ -1,4 +1,4 @@
-"""Tests of tests/long.txt, the files that run first because they take longest."""
+"""Tests of tests/long.txt, the list of files that run first because they take longest."""
 
 from pathlib import Path
 
@@ -6,6 +6,6 @@ TESTS = Path(__file__).parents[2]
 
 
 def test_every_long_file_exists() -> None:
-    """A renamed file is renamed in the list."""
+    """If a file is renamed, the list must be changed as well."""
     names = (TESTS / "long.txt").read_text(encoding="utf-8").splitlines()
     assert [name for name in names if not name.startswith("#") and not (TESTS.parent / name).is_file()] == []

@@ -1,4 +1,4 @@
-"""Tests of what a test may require of the machine."""
+"""Tests of the requirements that a test may place on the machine."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from tests.support.requirements import needs
 
 
 def test_a_met_requirement_lets_the_test_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A condition that holds does nothing, in CI or not."""
+    """A condition that holds has no effect, in CI or elsewhere."""
     monkeypatch.setenv("CI", "true")
     needs(True, "nothing")
 

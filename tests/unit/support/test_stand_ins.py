@@ -1,4 +1,4 @@
-"""Tests use only public names of the product; stand-ins are typed and accept no other calls."""
+"""Tests use only public names of the product; stand-ins are typed and reject unknown calls."""
 
 import ast
 import re
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from tests.support.sources import ROOT, files_of_tests
 
-# Names with an underscore that belong to a published interface.
+# Names with an underscore that are part of a published interface.
 PUBLISHED = {
     "_asdict": "of a named tuple",
     "_replace": "of a named tuple",
@@ -23,12 +23,12 @@ def test_private_attributes_are_not_read() -> None:
 
 
 def test_stand_ins_accept_only_known_calls() -> None:
-    """No `__getattr__`, no mock: a name that changed in the product fails in its tests."""
+    """With neither `__getattr__` nor a mock, a name that changed in the product fails in its tests."""
     assert [file for file, tree in trees("__getattr|mock|Mock") if any(answers_anything(tree))] == []
 
 
 def test_the_rule_finds_what_it_forbids() -> None:
-    """Reading, calling and setting; a class that answers everything; a mock, however it is imported."""
+    """Covers reading, calling and setting, a class that answers everything, and any import of a mock."""
     for text in ("x._y", "x.y._z()", "x._y = 1", "f()._y"):
         assert list(private(ast.parse(text))), text
     for text in ("self._y", "x.y", "x.__dict__", "t._replace(a=1)"):
@@ -43,7 +43,7 @@ def test_the_rule_finds_what_it_forbids() -> None:
 
 
 def trees(words: str) -> Iterator[tuple[str, ast.Module]]:
-    """Yield each file of the tests that matches the text, by its name in tests/, with its syntax tree."""
+    """Yield each test file that contains the text, by its name in tests/, with its syntax tree."""
     for path in files_of_tests():
         text = path.read_text(encoding="utf-8")
         if re.search(words, text):
@@ -51,7 +51,7 @@ def trees(words: str) -> Iterator[tuple[str, ast.Module]]:
 
 
 def private(tree: ast.Module) -> Iterator[str]:
-    """The attributes with an underscore that are not the object's own."""
+    """Yield the attributes with an underscore that are not the object's own."""
     for node in ast.walk(tree):
         if not isinstance(node, ast.Attribute) or node.attr in PUBLISHED:
             continue
@@ -61,7 +61,7 @@ def private(tree: ast.Module) -> Iterator[str]:
 
 
 def answers_anything(tree: ast.Module) -> Iterator[str]:
-    """Classes that make up attributes, and the mocks of the standard library."""
+    """Yield classes that invent attributes, and mocks of the standard library."""
     for node in ast.walk(tree):
         match node:
             case ast.FunctionDef(name="__getattr__" | "__getattribute__"):

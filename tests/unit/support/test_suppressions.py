@@ -1,4 +1,4 @@
-"""Each suppression of a checker has its reason beside it, in every language of the tree."""
+"""Each suppression of a checker has its reason on its line, in every language of the tree."""
 
 import re
 from collections.abc import Iterator
@@ -41,12 +41,12 @@ def test_each_suppression_has_its_reason() -> None:
     ],
 )
 def test_the_reason_is_what_follows(line: str, reason: str) -> None:
-    """After the last of a line, whatever separates it."""
+    """The reason follows the last suppression of a line, after any separator."""
     assert list(reasons_in(line)) == [reason]
 
 
 def reasons_in(text: str) -> Iterator[str]:
-    """Return the reason of each suppression; empty if there is none."""
+    """Yield the reason of each suppression; empty if there is none."""
     for line in text.splitlines():
         _code, *after = SUPPRESSION.split(line)
         if after:
@@ -54,7 +54,7 @@ def reasons_in(text: str) -> Iterator[str]:
 
 
 def sources() -> Iterator[Path]:
-    """Return each checked file except this one, which is full of examples."""
+    """Yield each checked file except this one, which is full of examples."""
     for folder in FOLDERS:
         for path in (ROOT / folder).rglob("*"):
             ours = path != Path(__file__) and not {"vendor", "__pycache__"} & set(path.parts)

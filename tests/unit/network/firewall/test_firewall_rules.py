@@ -37,13 +37,13 @@ FULL = FirewallSettings(
 
 
 def test_the_rules_only_ever_refuse() -> None:
-    """No rule of the appliance's namespace accepts a packet over the head of another firewall."""
+    """No rule in the appliance's namespace accepts a packet, so none overrides another firewall."""
     refusing = {PacketVerdict.RETURN, PacketVerdict.RESET, PacketVerdict.DROP}
     assert {rule.verdict for rule in appliance_rules(FULL)} == refusing | {PacketVerdict.COUNTED}
 
 
 def test_hosts_are_counted_after_the_handshake_only() -> None:
-    """A limit for each host counts packets after the handshake: the source of a first packet may be forged."""
+    """Packets count towards a host's limit only after the handshake: the source of a first packet may be forged."""
     limited = [rule for rule in appliance_rules(FULL) if rule.above is not None]
     assert len(limited) == 3
     assert all(rule.answered and not rule.opening for rule in limited)
@@ -52,7 +52,7 @@ def test_hosts_are_counted_after_the_handshake_only() -> None:
 
 
 def test_the_owner_passes_before_all_others_are_refused() -> None:
-    """For an inner port the owner's RETURN comes before the rule that refuses all users, at the first packet."""
+    """For an inner port, from the first packet on, the owner's RETURN precedes the rule that refuses all users."""
     outside, owner, others = inner_port("ROSMaster port", 11312, "control", 61011)
     assert (outside.chain, outside.arrives_on, outside.verdict) == (
         Chain.IN,
@@ -67,13 +67,13 @@ def test_the_owner_passes_before_all_others_are_refused() -> None:
 
 
 def test_unknown_ports_and_empty_lists_make_no_rule() -> None:
-    """A port that is not known yet, and a REST port or rate limit that is off, leave no rule behind."""
+    """A port that is not known yet, or a REST port or rate limit that is off, makes no rule."""
     bare = FirewallSettings(control_uid=1, rosmaster_uid=2, new_connections=None)
     assert appliance_rules(bare) == ()
 
 
 def test_an_address_of_the_machine_is_for_its_own_packets() -> None:
-    """A packet from a router with such an address is dropped before any other rule, for both families."""
+    """A packet from a router with one of the machine's addresses is dropped before any other rule, in both families."""
     first, second, *_ = appliance_rules(replace(FULL, neighbours=("10.111.0.1", "fd52::1")))
     assert [rule.families() for rule in (first, second)] == [(4,), (6,)]
     assert all(
@@ -95,7 +95,7 @@ def test_a_tunnelled_address_is_refused_both_ways_before_all_else() -> None:
 
 
 def test_the_rest_port_is_limited_before_its_networks_pass() -> None:
-    """The REST port's rate limit comes before the RETURN of the networks, its refusal after."""
+    """The REST port's rate limit precedes the RETURN of the allowed networks; its refusal follows."""
     purposes = [rule.purpose for rule in appliance_rules(FULL) if rule.purpose.startswith("REST")]
     assert purposes == [
         "REST port: new connections per host",
@@ -107,13 +107,13 @@ def test_the_rest_port_is_limited_before_its_networks_pass() -> None:
 
 
 def test_purposes_tell_rules_of_a_chain_apart() -> None:
-    """No two rules of a chain have the same purpose, because the counters are joined by it."""
+    """No two rules of a chain have the same purpose, because counters are matched by purpose."""
     keys = [(rule.chain, rule.purpose) for rule in appliance_rules(FULL)]
     assert len(keys) == len(set(keys))
 
 
 def test_families_follow_the_addresses() -> None:
-    """A rule with an address is of that address's family, any other of both."""
+    """A rule with an address has that address's family; any other rule has both families."""
     assert PacketRule(
         chain=Chain.IN, purpose="x", verdict=PacketVerdict.DROP, source="fd00::/8"
     ).families() == (6,)
@@ -165,7 +165,7 @@ def test_wrong_values_are_named(make: object, words: str) -> None:
 
 
 def test_a_rule_is_in_force_only_with_all_its_families() -> None:
-    """Counters of both families are added up; a rule that one family has lost is not in force."""
+    """The counters of both families are added up; a rule that is missing in one family is not in force."""
     rule = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP)
     four = RuleCounter("ROSRV-IN", 4, "p", 3, 300)
     six = RuleCounter("ROSRV-IN", 6, "p", 1, 100)
@@ -177,7 +177,7 @@ def test_a_rule_is_in_force_only_with_all_its_families() -> None:
 
 
 def test_a_kernel_without_a_family_lacks_no_rule_of_it() -> None:
-    """Where there is no IPv6, a rule for both is in force with IPv4's, and one for IPv6 alone has nothing to refuse."""
+    """Without IPv6, a rule for both families is in force with IPv4 alone; an IPv6 rule has nothing to refuse."""
     both = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP)
     six = PacketRule(chain=Chain.IN, purpose="six", verdict=PacketVerdict.DROP, source="fd00::/8")
     four = RuleCounter("ROSRV-IN", 4, "p", 3, 300)
@@ -193,7 +193,7 @@ def test_a_rule_describes_itself() -> None:
 
 
 def test_ports_of_the_own_nodes_are_closed_from_outside() -> None:
-    """Ports that the kernel chose are closed to other hosts; our own ports in that range stay open."""
+    """Ports chosen by the kernel are closed to other hosts; our own ports in that range stay open."""
     bare = FirewallSettings(
         control_uid=1, rosmaster_uid=2, new_connections=None, client_ports=PortRange(32768, 60999)
     )
@@ -214,7 +214,7 @@ def test_ports_of_the_own_nodes_are_closed_from_outside() -> None:
 
 
 def test_the_own_node_is_called_by_control_alone() -> None:
-    """Control reaches it at one address, the relay at its ports for messages; any other connection it never answers."""
+    """Control reaches the node at one address, the relay at its message ports; no other connection is answered."""
     of_node = [rule for rule in appliance_rules(FULL) if "own node" in rule.purpose]
     calls = [rule for rule in of_node if rule.destination == "127.87.79.1"]
     assert [(rule.uid, rule.verdict) for rule in calls] == [
@@ -233,7 +233,7 @@ def test_the_own_node_is_called_by_control_alone() -> None:
 
 
 def test_rosmaster_and_the_own_node_open_no_way_out() -> None:
-    """Programs that are not ours connect to their own peers only; none of their packets leaves the machine."""
+    """Foreign programs connect only to their own peers, and none of their packets leaves the machine."""
     rules = appliance_rules(FULL)
     for uid, port in ((61012, 4444), (61018, 5555)):
         opened = [rule for rule in rules if rule.uid == uid and rule.opening]
@@ -251,7 +251,7 @@ def test_rosmaster_and_the_own_node_open_no_way_out() -> None:
 
 
 def test_a_rule_is_for_tcp_or_for_udp() -> None:
-    """A packet cannot be both; a port of UDP is named in the words of the rule."""
+    """A port's rule is for TCP or for UDP, never both; the rule's description names UDP."""
     with pytest.raises(ValueError, match="TCP or UDP"):
         PacketRule(
             chain=Chain.IN,
@@ -265,7 +265,7 @@ def test_a_rule_is_for_tcp_or_for_udp() -> None:
 
 
 def test_the_forwarder_reaches_its_receiver_only() -> None:
-    """The forwarder's user sends to one address and port only; the rule concerns no other user."""
+    """The forwarder's user may send to one address and port only; other users are not affected."""
     for datagrams in (False, True):
         to = ForwarderAccess(61017, "10.0.0.9", 6514, datagrams=datagrams)
         settings = FirewallSettings(control_uid=1, rosmaster_uid=2, forwarder=to, new_connections=None)

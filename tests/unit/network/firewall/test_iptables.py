@@ -15,7 +15,7 @@ SYN = ("tcp-flags", ("SYN,ACK", "SYN"))
 
 
 def test_the_owner_rule_in_words_of_xtables() -> None:
-    """The owner match comes with the SYN and the port, once for each family."""
+    """The owner match has the SYN flag and the port, once for each family."""
     _, owner, others = inner_port("ROSMaster port", 11312, "control", 61011)
     attributes = (("protocol", "tcp"), ("out_interface", "lo"))
     assert render_rule(owner) == [
@@ -36,7 +36,7 @@ def test_the_owner_rule_in_words_of_xtables() -> None:
 
 
 def test_a_rate_limit_is_a_hashlimit_that_ports_share() -> None:
-    """Rules of the same limit name the same table of buckets, whatever their ports; ranges have a colon."""
+    """Rules of one limit share a table of buckets, whatever their ports; ranges are written with a colon."""
     rules = [
         PacketRule(
             chain=Chain.IN,
@@ -59,7 +59,7 @@ def test_a_rate_limit_is_a_hashlimit_that_ports_share() -> None:
 
 
 def test_ipsec_is_matched_by_policy_in_both_directions() -> None:
-    """Clear text is `--pol none`, of the direction of the chain; an address makes the rule of one family."""
+    """Clear text is `--pol none` in the direction of the chain; a rule with an address has one family."""
     for chain, direction in ((Chain.IN, "in"), (Chain.OUT, "out")):
         rule = PacketRule(
             chain=chain, purpose="p", verdict=PacketVerdict.DROP, source="fd77::1", clear_text=True
